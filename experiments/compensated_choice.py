@@ -15,7 +15,6 @@ Frames that serve as truth are noisy: their own variance is added to that of the
 
 import argparse
 import dataclasses
-import functools
 import itertools
 import pickle
 from collections.abc import Callable, Iterator
@@ -414,108 +413,119 @@ def plain(W: Any, mean: Any, spread: Any) -> Any:
     return W.at[..., -1].add(-(W[..., :-1] * mean[:-1]).sum(-1))
 
 
-def minimise(value: Callable[[Any], Any], start: Any, used: Any, iterations: int) -> Any:
-    """Minimise a function of weights, all but those `used` 0."""
+def minimise(value: Callable[..., Any], iterations: int) -> Callable[..., tuple[Any, Any]]:
+    """Compile a minimisation of `value(W, *data)` by Adam.
+
+    Returns a function of the start, a mask of the weights that are not 0, and the data, to the
+    weights and their value.
+    """
     optimiser = optax.adam(0.05)
-    state, step = optimiser.init(start), jax.jit(jax.grad(lambda W: value(W * used)))
-    for _ in range(iterations):
-        change, state = optimiser.update(step(start), state)
-        start = optax.apply_updates(start, change)
-    return start * used
+
+    @jax.jit
+    def minimised(start: Any, used: Any, *data: Any) -> tuple[Any, Any]:
+        def step(_: int, carry: tuple) -> tuple:
+            W, state = carry
+            gradient = jax.grad(lambda W: value(W * used, *data))(W)
+            change, state = optimiser.update(gradient, state)
+            return optax.apply_updates(W, change), state
+
+        W, _ = jax.lax.fori_loop(0, iterations, step, (start, optimiser.init(start)))
+        return W * used, value(W * used, *data)
+
+    return minimised
 
 
-class Fit(NamedTuple):
-    """Weights of the choice and of the variance, on standardised pixels."""
+def penalised_image_loss(W: Any, pixels: Pixels) -> Any:
+    """Return the loss of choice weights with a penalty."""
+    return image_loss(pixels, W) + 3e-4 * (W[:, :-1] ** 2).sum()
 
-    pixels: Pixels
-    scales: tuple  # mean and standard deviation of features
-    variance_scales: tuple
 
-    @classmethod
-    def of(cls, pixels: Pixels) -> "Fit":
-        """Standardise features."""
-        X, *scales = standardise(pixels.X)
-        variance_X, *variance_scales = standardise(pixels.variance_X)
-        pixels = pixels._replace(X=X, variance_X=variance_X)
-        return cls(pixels, tuple(scales), tuple(variance_scales))
+def penalised_variance_loss(w: Any, pixels: Pixels, squares: Any) -> Any:
+    """Return the loss of variance weights with a penalty."""
+    return variance_loss(pixels, w, squares) + 1e-4 * (w[:-1] ** 2).sum()
 
-    def choice_value(self, W: Any) -> Any:
-        """Return the loss of choice weights, with a penalty."""
-        return image_loss(self.pixels, W) + 3e-4 * (W[:, :-1] ** 2).sum()
 
-    def variance_value(self, w: Any, squares: Any) -> Any:
-        """Return the loss of variance weights, with a penalty."""
-        return variance_loss(self.pixels, w, squares) + 1e-4 * (w[:-1] ** 2).sum()
+class Fit:
+    """Fits of weights to pixels, whose features are standardised."""
 
-    def choice(self, used: Any, iterations: int = 400) -> Any:
+    def __init__(self, pixels: Pixels, iterations: int = 400):
+        X, *self.scales = standardise(pixels.X)
+        variance_X, *self.variance_scales = standardise(pixels.variance_X)
+        self.images, self.kinds = pixels.images, pixels.kinds
+        self.pixels = pixels._replace(X=X, variance_X=variance_X, images=None, kinds={})
+        self._choice = minimise(penalised_image_loss, iterations)
+        self._variance = minimise(penalised_variance_loss, iterations)
+
+    def choice(self, used: Any) -> Any:
         """Fit choice weights (2, features)."""
         start = jnp.zeros((len(FALLBACKS), len(FEATURES) + 1))
         start = start.at[:, -1].set(jnp.array([-2.0, -3.0]))
-        return minimise(self.choice_value, start, used, iterations)
+        return self._choice(start, used, self.pixels)[0]
 
     def squares(self, W: Any) -> Any:
         """Return the squared errors of log intensity."""
         return (blend(self.pixels, W) - self.pixels.level) ** 2
 
-    def variance(self, used: Any, squares: Any, iterations: int = 400) -> Any:
+    def variance(self, used: Any, squares: Any) -> Any:
         """Fit variance weights (features,), scaled to a standardised square of 1.
 
         Of that the geometric mean over images of a kind is taken, and then over kinds.
         """
         start = jnp.zeros(len(FEATURES) + 1).at[-1].set(jnp.log(squares.mean()))
-        w = minimise(lambda w: self.variance_value(w, squares), start, used, iterations)
-        edges, factor = np.cumsum([0, *self.pixels.images]), 1.0
+        w, _ = self._variance(start, used, self.pixels, squares)
+        edges, factor = np.cumsum([0, *self.images]), 1.0
         for _ in range(5):
             P = factor * jnp.exp(self.pixels.variance_X @ w) + self.pixels.R
             z2 = np.asarray(squares / P)
             means = [np.log(z2[i:j].mean()) for i, j in zip(edges[:-1], edges[1:], strict=True)]
-            kinds = self.pixels.kinds.values()
-            factor *= float(np.exp(np.mean([np.mean([means[k] for k in g]) for g in kinds])))
+            groups = [np.mean([means[k] for k in group]) for group in self.kinds.values()]
+            factor *= float(np.exp(np.mean(groups)))
         return w.at[-1].add(np.log(factor))
 
 
-def eliminate(value: Callable[[Any], Any], weights: Any, iterations: int = 60) -> list[int]:
+def eliminate(value: Callable[..., Any], weights: Any, *data: Any) -> list[int]:
     """Order features by backward elimination: the first one is the first to go.
 
     At each turn the feature goes without which the loss, after a few steps of the other weights, is
     least.
     """
-    used, order = np.ones(len(FEATURES) + 1, np.float32), []
+    minimised, used = minimise(value, 40), np.ones(len(FEATURES) + 1, np.float32)
+    order: list[int] = []
     while used[:-1].any():
         found = []
         for k in np.flatnonzero(used[:-1]):
             fewer = used.copy()
             fewer[k] = 0
-            W = minimise(value, weights, jnp.asarray(fewer), iterations)
-            found.append((float(value(W)), int(k), W))
+            W, loss = minimised(weights, jnp.asarray(fewer), *data)
+            found.append((float(loss), int(k), W))
         _, gone, weights = min(found, key=lambda one: one[0])
         used[gone] = 0
         order.append(gone)
     return order
 
 
+COUNTS = (16, 12, 10, 8, 6, 4, 2, 0)  # of features, whose held-out losses are printed
+
+
 def select(fitting: list[dict], testing: list[dict], noises: dict[str, float]) -> None:
     """Print the held-out losses of fewer features, in a table."""
-    few, held_out = Fit.of(gather(fitting, noises, 101)), gather(testing, noises)
-    fit = Fit.of(gather(fitting, noises))
-    every = jnp.ones(len(FEATURES) + 1)
+    few, held_out = Fit(gather(fitting, noises, 211)), gather(testing, noises, 31)
+    fit, every = Fit(gather(fitting, noises, 31)), jnp.ones(len(FEATURES) + 1)
     W = few.choice(every)
     squares = few.squares(W)
-    choice_order = eliminate(few.choice_value, W)
+    choice_order = eliminate(penalised_image_loss, W, few.pixels)
     w = few.variance(every, squares)
-    variance_order = eliminate(functools.partial(few.variance_value, squares=squares), w)
-    whole = fit.choice(every)
-    squares = fit.squares(whole)
-    held_out_squares = (blend(held_out, plain(whole, *fit.scales)) - held_out.level) ** 2
+    variance_order = eliminate(penalised_variance_loss, w, few.pixels, squares)
     for name, order in (("choice", choice_order), ("variance", variance_order)):
-        print(name, [FEATURES[k] for k in order])
+        print(name, [FEATURES[k] for k in order], flush=True)
+    W = fit.choice(every)
+    squares = fit.squares(W)
+    held_out_squares = (blend(held_out, plain(W, *fit.scales)) - held_out.level) ** 2
     print("| features | image loss, fitted | held out | variance loss, fitted | held out |")
     print("|---:|---:|---:|---:|---:|")
-    for count in (16, 14, 12, 10, 8, 6, 4, 3, 2, 1, 0):
-        used = [
-            every.at[jnp.array(o[: len(FEATURES) - count], int)].set(0)
-            for o in (choice_order, variance_order)
-        ]
+    for count in COUNTS:
+        gone = len(FEATURES) - count
+        used = [every.at[jnp.array(o[:gone], int)].set(0) for o in (choice_order, variance_order)]
         W, w = fit.choice(used[0]), fit.variance(used[1], squares)
         cells = (
             image_loss(fit.pixels, W),
@@ -524,6 +534,8 @@ def select(fitting: list[dict], testing: list[dict], noises: dict[str, float]) -
             variance_loss(held_out, plain(w, *fit.variance_scales), held_out_squares),
         )
         print(f"| {count} | " + " | ".join(f"{float(v):.4f}" for v in cells) + " |", flush=True)
+        weights = plain(W, *fit.scales), plain(w, *fit.variance_scales)
+        print("<!--", *(np.round(np.asarray(v), 3).tolist() for v in weights), "-->", flush=True)
 
 
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
@@ -586,7 +598,7 @@ def main() -> None:
     if given.features:
         rows = ([row for part in parts for row in part] for parts in (fitting, testing))
         return select(*rows, noises)
-    fit = Fit.of(gather([row for part in fitting for row in part], noises))
+    fit = Fit(gather([row for part in fitting for row in part], noises))
     every = jnp.ones(len(FEATURES) + 1)
     W = fit.choice(every)
     w = fit.variance(every, fit.squares(W))

@@ -62,7 +62,7 @@ class Images:
         self.live(self.live.stop)
 
     def held(self) -> int:
-        return len(self.live._events.held())
+        return len(self.live._events.retained())
 
     def compare(self) -> str:
         image = self.live(self.live.stop).mean
@@ -83,7 +83,7 @@ class Targets:
         self.live(self.live.stop)
 
     def held(self) -> int:
-        return len(self.live._tail.held())
+        return len(self.live._tail.retained())
 
     def compare(self) -> str:
         t = self.live.stop

@@ -165,10 +165,10 @@ MUTATIONS = (
     ),
     Mutation(
         "a file of compiled code is unpickled whoever wrote it",
-        "jaxevent/codegen/kept.py",
+        "jaxevent/codegen/cache.py",
         "return pickle.loads(payload) if own else None",
         "return pickle.loads(payload)",
-        "tests/codegen/test_kept.py -k signed",
+        "tests/codegen/test_cache.py -k signed",
     ),
     Mutation(
         "a layer of the house imports upwards",

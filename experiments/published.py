@@ -105,13 +105,13 @@ def rig(folder: Path, triggers: bool) -> tuple[Recording, bool]:
         offset = float((folder / "offset.txt").read_text())
     found = register.estimate(recording, other, grid, homography=H, offset=offset)
     if triggers:
-        other, found = register.by_triggers(recording, other, found)
-    print(f"{folder.name}: offset {found.offset:.6f} s, {register.seen(found.grid):.1%} seen")
-    both = register.registered(recording, other, found)
+        other, found = register.stamp_by_triggers(recording, other, found)
+    print(f"{folder.name}: offset {found.offset:.6f} s, {register.coverage(found.grid):.1%} seen")
+    both = register.apply_registration(recording, other, found)
     images = beside(folder, "hdr")
     if images is not None:
         reference = register.read_frames(images, reference=True)
-        both = register.registered(both, reference, found, reference=True)
+        both = register.apply_registration(both, reference, found, reference=True)
     return dataclasses.replace(both, name=folder.name), images is not None
 
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import jaxevent
 from jaxevent import register
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.geometry import undistorted
+from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import (
     SENSORS,
@@ -32,10 +32,10 @@ from jaxevent.simulate import (
     Pan,
     Sensor,
     World,
+    make_texture,
     planar_motion,
     scene,
     simulate,
-    texture_of,
 )
 from jaxevent.simulate.hybrid import expose, frame_times
 
@@ -83,14 +83,14 @@ class View:
 
     def __post_init__(self) -> None:
         y, x = np.mgrid[: self.size[1], : self.size[0]].reshape(2, -1)
-        at, f = undistorted(self.camera, x, y)
+        at, f = undistort(self.camera, x, y)
         ray = np.concatenate([at / f, np.ones((len(at), 1))], 1) @ self.rotation
         object.__setattr__(self, "_ray", ray)
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
         pose = self.motion.pose(np.array([float(t)]))[0]
         centre = pose[:3, 3] - pose[:3, :3] @ self.rotation.T @ self.translation
-        level, _ = self.world.seen(centre, self._ray @ pose[:3, :3].T, 1 / self.camera.fx)
+        level, _ = self.world.render(centre, self._ray @ pose[:3, :3].T, 1 / self.camera.fx)
         return np.exp(level).reshape(self.size[::-1]) / 3  # even ground is a third of white
 
 
@@ -151,7 +151,7 @@ def near_rig(
     sizes = [(round(w / shrink), round(h / shrink)) for w, h in ((128, 96), (200, 150))]
     rotation = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
     rig = register.Rig(one, two, rotation, np.array([-0.1, 0.01, 0.0]))
-    texture = texture_of("noise", 0.012 * shrink, seed, 2.0)
+    texture = make_texture("noise", 0.012 * shrink, seed, 2.0)
     world = World((-4.0, -4.0, -3.0), (4.0, 4.0, 2.0), texture)
     motion = planar_motion(
         (20, -15), 2.0, one.fx, amplitude=(60, 90), frequency=1.3, phase=float(rng.uniform(0, 6))
@@ -192,7 +192,7 @@ def naive(recording: Recording, other: Recording) -> Recording:
     grid = register.homography_grid(
         scale, (recording.width, recording.height), (other.width, other.height)
     )
-    return register.registered(recording, other, register.Registration(grid, 0.0, scale))
+    return register.apply_registration(recording, other, register.Registration(grid, 0.0, scale))
 
 
 def main() -> None:
@@ -211,7 +211,7 @@ def main() -> None:
                 continue
             size, seen = (recording.width, recording.height), (other.width, other.height)
             true = register.homography_grid(H, size, seen)
-            after = register.registered(recording, other, found)
+            after = register.apply_registration(recording, other, found)
             covered = after.extra["covered"]
             before = reconstruction_error(naive(recording, other), covered)
             later = reconstruction_error(after, covered)
@@ -228,7 +228,7 @@ def main() -> None:
         size, seen = (recording.width, recording.height), (other.width, other.height)
         grid = rig.grid(size, seen, plane=(0, 0, 1, 2.0))
         found = register.estimate(recording, other, grid)
-        after = register.registered(recording, other, found)
+        after = register.apply_registration(recording, other, found)
         covered = after.extra["covered"]
         before = reconstruction_error(naive(recording, other), covered)
         later = reconstruction_error(after, covered)

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 import jaxevent
-from jaxevent.io.deflate import shuffled
+from jaxevent.io.output import deflate_shuffled
 from jaxevent.show.export import evenly
 
 OPTIONS = {
@@ -50,7 +50,9 @@ def main() -> None:
                         )
                         for row in range(len(images)):
                             if name == OURS:
-                                stored.id.write_direct_chunk((row, 0, 0), shuffled(images[row]))
+                                stored.id.write_direct_chunk(
+                                    (row, 0, 0), deflate_shuffled(images[row])
+                                )
                             else:
                                 stored[row] = images[row]
                 writing.append(time.process_time() - clock)

@@ -13,7 +13,7 @@ import warnings
 import numpy as np
 
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io.options import ReadOptions
+from jaxevent.io.checks import ReadOptions
 from jaxevent.io.time_units import SAMPLE, SCALES, infer_unit
 
 SENSORS = [(64, 48), (128, 128), (240, 180), (346, 260), (640, 480), (1280, 720)]

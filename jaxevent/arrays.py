@@ -6,13 +6,15 @@ None of these libraries is imported. Plain arrays are of the machine's byte orde
 writable, as compiled functions take them; an array that is plain already is not copied.
 """
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import InputError
+from jaxevent.deprecated import renamed_names
+from jaxevent.errors import InputError, InputWarning
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
@@ -25,8 +27,12 @@ NAMES = {
 LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R 601
 MAX_PIXELS = 1 << 16  # of a side: coordinates are uint16
 MAX_TIME_US = 1 << 62  # 146,000 years: sums and differences of two times stay in int64
+UNITS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 SCALES: dict[str, float] = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
 _LUMA_16 = (19595, 38470, 7471)  # LUMA in units of 2^-16, as Pillow computes grey
+_MAX_STEP_US = 1000.0  # between neighbouring numbers of a type, from which it is refused
+_MIN_STEPS = 64  # of a type within the span of the events
+_MANY_EVENTS = 300  # from which events must span `_MIN_STEPS`
 _BLOCK = 1 << 20  # values compared together, so that a check needs no memory to speak of
 _HELD_NOT_NUMBERS = {
     "O": "convert it to numbers",
@@ -39,8 +45,8 @@ _HELD_NOT_NUMBERS = {
 }
 
 
-def find(names: Sequence[str]) -> dict[str, str] | None:
-    """The names of t, x, y and p among some; None unless each is there, once."""
+def find_fields(names: Sequence[str]) -> dict[str, str] | None:
+    """Find the names of t, x, y and p among some; None unless each is there, once."""
     found = {}
     for field, aliases in NAMES.items():
         fitting = [name for name in names if str(name).strip().lower() in aliases]
@@ -51,10 +57,17 @@ def find(names: Sequence[str]) -> dict[str, str] | None:
 
 
 def as_array(values: Any, what: str) -> NDArray:
-    """The numbers of an array-like, bool, integer or float, as a NumPy array of any shape.
+    """Turn an array-like into a NumPy array.
 
-    `what` names the argument in messages. Raises `InputError` for what holds no numbers and where
-    some are masked.
+    Args:
+        values: Numbers of any shape, bool, integer or float.
+        what: Name of the argument for messages.
+
+    Returns:
+        The numbers as an array, not copied if it is one.
+
+    Raises:
+        InputError: The values are no numbers, or some are masked.
     """
     if isinstance(values, np.ma.MaskedArray):
         if np.ma.getmaskarray(values).any():
@@ -82,14 +95,22 @@ def as_array(values: Any, what: str) -> NDArray:
 
 
 def _is_spent(values: Iterable[Any]) -> bool:
-    """Tell what can be passed over only once or has no order, as generators and files."""
+    """Return whether an iterable has no order or can be passed over only once."""
     return not (hasattr(values, "__len__") and hasattr(values, "__getitem__"))
 
 
 def as_column(values: Any, what: str) -> NDArray:
-    """The numbers of an array-like (n,), bool, integer or float.
+    """Turn an array-like of one axis into a NumPy array.
 
-    Raises `InputError` for other shapes and types, naming the argument `what`.
+    Args:
+        values: (n,) numbers, bool, integer or float.
+        what: Name of the argument for messages.
+
+    Returns:
+        (n,) numbers.
+
+    Raises:
+        InputError: The values have another shape or are no numbers.
     """
     array = as_array(values, what)
     if array.ndim != 1:
@@ -101,15 +122,23 @@ def as_column(values: Any, what: str) -> NDArray:
 
 
 def as_plain(values: NDArray, dtype: Any = None) -> NDArray:
-    """An array of the machine's byte order, contiguous and writable; itself if it is that."""
+    """Return an array of the machine's byte order, contiguous and writable.
+
+    Args:
+        values: The array, which is not copied if it is plain already.
+        dtype: Type of the result; None keeps that of `values`.
+
+    Returns:
+        The plain array.
+    """
     dtype = values.dtype.newbyteorder("=") if dtype is None else np.dtype(dtype)
     return np.require(values, dtype, "CAWE")
 
 
 def columns_of(events: Any) -> dict[str, Any]:
-    """The columns t, x, y and p of a structured array, a DataFrame, a table or a dictionary.
+    """Return the columns t, x, y and p of a structured array, a DataFrame, a table or a dictionary.
 
-    Raises `InputError` where these are not found by their names (`NAMES`).
+    Raises `InputError` if these are not found by their names (`NAMES`).
     """
     names: Any = getattr(getattr(events, "dtype", None), "names", None)
     if names is None and isinstance(events, Mapping):
@@ -120,7 +149,7 @@ def columns_of(events: Any) -> dict[str, Any]:
     if names is None and all(hasattr(events, name) for name in "txyp"):
         return {name: getattr(events, name) for name in "txyp"}
     try:
-        fields = None if names is None else find(list(names))
+        fields = None if names is None else find_fields(list(names))
     except TypeError:
         names = fields = None
     if fields is None:
@@ -145,53 +174,117 @@ def check_unit(time_unit: Any) -> None:
 
 
 def as_times(values: Any, what: str, time_unit: TimeUnit | None = None) -> NDArray[np.int64]:
-    """Times (n,) as plain int64 us.
+    """Convert the times of a caller to plain int64 us.
 
-    Integers are in `time_unit`, without one in us. Raises `InputError` for floats without a unit,
-    and for floats whose type cannot tell neighbouring times apart.
+    Args:
+        values: (n,) times.
+        what: Name of the argument for messages.
+        time_unit: Unit of the times, "s", "ms", "us" or "ns"; None has integers in us and refuses
+            floats.
+
+    Returns:
+        (n,) times in us. Times that their type rounds by more than 1 us raise an `InputWarning`.
+
+    Raises:
+        InputError: The times are no numbers, have no unit, or their type cannot resolve them.
     """
     t = as_column(values, what)
     if t.dtype.kind == "b" and len(t):
         raise InputError(f"{what} is of type bool, not times; give integers or floats")
     if t.dtype.kind == "f" and time_unit is None and len(t):
         raise InputError(
-            f"{what} is {t.dtype}, which tells no unit; give time_unit='s' (or 'ms', 'us', 'ns'), "
+            f"{what} is {t.dtype}, which states no unit; give time_unit='s' (or 'ms', 'us', 'ns'), "
             "or integer microseconds"
         )
     unit = time_unit or "us"
-    if t.dtype.kind == "f":
-        refuse_coarse_times(t, SCALES[unit], what)
+    if t.dtype.kind == "f" and len(t) and np.isfinite(t).all():
+        first, last = float(t.min()), float(t.max())
+        spread = (time_step(t), last - first, max(abs(first), abs(last)))
+        if (note := check_resolution(spread, len(t), unit, what)) is not None:
+            warnings.warn(f"{what}: {note}", InputWarning, stacklevel=3)
     elif unit != "us":
         check_span(t, what, "row", max(round(SCALES[unit]), 1))
     return as_plain(to_microseconds(t, unit, what, "row") if len(t) else t, np.int64)
 
 
-def refuse_coarse_times(t: NDArray, scale: float, what: str) -> None:
-    """Raise `InputError` for float times whose type cannot tell neighbours apart.
+def time_step(t: NDArray) -> float:
+    """Return the distance between neighbouring numbers near the largest value of a column.
 
-    That is where two values of the type next to each other, at the largest time, are over 1 us
-    apart and further than two events on average. `scale` is the us of one unit.
+    Numbers of a wider type that all are numbers of 32 bits were rounded to these before.
+
+    Args:
+        t: (n,) finite times.
+
+    Returns:
+        The distance in the unit of `t`; 0 for integers.
     """
-    if len(t) < 2:
-        return
-    first, last = float(t.min()), float(t.max())
-    largest = max(abs(first), abs(last))
-    if not np.isfinite(largest):
-        return
-    step = float(np.spacing(t.dtype.type(largest))) * scale
-    if step > 1 and step > (last - first) * scale / (len(t) - 1):
+    if t.dtype.kind != "f" or not len(t):
+        return 0.0
+    largest = np.abs(t).max().astype(np.float64)
+    step = float(np.spacing(t.dtype.type(largest)))
+    if t.dtype.itemsize > 4 and len(t) > 16 and largest < 3e38:
+        decimals = t[t != np.rint(t)]
+        if len(decimals) > 16 and (decimals.astype(np.float32) == decimals).all():
+            # Multiples of a large binary fraction, such as halves, are numbers of any type.
+            if (decimals * 1024 != np.rint(decimals * 1024)).any():
+                return float(np.spacing(np.float32(largest)))
+    return step
+
+
+def check_resolution(t: Sequence[float], count: int, unit: str, source: str) -> str | None:
+    """Check that the type of float times resolves events.
+
+    Times are refused where neighbouring numbers of their type are 1 ms or more apart, or where 300
+    or more events span fewer than 64 of them.
+
+    Args:
+        t: Distance between neighbouring numbers as of `time_step`, time from the first to the last
+            event, and largest time, all in a unit.
+        count: Number of events.
+        unit: The unit, "s", "ms", "us" or "ns".
+        source: Name of the file for messages.
+
+    Returns:
+        A sentence on times rounded by more than 1 us; None where they are not.
+
+    Raises:
+        InputError: The type cannot resolve the times.
+    """
+    step_us, span_us, largest_us = (value * SCALES[unit] for value in t)
+    if step_us <= 1 or count < 2 or not largest_us < MAX_TIME_US:
+        return None
+    if step_us >= _MAX_STEP_US or (count >= _MANY_EVENTS and span_us < _MIN_STEPS * step_us):
         raise InputError(
-            f"{what}: {t.dtype} holds times near {largest:g} in steps of {step:.3g} us, coarser "
-            "than neighbouring events; keep them as float64 or integer microseconds from the start"
+            f"{source}: the type of the times cannot resolve them: as {UNITS[unit]} its numbers "
+            f"near {_short_time(largest_us)} are {_short_time(step_us)} apart; store integer "
+            "microseconds or 64-bit floats, counted from the start of the recording"
         )
+    return f"times are rounded by their type to {_short_time(step_us)}"
+
+
+def _short_time(us: float) -> str:
+    if us < 1e3:
+        return f"{us:.3g} us"
+    return f"{us / 1e3:.3g} ms" if us < 1e6 else f"{us / 1e6:.10g} s"
 
 
 def times(
     values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
 ) -> NDArray[np.int64]:
-    """Times (n,) as int64 us: integers are us already, floats are multiplied by `scale`.
+    """Convert times of a file to int64 us: integers are us already, floats are scaled.
 
-    `first_row` is the row of the first one in `source`; both are for messages.
+    Args:
+        values: (n,) times.
+        source: Name of the file for messages.
+        what: "event", "image" or the like.
+        scale: Microseconds in one unit of floats.
+        first_row: Row of the first time in the file.
+
+    Returns:
+        (n,) times in us.
+
+    Raises:
+        InputError: A time is not finite or too large.
     """
     values = numbers(values, source, f"{what} times")
     is_float = values.dtype.kind == "f"
@@ -214,6 +307,9 @@ def to_microseconds(
         what: "event", "image" or the like.
         first_row: Row of the first time in the file.
 
+    Returns:
+        (n,) times in us.
+
     Raises:
         InputError: A time is not finite or too large for us.
     """
@@ -230,13 +326,24 @@ def to_microseconds(
 def check_span(
     values: NDArray, source: str, what: str, scale: float = 1, first_row: int = 0
 ) -> None:
-    """Raise `InputError` for times, of `scale` us each, that are not finite or beyond int64."""
+    """Check that times are finite and fit int64 us.
+
+    Args:
+        values: (n,) times.
+        source: Name of the file for messages.
+        what: "event", "image" or the like.
+        scale: Microseconds in one unit.
+        first_row: Row of the first time in the file.
+
+    Raises:
+        InputError: A time is not finite or too large.
+    """
     is_float = values.dtype.kind == "f"
     # NaN and infinity fail this comparison too.
     most = MAX_TIME_US / scale if is_float else MAX_TIME_US // scale
     if len(values) and not -most < values.min() <= values.max() < most:
         row = int(np.argmin((values > -most) & (values < most)))
-        unit = {1e6: "seconds", 1e3: "milliseconds", 1e-3: "nanoseconds"}.get(scale, "microseconds")
+        unit = next((UNITS[name] for name, us in SCALES.items() if us == scale), UNITS["us"])
         shown = f"{values[row]:.16g}" if is_float else str(values[row])
         raise InputError(
             f"{_place(source)}{what} {first_row + row} has the time {shown}, not finite "
@@ -245,7 +352,19 @@ def check_span(
 
 
 def numbers(values: NDArray, source: str, what: str) -> NDArray:
-    """The array, or `InputError` unless it is a list of integers or floats."""
+    """Check that an array is a list of integers or floats.
+
+    Args:
+        values: The array.
+        source: Name of the file for messages.
+        what: Name of the array for messages.
+
+    Returns:
+        The array.
+
+    Raises:
+        InputError: The array has another shape or type.
+    """
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise InputError(
             f"{_place(source)}{what} is {values.dtype} of shape {values.shape}; store a list of "
@@ -255,7 +374,7 @@ def numbers(values: NDArray, source: str, what: str) -> NDArray:
 
 
 def brief(value: Any) -> str:
-    """A value on one line, cut to 60 characters, for messages."""
+    """Format a value on one line, cut to 60 characters, for messages."""
     return " ".join(repr(value).split())[:60]
 
 
@@ -264,7 +383,19 @@ def _place(source: str) -> str:
 
 
 def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
-    """The sides of a sensor, whole numbers of pixels from 1 to `MAX_PIXELS`, or `InputError`."""
+    """Check the sides of a sensor.
+
+    Args:
+        width: Width in px.
+        height: Height in px.
+        source: Name of the file or recording for messages.
+
+    Returns:
+        (width, height), each from 1 to `MAX_PIXELS`.
+
+    Raises:
+        InputError: A side is no whole number, or out of this range.
+    """
     for name, side in (("width", width), ("height", height)):
         if not isinstance(side, int | np.integer) or isinstance(side, bool):
             raise InputError(
@@ -288,9 +419,21 @@ def coordinates(
     first_row: int = 0,
     origin: int = 0,
 ) -> NDArray[np.uint16]:
-    """Columns ("x") or rows ("y") of events on a sensor (width, height), plain.
+    """Check the columns or rows of events.
 
-    They count from `origin`. Raises `InputError` for the first that is no whole number on it.
+    Args:
+        name: "x" or "y".
+        values: (n,) coordinates in px.
+        size: (width, height) of the sensor in px.
+        source: Name of the file for messages.
+        first_row: Row of the first event in the file.
+        origin: Number of the first column or row of the sensor, 0 or 1.
+
+    Returns:
+        (n,) coordinates from 0, plain.
+
+    Raises:
+        InputError: A coordinate is no whole number on the sensor; the message names the first.
     """
     values = numbers(values, source, name)
     last = origin + (size[0] if name == "x" else size[1]) - 1
@@ -299,7 +442,7 @@ def coordinates(
         good = (values >= origin) & (values <= last) & (values == np.rint(values))
         bad_row = None if good.all() else int(np.argmin(good))
     else:
-        # What the type cannot hold is not looked for.
+        # What the type cannot hold is not searched.
         kind, bad_row = np.iinfo(values.dtype), None
         low = kind.min < origin and len(values) and values.min() < origin
         if low or (kind.max > last and len(values) and values.max() > last):
@@ -316,9 +459,18 @@ def coordinates(
 
 
 def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]:
-    """Polarity, bool, 0/1 or -1/1 of any type, as plain bool; True is ON.
+    """Check polarities: bool, 0/1 or -1/1 of any type.
 
-    Raises `InputError` for the first other value.
+    Args:
+        p: (n,) polarities.
+        source: Name of the file for messages.
+        first_row: Row of the first event in the file.
+
+    Returns:
+        (n,) plain bool, True is ON.
+
+    Raises:
+        InputError: There is another value; the message names the first.
     """
     if p.dtype.kind == "b" and p.ndim == 1:
         p = as_plain(p)
@@ -344,7 +496,18 @@ def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]
 
 
 def check_lengths(t: Any, x: Any, y: Any, p: Any, source: str) -> None:
-    """Raise `InputError` unless the four columns of events are equally long."""
+    """Check that the four columns of events are equally long.
+
+    Args:
+        t: Times.
+        x: Columns.
+        y: Rows.
+        p: Polarities.
+        source: Name of the file for messages.
+
+    Raises:
+        InputError: The lengths differ.
+    """
     if not len(t) == len(x) == len(y) == len(p):
         raise InputError(
             f"{_place(source)}t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
@@ -353,7 +516,15 @@ def check_lengths(t: Any, x: Any, y: Any, p: Any, source: str) -> None:
 
 
 def first_decrease(t: NDArray, strict: bool = False) -> int | None:
-    """The first row whose time is before the one above it, or with `strict` not after it."""
+    """Find the first row whose time is before that of the row above it.
+
+    Args:
+        t: (n,) times.
+        strict: Whether equal times count, too.
+
+    Returns:
+        The row; None if there is none.
+    """
     for begin in range(0, max(len(t) - 1, 0), _BLOCK):
         # Comparing neighbours is three times faster than np.diff, which writes differences.
         part = t[begin : begin + _BLOCK + 1]
@@ -364,10 +535,18 @@ def first_decrease(t: NDArray, strict: bool = False) -> int | None:
 
 
 def as_images(frames: Any, what: str = "frames") -> tuple[NDArray, NDArray[np.uint8] | None]:
-    """Grey images (n, H, W), and the colours (n, H, W, 3) of those given in colour, else None.
+    """Check the images of a caller, and convert colours to grey.
 
-    Images are uint8, uint16 or floats in [0, 1]; colours are red, green, blue. None stands for
-    colours that are grey too. Raises `InputError` for other types, shapes and values.
+    Args:
+        frames: (n, H, W) or (n, H, W, 3) images, red first: uint8, uint16 or floats in [0, 1].
+        what: Name of the argument for messages.
+
+    Returns:
+        Grey images (n, H, W), and the colours (n, H, W, 3) uint8; None if there are none, or all of
+        them are grey.
+
+    Raises:
+        InputError: Types, shapes or values are not valid.
     """
     images = as_array(frames, what)
     shape = images.shape
@@ -389,12 +568,21 @@ def as_images(frames: Any, what: str = "frames") -> tuple[NDArray, NDArray[np.ui
     if images.ndim == 3:
         return plain_images(images), None
     differ = any((one != one[..., :1]).any() for one in images)
-    grey = np.stack([grey_of(one) for one in images]) if len(images) else images[..., 0]
+    grey = np.stack([to_grey(one) for one in images]) if len(images) else images[..., 0]
     return plain_images(grey), np.stack([_in_8_bits(one) for one in images]) if differ else None
 
 
-def grey_of(image: NDArray) -> NDArray:
-    """The luma (H, W) of an image (H, W, 3) in its own type, rounded as Pillow does."""
+def to_grey(image: NDArray) -> NDArray:
+    """Convert an image to grey of its own type, rounded as Pillow does.
+
+    Args:
+        image: (H, W), which stays as it is, or (H, W, 3), red first.
+
+    Returns:
+        (H, W) luma of ITU-R 601.
+    """
+    if image.ndim == 2:
+        return image
     if image.dtype.kind == "f":
         return image @ LUMA.astype(image.dtype)
     parts = (image[..., k].astype(np.uint32) * np.uint32(_LUMA_16[k]) for k in range(3))
@@ -412,14 +600,22 @@ def _in_8_bits(image: NDArray) -> NDArray[np.uint8]:
 
 
 def plain_images(images: NDArray) -> NDArray:
-    """Images of the machine's byte order, contiguous and writable; of floats, float32 or 64."""
+    """Return images as plain arrays, see `as_plain`; floats become those of 32 or 64 bits."""
     if images.dtype.kind == "f" and images.dtype.itemsize not in (4, 8):
         return as_plain(images, np.float32 if images.dtype.itemsize < 4 else np.float64)
     return as_plain(images)
 
 
 def check_image_kind(dtype: np.dtype, what: str) -> None:
-    """Raise `InputError` unless images of a type are uint8, uint16 or floats."""
+    """Check the type of images: uint8, uint16 or floats.
+
+    Args:
+        dtype: The type.
+        what: Name of the images for messages.
+
+    Raises:
+        InputError: The type is another.
+    """
     if dtype.kind != "f" and (dtype.kind != "u" or dtype.itemsize > 2):
         raise InputError(
             f"{what} are {dtype}; store uint8, uint16 or floats in [0, 1], such as "
@@ -428,7 +624,15 @@ def check_image_kind(dtype: np.dtype, what: str) -> None:
 
 
 def check_image_values(images: Any, what: str) -> None:
-    """Raise `InputError` for float images (n, ...) that hold NaN or values outside [0, 1]."""
+    """Check that float images hold values in [0, 1].
+
+    Args:
+        images: (n, ...) images.
+        what: Name of the images for messages.
+
+    Raises:
+        InputError: A value is NaN or outside [0, 1].
+    """
     if images.dtype.kind != "f":
         return
     for row in range(len(images)):
@@ -438,3 +642,6 @@ def check_image_values(images: Any, what: str) -> None:
                 f"{what}: frame {row} holds NaN or values outside [0, 1]; scale float frames to "
                 "[0, 1], dividing by 255 if these are levels of 8 bits, and remove broken ones"
             )
+
+
+__getattr__ = renamed_names(__name__)

@@ -7,7 +7,7 @@ keeps nothing, and JAXEVENT_CACHE=FOLDER names another folder.
 
 Machine code that is loaded runs with the user's rights. So the folder is the user's alone: it is
 made with mode 0700, and not used where another user owns it or may write to it. Files of kernels,
-which hold pickles (`jaxevent.codegen.kept`), are read under a key that no other user can read
+which hold pickles (`jaxevent.codegen.cache`), are read under a key that no other user can read
 (`secret_key`).
 """
 

@@ -1,4 +1,4 @@
-"""Cameras: how intensity becomes grey levels and with what certainty; what a lens shows where."""
+"""Cameras: the response from intensity to grey levels and its certainty, and the lens."""
 
 import abc
 import dataclasses
@@ -16,12 +16,20 @@ from jaxevent.lenses import LENSES, find_model
 
 @dataclasses.dataclass(frozen=True)
 class PinholeCamera:
-    """A camera of one centre of projection: focal lengths and centre in px, and its lens.
+    """A camera of one centre of projection, with the distortion of its lens.
 
-    `model` names the distortion of the lens, see `jaxevent.lenses`: "radtan" (Brown-Conrady: k1,
-    k2, p1, p2, k3), "rational" (k1, k2, p1, p2, k3, k4, k5, k6) or "equidistant" (fisheye: k1, k2,
-    k3, k4). `distortion` holds its coefficients, floats; missing ones are 0. Raises `InputError`
-    for another model and for more coefficients than it has.
+    Attributes:
+        fx: Horizontal focal length in px.
+        fy: Vertical focal length in px.
+        cx: Column of the centre in px.
+        cy: Row of the centre in px.
+        distortion: Coefficients of the lens, floats; missing ones are 0.
+        model: Model of the distortion, see `jaxevent.lenses`: "radtan" (Brown-Conrady: k1, k2, p1,
+            p2, k3), "rational" (k1, k2, p1, p2, k3, k4, k5, k6) or "equidistant" (fisheye: k1, k2,
+            k3, k4).
+
+    Raises:
+        InputError: The model is another, or there are more coefficients than it has.
     """
 
     fx: float | int
@@ -49,16 +57,16 @@ class PinholeCamera:
 
     @property
     def is_distorted(self) -> bool:
-        """True where straight lines may be seen bent."""
+        """True if the image of a straight line may be bent."""
         return self.model == "equidistant" or any(self.distortion)
 
     @property
     def undistorted(self) -> "PinholeCamera":
-        """The camera of the same focal lengths and centre without distortion."""
+        """Camera of the same focal lengths and centre without distortion."""
         return PinholeCamera(self.fx, self.fy, self.cx, self.cy)
 
     def distort(self, at: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Places in px (n, 2) at which normalised coordinates X / Z, Y / Z (n, 2) are seen.
+        """Project normalised coordinates X / Z, Y / Z (n, 2) to places in px (n, 2).
 
         NaN beyond the radius at which the distortion turns back, where no light passes the lens.
         """
@@ -68,11 +76,18 @@ class PinholeCamera:
         return bent * (self.fx, self.fy) + (self.cx, self.cy)
 
     def normalise(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Normalised coordinates X / Z, Y / Z (n, 2) of what is seen at places x, y (n,) in px.
+        """Return the normalised coordinates of places in the image, with the distortion undone.
 
-        Distortion is undone. NaN where it has no inverse, which is far from the centre, and more
-        than 87 degrees from the axis. Raises `InputError` for a camera without positive focal
-        lengths.
+        Args:
+            x: (n,) columns in px.
+            y: (n,) rows in px.
+
+        Returns:
+            (n, 2) coordinates X / Z, Y / Z. NaN where the distortion has no inverse, which is far
+            from the centre, and more than 87 degrees from the axis.
+
+        Raises:
+            InputError: A focal length is not positive.
         """
         x, y = np.asarray(x), np.asarray(y)
         if not (0 < self.fx < np.inf and 0 < self.fy < np.inf):
@@ -91,23 +106,23 @@ Values = Float[Array | np.ndarray, "..."] | float
 
 
 class Response(eqx.Module):
-    """A camera response: grey values of intensities, the inverse, and how certain grey makes it.
+    """A camera response: grey values of intensities, its inverse, and the certainty of grey values.
 
-    Grey values are in [0, 1], of a uint8 level `level / 255`. Intensity is in units of what the
-    camera resolves. All methods take arrays of any shape and are differentiable.
+    Grey values are in [0, 1], of a uint8 level `level / 255`. Intensity is in units of the range
+    that the camera resolves. All methods take arrays of any shape and are differentiable.
     """
 
     @abc.abstractmethod
     def grey(self, intensity: Values) -> Float[Array, "..."]:
-        """Grey value in [0, 1] of an intensity, the camera response; clipped at both ends."""
+        """Return the grey value in [0, 1] of an intensity, clipped at both ends."""
 
     @abc.abstractmethod
     def intensity(self, grey: Values) -> Float[Array, "..."]:
-        """Intensity in [0, 1] of a grey value in [0, 1]: the inverse camera response."""
+        """Return the intensity in [0, 1] of a grey value in [0, 1]."""
 
     @abc.abstractmethod
     def certainty(self, grey: Values) -> Float[Array, "..."]:
-        """w = dCRF/dE at that grey value, scaled to the maximum 1 (AKF paper section 3.2.1)."""
+        """Return w = dCRF/dE at a grey value, scaled to the maximum 1 (AKF paper section 3.2.1)."""
 
 
 class UnknownResponse(Response):
@@ -153,11 +168,11 @@ class SCurve(Response):
         self.steepness = jnp.asarray(steepness, jnp.result_type(float))
 
     def scene(self, level: ArrayLike | int | float) -> Float[Array, "..."]:
-        """Intensity of an original image's level in [0, 255]; beyond [0, 1] the camera clips."""
+        """Return the intensity of a level in [0, 255] of an original image; it is not clipped."""
         return (jnp.asarray(level) - self.cut) / (255 - 2 * self.cut)
 
     def level(self, intensity: Values) -> Float[Array, "..."]:
-        """The original image's level, 0 to 255, of an intensity: the inverse of `scene`."""
+        """Return the original image's level, 0 to 255, of an intensity: the inverse of `scene`."""
         return self.cut + jnp.asarray(intensity) * (255 - 2 * self.cut)
 
     def grey(self, intensity: Values) -> Float[Array, "..."]:
@@ -173,7 +188,7 @@ class SCurve(Response):
         return 1 - ((2 * jnp.asarray(grey) - 1) * self._end()) ** 2
 
     def table(self, entries: int = 256) -> Float[Array, " entries"]:
-        """Intensities of `entries` evenly spaced grey values, as `TableResponse` takes them."""
+        """Return the intensities of evenly spaced grey values, as `TableResponse` takes them."""
         return self.intensity(jnp.linspace(0, 1, entries))
 
     def _end(self) -> Float[Array, ""]:
@@ -232,28 +247,35 @@ def estimate_response(
     samples: int = 20,
     seed: int = 0,
 ) -> TableResponse:
-    """The camera response from images of one still scene under different exposure times.
+    """Estimate a camera response from images of one still scene under different exposure times.
 
-    `images` is (N, H, W) uint8, `exposures` (N,) in s, of which only the ratios matter. Debevec and
-    Malik, "Recovering High Dynamic Range Radiance Maps from Photographs", SIGGRAPH 1997: with
-    g(z) = ln CRF^-1 the least squares fit of g(z_ij) = ln E_i + ln t_j, weighted by a hat over the
-    grey levels, and of g'' = 0, weighted by `smoothness`, relative to the data of a grey level. A
-    clipped pixel that noise shows as unclipped says something wrong: levels within `margin` of 0
-    and 255 count as clipped; give 3 to 4 standard deviations of the noise. Of each grey level of
-    each image as many as `samples` pixels are taken, drawn by `seed`, that are unclipped in two
-    images or more.
+    Debevec and Malik, "Recovering High Dynamic Range Radiance Maps from Photographs", SIGGRAPH
+    1997: with g(z) = ln CRF^-1 the least squares fit of g(z_ij) = ln E_i + ln t_j, weighted by a
+    hat over the grey levels, and of g'' = 0, weighted by `smoothness`.
 
-    The result never falls; grey level 255 has intensity 1. Its certainty is its slope, and 0 at
-    levels that no taken pixel showed, the clipped ones among them: there intensity is extrapolated.
+    Args:
+        images: (N, H, W) uint8.
+        exposures: (N,) exposure times in s, of which only the ratios matter.
+        smoothness: Weight of g'' = 0, relative to the data of a grey level.
+        margin: Levels within this distance of 0 and 255 count as clipped. A clipped pixel that
+            noise shows as unclipped misleads the fit: give 3 to 4 standard deviations of the noise.
+        samples: Number of pixels of each grey level of each image, unclipped in two images or more.
+        seed: Seed of the choice of pixels.
 
-    Raises `InputError` for images and exposures that do not fit together or all have one exposure,
-    for images with too few usable pixels, and for settings outside their range.
+    Returns:
+        A response that never falls; grey level 255 has intensity 1. Its certainty is its
+        derivative, and 0 at levels that no chosen pixel has, as clipped ones: there intensity is
+        extrapolated.
+
+    Raises:
+        InputError: Images and exposures do not fit together or all have one exposure, too few
+            pixels are usable, or a setting is outside its range.
     """
     stack, times = _stack(images, exposures)
     if len(np.unique(times)) < 2:
         raise InputError(
-            f"{len(stack)} images of one exposure time tell no camera response; give images of two "
-            "or more exposure times"
+            f"{len(stack)} images of one exposure time determine no camera response; give images "
+            "of two or more exposure times"
         )
     if not smoothness > 0 or not samples > 0 or not 0 <= margin <= 32:
         raise InputError(
@@ -268,8 +290,8 @@ def estimate_response(
     if surplus < 256 or not shown[:48].any() or not shown[208:].any():
         raise InputError(
             f"only {z.shape[1]} usable pixels, unclipped in two images, is too few or their grey "
-            "levels too alike to tell a camera response; expose so that many pixels are unclipped "
-            "in two images, from dark to bright"
+            "levels too alike to determine a camera response; expose so that many pixels are "
+            "unclipped in two images, from dark to bright"
         )
     levels = _debevec(z, np.log(times), hat, smoothness)
     slope = np.gradient(levels)
@@ -277,6 +299,7 @@ def estimate_response(
 
 
 def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
+    """Check the images and exposure times of a stack."""
     stack, times = np.asarray(images), np.asarray(exposures, float)
     if stack.dtype != np.uint8 or stack.ndim != 3:
         raise InputError(
@@ -294,7 +317,7 @@ def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.f
 
 
 def _drawn(z: NDArray, usable: NDArray, samples: int, rng: np.random.Generator) -> NDArray:
-    """Grey levels (images, drawn) of pixels that are usable twice, spread over the levels."""
+    """Draw grey levels (images, drawn) of pixels that are usable twice, spread over the levels."""
     z = z[:, usable[z].sum(0) >= 2]
     z = z[:, rng.permutation(z.shape[1])]
     drawn = np.zeros(z.shape[1], bool)
@@ -309,7 +332,7 @@ def _drawn(z: NDArray, usable: NDArray, samples: int, rng: np.random.Generator) 
 def _debevec(
     z: NDArray, log_exposure: NDArray, hat: NDArray, smoothness: float | int
 ) -> NDArray[np.float64]:
-    """Intensity of every grey level from the levels z of pixels (images, pixels).
+    """Fit the intensity of every grey level to the levels z of pixels (images, pixels).
 
     Pixel i contributes sum_j h_j (g(z_j) - ln t_j - ln E_i)^2, h_j = hat(z_j)^2. Its best ln E_i is
     the mean of g(z_j) - ln t_j under h. Put in, normal equations of the 256 values of g remain:
@@ -347,18 +370,28 @@ def merge_exposures(
     reference: float | int | None = None,
     margin: int = 3,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """An HDR image from images of one still scene under different exposure times.
+    """Merge images of one still scene under different exposure times into an HDR image.
 
-    `images` is (N, H, W) uint8, `exposures` (N,) in s. Intensity (H, W) is in units of frames with
-    the exposure time `reference`, in s, by default the first image's; the second result, (H, W), is
-    its variance relative to that of such a frame's pixel of certainty 1. The mean of
-    CRF^-1(z_j) t_ref / t_j under the weights w(z_j) (t_j / t_ref)^2, the inverse variances if
-    CRF^-1(z) has the variance 1 / w(z) (AKF paper (4); Robertson et al., ICIP 1999). Levels within
-    `margin` of 0 and 255 count as clipped and have no weight.
+    The intensity is the mean of CRF^-1(z_j) t_ref / t_j under the weights w(z_j) (t_j / t_ref)^2,
+    the inverse variances if CRF^-1(z) has the variance 1 / w(z) (AKF paper (4); Robertson et al.,
+    ICIP 1999).
 
-    Where all images are clipped the variance is infinite and intensity a bound: that of the
-    shortest saturated exposure, of the longest dark one, or their mean where there are both.
-    Raises `InputError` for images and exposures that do not fit together.
+    Args:
+        images: (N, H, W) uint8.
+        exposures: (N,) exposure times in s.
+        response: Camera response.
+        reference: Exposure time in s of the frames in whose units intensity is; by default the
+            first image's.
+        margin: Levels within this distance of 0 and 255 count as clipped and have no weight.
+
+    Returns:
+        Intensity (H, W), and its variance (H, W) relative to that of a pixel of certainty 1 in a
+        frame of the reference exposure. Where all images are clipped the variance is infinite and
+        intensity a bound: that of the shortest saturated exposure, of the longest dark one, or
+        their mean where there are both.
+
+    Raises:
+        InputError: Images and exposures do not fit together.
     """
     stack, times = _stack(images, exposures)
     reference = float(times[0]) if reference is None else reference

@@ -2,11 +2,11 @@
 
     recordings = jaxevent.datasets.open("mvsec", "/data/mvsec")
     recordings.names                         # ('indoor_flying1', 'indoor_flying2', ...)
-    recordings["indoor_flying1"].poses       # loaded when asked for
+    recordings["indoor_flying1"].poses       # loaded when needed
     for recording in recordings:
         ...
 
-Nothing is downloaded. A recording is found in any folder below, where `LAYOUTS` says:
+Nothing is downloaded. A recording is found in any folder below, at the places that `LAYOUTS` lists:
 
     name     files                                  ground truth
     ijrr     folders with events.txt, *.zip         poses, IMU
@@ -15,7 +15,7 @@ Nothing is downloaded. A recording is found in any folder below, where `LAYOUTS`
     m3ed     *_data.h5                              poses, `depth`
     hdr      *.mat of the AKF's authors             `HDR_mat`, where it is there
     ahdr     the same                               `HDR_mat`
-    evimo2   folders with dataset_events_t.npy      none: see `jaxevent.io.evimo`
+    evimo2   folders with dataset_events_t.npy      none: see `jaxevent.io.folders`
 
 `depth`, `disparity` and `flow` are in `Recording.extra`, as `jaxevent.io.truth` describes, with the
 layouts' sources; the readers of `jaxevent.io` describe the recordings' own. In configurations of
@@ -28,17 +28,23 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from jaxevent.errors import InputError
-from jaxevent.io import load, reading, truth
+from jaxevent.io import load, truth
+from jaxevent.io.checks import reading
 from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where the recordings of a data set lie.
+    """Layout of the recordings of a data set in a folder.
 
-    `pattern` is a glob of a recording's file, in which {side} is the camera. `up` is how many
-    levels above the file the folder is that names a recording; 0: the file does, without `end`.
+    Attributes:
+        pattern: Glob of a recording's file, in which {side} is the camera.
+        up: Number of levels above the file of the folder that names a recording; 0: the file does.
+        end: End of the name that is left out.
+        loads_folder: Whether the file's folder is loaded, not the file.
+        has_sides: Whether a file holds two cameras, left and right.
+        size: (width, height) in px, where files do not state it.
     """
 
     pattern: str
@@ -46,7 +52,7 @@ class Layout:
     end: str = ""
     loads_folder: bool = False  # the file's folder is what is loaded
     has_sides: bool = False  # a file holds two cameras, left and right
-    size: tuple[int, int] | None = None  # (width, height), where files do not tell it
+    size: tuple[int, int] | None = None  # (width, height), where files do not state it
 
 
 LAYOUTS: dict[str, tuple[Layout, ...]] = {
@@ -68,9 +74,14 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Recordings of a folder, in the order of their names; each is loaded when it is asked for.
+    """Recordings of a folder, in the order of their names, each loaded when it is needed.
 
-    `paths` are by name, as `jaxevent.load` takes them.
+    Attributes:
+        paths: Paths by name, as `jaxevent.load` takes them.
+        side: Camera, "left" or "right".
+        has_sides: Whether a file holds two cameras.
+        size: (width, height) in px, where files do not state it.
+        in_memory: Whether events and images are read into memory.
     """
 
     paths: dict[str, Path]
@@ -81,6 +92,7 @@ class Dataset:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the recordings."""
         return tuple(self.paths)
 
     def __len__(self) -> int:
@@ -90,7 +102,7 @@ class Dataset:
         return (self[name] for name in self.paths)
 
     def __getitem__(self, which: str | int) -> Recording:
-        """A recording by its name, or its number in `names`; `InputError` where it is damaged."""
+        """Load a recording by its name, or by its number in `names`."""
         if isinstance(which, int):
             which = self.names[which]
         if which not in self.paths:
@@ -108,14 +120,18 @@ def open(
     size: tuple[int, int] | None = None,
     in_memory: bool = False,
 ) -> Dataset:
-    """The recordings of a data set below a folder.
+    """Find the recordings of a data set below a folder.
 
     Args:
         name: A key of `LAYOUTS`.
         folder: The data set, or a part of it, as it was downloaded and unpacked.
-        side: Which of two cameras, "left" or "right".
-        size: (width, height) in pixels, where files do not tell it.
-        in_memory: As of `jaxevent.load`; depth and flow stay in their files in any case.
+        side: Camera, of files that hold two, "left" or "right".
+        size: (width, height) in px, where files do not state it.
+        in_memory: Whether events and images are read into memory; depth and flow stay in their
+            files in any case.
+
+    Returns:
+        The recordings, not loaded yet.
 
     Raises:
         InputError: There is no such data set, or none of its recordings below the folder.
@@ -144,7 +160,7 @@ def open(
 
 
 def _name(file: Path, folder: Path, layout: Layout) -> str:
-    """How a recording is called: its path below the folder, without what all have."""
+    """Return the name of a recording: its path below the folder, without the common parts."""
     named = file.parents[layout.up - 1] if layout.up else file
     text = named.resolve().name if named == folder else named.relative_to(folder).as_posix()
     return text.removesuffix(layout.end)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 Places = NDArray[np.float64]
 Coefficients = Sequence[float]
-_STEEPEST = 20.0  # tan of the widest angle from the axis that is told, 87 degrees
+_STEEPEST = 20.0  # tan of the widest angle from the axis that is supported, 87 degrees
 _STEPS = 20  # of Newton's method
 
 
@@ -44,7 +44,7 @@ class Lens:
 
 
 def find_model(name: str) -> str | None:
-    """The name in `LENSES` of a model by any of its names; None where it is not supported."""
+    """Find the name in `LENSES` of a model by any of its names; None if it is not supported."""
     name = name.strip().lower()
     for model, lens in LENSES.items():
         if name == model or name in lens.aliases:
@@ -53,7 +53,7 @@ def find_model(name: str) -> str | None:
 
 
 def _distort_rational(xy: Places, k: Coefficients) -> tuple[Places, NDArray[np.float64]]:
-    """Brown-Conrady distortion, its radial part N / D, and its Jacobian."""
+    """Apply Brown-Conrady distortion, its radial part N / D; return also its Jacobian."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *(0.0,) * (8 - len(k)))
     x, y = xy.T
     r2 = x * x + y * y
@@ -77,7 +77,7 @@ def _distort_rational(xy: Places, k: Coefficients) -> tuple[Places, NDArray[np.f
 
 
 def _undistort_rational(seen: Places, k: Coefficients) -> Places:
-    """Newton's method; the Jacobian is positive definite as far as an inverse exists."""
+    """Invert the distortion by Newton's method, where the Jacobian is positive definite."""
     straight = seen.copy()
     if not any(k):
         return straight
@@ -92,7 +92,7 @@ def _undistort_rational(seen: Places, k: Coefficients) -> Places:
 
 
 def _turn_rational(k: Coefficients) -> float:
-    """The least root of D or of (r N / D)' D^2 = (r N)' D - r N D', polynomials in r^2 = s."""
+    """Return the least root of D or of (r N / D)' D^2, polynomials in r^2 = s."""
     k1, k2, _, _, k3, k4, k5, k6 = (*k, *(0.0,) * (8 - len(k)))
     N, D = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([k6, k5, k4, 1.0])
     s = np.poly1d([1.0, 0.0])
@@ -113,7 +113,7 @@ def _distort_equidistant(xy: Places, k: Coefficients) -> tuple[Places, NDArray[n
 
 
 def _undistort_equidistant(seen: Places, k: Coefficients) -> Places:
-    """Newton's method for the angle, within the angles up to which the radius rises."""
+    """Invert the distortion by Newton's method, up to the angle at which the radius turns."""
     radius = np.hypot(*seen.T)
     most = min(_widest(k), np.arctan(_STEEPEST))
     angle = np.minimum(radius, most)
@@ -134,7 +134,7 @@ def _turn_equidistant(k: Coefficients) -> float:
 def _radius(
     angle: NDArray[np.float64], k: Coefficients
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The radius at which angles from the axis are seen, and its derivative."""
+    """Return the radius at which angles from the axis are imaged, and its derivative."""
     k1, k2, k3, k4 = k
     a2 = angle * angle
     radius = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
@@ -142,13 +142,13 @@ def _radius(
 
 
 def _widest(k: Coefficients) -> float:
-    """The angle from which on the radius no longer rises."""
+    """Return the angle from which on the radius no longer rises."""
     k1, k2, k3, k4 = k
     return float(np.sqrt(_least_root(np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0]))))
 
 
 def _least_root(roots: NDArray) -> float:
-    """The least positive real one; infinite where there is none."""
+    """Return the least positive real root; infinite if there is none."""
     real = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
 

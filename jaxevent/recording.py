@@ -1,14 +1,14 @@
-"""What a hybrid event camera recorded: events, frames, calibration, ground truth, IMU, triggers.
+"""Recordings of a hybrid event camera: events, frames, calibration, ground truth, IMU, triggers.
 
-Conventions, said once. Time is int64 microseconds on the recording's own clock. `x` is the column
+Conventions. Time is int64 microseconds on the recording's own clock. `x` is the column
 (to the right), `y` the row (downwards), both from 0; image arrays are [y, x]. Polarity is True for
-ON (brighter), False for OFF. Where a time is asked for, an integer means microseconds and a float
-means seconds, both on the recording's clock.
+ON (brighter), False for OFF. Where a function takes a time, an integer means microseconds and a
+float means seconds, both on the recording's clock.
 """
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,9 +27,17 @@ PER_FRAME = ("gain", "rgb")  # names of `Recording.extra` that hold one entry pe
 
 
 def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
-    """Times as int64 microseconds: integers are taken as microseconds, floats as seconds.
+    """Convert times to microseconds: integers are microseconds already, floats are seconds.
 
-    Raises `InputError` for other types and for times that are not finite or too large for int64.
+    Args:
+        time: Times of any shape.
+        what: Name of the times for messages.
+
+    Returns:
+        Times as int64 us, of the same shape.
+
+    Raises:
+        InputError: The times are of another type, not finite, or too large for int64.
     """
     try:
         time = np.asarray(time)
@@ -48,22 +56,29 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
 
 
 def check_times(times: Times, start: int, stop: int, name: str) -> None:
-    """Raise `InputError` for times outside start <= t <= stop (us), the span of the data.
+    """Check that times lie in the span of the data.
 
-    `name` is that of the recording, for the message. The message gives both conventions, since a
-    number of the wrong one is the usual reason.
+    Args:
+        times: Times, integers in us or floats in s.
+        start: First time of the data in us.
+        stop: Last time of the data in us.
+        name: Name of the recording for messages.
+
+    Raises:
+        InputError: A time is outside start <= t <= stop. The message gives both conventions, since
+            a number of the wrong one is the usual reason.
     """
     us = np.atleast_1d(microseconds(times))
     if len(us) and (us.min() < start or us.max() > stop):
         raise InputError(
-            f"{name}: times from {us.min()} to {us.max()} us were asked for, but it lasts from "
+            f"{name}: times from {us.min()} to {us.max()} us were requested, but it lasts from "
             f"{start} to {stop} us; give times of the recording's clock inside it (integers are "
             "microseconds, floats seconds), or extrapolate=True"
         )
 
 
 def _span(what: str, number: int, t: Any) -> str:
-    """As in "2 events from 0.1 to 0.2 s"."""
+    """Describe a number of things and their times, as in "2 events from 0.1 to 0.2 s"."""
     text = f"{number:,} {plural(what, number)}"
     return f"{text} from {t[0] / 1e6:g} to {t[-1] / 1e6:g} s" if number else text
 
@@ -75,16 +90,16 @@ class EventSource(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, rows: slice) -> "Events":
-        """The events of a range of rows, in memory."""
+        """Return the events of a range of rows, in memory."""
         ...
 
     def index(self, time: int) -> int:
-        """The number of events earlier than `time` (us)."""
+        """Count the events earlier than `time` (us)."""
         ...
 
 
 class EventColumns(NamedTuple):
-    """Events as they are stored, for those who check order and places while they use them."""
+    """Columns of events as they are stored, whose order and coordinates are not checked."""
 
     t: NDArray[np.int64]  # us after `offset`
     x: NDArray[np.uint16]
@@ -96,10 +111,18 @@ class EventColumns(NamedTuple):
 
 @runtime_checkable
 class ColumnSource(EventSource, Protocol):
-    """Events that can be read without being checked."""
+    """An `EventSource` that can be read without checks."""
 
-    def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
-        """A range of rows, written over those of `room` if they fit; None where types differ."""
+    def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
+        """Read a range of rows as they are stored.
+
+        Args:
+            rows: The rows, step 1.
+            out: Columns to write to, if they are long enough.
+
+        Returns:
+            The columns; None if they are stored as other types.
+        """
         ...
 
 
@@ -140,7 +163,17 @@ class Events:
 
     @classmethod
     def of_checked(cls, t: NDArray, x: NDArray, y: NDArray, p: NDArray) -> "Events":
-        """Events of columns that were checked and are plain, as rows of other events are."""
+        """Make events of columns that were checked and are plain, as rows of other events are.
+
+        Args:
+            t: (n,) times in us, int64.
+            x: (n,) columns in px, uint16.
+            y: (n,) rows in px, uint16.
+            p: (n,) polarities, bool.
+
+        Returns:
+            The events.
+        """
         events = object.__new__(cls)
         for name, values in zip("txyp", (t, x, y, p), strict=True):
             object.__setattr__(events, name, values)
@@ -148,7 +181,7 @@ class Events:
 
     @classmethod
     def empty(cls) -> "Events":
-        """No events."""
+        """Return no events."""
         kinds = (np.int64, np.uint16, np.uint16, np.bool_)
         return cls.of_checked(*(np.empty(0, kind) for kind in kinds))
 
@@ -159,7 +192,7 @@ class Events:
         return len(self.t)
 
     def __getitem__(self, rows: slice | NDArray) -> "Events":
-        """The events of a slice, a mask or row numbers that rise; `InputError` for others."""
+        """Return the events of a slice, a mask or row numbers that rise."""
         if isinstance(rows, slice) and rows.step in (None, 1):
             return Events.of_checked(self.t[rows], self.x[rows], self.y[rows], self.p[rows])
         _check_rows(rows, "events")
@@ -170,33 +203,48 @@ class Events:
         return part
 
     def index(self, time: int) -> int:
-        """The number of events earlier than `time` (us)."""
+        """Count the events earlier than `time` (us)."""
         return int(np.searchsorted(self.t, time))
 
     def to_structured(self) -> NDArray:
-        """The events as a NumPy structured array: t int64 us, x and y uint16, p bool."""
+        """Return the events as a structured array: t int64 us, x and y uint16, p bool."""
         out = np.empty(len(self), [("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")])
         for name in "txyp":
             out[name] = getattr(self, name)
         return out
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The events as a pandas table with the columns t (int64 us), x, y and p (bool)."""
+        """Return the events as a pandas table with the columns t (int64 us), x, y and p (bool)."""
         import pandas
 
         return pandas.DataFrame({name: getattr(self, name) for name in "txyp"})
 
     def check(self, width: int, height: int, source: str, first_row: int = 0) -> None:
-        """Raise `InputError` unless the events are sorted and inside a width x height sensor.
+        """Check that the events are sorted and inside a sensor.
 
-        `source` and `first_row` say where the events came from in the message.
+        Args:
+            width: Width of the sensor in px.
+            height: Height of the sensor in px.
+            source: Name of their file or recording for messages.
+            first_row: Row of the first event in the source.
+
+        Raises:
+            InputError: An event is not valid.
         """
         arrays.check_lengths(self.t, self.x, self.y, self.p, source)
         self.check_order(source, first_row)
         self.check_places(width, height, source, first_row)
 
     def check_order(self, source: str, first_row: int = 0) -> None:
-        """Raise `InputError` unless the events are sorted by time."""
+        """Check that the events are sorted by time.
+
+        Args:
+            source: Name of their file or recording for messages.
+            first_row: Row of the first event in the source.
+
+        Raises:
+            InputError: Times go back.
+        """
         row = arrays.first_decrease(self.t)
         if row is not None:
             raise OrderError(
@@ -205,18 +253,23 @@ class Events:
             )
 
     def check_places(self, width: int, height: int, source: str, first_row: int = 0) -> None:
-        """Raise `InputError` unless the events are inside a width x height sensor."""
-        for name, values, size in (("x", self.x, width), ("y", self.y, height)):
-            if len(values) and int(values.max()) >= size:
-                row = int(np.argmax(values >= size))
-                raise InputError(
-                    f"{source}: event {first_row + row} has {name} = {values[row]} outside the "
-                    f"{width}x{height} sensor; give the sensor's size or remove the event"
-                )
+        """Check that the events are inside a sensor.
+
+        Args:
+            width: Width of the sensor in px.
+            height: Height of the sensor in px.
+            source: Name of their file or recording for messages.
+            first_row: Row of the first event in the source.
+
+        Raises:
+            InputError: An event is outside.
+        """
+        for name, values in (("x", self.x), ("y", self.y)):
+            arrays.coordinates(name, values, (width, height), source, first_row=first_row)
 
 
 def _check_rows(rows: Any, what: str) -> None:
-    """Raise `InputError` for what chooses one row, or several columns, of `what`."""
+    """Raise `InputError` for rows that choose one row, or several columns, of `what`."""
     if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
         raise InputError(
             f"{what} are chosen by a slice, a mask or a list of rows, not {arrays.brief(rows)}; "
@@ -225,10 +278,10 @@ def _check_rows(rows: Any, what: str) -> None:
 
 
 class CheckedEvents:
-    """An `EventSource` around one that checks nothing: events are checked when they are read.
+    """An `EventSource` that checks the events of another one when they are read.
 
-    Raises `InputError` where events are not of the type `Events`, go back in time, lie outside the
-    sensor of `size` (width, height), or are not as many as the rows asked for.
+    Raises `InputError` if events are not of the type `Events`, go back in time, lie outside the
+    sensor of `size` (width, height), or are not as many as the rows of the slice.
     """
 
     def __init__(self, source: EventSource, size: tuple[int, int], name: str):
@@ -256,7 +309,7 @@ class CheckedEvents:
         return events[lead:]
 
     def index(self, time: int) -> int:
-        """The number of events earlier than `time` (us); raises `InputError` for a wrong one."""
+        """Count the events earlier than `time` (us); raise `InputError` for a wrong number."""
         row = self._source.index(time)
         if isinstance(row, int | np.integer) and 0 <= row <= len(self):
             row = int(row)
@@ -274,7 +327,7 @@ class CheckedEvents:
 
 
 def _checked_source(events: Any, size: tuple[int, int], name: str) -> EventSource:
-    """The events of a recording, checked or checking themselves when they are read."""
+    """Check the events of a recording, or have them checked when they are read."""
     if isinstance(events, Events):
         events.check_places(*size, name)
         return events
@@ -298,23 +351,33 @@ class ImageSource(Protocol):
     """Images of shape (frames, height, width) that stay in a file until np.asarray reads them."""
 
     @property
-    def dtype(self) -> np.dtype: ...
+    def dtype(self) -> np.dtype:
+        """Type of the pixels."""
+        ...
 
     @property
-    def shape(self) -> tuple[int, ...]: ...
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the images, (frames, height, width)."""
+        ...
 
     def __getitem__(self, rows: Any) -> "ImageSource":
-        """Some of the images, still in the file."""
+        """Return some of the images, still in the file."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Frames:
-    """Grey frames: images (frames, height, width), mid-exposure times and exposure lengths (us).
+    """Grey frames with the middles and lengths of their exposures.
 
-    Images are uint8 or uint16 grey levels, or floats in [0, 1]; times rise. An exposure of 0 means
-    that its length is not known. All is checked when it is given, of images that stay in a file
-    their type and shape. Raises `InputError` for other types, shapes and values.
+    Times rise. All is checked when it is given; of images that stay in a file, type and shape.
+
+    Attributes:
+        t: (frames,) times of the middle of each exposure in us.
+        images: (frames, height, width) uint8 or uint16 grey levels, or floats in [0, 1].
+        exposure: (frames,) lengths of the exposures in us; 0 where unknown.
+
+    Raises:
+        InputError: Types, shapes or values are not valid.
     """
 
     t: NDArray[np.int64]
@@ -347,7 +410,16 @@ class Frames:
     def of_checked(
         cls, t: NDArray[np.int64], images: NDArray | ImageSource, exposure: NDArray[np.int64]
     ) -> "Frames":
-        """Frames that were checked, as rows of others are, or references of linear intensity."""
+        """Make frames of arrays that were checked, as rows of other frames, or of linear intensity.
+
+        Args:
+            t: (n,) times in us.
+            images: (n, height, width) images.
+            exposure: (n,) lengths of the exposures in us.
+
+        Returns:
+            The frames.
+        """
         frames = object.__new__(cls)
         for name, values in (("t", t), ("images", images), ("exposure", exposure)):
             object.__setattr__(frames, name, values)
@@ -361,7 +433,7 @@ class Frames:
         return len(self.t)
 
     def __getitem__(self, rows: slice | NDArray) -> "Frames":
-        """The frames of a slice, a mask or row numbers that rise; `InputError` for others."""
+        """Return the frames of a slice, a mask or row numbers that rise."""
         _check_rows(rows, "frames")
         part = Frames.of_checked(self.t[rows], self.images[rows], self.exposure[rows])
         if not isinstance(rows, slice) or (rows.step or 1) < 1:
@@ -370,21 +442,39 @@ class Frames:
 
     @property
     def intensity(self) -> NDArray[np.float32]:
-        """The images as float32 grey values in [0, 1]."""
+        """Images as float32 grey values in [0, 1]."""
         images = np.asarray(self.images)
         if images.dtype.kind == "f":
             return images.astype(np.float32)
         return np.divide(images, np.iinfo(images.dtype).max, dtype=np.float32)
 
     def check(self, width: int, height: int, source: str) -> None:
-        """Raise `InputError` unless the frames fit the sensor, are in order and hold numbers."""
+        """Check that the frames fit a sensor, are in order and hold numbers.
+
+        Args:
+            width: Width of the sensor in px.
+            height: Height of the sensor in px.
+            source: Name of their file or recording for messages.
+
+        Raises:
+            InputError: A frame is not valid.
+        """
         arrays.check_image_kind(np.dtype(self.images.dtype), f"{source}: frames")
         self.check_shape(width, height, source)
         self._check_times(source)
         arrays.check_image_values(self.images, source)
 
     def check_shape(self, width: int, height: int, source: str) -> None:
-        """Raise `InputError` unless the images are those of a width x height sensor."""
+        """Check that the images are those of a sensor.
+
+        Args:
+            width: Width of the sensor in px.
+            height: Height of the sensor in px.
+            source: Name of their file or recording for messages.
+
+        Raises:
+            InputError: The images have another shape.
+        """
         if self.images.shape != (len(self.t), height, width) or len(self.exposure) != len(self.t):
             raise InputError(
                 f"{source}: frames have shape {self.images.shape} and {len(self.exposure)} "
@@ -408,7 +498,7 @@ class Frames:
 
 
 def _integer_times(values: Any, what: str) -> NDArray[np.int64]:
-    """Times (n,) of any integer type as plain int64 us, or `InputError`."""
+    """Return times (n,) of any integer type as plain int64 us, or raise `InputError`."""
     t = arrays.as_column(values, what)
     if t.dtype.kind == "f" and len(t):
         raise InputError(
@@ -440,57 +530,51 @@ def _set_rows(part: Any, what: str, **columns: tuple[tuple[int, ...], Any]) -> N
 
 
 @dataclasses.dataclass(frozen=True)
-class Poses:
-    """Ground-truth camera poses: t (us), position (n, 3) in m, quaternion (n, 4) as x y z w."""
+class _TimedRows:
+    """Rows of measurements at sorted times; subclasses have further columns."""
 
     t: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice | NDArray) -> Self:
+        return type(self)(*(values[rows] for values in vars(self).values()))
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses(_TimedRows):
+    """Ground-truth camera poses: t (us), position (n, 3) in m, quaternion (n, 4) as x y z w."""
+
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
 
     def __post_init__(self):
         _set_rows(self, "pose", position=((3,), np.float64), quaternion=((4,), np.float64))
 
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, rows: slice) -> "Poses":
-        return Poses(self.t[rows], self.position[rows], self.quaternion[rows])
-
 
 @dataclasses.dataclass(frozen=True)
-class Imu:
+class Imu(_TimedRows):
     """Inertial measurements: t (us), gyro (samples, 3) in rad/s, acc (samples, 3) in m/s^2."""
 
-    t: NDArray[np.int64]
     gyro: NDArray[np.float64]
     acc: NDArray[np.float64]
 
     def __post_init__(self):
         _set_rows(self, "IMU", gyro=((3,), np.float64), acc=((3,), np.float64))
 
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, rows: slice) -> "Imu":
-        return Imu(self.t[rows], self.gyro[rows], self.acc[rows])
-
 
 @dataclasses.dataclass(frozen=True)
-class Triggers:
+class Triggers(_TimedRows):
     """Signals from outside: t (us), edge (1 rising, 0 falling, -1 unknown), channel, each (n,)."""
 
-    t: NDArray[np.int64]
     edge: NDArray[np.int8]
     channel: NDArray[np.uint8]
 
     def __post_init__(self):
         _set_rows(self, "trigger", edge=((), np.int8), channel=((), np.uint8))
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, rows: slice | NDArray) -> "Triggers":
-        return Triggers(self.t[rows], self.edge[rows], self.channel[rows])
+        if not np.isin(self.edge, (-1, 0, 1)).all():
+            raise InputError("triggers need an edge, -1, 0 or 1, for each time; correct them")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -503,8 +587,8 @@ class Recording(HtmlRepr):
     frames do, see `jaxevent.colour`.
 
     `notes` are remarks of the reader, one sentence without a full stop each, that `jaxevent info`
-    prints: the unit of time it inferred, the number of words it skipped. `left_out` says, by the
-    name of a field that is None ("frames", "camera"), what the file holds of it and how to have it
+    prints: the unit of time it inferred, the number of words it skipped. `left_out` describes, by
+    the name of a field that is None ("frames", "camera"), the data of the file and how to have them
     read; messages that miss the field end with that.
     """
 
@@ -532,29 +616,22 @@ class Recording(HtmlRepr):
             object.__setattr__(self, side, pixels)
         events = _checked_source(self.events, size, self.name)
         object.__setattr__(self, "events", events)
-        parts = {
-            "frames": Frames, "camera": PinholeCamera, "poses": Poses, "imu": Imu,
-            "triggers": Triggers,
-        }  # fmt: skip
-        for field, kind in parts.items():
+        parts = {"camera": PinholeCamera, "frames": Frames, "poses": Poses, "imu": Imu}
+        parts["triggers"] = Triggers
+        for field, kind, remedy in (
+            *(
+                (name, one, f"{one.__module__}.{one.__name__} or None")
+                for name, one in parts.items()
+            ),
+            ("extra", Mapping, "a dictionary by name"),
+            ("left_out", Mapping, "a dictionary by name"),
+            ("notes", tuple | list, "a tuple of sentences"),
+        ):
             part = getattr(self, field)
-            if part is not None and not isinstance(part, kind):
-                raise InputError(
-                    f"{self.name}: {field} is a {type(part).__name__}; give "
-                    f"{kind.__module__}.{kind.__name__} or None"
-                )
+            if not isinstance(part, kind) and (part is not None or field not in parts):
+                raise InputError(f"{self.name}: {field} is a {type(part).__name__}; give {remedy}")
         if self.frames is not None:
             self.frames.check_shape(self.width, self.height, self.name)
-        for field in ("extra", "left_out"):
-            if not isinstance(getattr(self, field), Mapping):
-                raise InputError(
-                    f"{self.name}: {field} is a {type(getattr(self, field)).__name__}; give a "
-                    "dictionary by name"
-                )
-        if not isinstance(self.notes, tuple | list):
-            raise InputError(
-                f"{self.name}: notes is a {type(self.notes).__name__}; give a tuple of sentences"
-            )
 
     @classmethod
     def from_arrays(
@@ -676,19 +753,19 @@ class Recording(HtmlRepr):
 
     @property
     def start(self) -> int:
-        """The time of the first event or frame (us); the filters' time zero."""
+        """Time of the first event or frame in us; the filters' time zero."""
         first = [int(self.events[:1].t[0])] if len(self.events) else []
         return min(first + ([int(self.frames.t[0])] if self.frames else []))
 
     @property
     def stop(self) -> int:
-        """The time of the last event or frame (us)."""
+        """Time of the last event or frame in us."""
         last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
         return max(last + ([int(self.frames.t[-1])] if self.frames else []))
 
     @property
     def gain(self) -> NDArray[np.float64]:
-        """How much brighter each frame shows the scene than intensity 1 as white: `extra["gain"]`.
+        """Brightness of each frame relative to one in which intensity 1 is white: `extra["gain"]`.
 
         Frames of an automatic exposure: intensity is the response's, divided by the gain. 1 where
         there is none. Raises `InputError` for gains that are not one positive number per frame.
@@ -706,7 +783,7 @@ class Recording(HtmlRepr):
 
     @property
     def response(self) -> Response:
-        """The camera response that `extra` carries; `UnknownResponse()` where it carries none.
+        """Camera response in `extra`; `UnknownResponse()` if there is none.
 
         `extra["response"]` holds n >= 3 intensities of evenly spaced grey values from 0 to 1 that
         never fall, `extra["certainty"]`, where present, their n certainties. Recordings of the
@@ -725,7 +802,7 @@ class Recording(HtmlRepr):
             raise InputError(f"{self.name}: extra[{key!r}]{also}: {error}") from error
 
     def __getitem__(self, span: slice) -> "Recording":
-        """The part with start <= t < stop; ints are microseconds, floats seconds, of its clock."""
+        """Return the part with start <= t < stop; ints are us, floats s, of its clock."""
         if not isinstance(span, slice) or span.step is not None:
             raise TypeError("slice a recording by two times: recording[t0:t1]")
         t0 = self.start if span.start is None else int(microseconds(span.start))
@@ -757,7 +834,7 @@ class Recording(HtmlRepr):
         return part
 
     def describe_left_out(self, field: str) -> str:
-        """The end of a message that misses a field that is None: what the file holds of it."""
+        """Return the end of a message that misses a field: the entry of `left_out`."""
         is_missing = getattr(self, field) is None
         return f" ({self.left_out[field]})" if is_missing and field in self.left_out else ""
 
@@ -772,7 +849,7 @@ class Recording(HtmlRepr):
         return left_out
 
     def with_frames(self, rows: slice | NDArray) -> "Recording":
-        """The same recording with only some of its frames."""
+        """Return the recording with some of its frames, by a slice, a mask or row numbers."""
         frames = (self.frames[rows] if self.frames is not None else None) or None
         left_out = self._left_out_of({"frames": frames}, "not among those chosen")
         return dataclasses.replace(
@@ -780,16 +857,23 @@ class Recording(HtmlRepr):
         )
 
     def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, Any]:
-        """The further arrays; those with one entry per frame cut like frames."""
+        """Return the further arrays; those with one entry per frame are cut like frames."""
         if rows is None:
             return self.extra
         cut = {name: self.extra[name][rows] for name in PER_FRAME if name in self.extra}
         return {**self.extra, **cut}
 
     def check(self, source: str | None = None) -> "Recording":
-        """Return self, or raise `InputError` naming what is wrong and where.
+        """Check the recording again; arrays that were changed since it was made are found, too.
 
-        Arrays that were changed since the recording was made are found, too.
+        Args:
+            source: Name for messages; by default the recording's.
+
+        Returns:
+            The recording.
+
+        Raises:
+            InputError: Something is not valid; the message names the place.
         """
         source = source or self.name
         self.refuse_empty(source)
@@ -799,12 +883,12 @@ class Recording(HtmlRepr):
         return self
 
     def check_events(self, source: str | None = None) -> None:
-        """Raise `InputError` where events in memory were changed since they were checked."""
+        """Raise `InputError` if events in memory were changed since they were checked."""
         if isinstance(self.events, Events):
             self.events.check(self.width, self.height, source or self.name)
 
     def refuse_empty(self, source: str | None = None) -> None:
-        """Raise `InputError` where there is neither an event nor a frame."""
+        """Raise `InputError` if there is neither an event nor a frame."""
         if not len(self.events) and not self.frames:
             raise InputError(
                 f"{source or self.name}: holds no event and no frame; nothing can be estimated"

@@ -13,7 +13,7 @@ from jaxevent.errors import InputError
 
 AFTER = "import jax.numpy; jax.numpy.ones(3); import jaxevent; jaxevent.akf"
 BEFORE = "import jax, jaxevent; jax.numpy.ones(3); jaxevent.akf"
-LOOK = "; from jaxevent.reconstruction.engine import images; print(images.IN_TURN)"
+LOOK = "; from jaxevent.reconstruction.engine import images; print(images.IS_SYNCHRONOUS)"
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import jaxevent
 from jaxevent import events
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.events import parts
+from jaxevent.events import blocks as event_blocks
 from jaxevent.recording import Events, Frames, Recording
 
 WIDTH, HEIGHT = 7, 5
@@ -47,7 +47,7 @@ def rows(part: Events) -> list[tuple[int, int, int, bool]]:
 @pytest.fixture(autouse=True, params=[1 << 20, 33])
 def blocks(request, monkeypatch):
     """Results do not depend on the blocks in which events are read."""
-    monkeypatch.setattr(parts, "BLOCK", request.param)
+    monkeypatch.setattr(event_blocks, "BLOCK_EVENTS", request.param)
 
 
 def test_background_activity_is_what_no_neighbour_supports():
@@ -254,7 +254,7 @@ def test_what_cannot_be_is_said():
         (lambda: events.voxel_grid(part, 0, size=size), "0 bins"),
         (lambda: events.to_device(part, 3, size=size), "do not fit"),
         (lambda: events.to_device(part, origin=-(10**10), size=size), "2\\^31 us"),
-        (lambda: events.event_image(part, size=(3, 5)), "outside the 3x5 sensor"),
+        (lambda: events.event_image(part, size=(3, 5)), "on the 3x5 sensor"),
         (lambda: events.remove_hot_pixels(part, np.zeros((2, 2), bool), size=size), "give bool of"),
     ):
         with pytest.raises(InputError, match=said):

@@ -12,9 +12,9 @@ from together import in_child
 
 import jaxevent
 from jaxevent import codegen, progress
-from jaxevent.codegen import host
+from jaxevent.codegen import module as kernel_module
 from jaxevent.errors import InputError
-from jaxevent.io import prophesee
+from jaxevent.io import decoded
 from jaxevent.locks import TurnLock
 
 pytestmark = [
@@ -107,7 +107,7 @@ def test_recordings_in_files(tmp_path, monkeypatch, kind):
     if kind == "h5":
         jaxevent.save(recording, path)
     else:
-        monkeypatch.setattr(prophesee, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK", 500)
         path.write_bytes(formats.dat(recording.events, size))
     events = jaxevent.load(path, size, in_memory=False).events
     assert_equal([events[:1300].t], [recording.events.t[:1300]])  # on the way through the file
@@ -168,6 +168,6 @@ def test_locks_of_all_are_free():
     finally:
         end()
     # What is compiled when a process is forked is finished first.
-    end = busy(host._making)
+    end = busy(kernel_module._lock)
     threading.Timer(0.2, end).start()
-    assert in_child(lambda: host.once({}, "key", lambda: 5)) == 5
+    assert in_child(lambda: kernel_module.get_or_make({}, "key", lambda: 5)) == 5

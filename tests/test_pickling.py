@@ -19,7 +19,7 @@ import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events import crop
-from jaxevent.io import prophesee
+from jaxevent.io import decoded
 from jaxevent.io.decoded import DecodedEvents, DecodedImages
 from jaxevent.io.hdf5 import StoredEvents, StoredImages
 
@@ -179,7 +179,7 @@ def test_recordings_that_are_decoded(tmp_path, monkeypatch, kind, again):
     whole = texture.moving()
     size, path = (whole.width, whole.height), tmp_path / f"a.{kind}"
     if kind == "dat":
-        monkeypatch.setattr(prophesee, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK", 500)
         path.write_bytes(formats.dat(whole.events, size))
     else:
         frames = whole.frames

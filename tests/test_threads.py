@@ -14,9 +14,10 @@ import texture
 from together import THREADS, at_once
 
 import jaxevent
-from jaxevent.codegen import host, run_over_rows
+from jaxevent.codegen import module as kernel_module
+from jaxevent.codegen import run_over_rows
 from jaxevent.errors import InputError
-from jaxevent.io import prophesee
+from jaxevent.io import decoded
 from jaxevent.reconstruction.engine import kernel, passes, pixel, smoothed, smoothing
 
 # The default thresholds are not those of the texture.
@@ -88,7 +89,7 @@ def test_readings_of_one_video_may_alternate():
 
 def test_own_videos_translate_a_method_once(monkeypatch):
     for module in (kernel, smoothing):
-        monkeypatch.setattr(module, "_programs", {})
+        monkeypatch.setattr(module._kernels, "_programs", {})
     traced = []
     monkeypatch.setattr(
         kernel, "traced", lambda *given: traced.append(given) or pixel.traced(*given)
@@ -111,7 +112,7 @@ def test_what_is_made_once_is_made_by_one():
         made.append(1)
         return object()
 
-    found = at_once(lambda _: host.once(known, "key", make))
+    found = at_once(lambda _: kernel_module.get_or_make(known, "key", make))
     assert len(made) == 1 and len({id(one) for one in found}) == 1
 
 
@@ -189,7 +190,7 @@ def written(tmp_path, monkeypatch, kind: str):
         frames = recording.frames
         path.write_bytes(formats.event_utils(recording.events, size, frames.images, frames.t))
     else:
-        monkeypatch.setattr(prophesee, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK", 500)
         path.write_bytes(formats.dat(recording.events, size))
     return jaxevent.load(path, size, in_memory=False), jaxevent.load(path, size)
 

@@ -23,7 +23,7 @@ from jaxevent.blob.states import TrackStates, is_alive, tell
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
 from jaxevent.blob.tracks import Tracks
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, OptionKind, of_class
 from jaxevent.recording import Recording, Times, microseconds
@@ -194,7 +194,7 @@ class Tracker(Estimator[P]):
         self.check_options(
             seeds=seeds, start=start, stop=stop, detect=detect, found=found, smooth=smooth
         )
-        self._check_compiler(compiler)
+        choose_backend(compiler, True)
         if smooth:
             self._check_smoothing()
         smooth = self.filter.transition is not None if smooth is None else smooth
@@ -235,7 +235,7 @@ class Tracker(Estimator[P]):
         Raises:
             InputError: A seed is outside the sensor, or numba is asked for and has no kernel.
         """
-        self._check_compiler(compiler)
+        choose_backend(compiler, True)
         self.check_options(seeds=seeds, start=start, detect=detect)
         params = self.Params() if params is None else params
         kernel = functools.partial(self._fused, params, compiler)
@@ -250,20 +250,7 @@ class Tracker(Estimator[P]):
                 "`transition`; leave out smooth"
             )
 
-    def _check_compiler(self, compiler: str | None) -> None:
-        if compiler not in (None, "numba", "xla"):
-            raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-
     def _fused(self, params: P, compiler: str | None, packing: Packing) -> FusedRun | None:
         """The kernel that follows targets; None where XLA does."""
-        if compiler == "xla":
-            return None
-        try:
-            return FusedRun(self.filter, params, packing)
-        except Untranslatable as reason:
-            if compiler == "numba":
-                raise InputError(
-                    f"numba has no kernel for the method {self.name!r} ({reason}); leave out the "
-                    "compiler"
-                ) from reason
-            return None
+        make = functools.partial(FusedRun, self.filter, params, packing)
+        return make_kernel(self.name, compiler, True, make)

@@ -110,7 +110,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
 
     All paths among the options that are no outputs are inputs. Within the block, written files
     record that the command line `words` made them from these inputs. Raises `InputError` like
-    `jaxevent.io.places.check`.
+    `jaxevent.io.output.check_outputs`.
     """
     outputs = options.get("outputs", {})
     force = options.get("force", False)
@@ -122,9 +122,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
     elif outputs:
         from jaxevent.io.calibration import split_name
         from jaxevent.io.companions import companions
-        from jaxevent.io.description import Command, running
-        from jaxevent.io.output import into_folders
-        from jaxevent.io.places import check
+        from jaxevent.io.output import Command, check_outputs, into_folders, running
 
         named = [path for name in outputs if (path := taken[name]) is not None]
         inputs = [
@@ -136,7 +134,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
         ]
         if camera := taken.get("reading", {}).get("camera"):
             inputs.append(split_name(camera)[0])
-        check(named, inputs, force=force)
+        check_outputs(named, inputs, force=force)
         read = [file for path in inputs for file in (path, *companions(path))]
         with into_folders(force), running(Command(words, read)):
             yield taken

@@ -134,7 +134,7 @@ def response(
     out: Path,
 ) -> None:
     from jaxevent.camera import estimate_response
-    from jaxevent.io.exposures import read_stack, write_response
+    from jaxevent.io.images import read_stack, write_response
 
     images, seconds = read_stack(stack, exposures)
     found = estimate_response(images, seconds, smoothness=smoothness, margin=margin)
@@ -153,8 +153,7 @@ def merge(
     import numpy as np
 
     from jaxevent.camera import estimate_response, merge_exposures
-    from jaxevent.io.exposures import read_response, read_stack
-    from jaxevent.io.images import write_intensity
+    from jaxevent.io.images import read_response, read_stack, write_intensity
 
     images, seconds = read_stack(stack, exposures)
     if response is None:
@@ -174,7 +173,7 @@ def attach(path: Path, response: Path, reading: dict[str, Any], out: Path) -> No
     import numpy as np
 
     from jaxevent.io import save
-    from jaxevent.io.exposures import read_response
+    from jaxevent.io.images import read_response
 
     camera = read_response(response)
     recording = arguments.open_recording(path, reading)

@@ -189,8 +189,12 @@ def run(
         )  # fmt: skip
         if triggers is not None:
             frames_given = len(other.frames) if other.frames else 0
-            other, found = rig.by_triggers(recording, other, found, triggers, channel, lag=lag)
-        both = rig.registered(recording, other, found, crop=crop, reference=reference is not None)
+            other, found = rig.stamp_by_triggers(
+                recording, other, found, triggers, channel, lag=lag
+            )
+        both = rig.apply_registration(
+            recording, other, found, crop=crop, reference=reference is not None
+        )
         save(dataclasses.replace(both, name=name), partial, progress=show_progress())
     if found.homography is not None and H is None:
         print("homography from the event camera's pixels to the other's:")
@@ -204,5 +208,5 @@ def run(
         print(f"offset added to the other camera's time stamps, {how}: {found.offset:.6f} s")
     if found.agreement is not None:
         print(f"correlation of the changes that frames and events show: {found.agreement:.3f}")
-    print(f"pixels that the other camera sees: {rig.seen(found.grid):.1%}")
+    print(f"pixels that the other camera sees: {rig.coverage(found.grid):.1%}")
     print_stored(both, out)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import kept, support
+from jaxevent.codegen import cache, support
 
 # numba makes two functions more of each. The one for those that call it by its address is left out;
 # without the one for Python a call from there would end the process.
@@ -19,7 +19,7 @@ _USUAL: dict[str, Any] = {"nogil": True}
 # Counting references to arrays is two thirds of a function that takes many of them.
 _LEAN: dict[str, Any] = {}
 if support.HAS_INTERNALS:
-    from jaxevent.codegen.internals import part_of_others
+    from jaxevent.codegen.internals import njit_linked
 
     _USUAL |= {"no_cfunc_wrapper": True}
     _LEAN |= {"_nrt": False}
@@ -29,7 +29,7 @@ _LOOSE: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reas
 
 def njit(function: Callable) -> Any:
     """Compile with numba, without the argument checks that tests wrap around functions."""
-    return kept.compiled(inspect.unwrap(function), **_USUAL)
+    return cache.njit_cached(inspect.unwrap(function), **_USUAL)
 
 
 def njit_inlined(function: Callable) -> Any:
@@ -39,7 +39,7 @@ def njit_inlined(function: Callable) -> Any:
 
 def njit_noalloc(function: Callable) -> Any:
     """Compile as `compiled` does, in less time, what makes no arrays of its own."""
-    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LEAN)
+    return cache.njit_cached(inspect.unwrap(function), **_USUAL, **_LEAN)
 
 
 def njit_noalloc_inlined(function: Callable) -> Any:
@@ -49,7 +49,7 @@ def njit_noalloc_inlined(function: Callable) -> Any:
 
 def njit_fastmath(function: Callable) -> Any:
     """Compile as `lean` does, sums in whatever order is fastest: the same one every time."""
-    return kept.compiled(inspect.unwrap(function), **_USUAL, **_LEAN, **_LOOSE)
+    return cache.njit_cached(inspect.unwrap(function), **_USUAL, **_LEAN, **_LOOSE)
 
 
 def njit_fastmath_inlined(function: Callable) -> Any:
@@ -64,7 +64,7 @@ def _inside(function: Callable, **options: Any) -> Any:
 
 
 def _lean_inside(function: Callable, **options: Any) -> Any:
-    return (part_of_others if support.HAS_INTERNALS else _inside)(function, **options)
+    return (njit_linked if support.HAS_INTERNALS else _inside)(function, **options)
 
 
 class ZeroedScratch:

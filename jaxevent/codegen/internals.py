@@ -4,8 +4,8 @@ numba makes machine code of every function, and of what calls it once more, with
 inside. For a part, which compiled functions alone call, the first is left out: a fifth to a quarter
 of the time of compilation.
 
-What is compiled can be kept: a `KeptCache` takes the place of numba's own cache, which keeps an
-index of a function's signatures in a folder that others may write to.
+What is compiled can be kept: a `SignatureCache` takes the place of numba's own cache, which keeps
+an index of a function's signatures in a folder that others may write to.
 """
 
 import hashlib
@@ -65,7 +65,7 @@ class _Compiler(Compiler):
         super().__init__(typing, target, library, *rest)
 
 
-def part_of_others(function: Callable, **options: Any) -> Any:
+def njit_linked(function: Callable, **options: Any) -> Any:
     """`numba.njit` with these options; called from Python it raises `TypeError`.
 
     It may neither make arrays nor print, nor raise with anything but constants.
@@ -84,7 +84,7 @@ def _refuse(*_: Any, **named: Any) -> None:
     raise TypeError("this is for compiled functions to call, not for Python")
 
 
-class KeptCache:
+class SignatureCache:
     """A cache for a function's compiled signatures, as numba's dispatchers use one.
 
     `files` has the methods `load(key)`, `save(key, data)` and `flush()`; see `kept.Files`.
@@ -130,15 +130,15 @@ class KeptCache:
         return signature, codegen.magic_tuple(), hashlib.blake2b(about).hexdigest()
 
 
-def keep(dispatcher: Any, files: Any) -> Any:
+def use_signature_cache(dispatcher: Any, files: Any) -> Any:
     """Have what `numba.njit` made keep its signatures in `files`; returns it."""
-    dispatcher._cache = KeptCache(dispatcher.py_func, files)
+    dispatcher._cache = SignatureCache(dispatcher.py_func, files)
     return dispatcher
 
 
-def kept_callback(function: Callable, signature: Any, options: dict[str, Any], files: Any) -> CFunc:
+def cached_cfunc(function: Callable, signature: Any, options: dict[str, Any], files: Any) -> CFunc:
     """`numba.cfunc` of a signature with these options, kept in `files`."""
     made: Any = CFunc(function, sigutils.normalize_signature(signature), {}, options)
-    made._cache = KeptCache(function, files)
+    made._cache = SignatureCache(function, files)
     made.compile()
     return made

@@ -4,14 +4,13 @@
     clean = events.filter_background(recording, 5_000)  # us; 0.005 would be seconds
     grid = events.voxel_grid(clean[1.0:1.1], 5)  # (5, height, width)
 
-What changes events takes `Events` or a `Recording` and returns the same. Of a recording, frames,
-camera and images among the further arrays change with the events. Events that were left in a file
-are read block by block; those that remain are held in memory. `Events` alone do not tell the
-sensor: where it counts, give `size=(width, height)`. Lengths of time are integers in us or floats
-in s, as times are everywhere.
+Functions that change events take `Events` or a `Recording` and return the same type. Frames, camera
+and images among the further arrays of a recording change with the events. Events in a file are read
+block by block; the result is held in memory. `Events` have no sensor: where it matters, give
+`size=(width, height)`. Lengths of time are integers in us or floats in s, as times are everywhere.
 
-Images are arrays [..., y, x]. Those who gather them within `jax.jit` give `DeviceEvents`, made by
-`to_device`, in place of events.
+Images are arrays [..., y, x]. Within `jax.jit` they are made of `DeviceEvents`, the result of
+`to_device`.
 """
 
 from jaxevent.events.filters import (

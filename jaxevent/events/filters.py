@@ -1,4 +1,4 @@
-"""Which events remain: by time, polarity, hot pixels, background activity and dead time."""
+"""Filters of events by time, polarity, hot pixels, background activity and dead time."""
 
 from typing import Any
 
@@ -7,17 +7,28 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit
 from jaxevent.errors import InputError
+from jaxevent.events.blocks import Part, Size, parse_duration, select_events, size_of
 from jaxevent.events.images import count_events
-from jaxevent.events.parts import Part, Size, duration, select, size_of
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 LONG_AGO = np.iinfo(np.int64).min // 2  # us
 
 
 def crop_time(part: Part, start: Times | None = None, stop: Times | None = None) -> Part:
-    """The part with start <= t < stop; None: from the beginning, to the end.
+    """Select the events with start <= t < stop.
 
-    Of a recording the same as `recording[start:stop]`, which raises `InputError` where nothing is.
+    For a recording this is `recording[start:stop]`.
+
+    Args:
+        part: Events, or a recording.
+        start: Begin, us or s; None: the beginning.
+        stop: End, us or s; None: the end.
+
+    Returns:
+        The same type.
+
+    Raises:
+        InputError: A recording has nothing in that time.
     """
     if isinstance(part, Recording):
         return part[start:stop]
@@ -26,23 +37,38 @@ def crop_time(part: Part, start: Times | None = None, stop: Times | None = None)
 
 
 def select_polarity(part: Part, on: bool = True) -> Part:
-    """Only the ON events, or with `on=False` only the OFF events."""
-    return select(part, lambda events: events.p == on)
+    """Select the events of one polarity.
+
+    Args:
+        part: Events, or a recording.
+        on: True for ON events, False for OFF events.
+
+    Returns:
+        The same type.
+    """
+    return select_events(part, lambda events: events.p == on)
 
 
 def is_hot(
     counts: NDArray[np.integer], ratio: float | int = 5, least: int = 20
 ) -> NDArray[np.bool_]:
-    """Which pixels are hot (H, W), by how many events each fired (H, W).
+    """Find hot pixels by the number of events of each.
 
-    A hot pixel fired more than `ratio` times as often as the busiest of its neighbours, and at
-    least `least` times. An edge that passes has busy neighbours.
+    A hot pixel fired more often than its neighbours. An edge that passes has busy neighbours.
+
+    Args:
+        counts: (H, W) events of each pixel.
+        ratio: Factor on the count of the busiest neighbour that a hot pixel exceeds.
+        least: Least count of a hot pixel.
+
+    Returns:
+        (H, W), True for hot pixels.
     """
     return (counts >= least) & (counts > ratio * busiest_neighbour(counts))
 
 
 def busiest_neighbour(counts: NDArray[np.integer]) -> NDArray[np.integer]:
-    """The most events (H, W) that one of the 8 pixels around each fired, by counts (H, W)."""
+    """Return the largest count of the 8 pixels around each, (H, W), of counts (H, W)."""
     height, width = counts.shape
     around = np.pad(counts, 1)
     busiest = np.zeros_like(counts)
@@ -54,14 +80,34 @@ def busiest_neighbour(counts: NDArray[np.integer]) -> NDArray[np.integer]:
 
 
 def find_hot_pixels(part: Events | Recording, *, size: Size | None = None) -> NDArray[np.bool_]:
-    """Which pixels are hot, (H, W); see `is_hot`. `jaxevent info` counts the same ones."""
+    """Find hot pixels as `is_hot` does by default; `jaxevent info` counts the same ones.
+
+    Args:
+        part: Events, or a recording.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        (H, W), True for hot pixels.
+    """
     return is_hot(count_events(part, size=size))
 
 
 def remove_hot_pixels(
     part: Part, hot: NDArray[np.bool_] | None = None, *, size: Size | None = None
 ) -> Part:
-    """Without the events of hot pixels: `hot` (H, W), by default those that are found."""
+    """Remove the events of hot pixels.
+
+    Args:
+        part: Events, or a recording.
+        hot: (H, W), True for hot pixels; None: those of `find_hot_pixels`.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        The same type.
+
+    Raises:
+        InputError: `hot` has another shape or type.
+    """
     width, height = size_of(part, size)
     if hot is None:
         hot = find_hot_pixels(part, size=size)
@@ -69,32 +115,53 @@ def remove_hot_pixels(
         raise InputError(
             f"hot pixels are {hot.dtype} of shape {hot.shape}; give bool of ({height}, {width})"
         )
-    return select(part, lambda events: ~hot[events.y, events.x])
+    return select_events(part, lambda events: ~hot[events.y, events.x])
 
 
 def filter_background(
     part: Part, window: int | float, neighbours: int = 1, *, size: Size | None = None
 ) -> Part:
-    """Without background activity: events that nothing around them supports are left out.
+    """Remove background activity: events that no event nearby supports.
 
-    An event remains if `neighbours` or more of the 8 pixels around it have fired at most `window`
-    (us or s) before. Those may have been left out themselves. (Delbruck, "Frame-free dynamic
-    digital vision", 2008. dv-processing's `BackgroundActivityNoiseFilter` says less than `window`,
-    and keeps the same events for a window 1 us longer. tonic's `Denoise` looks at 4 pixels.)
+    An event remains if enough of the 8 pixels around it have fired shortly before. The supporting
+    events may have been removed themselves. (Delbruck, "Frame-free dynamic digital vision", 2008.
+    dv-processing's `BackgroundActivityNoiseFilter` requires less than `window`, and keeps the same
+    events for a window 1 us longer. tonic's `Denoise` uses 4 pixels.)
+
+    Args:
+        part: Events, or a recording.
+        window: Longest time between an event and its support, us or s.
+        neighbours: Least number of supporting pixels, 1 to 8.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        The same type.
+
+    Raises:
+        InputError: The window is shorter than 1 us, or the number of neighbours is not possible.
     """
     width, height = size_of(part, size)
-    reach = duration(window, "the window of the background filter")
+    window_us = parse_duration(window, "the window of the background filter")
     if not 1 <= neighbours <= 8:
         raise InputError(f"{neighbours} of 8 neighbours are not possible; give 1 to 8")
     last = np.full((height + 2, width + 2), LONG_AGO)
-    return select(part, lambda e: supported(e.t, e.x, e.y, last, reach, neighbours))
+    return select_events(part, lambda e: supported(e.t, e.x, e.y, last, window_us, neighbours))
 
 
 @njit
-def supported(t: Any, x: Any, y: Any, last: Any, reach: Any, neighbours: Any) -> Any:
-    """Events of which `neighbours` of the 8 pixels around fired at most `reach` us before.
+def supported(t: Any, x: Any, y: Any, last: Any, window_us: Any, neighbours: Any) -> Any:
+    """Find events that pixels around them support.
 
-    `last` (H + 2, W + 2), with a border, holds the times before and is written over.
+    Args:
+        t: (n,) times, us, in order.
+        x: (n,) columns.
+        y: (n,) rows.
+        last: (H + 2, W + 2) last time of each pixel, us, with a border; updated.
+        window_us: Longest time between an event and its support, us.
+        neighbours: Least number of supporting pixels.
+
+    Returns:
+        (n,), True for supported events.
     """
     kept = np.empty(len(t), np.bool_)
     for i in range(len(t)):
@@ -102,30 +169,41 @@ def supported(t: Any, x: Any, y: Any, last: Any, reach: Any, neighbours: Any) ->
         for row in range(int(y[i]), int(y[i]) + 3):
             for column in range(int(x[i]), int(x[i]) + 3):
                 centre = row == int(y[i]) + 1 and column == int(x[i]) + 1
-                count += not centre and t[i] - last[row, column] <= reach
+                count += not centre and t[i] - last[row, column] <= window_us
         kept[i] = count >= neighbours
         last[int(y[i]) + 1, int(x[i]) + 1] = t[i]
     return kept
 
 
 def filter_refractory(part: Part, period: int | float, *, size: Size | None = None) -> Part:
-    """Only events at least `period` (us or s) after the one kept before at the same pixel.
+    """Remove events within a dead time after the last one kept at the same pixel.
 
-    As a pixel with that dead time would have fired. (tonic's `RefractoryPeriod` measures from the
+    A pixel with that dead time would have fired so. (tonic's `RefractoryPeriod` measures from the
     event before, kept or not, so that a fast pixel falls silent.)
+
+    Args:
+        part: Events, or a recording.
+        period: The dead time, us or s.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        The same type.
+
+    Raises:
+        InputError: The period is shorter than 1 us.
     """
     width, height = size_of(part, size)
-    dead = duration(period, "the refractory period")
+    dead_us = parse_duration(period, "the refractory period")
     last = np.full((height, width), LONG_AGO)
-    return select(part, lambda e: _ready(e.t, e.x, e.y, last, dead))
+    return select_events(part, lambda e: _outside_dead_time(e.t, e.x, e.y, last, dead_us))
 
 
 @njit
-def _ready(t, x, y, last, dead):
-    """Events at least `dead` us after the last one kept at their pixel; `last` is written over."""
+def _outside_dead_time(t, x, y, last, dead_us):
+    """Find events `dead_us` or more after the last one kept at their pixel; updates `last`."""
     kept = np.empty(len(t), np.bool_)
     for i in range(len(t)):
-        kept[i] = t[i] - last[y[i], x[i]] >= dead
+        kept[i] = t[i] - last[y[i], x[i]] >= dead_us
         if kept[i]:
             last[y[i], x[i]] = t[i]
     return kept

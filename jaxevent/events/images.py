@@ -1,6 +1,6 @@
-"""Events gathered into images: counts, event images, time surfaces, voxel grids.
+"""Images of events: counts, event images, time surfaces, voxel grids.
 
-Each is written once, for events on the host, which NumPy sums exactly and block by block, and for
+Each is written once: for events on the host, which NumPy sums exactly and block by block, and for
 `DeviceEvents`, which JAX sums within `jit`, `vmap` and `scan`.
 """
 
@@ -14,27 +14,27 @@ from jaxtyping import Array, Bool, Int
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.events.parts import Size, blocks, duration, size_of, source_of
+from jaxevent.events.blocks import Size, parse_duration, read_blocks, size_of, source_of
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 Numeric = Array | np.ndarray
 
 
 class DeviceEvents(eqx.Module):
-    """Events of a fixed number for `jax.jit`: those that fill up are not valid.
+    """A fixed number of events for `jax.jit`; those that pad the number are not valid.
 
-    Times are int32 us since an origin; all times that go with them are too.
+    Times are int32 us since an origin, and so are all times that are passed with them.
     """
 
-    t: Int[Numeric, "*batch n"]
-    x: Int[Numeric, "*batch n"]
-    y: Int[Numeric, "*batch n"]
-    p: Bool[Numeric, "*batch n"]
+    t: Int[Numeric, "*batch n"]  # us
+    x: Int[Numeric, "*batch n"]  # column
+    y: Int[Numeric, "*batch n"]  # row
+    p: Bool[Numeric, "*batch n"]  # True: ON
     valid: Bool[Numeric, "*batch n"]
-    size: Size = eqx.field(static=True)  # width, height
+    size: Size = eqx.field(static=True)  # width, height, px
 
 
-Given = Events | Recording | DeviceEvents
+AnyEvents = Events | Recording | DeviceEvents
 
 
 def to_device(
@@ -44,11 +44,20 @@ def to_device(
     origin: Times | None = None,
     size: Size | None = None,
 ) -> DeviceEvents:
-    """The events in arrays of `length`, filled up with events that are not valid.
+    """Put events into arrays of a fixed length, padded with events that are not valid.
 
-    `origin` is the time that becomes 0, by default that of the first event; `length` is by default
-    the next power of two, so that few programs are compiled. Raises `InputError` for more events
-    than `length` and for times more than 2^31 us, 35 minutes, from the origin.
+    Args:
+        part: Events, or a recording.
+        length: Number of events; None: the next power of two, so that few programs are compiled.
+        origin: The time that becomes 0, us or s; None: that of the first event.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        The events for `jax.jit`.
+
+    Raises:
+        InputError: There are more events than `length`, or times more than 2^31 us, 35 minutes,
+            from the origin.
     """
     width, height = size_of(part, size)
     events = source_of(part)[:]
@@ -64,36 +73,37 @@ def to_device(
             "origin; take a shorter part, or an origin in it"
         )
 
-    def filled(values: NDArray, kind: type) -> NDArray:
+    def pad(values: NDArray, kind: type) -> NDArray:
         return np.pad(values.astype(kind), (0, length - count))
 
-    # What fills up has the last event's time, so that times stay sorted.
+    # Padding has the last event's time, so that times stay sorted.
     t = np.pad(since.astype(np.int32), (0, length - count), mode="edge" if count else "constant")
     return DeviceEvents(
-        t, filled(events.x, np.int32), filled(events.y, np.int32), filled(events.p, np.bool_),
+        t, pad(events.x, np.int32), pad(events.y, np.int32), pad(events.p, np.bool_),
         np.arange(length) < count, (width, height),
     )  # fmt: skip
 
 
-class _Added(NamedTuple):
-    """What some events add: `weight` to the image `plane`; numbers or (events,)."""
+class _Increment(NamedTuple):
+    """Values that events add to an image each; numbers or (events,)."""
 
-    plane: Any
+    plane: Any  # the image of a stack
     weight: Any
 
 
-def _sum(
-    part: Given, size: Size | None, planes: int, kind: Any, added: Callable, *span: Any
+def _accumulate(
+    part: AnyEvents, size: Size | None, planes: int, kind: Any, increments: Callable, *span: Any
 ) -> Any:
-    """The sums (planes, H, W) of what `added(events, xp)` says; `xp` is numpy or jax.numpy.
+    """Sum the increments of events into images (planes, H, W).
 
-    `added` returns several `_Added`. `span` limits the times (us), start <= t <= stop, of events
-    that are read from a recording; it need not be exact.
+    `increments(events, xp)` returns several `_Increment`; `xp` is numpy or jax.numpy. `span` limits
+    the times (us), start <= t <= stop, of events that are read from a recording; it need not be
+    exact.
     """
     if isinstance(part, DeviceEvents):
         width, height = part.size
         total = jnp.zeros(planes * height * width, kind)
-        for plane, weight in added(part, jnp):
+        for plane, weight in increments(part, jnp):
             weight = jnp.where(part.valid, weight, 0).astype(kind)
             at = (plane * height + part.y) * width + part.x
             total = total.at[at].add(weight, mode="drop")
@@ -102,7 +112,7 @@ def _sum(
     total = np.zeros(planes * height * width, np.float64 if kind == np.float32 else kind)
     for events in _read(part, *span):
         pixel = events.y.astype(np.intp) * width + events.x
-        for plane, weight in added(events, np):
+        for plane, weight in increments(events, np):
             weight = np.broadcast_to(weight, len(events)).astype(total.dtype)
             np.add.at(total, pixel + plane * (height * width), weight)
     return total.astype(kind).reshape(planes, height, width)
@@ -111,24 +121,52 @@ def _sum(
 def _read(part: Events | Recording, *span: Any) -> Iterator[Events]:
     source = source_of(part)
     rows = [source.index(int(span[0])), source.index(int(span[1]) + 1)] if span else []
-    return blocks(source, *rows)
+    return read_blocks(source, *rows)
 
 
-def count_events(part: Given, *, size: Size | None = None) -> Any:
-    """How many events each pixel fired, (H, W) integers."""
-    return _sum(part, size, 1, _whole(part), lambda e, xp: [_Added(0, 1)])[0]
+def count_events(part: AnyEvents, *, size: Size | None = None) -> Any:
+    """Count the events of each pixel.
+
+    Args:
+        part: Events, a recording, or `DeviceEvents`.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        (H, W) integers.
+    """
+    return _accumulate(part, size, 1, _integer_type(part), lambda e, xp: [_Increment(0, 1)])[0]
 
 
-def event_image(part: Given, *, size: Size | None = None) -> Any:
-    """ON events less OFF events of each pixel, (H, W) integers."""
-    return _sum(part, size, 1, _whole(part), lambda e, xp: [_Added(0, _sign(e, xp))])[0]
+def event_image(part: AnyEvents, *, size: Size | None = None) -> Any:
+    """Count the ON events of each pixel minus its OFF events.
+
+    Args:
+        part: Events, a recording, or `DeviceEvents`.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        (H, W) integers.
+    """
+    return _accumulate(
+        part, size, 1, _integer_type(part), lambda e, xp: [_Increment(0, _sign(e, xp))]
+    )[0]
 
 
-def count_frames(part: Given, edges: Any, *, size: Size | None = None) -> Any:
-    """How many OFF and how many ON events each pixel fired between times, (n, 2, H, W) integers.
+def count_frames(part: AnyEvents, edges: Any, *, size: Size | None = None) -> Any:
+    """Count the OFF and ON events of each pixel between times.
 
-    `edges` are n + 1 rising times; frame i counts edges[i] <= t < edges[i + 1]. Frames of 10 ms:
-    `count_frames(recording, np.arange(recording.start, recording.stop, 10_000))`.
+    Frames of 10 ms: `count_frames(recording, np.arange(recording.start, recording.stop, 10_000))`.
+
+    Args:
+        part: Events, a recording, or `DeviceEvents`.
+        edges: (n + 1,) rising times, us or s; frame i counts edges[i] <= t < edges[i + 1].
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        (n, 2, H, W) integers, OFF before ON.
+
+    Raises:
+        InputError: The edges do not rise.
     """
     if not isinstance(part, DeviceEvents):
         edges = np.atleast_1d(microseconds(edges, "edges of frames"))
@@ -136,78 +174,101 @@ def count_frames(part: Given, edges: Any, *, size: Size | None = None) -> Any:
             raise InputError("edges of frames must be two or more rising times; sort them")
     n = len(edges) - 1
 
-    def added(e: Any, xp: Any) -> list[_Added]:
-        place = xp.searchsorted(edges, e.t, "right") - 1
-        inside = (place >= 0) & (place < n)
-        return [_Added(xp.clip(place, 0, n - 1) * 2 + e.p, inside * 1)]
+    def increments(e: Any, xp: Any) -> list[_Increment]:
+        index = xp.searchsorted(edges, e.t, "right") - 1
+        inside = (index >= 0) & (index < n)
+        return [_Increment(xp.clip(index, 0, n - 1) * 2 + e.p, inside * 1)]
 
     span = () if isinstance(part, DeviceEvents) else (edges[0], edges[-1])
-    counts = _sum(part, size, 2 * n, _whole(part), added, *span)
+    counts = _accumulate(part, size, 2 * n, _integer_type(part), increments, *span)
     return counts.reshape(n, 2, *counts.shape[1:])
 
 
 def voxel_grid(
-    part: Given,
+    part: AnyEvents,
     bins: int,
     start: Times | None = None,
     stop: Times | None = None,
     *,
     size: Size | None = None,
 ) -> Any:
-    """Polarities shared out to the nearest two of `bins` times, (bins, H, W) float32.
+    """Distribute polarities to the nearest two of several times.
 
     An event at t lies at (bins - 1) (t - start) / (stop - start) and adds its sign to the bins
-    before and after in proportion. `start` and `stop` are by default the times of the first and the
-    last event; events outside do not count. (Zhu et al., "Unsupervised Event-Based Learning of
-    Optical Flow, Depth, and Egomotion", CVPR 2019, equations 1 and 2; as E2VID has it. tonic has
-    `bins` in place of bins - 1.)
+    before and after in proportion. Events outside do not count. (Zhu et al., "Unsupervised
+    Event-Based Learning of Optical Flow, Depth, and Egomotion", CVPR 2019, equations 1 and 2; as
+    E2VID has it. tonic has `bins` in index of bins - 1.)
+
+    Args:
+        part: Events, a recording, or `DeviceEvents`.
+        bins: Number of times.
+        start: First time, us or s; None: that of the first event.
+        stop: Last time, us or s; None: that of the last event.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        (bins, H, W) float32.
+
+    Raises:
+        InputError: There is no bin.
     """
     if bins < 1:
         raise InputError(f"a voxel grid of {bins} bins is not possible; give 1 or more")
     first, last = _ends(part, start, stop)
 
-    def added(e: Any, xp: Any) -> list[_Added]:
+    def increments(e: Any, xp: Any) -> list[_Increment]:
         length = xp.maximum(last - first, 1)
         inside = (e.t >= first) & (e.t <= last)
         at = (bins - 1) * xp.clip((e.t - first) / length, 0, 1)
         before = xp.clip(xp.floor(at).astype(int), 0, bins - 1)
         sign, share = _sign(e, xp) * inside, at - before
         after = xp.minimum(before + 1, bins - 1)
-        return [_Added(before, sign * (1 - share)), _Added(after, sign * share)]
+        return [_Increment(before, sign * (1 - share)), _Increment(after, sign * share)]
 
     span = () if isinstance(part, DeviceEvents) else (first, last)
-    return _sum(part, size, bins, np.float32, added, *span)
+    return _accumulate(part, size, bins, np.float32, increments, *span)
 
 
 def time_surface(
-    part: Given, tau: int | float, at: Times | None = None, *, size: Size | None = None
+    part: AnyEvents, tau: int | float, at: Times | None = None, *, size: Size | None = None
 ) -> Any:
-    """How recently each pixel fired an OFF and an ON event, (2, H, W) float32.
+    """Make the time surface exp(-(at - t) / tau), t the time of the last event of each polarity.
 
-    exp(-(at - t) / tau), t the last such event's time at or before `at`, by default the last
-    event's. 0 where there was none. `tau` is in us or s. (Lagorce et al., "HOTS", TPAMI 2017.)
+    It is 0 where there was none. (Lagorce et al., "HOTS", TPAMI 2017.)
+
+    Args:
+        part: Events, a recording, or `DeviceEvents`.
+        tau: Time constant, us or s.
+        at: Time of the surface, us or s; None: that of the last event.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        (2, H, W) float32, OFF before ON.
+
+    Raises:
+        InputError: The time constant is shorter than 1 us.
     """
-    us = duration(tau, "the time constant of a time surface")
+    tau_us = parse_duration(tau, "the time constant of a time surface")
     _, now = _ends(part, None, at)
     if isinstance(part, DeviceEvents):
         width, height = part.size
-        place = (part.p * height + part.y) * width + part.x
+        index = (part.p * height + part.y) * width + part.x
         # No int32 is earlier than this one, which stands for never.
         never = jnp.iinfo(part.t.dtype).min
         t = jnp.where(part.valid & (part.t <= now), part.t, never)
-        last = jnp.full(2 * height * width, never).at[place].max(t)
-        surface = jnp.where(last == never, 0, jnp.exp((last - now) / us))
+        last = jnp.full(2 * height * width, never).at[index].max(t)
+        surface = jnp.where(last == never, 0, jnp.exp((last - now) / tau_us))
         return surface.astype(jnp.float32).reshape(2, height, width)
     width, height = size_of(part, size)
     source = source_of(part)
     last = np.full(2 * height * width, np.inf)
-    for events in blocks(source, 0, source.index(int(now) + 1)):
-        place = (events.p.astype(np.intp) * height + events.y) * width + events.x
-        last[place] = now - events.t  # the last of several counts
-    return np.exp(-last / us).astype(np.float32).reshape(2, height, width)
+    for events in read_blocks(source, 0, source.index(int(now) + 1)):
+        index = (events.p.astype(np.intp) * height + events.y) * width + events.x
+        last[index] = now - events.t  # the last of several counts
+    return np.exp(-last / tau_us).astype(np.float32).reshape(2, height, width)
 
 
-def _whole(part: Given) -> Any:
+def _integer_type(part: AnyEvents) -> Any:
     return jnp.int32 if isinstance(part, DeviceEvents) else np.int64
 
 
@@ -215,8 +276,8 @@ def _sign(e: Any, xp: Any) -> Any:
     return xp.where(e.p, 1, -1)
 
 
-def _ends(part: Given, start: Any, stop: Any) -> tuple[Any, Any]:
-    """The two times, those of the first and the last event where they are None."""
+def _ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
+    """Return two times (us), where they are None those of the first and the last event."""
     if isinstance(part, DeviceEvents):
         limits = jnp.iinfo(part.t.dtype)
         first = jnp.where(part.valid, part.t, limits.max).min() if start is None else start

@@ -1,4 +1,4 @@
-"""Other pixels for the same scene: a region, fewer and larger ones, those of an ideal camera."""
+"""Changes of the pixel grid: crop, downsample, undistort."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -10,15 +10,22 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit
 from jaxevent.errors import InputError
+from jaxevent.events.blocks import (
+    Part,
+    Size,
+    map_events,
+    parse_duration,
+    select_events,
+    size_of,
+)
 from jaxevent.events.filters import LONG_AGO
-from jaxevent.events.parts import Part, Size, duration, pick, rewrite, select, size_of
 from jaxevent.recording import Events, ImageSource, Recording
 
 Change = Callable[[NDArray], NDArray]  # of images (n, H, W) or (n, H, W, 3)
 
 
 class ChangedImages:
-    """An `ImageSource` whose images are changed when they are read."""
+    """An `ImageSource` that changes images when they are read."""
 
     def __init__(self, images: ImageSource | NDArray, change: Change, size: Size):
         self._images, self._change = images, change
@@ -38,14 +45,14 @@ class ChangedImages:
         return out
 
 
-def _seen(
+def _with_pixels(
     recording: Recording,
     events: Events,
     size: Size,
     change: Change,
     camera: PinholeCamera | None,
 ) -> Recording:
-    """The recording on other pixels: its images changed, as its further arrays that are images."""
+    """Replace the pixels of a recording: change its frames, and further arrays that are images."""
     width, height = size
     frames = recording.frames
     if frames is not None:
@@ -53,15 +60,15 @@ def _seen(
         if isinstance(frames.images, np.ndarray):
             images = np.asarray(images)
         frames = dataclasses.replace(frames, images=images)
-    extra = _images_of(recording, change)
+    extra = _change_extra(recording, change)
     return dataclasses.replace(
         recording, width=width, height=height, events=events, frames=frames, camera=camera,
         extra=extra,
     )  # fmt: skip
 
 
-def _images_of(recording: Recording, change: Change) -> Mapping[str, NDArray]:
-    """The further arrays; those of shape (..., H, W) and (..., H, W, 3) changed."""
+def _change_extra(recording: Recording, change: Change) -> Mapping[str, NDArray]:
+    """Change the further arrays of shape (..., H, W) and (..., H, W, 3)."""
     extra, sensor = dict(recording.extra), (recording.height, recording.width)
     for name, values in extra.items():
         values = np.asarray(values)
@@ -74,10 +81,23 @@ def _images_of(recording: Recording, change: Change) -> Mapping[str, NDArray]:
 
 
 def crop(part: Part, x: int, y: int, width: int, height: int, *, size: Size | None = None) -> Part:
-    """The region of `width` by `height` pixels whose upper left pixel is (x, y), as a sensor.
+    """Crop to a region, whose upper left pixel becomes (0, 0).
 
-    Coordinates count from that pixel. Of a recording, frames and the camera's centre move with it.
-    Raises `InputError` for a region that is not inside the sensor.
+    The frames and the camera's centre of a recording change with it.
+
+    Args:
+        part: Events, or a recording.
+        x: First column, px.
+        y: First row, px.
+        width: Width of the region, px.
+        height: Height of the region, px.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        The same type.
+
+    Raises:
+        InputError: The region is not inside the sensor.
     """
     across, down = size_of(part, size)
     if not (0 <= x < x + width <= across and 0 <= y < y + height <= down):
@@ -87,30 +107,41 @@ def crop(part: Part, x: int, y: int, width: int, height: int, *, size: Size | No
         )
 
     def step(e: Events) -> Events:
-        e = pick(e, (e.x >= x) & (e.x < x + width) & (e.y >= y) & (e.y < y + height))
+        e = e[(e.x >= x) & (e.x < x + width) & (e.y >= y) & (e.y < y + height)]
         return Events(e.t, e.x - np.uint16(x), e.y - np.uint16(y), e.p)
 
-    new = rewrite(part, step)
+    new = map_events(part, step)
     if not isinstance(part, Recording) or not isinstance(new, Recording):
         return new
     camera = part.camera
     if camera is not None:
         camera = dataclasses.replace(camera, cx=camera.cx - x, cy=camera.cy - y)
     window = np.s_[:, y : y + height, x : x + width]
-    return _seen(part, _held(new), (width, height), lambda i: i[window], camera)  # ty: ignore[invalid-explicit-return]
+    return _with_pixels(part, _in_memory(new), (width, height), lambda i: i[window], camera)  # ty: ignore[invalid-explicit-return]
 
 
 def downsample(
     part: Part, factor: int = 1, period: int | float = 0, *, size: Size | None = None
 ) -> Part:
-    """Fewer pixels, and fewer events in time.
+    """Merge blocks of pixels, and thin out events in time.
 
     Blocks of `factor` x `factor` pixels become one, which fires the events of all; columns and rows
-    that fill no block are left out. Of the events of one such pixel and one polarity in each
-    `period` (us or s, counted from time 0) only the first remains; 0: all remain. Frames show the
-    blocks' means; the camera's focal lengths and centre change with the pixels. (tonic's
-    `Downsample` keeps all events too; its time factor changes the unit of time, which this does
-    not.)
+    that fill no block are left out. Frames show the blocks' means; the camera's focal lengths and
+    centre change with the pixels. (tonic's `Downsample` keeps all events too; its time factor
+    changes the unit of time, which this does not.)
+
+    Args:
+        part: Events, or a recording.
+        factor: Width and height of a block, px.
+        period: Time in which only the first event of a pixel and polarity remains, us or s, counted
+            from time 0; 0: all remain.
+        size: Width and height of the sensor, for events alone.
+
+    Returns:
+        The same type.
+
+    Raises:
+        InputError: The factor or the period is not possible.
     """
     across, down = size_of(part, size)
     if not 1 <= factor <= min(across, down):
@@ -119,16 +150,16 @@ def downsample(
             "whole number from 1"
         )
     width, height = across // factor, down // factor
-    us = duration(period, "the period of one event per pixel", least=0)
+    period_us = parse_duration(period, "the period of one event per pixel", least=0)
 
     def step(e: Events) -> Events:
         e = Events(e.t, e.x // np.uint16(factor), e.y // np.uint16(factor), e.p)
-        return pick(e, (e.x < width) & (e.y < height))
+        return e[(e.x < width) & (e.y < height)]
 
-    new = part if factor == 1 else rewrite(part, step)
-    if us:
+    new = part if factor == 1 else map_events(part, step)
+    if period_us:
         last = np.full((2, height, width), LONG_AGO)
-        new = select(new, lambda e: _first(e.t, e.x, e.y, e.p, last, us))
+        new = select_events(new, lambda e: _is_first(e.t, e.x, e.y, e.p, last, period_us))
     if not isinstance(part, Recording) or not isinstance(new, Recording) or factor == 1:
         return new
     camera = part.camera
@@ -141,14 +172,14 @@ def downsample(
     def mean(images: NDArray) -> NDArray:
         images = images[:, : height * factor, : width * factor]
         shape = (len(images), height, factor, width, factor, *images.shape[3:])
-        return _typed(images.reshape(shape).mean((2, 4), dtype=np.float64), images.dtype)
+        return _cast(images.reshape(shape).mean((2, 4), dtype=np.float64), images.dtype)
 
-    return _seen(part, _held(new), (width, height), mean, camera)  # ty: ignore[invalid-explicit-return]
+    return _with_pixels(part, _in_memory(new), (width, height), mean, camera)  # ty: ignore[invalid-explicit-return]
 
 
 @njit
-def _first(t, x, y, p, last, period):
-    """Events that are the first of their pixel, polarity and period; `last` is written over."""
+def _is_first(t, x, y, p, last, period):
+    """Find the first events of their pixel, polarity and period; updates `last`."""
     kept = np.empty(len(t), np.bool_)
     for i in range(len(t)):
         number = t[i] // period
@@ -158,12 +189,20 @@ def _first(t, x, y, p, last, period):
 
 
 def undistort(recording: Recording) -> Recording:
-    """The recording as a camera without distortion sees it, of the same focal lengths and centre.
+    """Undistort a recording: a camera without distortion, of the same focal lengths and centre.
 
-    Events move to the nearest pixel of the undistorted image; those that leave the sensor and
-    those at which the distortion has no inverse are left out, and where the image is spread some
-    pixels fire none. Frames are interpolated linearly, 0 where the camera saw nothing. Raises
-    `InputError` for a recording without calibration.
+    Events move to the nearest pixel of the undistorted image. Those that leave the sensor are
+    removed, and those where the distortion has no inverse. Where the image is spread, some pixels
+    fire none. Frames are interpolated linearly, 0 where the camera saw nothing.
+
+    Args:
+        recording: The recording, with calibration.
+
+    Returns:
+        The recording.
+
+    Raises:
+        InputError: The recording has no calibration.
     """
     camera, width, height = recording.camera, recording.width, recording.height
     if camera is None:
@@ -179,16 +218,18 @@ def undistort(recording: Recording) -> Recording:
 
     def step(e: Events) -> Events:
         pixel = e.y.astype(np.intp) * width + e.x
-        e, pixel = pick(e, seen[pixel]), pixel[seen[pixel]]
+        e, pixel = e[seen[pixel]], pixel[seen[pixel]]
         return Events(e.t, column[pixel], row[pixel], e.p)
 
-    events = _held(rewrite(recording, step))
+    events = _in_memory(map_events(recording, step))
     at = camera.distort(ideal.normalise(x, y)).reshape(height, width, 2)
-    return _seen(recording, events, (width, height), lambda images: _sampled(images, at), ideal)
+    return _with_pixels(
+        recording, events, (width, height), lambda images: _interpolate(images, at), ideal
+    )
 
 
-def _sampled(images: NDArray, at: NDArray[np.float64]) -> NDArray:
-    """Images (n, H, W[, 3]) at places (H, W, 2) in px, linearly; 0 outside."""
+def _interpolate(images: NDArray, at: NDArray[np.float64]) -> NDArray:
+    """Interpolate images (n, H, W[, 3]) linearly at points (H, W, 2), px; 0 outside."""
     height, width = images.shape[1:3]
     inside = np.all((at >= 0) & (at <= (width - 1, height - 1)), axis=-1)
     at = np.where(inside[..., None], at, 0)
@@ -199,14 +240,15 @@ def _sampled(images: NDArray, at: NDArray[np.float64]) -> NDArray:
         u, v, inside = u[..., None], v[..., None], inside[..., None]
     upper = (1 - u) * images[:, top, left] + u * images[:, top, right]
     lower = (1 - u) * images[:, below, left] + u * images[:, below, right]
-    return _typed(np.where(inside, (1 - v) * upper + v * lower, 0), images.dtype)
+    return _cast(np.where(inside, (1 - v) * upper + v * lower, 0), images.dtype)
 
 
-def _typed(values: NDArray[np.floating], kind: np.dtype) -> NDArray:
-    """Rounded where the images are of integers."""
+def _cast(values: NDArray[np.floating], kind: np.dtype) -> NDArray:
+    """Convert to the type of images, rounded to integers where these are."""
     return (values if kind.kind == "f" else np.rint(values)).astype(kind)
 
 
-def _held(recording: Recording) -> Events:
-    assert isinstance(recording.events, Events)  # as `rewrite` leaves them
+def _in_memory(recording: Recording) -> Events:
+    """Return the events of a recording that `map_events` made."""
+    assert isinstance(recording.events, Events)
     return recording.events

@@ -1,4 +1,4 @@
-"""The last events of a stream that is still coming."""
+"""The last events of a live stream."""
 
 import numpy as np
 
@@ -7,7 +7,17 @@ from jaxevent.recording import Events
 
 
 class Tail:
-    """An `EventSource` of which only the last events, and the very first one, are held."""
+    """An `EventSource` that keeps only the last events of a stream, and the first one.
+
+    Args:
+        width: Width of the sensor, px.
+        height: Height of the sensor, px.
+
+    Attributes:
+        count: Number of events so far.
+        dropped: Number of events that are not kept.
+        last: Time of the last event, us.
+    """
 
     def __init__(self, width: int, height: int) -> None:
         self.checked_size = (width, height)
@@ -20,7 +30,14 @@ class Tail:
         return self.count
 
     def add(self, events: Events) -> None:
-        """Add events of the sensor; raises `InputError` for bad or earlier ones."""
+        """Add events.
+
+        Args:
+            events: Events of the sensor, not earlier than those before.
+
+        Raises:
+            InputError: They are not valid events of the sensor, or earlier.
+        """
         if not isinstance(events, Events):
             raise InputError(
                 f"the events added are a {type(events).__name__}; give jaxevent.Events(t, x, y, p)"
@@ -32,15 +49,15 @@ class Tail:
                 "us; add them in order of time"
             )
         if len(events):
-            # A copy: who gives events may use their memory again.
+            # A copy: the caller may use the memory of the events again.
             own = Events.of_checked(*(getattr(events, name).copy() for name in "txyp"))
             self._first = self._first if self.count else own[:1]
             self._parts.append(own)
             self.count += len(events)
             self.last = int(events.t[-1])
 
-    def held(self) -> Events:
-        """Those from row `dropped` on."""
+    def retained(self) -> Events:
+        """Return the events from row `dropped` on."""
         if len(self._parts) != 1:
             parts = self._parts or [Events.empty()]
             joined = (np.concatenate([getattr(e, name) for e in parts]) for name in "txyp")
@@ -53,14 +70,14 @@ class Tail:
             return self._first
         if first < self.dropped:
             raise IndexError(f"events before row {self.dropped} are gone")
-        return self.held()[first - self.dropped : stop - self.dropped]
+        return self.retained()[first - self.dropped : stop - self.dropped]
 
     def index(self, time: int) -> int:
-        return self.dropped + self.held().index(time)
+        return self.dropped + self.retained().index(time)
 
     def drop(self, row: int) -> None:
-        """Forget the events before a row."""
-        held = self.held()[max(row - self.dropped, 0) :]
+        """Drop the events before a row."""
+        kept = self.retained()[max(row - self.dropped, 0) :]
         # A copy: a slice would hold the array that it is of.
-        self._parts = [Events.of_checked(*(getattr(held, name).copy() for name in "txyp"))]
+        self._parts = [Events.of_checked(*(getattr(kept, name).copy() for name in "txyp"))]
         self.dropped = max(row, self.dropped)

@@ -1,10 +1,18 @@
-"""The containers of ROS messages: bags of ROS 1, and of ROS 2 as a folder, .mcap or .db3.
+"""Bags of ROS 1, and of ROS 2 as a folder, .mcap or .db3, and the messages in them.
 
 The package rosbags (Apache 2, no ROS) reads all of them. Its readers unfold a compressed chunk to
 however much it holds; here neither a chunk nor all chunks of a file together, named by an index or
-not, may unfold beyond `most_unfolded`. A database (.db3)
-may hold plain tables only, as a view or a column made by a formula could take any time and memory.
-A folder whose files or messages rosbag2 compressed by itself is refused for the same reason.
+not, may unfold beyond `max_unfolded`. A database (.db3) may hold plain tables only, as a view or a
+column made by a formula could take any time and memory. A folder whose files or messages rosbag2
+compressed by itself is refused for the same reason.
+
+Messages of events are read by the fields that their definitions list. The typed decoding of rosbags
+makes an object of each element of an array and needs a class made of each definition; here NumPy
+reads an array of elements of one size at once, for types of any name. ROS 1 packs fields without
+gaps. CDR, of ROS 2, aligns each number to its size, counted from the fifth byte: an element of 13
+bytes, x and y (uint16), time (2 x 32 bits) and polarity (uint8), has its first x at 0, the next at
+14, then one every 16 bytes. From the second element on all are equally long: the number of the
+largest alignment in the first one decides where its end lies.
 """
 
 import contextlib
@@ -12,12 +20,15 @@ import functools
 import importlib
 import sqlite3
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from jaxevent.errors import InputError, require
-from jaxevent.io import check_unfolded, most_unfolded
+from jaxevent.io.checks import check_unfolded, max_unfolded
 
 _PACKET = """std_msgs/Header header
 uint32 height
@@ -43,15 +54,23 @@ bool polarity
 """
 _EVENT_PACKAGES = ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs")
 
-_LONGEST = 1 << 16  # characters of a definition that is parsed
-_CHUNK = 6  # records of MCAP
+_MAX_DEFINITION = 1 << 16  # characters of a definition that is parsed
+_MCAP_CHUNK = 6  # kind of a record
+
+_BASES = {
+    "bool": "u1", "byte": "u1", "octet": "u1", "char": "u1",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_MAX_FIELDS = 64  # of an element of an array
+_MAX_DEPTH = 8  # parts within parts
 
 Fields = list[tuple[str, Any]]  # of a type of message: names, and types as rosbags parses them
-Place = tuple[int, int]  # a time of recording (ns), and how many messages of it come before
+Place = tuple[int, int]  # a time of recording (ns), and the number of messages of it before
 
 
 class Bag:
-    """A bag's topics and messages; every pass opens the file anew."""
+    """Topics and messages of a bag; every pass opens the file anew."""
 
     def __init__(self, path: Path):
         require("rosbags", "ros")
@@ -94,36 +113,51 @@ class Bag:
         return contextlib.closing(reader)
 
     def topics(self, *kinds: str) -> list[str]:
+        """Return the topics that hold messages of some types, sorted."""
         return sorted({topic for topic, kind, count in self._types if kind in kinds and count})
 
     def kind(self, topic: str) -> str:
-        """The type of a topic's messages."""
+        """Return the type of a topic's messages."""
         return next(kind for name, kind, count in self._types if name == topic and count)
 
     def kinds(self) -> dict[str, str]:
-        """The types of all topics that hold messages, by topic."""
+        """Return the types of all topics that hold messages, by topic."""
         return {topic: kind for topic, kind, count in self._types if count}
 
     @functools.cached_property
     def fields(self) -> dict[str, Fields]:
-        """The fields of every type of message, by the definitions that the bag holds, or else
-        that are known; of a type without a definition there are none."""
-        found = {name: fields for name, (_, fields) in _types(self.is_ros1).fielddefs.items()}
+        """Fields of every type of message, by the bag's definitions or else by known ones."""
+        found = {name: fields for name, (_, fields) in _type_store(self.is_ros1).fielddefs.items()}
         for kind, definition in self._definitions.items():
             if kind not in found:
                 found = _parse(kind, definition) | found
         return found
 
     def beside(self, events: str | None, several: list[str]) -> list[str]:
-        """The topics that belong to the same camera as the events: the only one, or those of the
-        events' own name."""
+        """Select the topics that belong to the same camera as the events.
+
+        Args:
+            events: Topic of the events, if there is one.
+            several: Topics of one kind.
+
+        Returns:
+            The only topic, or those under the events' own name.
+        """
         if len(several) > 1 and events is not None:
             parent = events.rpartition("/")[0] + "/"
             several = [topic for topic in several if topic.startswith(parent)]
         return several
 
     def messages(self, topic: str, place: Place | None = None) -> Iterator[tuple[Place, bytes]]:
-        """Contents of a topic's messages, each with its place, from a place on."""
+        """Iterate over the contents of a topic's messages.
+
+        Args:
+            topic: The topic.
+            place: Place of the first message; None begins with the first of all.
+
+        Yields:
+            The place and the bytes of each message.
+        """
         start, skip = place or (None, 0)
         here = (-1, 0)
         with self._open() as reader:
@@ -134,18 +168,26 @@ class Bag:
                     yield here, data
 
     def decoded(self, topic: str | None, place: Place | None = None) -> Iterator[tuple[Place, Any]]:
-        """Typed messages of a topic, each with its place, from a place on; None: no topic."""
+        """Iterate over the typed messages of a topic.
+
+        Args:
+            topic: The topic; None yields nothing.
+            place: Place of the first message; None begins with the first of all.
+
+        Yields:
+            The place of each message, and the message.
+        """
         if topic is None:
             return
-        store, kind = _types(self.is_ros1), self.kind(topic)
+        store, kind = _type_store(self.is_ros1), self.kind(topic)
         decode = store.deserialize_ros1 if self.is_ros1 else store.deserialize_cdr
         for here, data in self.messages(topic, place):
             yield here, decode(data, kind)
 
 
 @functools.cache
-def _types(is_ros1: bool) -> Any:
-    """What the messages of a ROS hold; made once, as it takes longer than a small bag."""
+def _type_store(is_ros1: bool) -> Any:
+    """Make the known types of messages, once, as it takes longer than to read a small bag."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
@@ -154,7 +196,7 @@ def _types(is_ros1: bool) -> Any:
 
 
 def _parse(kind: str, definition: Any) -> dict[str, Fields]:
-    """The fields of a type and of those that it holds; none where its definition is damaged."""
+    """Parse the fields of a type and its parts; none if the definition is damaged."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
@@ -164,7 +206,7 @@ def _parse(kind: str, definition: Any) -> dict[str, Fields]:
         is_array = package in _EVENT_PACKAGES and kind.endswith("/EventArray")
         text = _EVENTS.format(package) if is_array else ""
     parsed: dict[str, Any] = {}
-    if len(text) > _LONGEST:
+    if len(text) > _MAX_DEFINITION:
         return parsed
     with contextlib.suppress(Exception):  # of any kind: the parser follows the text of the file
         parsed = get_types_from_idl(text) if is_idl else get_types_from_msg(text, kind)
@@ -179,13 +221,13 @@ def _open_ros1(path: Path) -> Any:
     reader.open()
     for place, chunk in reader.chunks.items():
         if chunk.decompressor is not decompressors["none"]:
-            unfold = functools.partial(_unfolded, path)
+            unfold = functools.partial(_unfold, path)
             reader.chunks[place] = chunk._replace(decompressor=unfold)
     return contextlib.closing(reader)
 
 
-def _unfolded(path: Path, data: bytes) -> bytes:
-    """A chunk without its compression, bz2 or LZ4; rosbags takes however much it unfolds to."""
+def _unfold(path: Path, data: bytes) -> bytes:
+    """Unfold a chunk, bz2 or LZ4, within bounds, which rosbags does not check."""
     import bz2
 
     import lz4.frame
@@ -193,13 +235,13 @@ def _unfolded(path: Path, data: bytes) -> bytes:
     length = path.stat().st_size
     is_bz2 = data.startswith(b"BZh")
     decompressor: Any = bz2.BZ2Decompressor() if is_bz2 else lz4.frame.LZ4FrameDecompressor()
-    unfolded = decompressor.decompress(data, max_length=most_unfolded(length) + 1)
+    unfolded = decompressor.decompress(data, max_length=max_unfolded(length) + 1)
     check_unfolded(len(unfolded), length, str(path))
     return unfolded
 
 
 def _check_chunks(path: Path) -> None:
-    """Raise `InputError` where the chunks of an MCAP together claim too much.
+    """Raise `InputError` if the chunks of an MCAP together claim too much.
 
     Without an index rosbags finds them one after another; each could claim the most for itself.
     """
@@ -208,15 +250,15 @@ def _check_chunks(path: Path) -> None:
         while at + 9 <= length:
             file.seek(at)
             kind, size = struct.unpack("<BQ", file.read(9))
-            if kind == _CHUNK and len(head := file.read(24)) == 24:
+            if kind == _MCAP_CHUNK and len(head := file.read(24)) == 24:
                 unfolded += struct.unpack("<16xQ", head)[0]
             at += 9 + size
     check_unfolded(unfolded, length, str(path))
 
 
 def _check_chunk(size: int, data: bytes) -> None:
-    """Raise `ValueError` for a chunk that claims too much; who reads the file names it."""
-    if size > most_unfolded(len(data)):
+    """Raise `ValueError` for a chunk that claims too much; the caller names the file."""
+    if size > max_unfolded(len(data)):
         raise ValueError(f"a chunk of {len(data):,} bytes claims to hold {size:,}")
 
 
@@ -276,3 +318,158 @@ def _check_tables(path: Path) -> None:
             f"{path}: the database holds more than plain tables, so it is not a bag as ROS 2 "
             "writes them; record it again"
         )
+
+
+class MessageLayout:
+    """The fields of a type of message."""
+
+    def __init__(self, types: Mapping[str, Fields], kind: str, is_ros1: bool):
+        """Take the fields of every type by its name, and the name of the message's type."""
+        self._types, self._kind, self._is_ros1 = types, kind, is_ros1
+        self._known: dict[Any, tuple[tuple[str, str], ...] | None] = {}
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Types of the message's own fields, by name; none of an unknown type."""
+        return dict(self._types.get(self._kind, ()))
+
+    def members(self, type_: Any) -> list[tuple[str, str]] | None:
+        """Find the names and NumPy types of the numbers of an element of an array.
+
+        Numbers of a part have its name before theirs, as in `ts.sec`. Returns None of other fields.
+        """
+        node, detail = type_
+        return _members(self._types, detail[0], "") if node.name == "SEQUENCE" else None
+
+    def read(self, data: bytes) -> dict[str, Any]:
+        """Read the values of a message, by name.
+
+        Parts are dictionaries, texts str. An array of elements of one size is a list of NumPy
+        arrays, to be taken one after the other, whose fields are named as by `members`; of bare
+        numbers the field is `value`. Raises `ValueError` where the bytes do not fit the definition.
+        """
+        order = "<" if self._is_ros1 or data[1] & 1 else ">"
+        reader = _MessageReader(self._types, data, order, self._is_ros1, self._known)
+        values = reader.read_part(self._kind)
+        # A writer of CDR may fill up to a multiple of 4 bytes.
+        if not 0 <= len(data) - reader.at <= (0 if self._is_ros1 else 3):
+            raise ValueError(f"{len(data)} bytes, of which the fields take {reader.at}")
+        return values
+
+
+def _members(
+    types: Mapping[str, Fields], type_: Any, name: str, depth: int = 0
+) -> list[tuple[str, str]] | None:
+    node, detail = type_
+    if node.name == "BASE":
+        return [(name, _BASES[detail[0]])] if detail[0] in _BASES else None
+    if node.name == "ARRAY":
+        inner, count = detail
+        parts = [(f"{name}[{i}]", inner) for i in range(count if count <= _MAX_FIELDS else 0)]
+    else:
+        fields = types.get(detail, ()) if node.name == "NAME" and depth < _MAX_DEPTH else ()
+        parts = [(f"{name}.{field}".lstrip("."), inner) for field, inner in fields]
+    found: list[tuple[str, str]] = []
+    for part, inner in parts:
+        more = _members(types, inner, part, depth + 1)
+        if more is None or len(found) + len(more) > _MAX_FIELDS:
+            return None
+        found += more
+    return found or None
+
+
+class _MessageReader:
+    """Reader of the bytes of a message from front to back.
+
+    Attributes:
+        types: Fields of every type, by its name.
+        data: Bytes of the message.
+        order: "<" or ">", as NumPy writes the order of bytes.
+        is_ros1: Whether fields are packed without gaps.
+        known: Members of the arrays' elements, kept from message to message.
+        at: Offset of the next byte.
+    """
+
+    def __init__(
+        self, types: Mapping[str, Fields], data: bytes, order: str, is_ros1: bool, known: dict
+    ):
+        self.types, self.data, self.order, self.is_ros1 = types, data, order, is_ros1
+        self.known = known
+        self.at = 0 if is_ros1 else 4
+        # Parts without fields take no bytes, so that these alone would not bound the work.
+        self.parts_left = len(data) + _MAX_FIELDS
+
+    def read_part(self, kind: str, depth: int = 0) -> dict[str, Any]:
+        self.parts_left -= 1
+        if kind not in self.types or depth > _MAX_DEPTH or self.parts_left < 0:
+            raise ValueError(f"a part {kind[:60]!r} without a usable definition")
+        return {name: self.read_value(type_, depth) for name, type_ in self.types[kind]}
+
+    def read_value(self, type_: Any, depth: int) -> Any:
+        node, detail = type_
+        if node.name == "NAME":
+            return self.read_part(detail, depth + 1)
+        if node.name == "BASE":
+            return (
+                self.read_text() if "string" in detail[0] else self.read_number(_BASES[detail[0]])
+            )
+        inner, count = detail
+        if node.name == "SEQUENCE":
+            count = self.read_number("u4")
+        if inner not in self.known:
+            found = _members(self.types, inner, "")
+            self.known[inner] = None if found is None else tuple(found)
+        members = self.known[inner]
+        if members is None:
+            if count > len(self.data):
+                raise ValueError(f"an array claims {count} elements")
+            return [self.read_value(inner, depth) for _ in range(count)]
+        return self.read_elements(members, count)
+
+    def read_number(self, kind: str) -> Any:
+        size = int(kind[1])
+        if not self.is_ros1:
+            self.at += -(self.at - 4) % size
+        if size > len(self.data) - self.at:
+            raise ValueError(f"{len(self.data)} bytes, too few for its fields")
+        value = np.frombuffer(self.data, self.order + kind, 1, self.at).item()
+        self.at += size
+        return value
+
+    def read_text(self) -> str:
+        length = self.read_number("u4")
+        text = self.data[self.at : self.at + length]
+        self.at += length
+        return text.rstrip(b"\0").decode(errors="replace")
+
+    def read_elements(self, members: tuple[tuple[str, str], ...], count: int) -> list[NDArray]:
+        pieces = []
+        for some in (count,) if self.is_ros1 else (min(count, 1), max(0, count - 1)):
+            alignment = 0 if self.is_ros1 else (self.at - 4) % 8
+            dtype = _element_type(members, self.order, alignment, self.is_ros1)
+            size = some * dtype.itemsize
+            if size > len(self.data) - self.at:
+                raise ValueError(
+                    f"{len(self.data) - self.at} bytes for {some} elements, not {size}"
+                )
+            pieces.append(np.frombuffer(self.data, dtype, some, self.at))
+            self.at += size
+        return pieces
+
+
+@functools.cache
+def _element_type(
+    members: tuple[tuple[str, str], ...], order: str, start: int, is_ros1: bool
+) -> np.dtype:
+    """Return the NumPy type of an element that begins at `start` modulo 8."""
+    at, offsets = start, []
+    for _, kind in members:
+        size = np.dtype(kind).itemsize
+        at += 0 if is_ros1 else -at % size
+        offsets.append(at - start)
+        at += size
+    names = [name or "value" for name, _ in members]
+    formats = [order + kind for _, kind in members]
+    return np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": at - start}
+    )

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError, require
-from jaxevent.io import calibrated, reading, whole_number
+from jaxevent.io.checks import make_supported_camera, reading, whole_size
 
 SUFFIXES = (".yaml", ".yml")
-_OF_OPENCV = re.compile(r"\A%YAML:1\.0[^\n]*|!!opencv-matrix\b")  # no YAML by its own rules
-_MOST_BYTES = 1 << 20  # of a file of a few cameras
+_OPENCV_WORDS = re.compile(r"\A%YAML:1\.0[^\n]*|!!opencv-matrix\b")  # no YAML by its own rules
+_MAX_BYTES = 1 << 20  # of a file of a few cameras
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,9 +39,9 @@ class CalibratedCamera:
     """A camera of a calibration file.
 
     Attributes:
-        lens: Its focal lengths, centre and distortion; None where they are not supported.
-        left_out: Why they are not, a sentence without a full stop.
-        size: (width, height) in px, None where the file does not tell them.
+        lens: Focal lengths, centre and distortion; None where they are not supported.
+        left_out: The reason why they are not supported, a sentence without a full stop.
+        size: (width, height) in px, None where the file does not state them.
         transform: (4, 4), takes places in m from the axes of the first camera of the file to those
             of this camera.
     """
@@ -63,17 +63,17 @@ def read_cameras(path: Path) -> dict[str, CalibratedCamera]:
     source = str(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; correct the path")
-    with reading(source):
-        if path.stat().st_size > _MOST_BYTES:
+    with reading(path):
+        if path.stat().st_size > _MAX_BYTES:
             raise InputError(f"{path}: is too large for a calibration; give the YAML of cameras")
-        text = _OF_OPENCV.sub("", path.read_text(encoding="utf-8-sig"))
+        text = _OPENCV_WORDS.sub("", path.read_text(encoding="utf-8-sig"))
         table: Any = YAML(typ="safe", pure=True).load(text)
     if isinstance(table, Mapping):
         if "camera_matrix" in table:
-            return {str(table.get("camera_name") or "camera"): _of_ros(table, source)}
+            return {str(table.get("camera_name") or "camera"): _read_camera_info(table, source)}
         names = [name for name in table if str(name).startswith("cam")]
         if names and all(isinstance(table[name], Mapping) for name in names):
-            return _chain({str(name): table[name] for name in names}, source)
+            return _read_chain({str(name): table[name] for name in names}, source)
     raise InputError(
         f"{path}: holds no camera; give a camchain of Kalibr (cam0: intrinsics, ...) or "
         "camera_info of ROS or OpenCV (camera_matrix, ...)"
@@ -94,6 +94,9 @@ def read_camera(source: str | os.PathLike[str], size: tuple[int, int]) -> Pinhol
         source: The file, or FILE:NAME, as camchain.yaml:cam0.
         size: (width, height) in px of the images that it is for. Without a name the camera of this
             size is taken.
+
+    Returns:
+        The camera.
 
     Raises:
         InputError: The file holds no such camera, several, one of another size, or one whose lens
@@ -120,14 +123,26 @@ def read_camera(source: str | os.PathLike[str], size: tuple[int, int]) -> Pinhol
 
 
 def lens_of(cameras: Mapping[str, CalibratedCamera], name: str, path: Path) -> PinholeCamera:
-    """The lens of a camera of a file; raises `InputError` where it is not supported."""
+    """Return the lens of a camera of a file.
+
+    Args:
+        cameras: Cameras of the file by name, as of `read_cameras`.
+        name: Name of the camera.
+        path: The file, for messages.
+
+    Returns:
+        The lens.
+
+    Raises:
+        InputError: The lens is not supported.
+    """
     lens = cameras[name].lens
     if lens is None:
         raise InputError(f"{cameras[name].left_out}; calibrate {name} of {path.name} with another")
     return lens
 
 
-def _chain(table: Mapping[str, Any], path: str) -> dict[str, CalibratedCamera]:
+def _read_chain(table: Mapping[str, Any], path: str) -> dict[str, CalibratedCamera]:
     found: dict[str, CalibratedCamera] = {}
     transform = np.eye(4)
     for name, one in table.items():
@@ -141,7 +156,7 @@ def _chain(table: Mapping[str, Any], path: str) -> dict[str, CalibratedCamera]:
             )
         size = None
         if "resolution" in one:
-            size = _size(*_numbers(one["resolution"], 2, f"{source}: resolution"), source)
+            size = whole_size(*_numbers(one["resolution"], 2, f"{source}: resolution"), source)
         model = str(one.get("camera_model", "pinhole"))
         if model != "pinhole":
             why = f"{source}: the camera model {model[:40]!r} is not supported, pinhole is"
@@ -150,22 +165,24 @@ def _chain(table: Mapping[str, Any], path: str) -> dict[str, CalibratedCamera]:
         numbers = _numbers(one.get("intrinsics"), 4, f"{source}: intrinsics")
         lens = str(one.get("distortion_model") or "none")
         k = one.get("distortion_coeffs") or []
-        found[name] = _camera(numbers, "" if lens == "none" else lens, k, source, (size, transform))
+        found[name] = _make_camera(
+            numbers, "" if lens == "none" else lens, k, source, (size, transform)
+        )
     return found
 
 
-def _of_ros(table: Mapping[str, Any], source: str) -> CalibratedCamera:
+def _read_camera_info(table: Mapping[str, Any], source: str) -> CalibratedCamera:
     size = None
     if {"image_width", "image_height"} <= set(table):
-        size = _size(table["image_width"], table["image_height"], source)
+        size = whole_size(table["image_width"], table["image_height"], source)
     matrix = _numbers(_data(table["camera_matrix"]), 9, f"{source}: camera_matrix: data")
     k = _data(table.get("distortion_coefficients")) or []
     fisheye = "equidistant" if table.get("fisheye_model") else ""
     model = str(table.get("distortion_model") or fisheye)
-    return _camera(matrix[[0, 4, 2, 5]], model, k, source, (size, np.eye(4)))
+    return _make_camera(matrix[[0, 4, 2, 5]], model, k, source, (size, np.eye(4)))
 
 
-def _camera(
+def _make_camera(
     intrinsics: NDArray[np.float64],
     model: str,
     coefficients: Any,
@@ -179,17 +196,12 @@ def _camera(
             f"{source}: has the focal lengths {intrinsics[0]:g} and {intrinsics[1]:g} px; give "
             "positive ones"
         )
-    lens, left_out = calibrated(intrinsics, model, k, source)
+    lens, left_out = make_supported_camera(intrinsics, model, k, source)
     return CalibratedCamera(lens, left_out.get("camera", ""), *place)
 
 
 def _data(part: Any) -> Any:
     return part.get("data") if isinstance(part, Mapping) else part
-
-
-def _size(width: Any, height: Any, source: str) -> tuple[int, int]:
-    with reading(source):
-        return whole_number(width, source, "width"), whole_number(height, source, "height")
 
 
 def _matrix(values: Any, where: str) -> NDArray[np.float64]:
@@ -199,7 +211,7 @@ def _matrix(values: Any, where: str) -> NDArray[np.float64]:
 
 
 def _numbers(values: Any, count: int, where: str) -> NDArray[np.float64]:
-    """A list of so many finite numbers, or `InputError`; a list of YAML may hold itself."""
+    """Return a list of `count` finite numbers, or raise `InputError`; lists may hold themselves."""
     held = values if isinstance(values, list) else []
     are_numbers = all(isinstance(value, int | float) for value in held)
     if len(held) != count or not are_numbers or not all(abs(value) < 1e300 for value in held):

@@ -7,7 +7,7 @@ _TRUTH = {"_data.hdf5": ("_gt.hdf5",), "_data.h5": ("_pose_gt.h5", "_depth_gt.h5
 
 
 def companions(path: Path) -> list[Path]:
-    """All that exist: ground truth, triggers, and the map that rectifies DSEC's pixels."""
+    """Find the files beside a recording's: ground truth, triggers, and DSEC's rectifying map."""
     found = truth(path)
     for other in (triggers(path), rectify_map(path)):
         found += [] if other is None else [other]
@@ -15,7 +15,7 @@ def companions(path: Path) -> list[Path]:
 
 
 def truth(path: Path) -> list[Path]:
-    """The files of ground truth that exist."""
+    """Find the files of ground truth that exist."""
     found = []
     for end, others in _TRUTH.items():
         if path.name.endswith(end):
@@ -25,7 +25,7 @@ def truth(path: Path) -> list[Path]:
 
 
 def truth_folders(path: Path) -> list[tuple[Path, str]]:
-    """Where the truth of DSEC's left camera lies, whose events are in `path`, and its times."""
+    """Find the folders of ground truth of DSEC's left camera, and the names of their times."""
     if path.name != "events.h5":
         return []
     if path.parts[-3:-1] == ("events", "left"):
@@ -45,18 +45,18 @@ def truth_folders(path: Path) -> list[tuple[Path, str]]:
 
 
 def triggers(path: Path) -> Path | None:
-    """The external triggers of Prophesee's events NAME_cd.dat or NAME_td.dat: NAME_trigger.dat."""
+    """Find the triggers NAME_trigger.dat of Prophesee's events NAME_cd.dat or NAME_td.dat."""
     name = re.sub(r"_(cd|td)(\.dat)$", r"_trigger\2", path.name, flags=re.IGNORECASE)
     return _existing(path, name)
 
 
 def rectify_map(path: Path) -> Path | None:
-    """Where each pixel of a camera of DSEC lies in the rectified image."""
+    """Find the file of the places of a DSEC camera's pixels in the rectified image."""
     return _existing(path, "rectify_map.h5") if path.suffix in (".h5", ".hdf5") else None
 
 
 def images(path: Path) -> Path | None:
-    """The folder of the images that DSEC's frame camera took beside the events in `path`."""
+    """Find the folder of the images of DSEC's frame camera beside the events in `path`."""
     if path.name != "events.h5" or path.parts[-3:-2] != ("events",):
         return None
     folder = path.parents[2] / "images" / path.parent.name

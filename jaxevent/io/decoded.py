@@ -1,99 +1,247 @@
 """Events and images of a decoder that gives them block by block, in memory or left in the file.
 
-A decoder is a generator function. Called with None it gives the blocks of a file in order, each
-after the state that it was in before the block; called with one of these states it gives that
-block and those after it. What a state is, is the decoder's own affair: an offset into the file and
-the time base there, or, where packets can only be read in turn, the number of a packet. The first
-pass over a file checks every event; a file that is left on disk is later decoded again where
-events are asked for, at the memory of a few blocks.
+A decoder is a generator function. Called with None it yields the blocks of a file in order, each
+after the state that it was in before the block; called with one of these states it yields that
+block and those after it. Each decoder chooses what its state is: an offset into the file and the
+time base there, or the number of a packet where packets can only be read in turn. The first pass
+over a file checks every event. A file that is left on disk is decoded again later, where events
+are needed, at the memory of a few blocks.
+
+Events and images that stay in files are pickled and copied by the arguments of `load` that opened
+them: a copy opens the file again.
 """
 
-import dataclasses
+import functools
 import os
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, OrderError
-from jaxevent.io import checked_events, disorder, reading
-from jaxevent.io.options import ReadOptions
-from jaxevent.io.reopening import EventsInFile, ImagesInFile
+from jaxevent.io import disorder
+from jaxevent.io.checks import ReadOptions, check_events, reading
 from jaxevent.locks import TurnLock, synchronized
 from jaxevent.progress import bar
-from jaxevent.recording import Events, EventSource, Triggers
+from jaxevent.recording import Events, EventSource, Recording, Triggers
 
 BLOCK = 1 << 20  # events decoded together: 13 MB
 
 Columns = disorder.Columns
 Decoder = disorder.Decoder
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class LoadCall:
+    """The arguments of `load` by which a recording was opened."""
+
+    def __init__(self, arguments: tuple[Any, ...], options: dict[str, Any]):
+        self.arguments, self.options = arguments, options
+        self._recording: Recording | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return LoadCall, (self.arguments, self.options)
+
+    def find(self, name: str) -> Any:
+        """Return a part of the recording by name, or None; the file is opened once for all."""
+        if self._recording is None:
+            from jaxevent.io import load
+
+            self._recording = load(*self.arguments, **self.options)
+        return _lazy_parts(self._recording).get(name)
+
+    def error(self, name: str) -> InputError:
+        """Return the error to raise if a part of the recording has changed since it was opened."""
+        return InputError(
+            f"{self.arguments[0]}: no longer holds the {name} that were pickled; load it again"
+        )
+
+
+class InFile:
+    """A part of a recording that stays in a file.
+
+    A pickle or copy opens the file again, by its absolute path. What `load` did not open is read,
+    and held in memory.
+    """
+
+    opened: tuple[LoadCall, str] | None = None  # and the name of the part of the recording
+
+
+class EventsInFile(InFile):
+    """An `EventSource` that stays in a file."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        it: Any = self
+        if self.opened is None:
+            return it[:].__reduce_ex__(2)
+        return _reopen_events, (*self.opened, len(it))
+
+
+class ImagesInFile(InFile):
+    """An `ImageSource` of some images of a file; subclasses read them.
+
+    Attributes:
+        dtype: Type of the pixels.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: np.dtype):
+        self._rows: Sequence[int] = range(shape[0])
+        self._image_shape, self.dtype = tuple(shape[1:]), dtype
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the images, (images, height, width) or with further axes."""
+        return (len(self._rows), *self._image_shape)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, rows: slice | NDArray) -> Self:
+        if isinstance(rows, slice):
+            return self.select(self._rows[rows])
+        return self.select([self._rows[i] for i in np.arange(len(self))[rows].tolist()])
+
+    def select(self, rows: Sequence[int]) -> Self:
+        """Return the images of the file with the numbers `rows`."""
+        part = object.__new__(type(self))
+        vars(part).update(vars(self), _rows=rows)
+        return part
+
+    def read(self, rows: Sequence[int]) -> NDArray:
+        """Read images of the file by their numbers."""
+        raise NotImplementedError
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        return np.asarray(self.read(self._rows), dtype)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.opened is None:
+            return np.asarray, (np.asarray(self),)
+        return _reopen_images, (*self.opened, self._rows, self._image_shape, self.dtype)
+
+
+def _lazy_parts(recording: Recording) -> dict[str, Any]:
+    """Return all parts of a recording that may stay in a file, by name."""
+    frames = recording.frames
+    images = {} if frames is None else {"frames": frames.images}
+    return {"events": recording.events, **images, **recording.extra}
+
+
+def _reopen_events(call: LoadCall, name: str, count: int) -> Any:
+    found: Any = call.find(name)
+    if not isinstance(found, EventsInFile) or len(found) != count:
+        raise call.error(name)
+    return found
+
+
+def _reopen_images(
+    call: LoadCall, name: str, rows: Sequence[int], shape: tuple[int, ...], dtype: np.dtype
+) -> Any:
+    found: Any = call.find(name)
+    if isinstance(found, ImagesInFile) and set(rows) <= set(found._rows):
+        part: Any = found.select(rows)
+        if (part.shape[1:], part.dtype) == (shape, dtype):
+            return part
+    raise call.error(name)
+
+
+def remember_call(load: Callable[P, Recording]) -> Callable[P, Recording]:
+    """Decorate a function like `load`: parts left in a file keep the call that opened them."""
+
+    @functools.wraps(load)
+    def loaded(*arguments: P.args, **options: P.kwargs) -> Recording:
+        recording = load(*arguments, **options)
+        parts = {n: one for n, one in _lazy_parts(recording).items() if isinstance(one, InFile)}
+        if parts:
+            path: Any = options.pop("path") if "path" in options else arguments[0]
+            call = LoadCall((os.path.abspath(path), *arguments[1:]), dict(options))
+            for name, one in parts.items():
+                one.opened = call, name
+        return recording
+
+    return loaded
 
 
 class _Block(NamedTuple):
+    """A block of a file: the decoder's state before it, its first row, its first and last time."""
+
     state: Any
     row: int
     first: int
     last: int
 
 
-def decoded(
+def read_events(
     decode: Decoder,
     size: tuple[int, int],
     source: str,
     options: ReadOptions,
     origin: int = 0,
 ) -> EventSource:
-    """All events of a decoder, checked: `Events` in memory, else `DecodedEvents`.
+    """Read all events of a decoder and check them.
 
-    The blocks hold t (int64 us), x, y and p as `checked_events` takes them. `size` is (width,
-    height). Raises `InputError` for the first bad event and whatever the decoder finds wrong.
+    Args:
+        decode: The decoder; its blocks hold t (int64 us), x, y and p as `check_events` takes them.
+        size: (width, height) of the sensor in px.
+        source: Name of the file for messages.
+        options: Choices of the caller.
+        origin: Number of the first column and row of the sensor, 0 or 1.
+
+    Returns:
+        `Events` in memory, else `DecodedEvents`.
+
+    Raises:
+        InputError: An event is not valid, or the decoder finds a fault.
     """
     if options.repair is not None:
         decode = _with_repair(decode, source, options, options.repair)
     blocks: list[_Block] = []
-    kept: list[Events] = []
+    pieces: list[Events] = []
     row = 0
     with (
         reading(source),
         bar(desc="decode", unit=" events", unit_scale=True, progress=options.progress) as shown,
     ):
-        for state, (t, x, y, p) in decode(None):
-            if not len(t):
+        for state, columns in decode(None):
+            if not len(columns[0]):
                 continue
             try:
-                events = checked_events(t, x, y, p, size, source, first_row=row, origin=origin)
+                events = check_events(*columns, size, source, first_row=row, origin=origin)
             except OrderError:
-                raise _disorder(decode, source).explain(source) from None
+                raise _find_disorder(decode, source).explain(source) from None
             first, last = int(events.t[0]), int(events.t[-1])
             if blocks and first < blocks[-1].last:
-                raise _disorder(decode, source).explain(source)
+                raise _find_disorder(decode, source).explain(source)
             blocks.append(_Block(state, row, first, last))
-            if options.in_memory or len(kept) < 2:
-                kept.append(events)
+            if options.in_memory or len(pieces) < 2:
+                pieces.append(events)
             else:
-                kept[1] = events
+                pieces[1] = events
             row += len(events)
             shown.update(len(events))
     if not blocks:
         return Events.empty()
     if options.in_memory or len(blocks) <= 2:
-        return _joined(kept)
-    return DecodedEvents(decode, blocks, row, (kept[0], kept[1]), size, source, origin)
+        return _joined(pieces)
+    return DecodedEvents(decode, blocks, row, (pieces[0], pieces[1]), size, source, origin=origin)
 
 
-def _with_repair(decode: Decoder, source: str, options: ReadOptions, asked: str) -> Decoder:
-    """A decoder that makes the repairs asked for, with a note of them in the options."""
-    repair = disorder.parse_repair(asked)
-    found = _disorder(decode, source, repair.bound)
+def _with_repair(decode: Decoder, source: str, options: ReadOptions, words: str) -> Decoder:
+    """Return a decoder that makes repairs, with a note of them in the options."""
+    repair = disorder.parse_repair(words)
+    found = _find_disorder(decode, source, repair.bound)
     found.refuse_rest(repair, source)
     options.notes.append(found.describe_repair(repair))
-    return disorder.repaired(decode, found, repair)
+    return disorder.repair_decoder(decode, found, repair)
 
 
-def _disorder(decode: Decoder, source: str, bound: int = disorder.BOUND) -> disorder.Disorder:
+def _find_disorder(
+    decode: Decoder, source: str, bound: int = disorder.BOUND_US
+) -> disorder.Disorder:
     with reading(source):
-        return disorder.examine((columns[0] for _, columns in decode(None)), bound, source)
+        return disorder.find_disorder((columns[0] for _, columns in decode(None)), bound, source)
 
 
 def _joined(pieces: list[Events]) -> Events:
@@ -105,54 +253,84 @@ def _joined(pieces: list[Events]) -> Events:
     return Events.of_checked(*columns)
 
 
-def from_columns(
-    columns: Columns, size: tuple[int, int], source: str, options: ReadOptions, origin: int = 0
-) -> Events:
-    """The events of whole columns, checked and repaired as those of `decoded`."""
-    whole = dataclasses.replace(options, in_memory=True, progress=False, notes=options.notes)
-    return decoded(lambda _: iter([(None, columns)]), size, source, whole, origin)[:]
+class FirstPass:
+    """Counts and external triggers that a decoder meets on its first pass over a file.
 
-
-class Tally:
-    """Counts of what a decoder meets on its first pass; later passes add nothing."""
+    A place in the file rises from block to block; a place that was met before adds nothing.
+    """
 
     def __init__(self):
         self._counts: dict[str, int] = {}
-        self._places: dict[str, int] = {}
+        self._last_places: dict[str, int] = {}
+        self._triggers: list[tuple[NDArray, NDArray, NDArray]] = []
 
-    def add(self, name: str, number: int, place: int) -> None:
-        """Count `number` more in the block at a place of the file, which rises block by block."""
-        if number and place > self._places.get(name, -1):
-            self._places[name] = place
+    def _is_new(self, name: str, place: int) -> bool:
+        is_new = place > self._last_places.get(name, -1)
+        self._last_places[name] = max(place, self._last_places.get(name, -1))
+        return is_new
+
+    def count(self, name: str, number: int, place: int) -> None:
+        """Add to a count.
+
+        Args:
+            name: Name of the count.
+            number: Number to add.
+            place: Place of the block in the file.
+        """
+        if number and self._is_new(name, place):
             self._counts[name] = self._counts.get(name, 0) + number
 
-    def arrays(self) -> dict[str, NDArray]:
-        """The counts that are not 0, by name."""
+    def counts(self) -> dict[str, NDArray]:
+        """Return the counts that are not 0, by name, as `Recording.extra` keeps them."""
         return {name: np.array(number) for name, number in sorted(self._counts.items())}
 
+    def add_triggers(
+        self, place: int, t: NDArray, edge: NDArray | int, channel: NDArray | int
+    ) -> None:
+        """Keep the triggers of a block.
 
-class TriggerList:
-    """External triggers that a decoder meets on its first pass; later ones add none again."""
+        Args:
+            place: Place of the block in the file.
+            t: (n,) times in us.
+            edge: 1 rising, 0 falling, -1 unknown, one for all or (n,).
+            channel: Number of the input, one for all or (n,).
+        """
+        if self._is_new("triggers", place) and len(t):
+            edge, channel = np.broadcast_to(edge, len(t)), np.broadcast_to(channel, len(t))
+            self._triggers.append((t, edge, channel))
 
-    def __init__(self):
-        self._pieces: list[tuple[NDArray, NDArray, NDArray]] = []
-        self._place = -1
-
-    def add(self, place: int, t: NDArray, edge: NDArray | int, channel: NDArray | int) -> None:
-        """Keep triggers of the block at a place of the file, which rises from block to block."""
-        if place > self._place:
-            self._place = place
-            if len(t):
-                edge, channel = np.broadcast_to(edge, len(t)), np.broadcast_to(channel, len(t))
-                self._pieces.append((t, edge, channel))
-
-    def all(self) -> Triggers | None:
-        if not self._pieces:
+    def triggers(self) -> Triggers | None:
+        """Return all triggers in the order of their times; None if there are none."""
+        if not self._triggers:
             return None
-        t, edge, channel = (np.concatenate(values) for values in zip(*self._pieces, strict=True))
+        t, edge, channel = (np.concatenate(one) for one in zip(*self._triggers, strict=True))
         order = np.argsort(t, kind="stable")
         found = Triggers(t.astype(np.int64), edge.astype(np.int8), channel.astype(np.uint8))
         return found[order]
+
+
+def gather_pieces(
+    pieces: Iterable[tuple[Any, int, T]], count: int | None = None
+) -> Iterator[tuple[Any, list[T]]]:
+    """Gather small pieces of a file, as packets, into blocks.
+
+    Args:
+        pieces: State of the decoder before each piece, size of the piece, and the piece.
+        count: Size of a block; None takes `BLOCK`.
+
+    Yields:
+        The state before each block, and its pieces.
+    """
+    first, held, size = None, [], 0
+    for state, number, piece in pieces:
+        first = first if held else state
+        held.append(piece)
+        size += number
+        if size >= (count or BLOCK):
+            yield first, held
+            held, size = [], 0
+    if held:
+        yield first, held
 
 
 class DecodedEvents(EventsInFile):
@@ -166,6 +344,7 @@ class DecodedEvents(EventsInFile):
         ends: tuple[Events, Events],
         size: tuple[int, int],
         source: str,
+        *,
         origin: int,
     ):
         self._decode = decode
@@ -173,7 +352,7 @@ class DecodedEvents(EventsInFile):
         self._rows = np.array([block.row for block in blocks] + [count])
         self._first = np.array([block.first for block in blocks])
         self._last = np.array([block.last for block in blocks])
-        # A recording's start and stop are asked for often; neither may cost a pass over the file.
+        # A recording's start and stop are needed often; neither may cost a pass over the file.
         self._ends = {0: ends[0], len(blocks) - 1: ends[1]}
         self._recent: dict[int, Events] = {}
         self._stream: Iterator[tuple[Any, Columns]] = iter(())
@@ -187,9 +366,7 @@ class DecodedEvents(EventsInFile):
     @synchronized
     def __getitem__(self, rows: slice) -> Events:
         """Decode the events of a range of rows; the file must not have changed since."""
-        start, stop, step = rows.indices(len(self))
-        if step != 1:
-            raise ValueError("decoded events are read as a range of rows, events[i:j], step 1")
+        start, stop = row_range(rows, len(self))
         if stop <= start:
             return Events.empty()
         block = int(np.searchsorted(self._rows, start, side="right")) - 1
@@ -202,7 +379,7 @@ class DecodedEvents(EventsInFile):
 
     @synchronized
     def index(self, time: int) -> int:
-        """The number of events earlier than `time` (us): at most one block is decoded."""
+        """Count the events earlier than `time` (us): at most one block is decoded."""
         block = int(np.searchsorted(self._first, time)) - 1
         if block < 0:
             return 0
@@ -222,11 +399,8 @@ class DecodedEvents(EventsInFile):
             columns = next((block for _, block in self._stream if len(block[0])), None)
         count = int(self._rows[number + 1] - self._rows[number])
         if columns is None or len(columns[0]) != count:
-            raise InputError(
-                f"{self._source}: no longer holds the events it held when it was opened; load it "
-                "again"
-            )
-        events = checked_events(
+            raise _changed(self._source, "events")
+        events = check_events(
             *columns,
             self.checked_size,
             self._source,
@@ -241,11 +415,22 @@ class DecodedEvents(EventsInFile):
         return events
 
 
+def row_range(rows: slice, count: int) -> tuple[int, int]:
+    """Return the first row and the one after the last of a slice of `count` events, step 1."""
+    start, stop, step = rows.indices(count)
+    if step != 1:
+        raise ValueError("events in a file are read as a range of rows, events[i:j], step 1")
+    return start, stop
+
+
+def _changed(source: str, what: str) -> InputError:
+    return InputError(
+        f"{source}: no longer holds the {what} it held when it was opened; load it again"
+    )
+
+
 class DecodedImages(ImagesInFile):
-    """Images (frames, height, width), or in colour (frames, height, width, 3), left in the file.
-
-    `images(i)` decodes the images from number i on, in turn.
-    """
+    """Images (frames, height, width), or in colour (frames, height, width, 3), left in the file."""
 
     def __init__(
         self,
@@ -254,51 +439,42 @@ class DecodedImages(ImagesInFile):
         dtype: np.dtype,
         source: str,
     ):
-        self._reader = _ImageReader(images, shape[1:], dtype, source)
-        self._rows = range(shape[0])
+        """Describe the images without decoding them.
 
-    @property
-    def dtype(self) -> np.dtype:
-        return self._reader.dtype
+        Args:
+            images: Decoder: `images(i)` yields the images from number i on, in turn.
+            shape: Shape of all images.
+            dtype: Type of the pixels.
+            source: Name of the file for messages.
+        """
+        super().__init__(shape, dtype)
+        self._stream = _ImageStream(images, source)
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return (len(self._rows), *self._reader.shape)
+    def read(self, rows: Sequence[int]) -> NDArray:
+        """Read images of the file by their numbers."""
+        out = np.empty((len(rows), *self._image_shape), self.dtype)
+        with self._stream.turns:
+            for i, row in enumerate(rows):
+                image = self._stream.read(row)
+                if image is None or (image.shape, image.dtype) != (out.shape[1:], self.dtype):
+                    raise _changed(self._stream.source, "image")
+                out[i] = image
+        return out
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
-        images = np.empty(self.shape, self.dtype)
-        with self._reader.turns:
-            for i, row in enumerate(self._rows):
-                images[i] = self._reader.read(row)
-        return np.asarray(images, dtype)
 
+class _ImageStream:
+    """The decoder of images, which goes on from its last place or begins anew."""
 
-class _ImageReader:
-    """The images of a file, read on from where it was left or else from anew."""
-
-    def __init__(
-        self,
-        images: Callable[[int], Iterable[NDArray]],
-        shape: tuple[int, ...],
-        dtype: np.dtype,
-        source: str,
-    ):
-        self.shape, self.dtype = shape, dtype
-        self._images, self._source = images, source
+    def __init__(self, images: Callable[[int], Iterable[NDArray]], source: str):
+        self._images, self.source = images, source
         self.turns, self._process = TurnLock(source), os.getpid()
         self._stream: Iterator[NDArray] = iter(())
         self._next = -1
 
-    def read(self, row: int) -> NDArray:
-        with reading(self._source):
+    def read(self, row: int) -> NDArray | None:
+        with reading(self.source):
             if row != self._next or self._process != os.getpid():
                 self._process = os.getpid()
                 self._stream = iter(self._images(row))
-            image = next(self._stream, None)
-        if image is None or image.shape != self.shape or image.dtype != self.dtype:
-            raise InputError(
-                f"{self._source}: no longer holds the image it held when it was opened; load it "
-                "again"
-            )
-        self._next = row + 1
+            image, self._next = next(self._stream, None), row + 1
         return image

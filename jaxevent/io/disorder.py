@@ -1,6 +1,6 @@
 """Event times that go back: what kind of fault it is, and how each kind is mended.
 
-Four faults are told apart, in times of int64 us:
+Four faults are distinguished, in times of int64 us:
 
     jitter    events that come late by at most a bound: they are sorted
     outliers  a few events far before or after their neighbours, to whose times the stream
@@ -8,8 +8,8 @@ Four faults are told apart, in times of int64 us:
     wraps     a counter that begins again after 2^k us or ns: it is continued
     resets    a clock that is set back and goes on from there: one of the parts is kept
 
-`examine` finds the faults in one pass over the times, and `repaired` mends those that the user
-asked for while the file is decoded, both at the memory of a few blocks.
+`find_disorder` finds the faults in one pass over the times. `repair_decoder` mends those that the
+user named, while the file is decoded. Both need the memory of a few blocks.
 """
 
 import dataclasses
@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from jaxevent.display import plural
 from jaxevent.errors import InputError, OrderError
 
-BOUND = 10_000  # us that an event may be late where sorting has no bound of its own
-_RUN = 1000  # events that may be outliers together
-_EDGE = 10  # events that are outliers where the stream before or after them is missing
-_FEWEST_BITS = {1.0: 24, 1000.0: 32}  # of counters of us and of ns, by ticks in a us
+BOUND_US = 10_000  # us that an event may be late where sorting has no bound of its own
+_MAX_RUN = 1000  # events that may be outliers together
+_MAX_EDGE = 10  # events that are outliers where the stream before or after them is missing
+_MIN_BITS = {1.0: 24, 1000.0: 32}  # of counters of us and of ns, by ticks in a us
 _WRAP_TOLERANCE = 1e-3  # of a wrap's period, in which there was no event
-_MOST_FAULTS = 0.05  # share of events that begin a fault; beyond, times are in no order at all
-_FEW = 1000  # faults that are always looked at
+_MAX_FAULTS = 0.05  # share of events that begin a fault; beyond, times are in no order at all
+_MIN_FAULTS = 1000  # that are always examined
 
 KINDS = ("sort", "drop", "unwrap", "part")
-WANTED = (
+_USAGE = (
     "sort (events late by at most 10 ms, or sort:20000 in us, sort:0.02 in s), drop (outliers), "
     "unwrap (a counter) and part (the longest part between resets, or part:2), several joined by "
     "commas"
@@ -43,7 +43,7 @@ Decoder = Callable[[Any], Iterator[tuple[Any, Columns]]]
 
 @dataclasses.dataclass(frozen=True)
 class Repair:
-    """The repairs that a user asked for.
+    """The repairs that a user named.
 
     Attributes:
         sort: Whether to sort late events.
@@ -54,7 +54,7 @@ class Repair:
     """
 
     sort: bool = False
-    bound: int = BOUND
+    bound: int = BOUND_US
     drop: bool = False
     unwrap: bool = False
     part: int | None = None
@@ -74,7 +74,7 @@ def parse_repair(text: str) -> Repair:
 
 
 def _option(text: str, kind: str, value: str | None) -> dict[str, Any]:
-    refused = InputError(f"repair = {text!r} is not known; give {WANTED}")
+    refused = InputError(f"repair = {text!r} is not known; give {_USAGE}")
     if kind not in KINDS or (value is not None and kind in ("drop", "unwrap")):
         raise refused
     if value is None:
@@ -143,7 +143,9 @@ class Disorder:
                 f"event {self.first.row} is at {self.first.after} us, earlier than the one before "
                 f"it at {self.first.before} us: "
             )
-        if self.events <= 2 * _EDGE and (self.resets or self.outliers):  # too few to tell apart
+        if self.events <= 2 * _MAX_EDGE and (
+            self.resets or self.outliers
+        ):  # too few to distinguish
             return OrderError(f"{where.rstrip(': ')}; sort the events by time (stable)")
         return OrderError(
             f"{where}{'; '.join(faults)}; mend this with repair={repairs!r} or jaxevent convert "
@@ -151,7 +153,7 @@ class Disorder:
         )
 
     def _faults(self) -> Iterator[tuple[str, str]]:
-        """The repair of each kind of fault that there is, and a description of the fault."""
+        """Yield the repair of each kind of fault that there is, and a description of the fault."""
         if self.wraps:
             period = abs(self.wraps[0][1])
             number = sum(1 for _, size in self.wraps if size > 0)
@@ -169,7 +171,7 @@ class Disorder:
             yield "drop", f"{n:,} {plural('event', n)} far from the times around {_them(n)}"
         if self.late:
             n, bound = self.late, max(self.bound, self.latest)
-            sort = "sort" if bound == BOUND else f"sort:{bound}"
+            sort = "sort" if bound == BOUND_US else f"sort:{bound}"
             yield (
                 sort,
                 f"{n:,} {plural('event', n)} late by at most {self.latest:,} us (jitter)",
@@ -178,9 +180,9 @@ class Disorder:
     def refuse_rest(self, repair: Repair, source: str) -> None:
         """Raise `InputError` where faults remain that `repair` does not mend."""
         sorts = repair.sort and self.latest <= repair.bound
-        asked = (repair.unwrap, repair.part is not None, repair.drop, sorts)
+        mends = (repair.unwrap, repair.part is not None, repair.drop, sorts)
         present = (self.wraps, self.resets, self.outliers, self.late)
-        if any(bool(found) and not mended for found, mended in zip(present, asked, strict=True)):
+        if any(bool(found) and not mended for found, mended in zip(present, mends, strict=True)):
             raise self.explain(source)
         if repair.part is not None and repair.part > len(self.parts):
             raise InputError(
@@ -188,8 +190,8 @@ class Disorder:
                 f"{_times(len(self.resets))}; give a part from 1 to {len(self.parts)}"
             )
 
-    def kept(self, repair: Repair) -> tuple[int, int]:
-        """Rows [begin, end) of the part that `repair` keeps."""
+    def kept_rows(self, repair: Repair) -> tuple[int, int]:
+        """Return the rows [begin, end) of the part that `repair` keeps."""
         parts = self.parts
         if repair.part is None or len(parts) == 1:
             return 0, self.events
@@ -206,7 +208,7 @@ class Disorder:
             made.append(
                 f"{touched:,} {plural('event', touched)} moved by multiples of {_period(period)}"
             )
-        begin, end = self.kept(repair)
+        begin, end = self.kept_rows(repair)
         if end - begin < self.events:
             made.append(
                 f"{self.events - end + begin:,} events of other parts dropped (events {begin} to "
@@ -231,7 +233,7 @@ def _them(number: int) -> str:
 
 
 def _period(period: float) -> str:
-    """The period of a counter in us, as in "2^32 us"."""
+    """Describe the period of a counter, as in "2^32 us"."""
     for unit, scale in (("us", 1.0), ("ns", 1000.0)):
         bits = np.log2(abs(period) * scale)
         if abs(bits - round(bits)) < 1e-9:
@@ -239,7 +241,9 @@ def _period(period: float) -> str:
     return f"{period:g} us"
 
 
-def examine(blocks: Iterable[NDArray[np.int64]], bound: int = BOUND, source: str = "") -> Disorder:
+def find_disorder(
+    blocks: Iterable[NDArray[np.int64]], bound: int = BOUND_US, source: str = ""
+) -> Disorder:
     """Find the faults of event times.
 
     A step back by more than `bound` is the wrap of a counter where it is nearly 2^k us or ns. It
@@ -262,19 +266,19 @@ def examine(blocks: Iterable[NDArray[np.int64]], bound: int = BOUND, source: str
     held = np.empty(0, np.int64)
     for block in blocks:
         # The rows before a step and those after it decide what it is: they are held back.
-        held = np.concatenate([held, scan.continued(np.asarray(block, np.int64))])
-        if len(held) > 4 * _RUN:
-            scan.decide(held, len(held) - _RUN)
-            scan.count_late(held, len(held) - 2 * _RUN)
-            held = held[-3 * _RUN :]
-    scan.decide(held, len(held))
+        held = np.concatenate([held, scan.continue_wraps(np.asarray(block, np.int64))])
+        if len(held) > 4 * _MAX_RUN:
+            scan.classify_steps(held, len(held) - _MAX_RUN)
+            scan.count_late(held, len(held) - 2 * _MAX_RUN)
+            held = held[-3 * _MAX_RUN :]
+    scan.classify_steps(held, len(held))
     scan.count_late(held, len(held))
-    scan.settle_edges()
+    scan.turn_edges_into_outliers()
     return found
 
 
 class _Scan:
-    """The state of `examine`."""
+    """The state of `find_disorder` between blocks of times."""
 
     def __init__(self, found: Disorder, source: str):
         self.found, self.source = found, source
@@ -285,8 +289,8 @@ class _Scan:
         self.before: int | None = None  # last raw time
         self.faults = 0
 
-    def continued(self, block: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The times of a block with wraps continued; notes wraps and the first step back."""
+    def continue_wraps(self, block: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Continue the times of a block over wraps; note wraps and the first step back."""
         if not len(block):
             return block
         found, row = self.found, self.found.events
@@ -310,8 +314,8 @@ class _Scan:
             self._count()
         return block + np.rint(self.shift - shifts.sum() + np.cumsum(shifts)).astype(np.int64)
 
-    def decide(self, t: NDArray[np.int64], stop: int) -> None:
-        """Decide the steps before place `stop` of times whose last one is the last one read."""
+    def classify_steps(self, t: NDArray[np.int64], stop: int) -> None:
+        """Classify the steps before place `stop` of times whose last one is the last one read."""
         found = self.found
         origin = found.events - len(t)  # row of t[0]
         last_run = found.outliers[-1][1] if found.outliers else 0
@@ -329,7 +333,7 @@ class _Scan:
         self.settled = origin + stop
 
     def count_late(self, t: NDArray[np.int64], end: int) -> None:
-        """Count the late events before place `end` of such times, of which no outlier is one."""
+        """Count the late events before place `end` of such times; outliers are not late."""
         found = self.found
         origin = found.events - len(t)
         begin, self.counted = self.counted - origin, origin + end
@@ -352,17 +356,20 @@ class _Scan:
             found.latest = max(found.latest, int(late.max()))
             self.highest = int(reached[-1])
 
-    def settle_edges(self) -> None:
+    def turn_edges_into_outliers(self) -> None:
         """Turn parts of a few events at either end into outliers."""
         found = self.found
-        while found.resets and found.resets[0].row <= _EDGE < found.events - _EDGE:
+        while found.resets and found.resets[0].row <= _MAX_EDGE < found.events - _MAX_EDGE:
             found.outliers.insert(0, (0, found.resets.pop(0).row))
-        while found.resets and found.events - found.resets[-1].row <= _EDGE < found.events - _EDGE:
+        while (
+            found.resets
+            and found.events - found.resets[-1].row <= _MAX_EDGE < found.events - _MAX_EDGE
+        ):
             found.outliers.append((found.resets.pop().row, found.events))
 
     def _count(self) -> None:
         self.faults += 1
-        if self.faults > _FEW and self.faults > _MOST_FAULTS * self.found.events:
+        if self.faults > _MIN_FAULTS and self.faults > _MAX_FAULTS * self.found.events:
             raise OrderError(
                 f"{self.source}: the event times go back at one in "
                 f"{self.found.events // self.faults} events by more than {self.found.bound:,} us, "
@@ -371,14 +378,14 @@ class _Scan:
 
 
 def _periods(steps: NDArray[np.int64], bound: int) -> NDArray[np.float64]:
-    """Periods (us) of counters whose wraps may make these steps; 0 where none does.
+    """Return the periods (us) of counters whose wraps may make steps; 0 where none does.
 
     Between the last event before a wrap and the first one after it, a little time passes: the step
     is a little less than the period. Jitter can make it a little more.
     """
     sizes = np.abs(steps).astype(np.float64)
     periods = np.zeros(len(steps))
-    for scale, fewest in list(_FEWEST_BITS.items())[::-1]:  # microseconds win
+    for scale, fewest in list(_MIN_BITS.items())[::-1]:  # microseconds win
         bits = np.ceil(np.log2(np.maximum((sizes - bound) * scale, 1)))
         period = 2.0**bits / scale
         missing = period - sizes
@@ -391,40 +398,40 @@ def _periods(steps: NDArray[np.int64], bound: int) -> NDArray[np.float64]:
 def _run_of_outliers(
     t: NDArray[np.int64], at: int, bound: int, begins: bool
 ) -> tuple[int, int] | None:
-    """Places [begin, end) of the outliers that make times fall at a place; None where none do.
+    """Find the places [begin, end) of outliers that make times fall at a place; None if none do.
 
     Times that return to where they were, before or after the fall, do so by a step of at least
     half its size: a clock that was set back climbs there slowly.
     """
     depth = t[at - 1] - t[at]
-    ahead = t[at : at + _RUN]
+    ahead = t[at : at + _MAX_RUN]
     back = np.flatnonzero(ahead >= t[at - 1] - bound)
     late = None
     if len(back) and ahead[back[0]] - ahead[back[0] - 1] >= depth // 2:
         late = (at, at + int(back[0]))
-    behind = t[max(at - _RUN, 0) : at][::-1]
+    behind = t[max(at - _MAX_RUN, 0) : at][::-1]
     low = np.flatnonzero(behind <= t[at] + bound)
     early = None
     if len(low) and behind[low[0] - 1] - behind[low[0]] >= depth // 2:
         early = (at - int(low[0]), at)
-    elif not len(low) and begins and at <= _EDGE < len(t) - at:
+    elif not len(low) and begins and at <= _MAX_EDGE < len(t) - at:
         early = (0, at)
     runs = [run for run in (late, early) if run is not None]
     return min(runs, key=lambda run: run[1] - run[0], default=None)
 
 
-def repaired(decode: Decoder, found: Disorder, repair: Repair) -> Decoder:
-    """A decoder whose events are those of `decode` with the faults that were found mended.
+def repair_decoder(decode: Decoder, found: Disorder, repair: Repair) -> Decoder:
+    """Make a decoder that mends the faults of another one.
 
     Args:
-        decode: The decoder of a file, as `jaxevent.io.decoded` describes it.
+        decode: The decoder of a file, see `jaxevent.io.decoded`.
         found: The faults of its times.
         repair: The repairs to make.
 
     Returns:
         The decoder. Its states hold the events that wait to be sorted.
     """
-    begin, end = found.kept(repair)
+    begin, end = found.kept_rows(repair)
     rows = np.array([row for row, _ in found.wraps], np.int64)
     shifts = np.concatenate([[0.0], np.cumsum([size for _, size in found.wraps])])
     starts = np.array([first for first, _ in found.outliers], np.int64)
@@ -441,7 +448,7 @@ def repaired(decode: Decoder, found: Disorder, repair: Repair) -> Decoder:
         if repair.unwrap:
             moved = shifts[np.searchsorted(rows, number, "right")]
             t = t + np.rint(moved).astype(np.int64)
-        return _rows_of((t, *columns[1:]), keep)
+        return _select_rows((t, *columns[1:]), keep)
 
     def decode_repaired(state: Any) -> Iterator[tuple[Any, Columns]]:
         inner, row, waiting, is_end = state or (None, 0, None, False)
@@ -450,7 +457,7 @@ def repaired(decode: Decoder, found: Disorder, repair: Repair) -> Decoder:
             out = mended(columns, row)
             row += len(columns[0])
             if repair.sort:
-                out, waiting = _sorted(out, waiting, repair.bound)
+                out, waiting = _sort_events(out, waiting, repair.bound)
             yield here, out
         if waiting is not None:
             yield (None, row, waiting, True), waiting
@@ -458,19 +465,19 @@ def repaired(decode: Decoder, found: Disorder, repair: Repair) -> Decoder:
     return decode_repaired
 
 
-def _rows_of(columns: Columns, rows: Any) -> Columns:
+def _select_rows(columns: Columns, rows: Any) -> Columns:
     t, x, y, p = (np.asarray(column)[rows] for column in columns)
     return t, x, y, p
 
 
-def _sorted(columns: Columns, waiting: Columns | None, bound: int) -> tuple[Columns, Columns]:
-    """Sort events by time; those to which later ones may still belong wait for the next block."""
+def _sort_events(columns: Columns, waiting: Columns | None, bound: int) -> tuple[Columns, Columns]:
+    """Sort events by time; those after which earlier ones may still come wait."""
     if waiting is not None:
         pairs = zip(waiting, columns, strict=True)
         t, x, y, p = (np.concatenate(pair) for pair in pairs)
         columns = t, x, y, p
     order = np.argsort(columns[0], kind="stable")
-    columns = _rows_of(columns, order)
+    columns = _select_rows(columns, order)
     t = columns[0]
     ready = int(np.searchsorted(t, t[-1] - bound)) if len(t) else 0
-    return _rows_of(columns, slice(0, ready)), _rows_of(columns, slice(ready, None))
+    return _select_rows(columns, slice(0, ready)), _select_rows(columns, slice(ready, None))

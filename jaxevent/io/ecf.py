@@ -24,45 +24,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit, njit_inlined
-from jaxevent.errors import InputError
+from jaxevent.deprecated import renamed_names
+from jaxevent.io.checks import damaged
 
 FILTER = 36559
-MOST = 65535  # events of a chunk
+MAX_EVENTS = 65535  # of a chunk
 RECORD: np.dtype = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
 
 
 class Records:
-    """Compressed records x, y, p, t of a dataset, decoded where they are asked for.
+    """Compressed records x, y, p, t of a dataset, decoded when they are sliced.
 
-    The last rows that were asked for are kept, as the fields are read one after the other.
+    The rows of the last slice are kept, as the fields are read one after the other.
     """
 
     def __init__(self, stored: h5py.Dataset, source: str):
         if stored.dtype != RECORD or len(stored.shape) != 1:
-            raise InputError(
+            raise damaged(
                 f"{source} is compressed with Prophesee's ECF but holds {stored.dtype}, not "
-                "records x, y, p and t; fetch the file again"
+                "records x, y, p and t"
             )
         self._stored, self._source = stored, source
         self._size: int = (stored.chunks or (1,))[0]
         self.shape, self.dtype = stored.shape, RECORD
-        self._kept = 0, 0, np.empty(0, RECORD)  # a range of rows, replaced as a whole
+        self._recent = 0, 0, np.empty(0, RECORD)  # a range of rows, replaced as a whole
 
     def fields(self, name: str) -> "_Field":
+        """Return one field of the records, decoded when it is sliced."""
         return _Field(self, name)
 
     def __getitem__(self, rows: slice) -> NDArray:
-        """Records of a range of rows; raises `InputError` where a chunk is damaged."""
+        """Decode a range of rows; `InputError` if a chunk is damaged."""
         start, stop, _ = rows.indices(self.shape[0])
-        low, high, kept = self._kept
+        low, high, recent = self._recent
         if not low <= start <= stop <= high:
             size = self._size
             chunks = range(start // size, -(-stop // size))
             parts = [self._chunk(number) for number in chunks]
             low, high = chunks.start * size, min(chunks.stop * size, self.shape[0])
-            kept = np.concatenate(parts) if parts else np.empty(0, RECORD)
-            self._kept = low, high, kept
-        return kept[start - low : stop - low]
+            recent = np.concatenate(parts) if parts else np.empty(0, RECORD)
+            self._recent = low, high, recent
+        return recent[start - low : stop - low]
 
     def _chunk(self, number: int) -> NDArray:
         first = number * self._size
@@ -73,13 +75,13 @@ class Records:
         else:
             records = decode(np.frombuffer(data, np.uint8))
         if records is None or len(records) < count:
-            raise InputError(
-                f"{self._source}: the chunk of row {first} is damaged; fetch the file again"
-            )
+            raise damaged(f"{self._source}: the chunk of row {first} cannot be decoded")
         return records[:count]
 
 
 class _Field:
+    """A field of compressed records as a list of its own."""
+
     def __init__(self, records: Records, name: str):
         self._records, self._name = records, name
 
@@ -91,9 +93,9 @@ class _Field:
 
 
 def decode(data: NDArray[np.uint8]) -> NDArray | None:
-    """The records of a chunk; None of one that is damaged."""
-    count = int(data[:4].copy().view("<u4")[0]) >> 2 if len(data) >= 12 else MOST + 1
-    if count > MOST:
+    """Decode the records of a chunk; None if it is damaged."""
+    count = int(data[:4].copy().view("<u4")[0]) >> 2 if len(data) >= 12 else MAX_EVENTS + 1
+    if count > MAX_EVENTS:
         return None
     records = np.zeros(count, RECORD)
     t, x, y, p = np.zeros(count, np.int64), *np.zeros((3, count), np.uint16)
@@ -105,7 +107,7 @@ def decode(data: NDArray[np.uint8]) -> NDArray | None:
 
 @njit_inlined
 def _word(data, at, size):
-    """A number of so many bytes."""
+    """Read a number of `size` bytes."""
     value = np.uint64(0)
     for k in range(size):
         value |= np.uint64(data[at + k]) << np.uint64(8 * k)
@@ -114,7 +116,7 @@ def _word(data, at, size):
 
 @njit_inlined
 def _runs(data, at, bits, size, out):
-    """Fill `out` by runs of numbers of so many bytes, their counts the low bits; where they end."""
+    """Fill `out` by runs of numbers of `size` bytes, whose low bits are counts; return the end."""
     most, i = (1 << bits) - 1, 0
     while i < len(out):
         if at + size > len(data):
@@ -160,7 +162,7 @@ def _times(data, at, t):
 
 @njit_inlined
 def _packed(data, at, width, i):
-    """The i-th of numbers of `width` bits (24 or 12), of which three words hold four."""
+    """Read the i-th of numbers of `width` bits (24 or 12), of which three words hold four."""
     size, begin = width // 6, i % 4 * width  # bytes of a word; the bit where the number begins
     bits = 8 * size
     first = min(begin // bits, 1)
@@ -171,7 +173,7 @@ def _packed(data, at, width, i):
 
 @njit
 def _decode(data, t, x, y, p):
-    """Whether the chunk is whole; fills t, x, y and p."""
+    """Fill t, x, y and p from a chunk; return whether it is whole."""
     n, kind = len(t), data[0] & 3
     at = _times(data, 4, t)
     if at < 0:
@@ -205,3 +207,6 @@ def _decode(data, t, x, y, p):
                 x[i] = (value >> 5) + k + 1
                 i += 1
     return _runs(data, at, 7, 1, p) >= 0
+
+
+__getattr__ = renamed_names(__name__)

@@ -19,18 +19,18 @@
 
 All times but events/t are on the recording's clock. Only /events is required to read a file, so
 files of DSEC and VECtor (t uint32, no attributes) can be read too, and RVT's (events/width and
-height). DSEC's rectify_map.h5, where it lies beside the file, tells the sensor's size and is kept
+height). DSEC's rectify_map.h5, where it lies beside the file, shows the sensor's size and is kept
 in `extra["rectify_map"]`; otherwise files of this layout compressed by Blosc, as DSEC and VECtor
 publish theirs, have 640x480 pixels, and of others the size must be given. Other
 layouts: `hdf5_layouts`.
 
 Data compressed by a filter that HDF5 itself lacks (DSEC: Blosc) need the package hdf5plugin, which
 is imported when first needed. A file that claims many more events than its bytes can hold is
-refused before any memory is asked for.
+refused before any memory is taken.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,28 +38,32 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import to_microseconds
+from jaxevent.arrays import UNITS, times, to_microseconds
 from jaxevent.errors import InputError, OrderError
-from jaxevent.io import (
+from jaxevent.io import companions
+from jaxevent.io.checks import (
+    ReadOptions,
+    check_events,
     check_unfolded,
-    checked_events,
-    companions,
-    pinhole,
+    make_camera,
     reading,
-    refuse_time_unit,
-    times,
-    vectors,
+    sensor_size,
     whole_number,
+    whole_size,
 )
-from jaxevent.io.columns import first_and_last, signed, stated_unit, unsigned_off
-from jaxevent.io.decoded import decoded
-from jaxevent.io.description import CLOCK
-from jaxevent.io.disorder import Columns, examine
-from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, open_file
-from jaxevent.io.options import ReadOptions
-from jaxevent.io.output import complete_hdf5
-from jaxevent.io.reopening import EventsInFile, ImagesInFile
-from jaxevent.io.time_units import NAMES, Clock, InferredUnit, infer_unit, unit_of_words
+from jaxevent.io.columns import MICROSECONDS, ColumnFormat, infer_format, sample_ends
+from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events, row_range
+from jaxevent.io.disorder import Columns, find_disorder
+from jaxevent.io.hdf5_files import (
+    array,
+    attribute,
+    dataset,
+    describe_images,
+    filters_of,
+    open_file,
+)
+from jaxevent.io.output import CLOCK_UNIT, complete_hdf5
+from jaxevent.io.time_units import Clock, unit_of_words
 from jaxevent.progress import bar
 from jaxevent.recording import (
     EventColumns,
@@ -74,29 +78,29 @@ from jaxevent.recording import (
 )
 
 VERSION = 1
-_LEVELS = "levels: 0 black, {most} white"  # of images
+_LEVELS_UNIT = "levels: 0 black, {most} white"  # of images
 _UNITS = {
-    "t_offset": CLOCK,
+    "t_offset": CLOCK_UNIT,
     "events/t": "us since t_offset",
     "events/x": "px",
     "events/y": "px",
     "events/p": "1 ON, 0 OFF",
     "ms_to_idx": "rows of events",
-    "frames/t": CLOCK,
+    "frames/t": CLOCK_UNIT,
     "frames/exposure": "us",
     "camera": "px (fx, fy, cx, cy), 1 (of the lens)",
-    "poses/t": CLOCK,
+    "poses/t": CLOCK_UNIT,
     "poses/position": "m",
     "poses/quaternion": "1",
-    "imu/t": CLOCK,
+    "imu/t": CLOCK_UNIT,
     "imu/gyro": "rad/s",
     "imu/acc": "m/s^2",
-    "triggers/t": CLOCK,
+    "triggers/t": CLOCK_UNIT,
     "triggers/edge": "1 rising, 0 falling, -1 unknown",
     "triggers/channel": "1",
     # Of the simulators and of `register`. What further arrays mean is not known here.
     "extra/hdr": "linear intensity: 0 is the frames' black, 1 their white",
-    "extra/hdr_t": CLOCK,
+    "extra/hdr_t": CLOCK_UNIT,
     "extra/response": "intensity of grey values from 0 to 1",
     "extra/certainty": "1, of grey values from 0 to 1",
     "extra/clip": "intensity",
@@ -116,48 +120,21 @@ _UNITS = {
     "extra/read_noise": "levels: 0 black, 255 white",
     "extra/clock_offset": "s",
     "extra/depth": "m",
-    "extra/depth_t": CLOCK,
+    "extra/depth_t": CLOCK_UNIT,
     "extra/mask": "1000 times the number of the object",
-    "extra/mask_t": CLOCK,
+    "extra/mask_t": CLOCK_UNIT,
     "extra/flow": "px",
-    "extra/flow_t": CLOCK,
+    "extra/flow_t": CLOCK_UNIT,
 }
-_BLOSC = 32001
+_BLOSC_FILTER = 32001
 _BLOCK = 1 << 20  # events copied at a time: 13 MB
 _CHUNK = 1 << 16  # values compressed together
-_MOST_MS = 1 << 22  # entries of ms_to_idx, 70 minutes and 33 MB, or two for each event
+_MAX_TABLE = 1 << 22  # entries of ms_to_idx, 70 minutes and 33 MB, or two for each event
+
+Column = Any  # one field of the events: a dataset, or an object that is sliced like one
 
 
-Column = Any  # one field of the events: a dataset, or what is sliced like one
-
-
-class Microseconds:
-    """Times in another unit or of another type, read as int64 us."""
-
-    def __init__(self, stored: Column, unit: str, source: str):
-        self._stored, self._unit, self._source = stored, unit, source
-        self.shape, self.dtype = stored.shape, np.dtype(np.int64)
-        self.is_float = stored.dtype.kind == "f"
-
-    def __getitem__(self, rows: Any) -> Any:
-        values = np.asarray(self._stored[rows])
-        first = rows.start or 0 if isinstance(rows, slice) else int(rows)
-        t = to_microseconds(values.reshape(-1), self._unit, self._source, "event", first)
-        return t if values.ndim else t[0]
-
-
-class SignedPolarities:
-    """Polarities of which a large number stands for -1, see `columns.unsigned_off`."""
-
-    def __init__(self, stored: Column, off: float):
-        self._stored, self._off = stored, off
-        self.shape, self.dtype = stored.shape, np.dtype(np.float64)
-
-    def __getitem__(self, rows: Any) -> Any:
-        return signed(np.asarray(self._stored[rows]), self._off)
-
-
-def convert_columns(
+def infer_column_format(
     columns: Mapping[str, Column],
     size: tuple[int, int],
     source: str,
@@ -165,19 +142,19 @@ def convert_columns(
     *,
     name: str = "t",
     usual: str | None = None,
-) -> tuple[dict[str, Column], InferredUnit]:
-    """Convert stored columns to those of `StoredEvents`, without reading more than their ends.
+) -> ColumnFormat:
+    """Infer the format of stored columns, without reading more than their ends.
 
     Args:
         columns: Columns t, x, y and p, in any unit of time.
-        size: (width, height) of the sensor.
+        size: (width, height) of the sensor in px.
         source: Name of the file for messages.
         options: Choices of the caller.
-        name: Name of the column of times.
+        name: Name of the column of times, which may state a unit.
         usual: Usual unit of the layout, see `infer_unit`.
 
     Returns:
-        The columns with t in us and p with signs, and the unit.
+        The format of the columns.
 
     Raises:
         InputError: The type of the times cannot resolve them.
@@ -185,52 +162,18 @@ def convert_columns(
     t = columns["t"]
     shapes = {column.shape for column in columns.values()}
     if len(shapes) > 1 or len(t.shape) != 1 or not t.shape[0]:
-        return dict(columns), InferredUnit("us")  # `StoredEvents` names the fault
+        return MICROSECONDS  # `StoredEvents` names the fault
     with reading(f"{source}: events"):
-        sample = first_and_last(
+        sample = sample_ends(
             lambda rows: {key: np.asarray(columns[key][rows]) for key in "txyp"}, t.shape[0]
         )
-    stated = _unit_attribute(t) or stated_unit(name, sample["t"])
-    unit = infer_unit(sample, t.shape[0], size, source, options, stated=stated, usual=usual)
-    converted = dict(columns)
-    if unit.name != "us" or t.dtype.kind not in "iu":
-        converted["t"] = Microseconds(t, unit.name, f"{source}: events/t")
-    off = unsigned_off(sample["p"])
-    if off is not None:
-        converted["p"] = SignedPolarities(columns["p"], off)
-    return converted, unit
-
-
-def _unit_attribute(t: Column) -> tuple[str, str] | None:
-    """Return the unit in an attribute of a column of times, and the words for it."""
-    if isinstance(t, h5py.Dataset):
-        for name in ("unit", "units"):
-            if (unit := unit_of_words(attribute(t, name))) is not None:
-                return unit, f"its attribute {name!r}"
-    return None
-
-
-def clock_of_columns(
-    columns: Mapping[str, Column],
-    unit: InferredUnit,
-    source: str,
-    offset: int = 0,
-) -> Clock:
-    """Return the clock of events for the times of images, poses and samples beside them.
-
-    Args:
-        columns: Columns of `convert_columns`.
-        unit: Unit of the event times, as stored.
-        source: Name of the file for messages.
-        offset: Time that is added to the events' in us.
-    """
-    t = columns["t"]
-    if len(t.shape) != 1 or not t.shape[0] or t.dtype.kind not in "iu":
-        return Clock(unit.name, 0, 0, False)
-    with reading(f"{source}: events"):
-        first, last = t[:1][0], t[t.shape[0] - 1 :][0]
-    is_float = isinstance(t, Microseconds) and t.is_float
-    return Clock(unit.name, int(first) + offset, int(last) + offset, is_float)
+    stated = None
+    for attribute_name in ("unit", "units") if isinstance(t, h5py.Dataset) else ():
+        if (unit := unit_of_words(attribute(t, attribute_name))) is not None:
+            stated = stated or (unit, f"its attribute {attribute_name!r}")
+    return infer_format(
+        sample, t.shape[0], size, source, options, name=name, stated=stated, usual=usual
+    )
 
 
 class StoredEvents(EventsInFile):
@@ -244,15 +187,26 @@ class StoredEvents(EventsInFile):
         columns: Mapping[str, Column],
         size: tuple[int, int],
         source: str,
+        found: ColumnFormat = MICROSECONDS,
+        *,
         offset: int = 0,
         ms_to_idx: h5py.Dataset | None = None,
     ):
-        """`columns` are t, x, y and p; t holds us since `offset` (us).
+        """Check that columns fit each other.
 
-        `size` is (width, height). Raises `InputError` unless the fields fit each other.
+        Args:
+            columns: t, x, y and p as stored.
+            size: (width, height) of the sensor in px.
+            source: Name of the file for messages.
+            found: Format of the columns.
+            offset: Time in us that is added to those of the events.
+            ms_to_idx: Table of the first row of each millisecond after `offset`.
+
+        Raises:
+            InputError: The columns do not fit each other.
         """
         self.checked_size = size
-        self._source = source
+        self._source, self._format = source, found
         self._t, self._x, self._y, self._p = (columns[name] for name in "txyp")
         shapes = [field.shape for field in (self._t, self._x, self._y, self._p)]
         if len(shapes[0]) != 1 or len(set(shapes)) != 1:
@@ -260,7 +214,7 @@ class StoredEvents(EventsInFile):
                 f"{source}: events/t, x, y and p have shapes {', '.join(map(str, shapes))}; they "
                 "must be equally long lists"
             )
-        if self._t.dtype.kind not in "iu":
+        if self._t.dtype.kind not in "iuf":
             raise InputError(f"{source}: events/t is {self._t.dtype}; store integer microseconds")
         self._offset = offset
         self._ms_to_idx = ms_to_idx
@@ -270,58 +224,78 @@ class StoredEvents(EventsInFile):
     def __len__(self) -> int:
         return self._t.shape[0]
 
+    def _times(self, start: int, stop: int) -> NDArray[np.int64]:
+        """Read times of a range of rows in us, without the offset."""
+        stored = np.asarray(self._t[start:stop])
+        return to_microseconds(stored, self._format.unit.name, self._source, "event", start)
+
+    def _read(self, start: int, stop: int) -> Columns:
+        with reading(f"{self._source}: events"):
+            t = self._times(start, stop) + self._offset
+            x, y, p = (np.asarray(c[start:stop]) for c in (self._x, self._y, self._p))
+        return t, x, y, self._format.signed(p)
+
     def __getitem__(self, rows: slice) -> Events:
         """Read the events of a range of rows; `InputError` if one of them is not valid.
 
         The event before the range is read too, so that pieces read in turn are sorted as a whole.
         """
-        start, stop, step = rows.indices(len(self))
-        if step != 1:
-            raise ValueError("stored events are read as a range of rows, events[i:j], step 1")
+        start, stop = row_range(rows, len(self))
         if stop <= start:
             return Events.empty()
         lead = min(start, 1)
-        part = slice(start - lead, stop)
-        with reading(f"{self._source}: events"):
-            t = times(self._t[part], self._source, "event", first_row=part.start) + self._offset
-            x, y, p = self._x[part], self._y[part], self._p[part]
+        columns = self._read(start - lead, stop)
         try:
-            events = checked_events(
-                t, x, y, p, self.checked_size, self._source, first_row=start - lead
-            )
+            events = check_events(*columns, self.checked_size, self._source, first_row=start - lead)
         except OrderError:
             times_of_blocks = (columns[0] for _, columns in self.decode(None))
-            raise examine(times_of_blocks, source=self._source).explain(self._source) from None
+            raise find_disorder(times_of_blocks, source=self._source).explain(
+                self._source
+            ) from None
         return events[lead:] if lead else events
 
     def decode(self, row: int | None) -> Iterator[tuple[int, Columns]]:
-        """Blocks of columns that are not checked, from a row on: a `Decoder`."""
+        """Yield blocks of columns that are not checked, from a row on: a `Decoder`."""
         for start in range(row or 0, len(self), _BLOCK):
-            part = slice(start, min(start + _BLOCK, len(self)))
-            with reading(f"{self._source}: events"):
-                t = times(self._t[part], self._source, "event", first_row=start) + self._offset
-                yield start, (t, self._x[part], self._y[part], self._p[part])
+            yield start, self._read(start, min(start + _BLOCK, len(self)))
 
     def repaired(self, options: ReadOptions) -> EventSource:
-        """These events, with their times repaired as the options say."""
+        """Return these events, with their times repaired by the options."""
         if options.repair is None:
             return self
-        return decoded(self.decode, self.checked_size, self._source, options)
+        return read_events(self.decode, self.checked_size, self._source, options)
 
-    def columns(self, rows: slice, room: EventColumns | None = None) -> EventColumns | None:
-        """See `recording.ColumnSource`."""
-        kinds = [getattr(c, "dtype", None) for c in (self._t, self._x, self._y, self._p)]
+    def clock(self) -> Clock:
+        """Return the clock of the events, for the times of images, poses and samples."""
+        if not len(self):
+            return self._format.clock(0, 0)._replace(is_float=False)
+        with reading(f"{self._source}: events"):
+            first, last = (self._times(row, row + 1)[0] for row in (0, len(self) - 1))
+        return self._format.clock(int(first) + self._offset, int(last) + self._offset)
+
+    def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
+        """Read a range of rows as they are stored; see `recording.ColumnSource`.
+
+        Args:
+            rows: The rows, step 1.
+            out: Columns to write to, if they are long enough.
+
+        Returns:
+            The columns; None if they are stored as other types.
+        """
         stored: list[Any] = [self._t, self._x, self._y, self._p]
         if not all(isinstance(column, h5py.Dataset) for column in stored):
             return None
-        if kinds not in ([t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)):
+        kinds = [column.dtype for column in stored]
+        known = [[t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)]
+        if kinds not in known or self._format[:2] != MICROSECONDS[:2]:
             return None
         start, stop, _ = rows.indices(len(self))
         count, previous = max(stop - start, 0), np.iinfo(np.int64).min
-        if room is None or len(room.t) < count:
+        if out is None or len(out.t) < count:
             t, x, y, p = (np.empty(count, kind) for kind in ("i8", "u2", "u2", "u1"))
         else:
-            t, x, y, p = room.t[:count], room.x[:count], room.y[:count], room.p[:count]
+            t, x, y, p = out.t[:count], out.x[:count], out.y[:count], out.p[:count]
         with reading(f"{self._source}: events"):
             if start and count:
                 previous = int(self._t[start - 1])
@@ -331,7 +305,7 @@ class StoredEvents(EventsInFile):
         return EventColumns(t, x, y, p, self._offset, previous)
 
     def index(self, time: int) -> int:
-        """The number of events earlier than `time` (us): a few small reads."""
+        """Count the events earlier than `time` (us) by a few small reads."""
         since = int(time) - self._offset
         with reading(f"{self._source}: ms_to_idx"):
             low, high = self._millisecond(since // 1000)
@@ -339,14 +313,13 @@ class StoredEvents(EventsInFile):
                 # Without the table, or in a dense millisecond, bisect down to one chunk.
                 while high - low > _CHUNK:
                     middle = (low + high) // 2
-                    if int(self._t[middle]) < since:
+                    if self._times(middle, middle + 1)[0] < since:
                         low = middle + 1
                     else:
                         high = middle
-                near = times(self._t[low:high], self._source, "event", first_row=low)
-                row = low + int(np.searchsorted(near, since))
-                fits_before = row == 0 or int(self._t[row - 1]) < since
-                fits_after = row == len(self) or int(self._t[row]) >= since
+                row = low + int(np.searchsorted(self._times(low, high), since))
+                fits_before = row == 0 or self._times(row - 1, row)[0] < since
+                fits_after = row == len(self) or self._times(row, row + 1)[0] >= since
                 if fits_before and fits_after:
                     return row
         raise InputError(
@@ -355,7 +328,7 @@ class StoredEvents(EventsInFile):
         )
 
     def _millisecond(self, ms: int) -> tuple[int, int]:
-        """Rows between which the first event at or after any time of a millisecond lies."""
+        """Return the rows between which the first event of a millisecond lies."""
         table = self._ms_to_idx
         low, high = 0, len(self)
         if table is not None and len(table):
@@ -367,45 +340,52 @@ class StoredEvents(EventsInFile):
 
 
 class StoredImages(ImagesInFile):
-    """Images (frames, height, width) that stay in the file until np.asarray reads them."""
+    """Images (frames, height, width) that stay in an HDF5 file until np.asarray reads them."""
 
-    def __init__(self, dataset: h5py.Dataset, source: str):
-        self._dataset, self._source = dataset, source
-        self._rows = range(len(dataset))
+    def __init__(self, stored: h5py.Dataset, source: str):
+        super().__init__(stored.shape, stored.dtype)
+        self._dataset, self._source = stored, source
 
-    @property
-    def dtype(self) -> np.dtype:
-        return self._dataset.dtype
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return (len(self._rows), *self._dataset.shape[1:])
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
-        rows = self._rows
+    def read(self, rows: Sequence[int]) -> NDArray:
+        """Read images of the file by their numbers."""
         with reading(self._source):
             if isinstance(rows, range) and rows.step > 0:
-                images = self._dataset[rows.start : rows.stop : rows.step]
-            else:
-                images = np.array([self._dataset[i] for i in rows], self._dataset.dtype)
-        return np.asarray(images, dtype)
+                return np.asarray(self._dataset[rows.start : rows.stop : rows.step])
+            return np.array([self._dataset[i] for i in rows], self.dtype)
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read a file. Raises `InputError` for bad input.
+    """Read a file of jaxevent's own layout.
 
-    Unless `options.in_memory`, events and images stay in it: `StoredEvents`, `StoredImages`.
+    Args:
+        path: The file.
+        options: Choices of the caller.
+
+    Returns:
+        The recording; unless `options.in_memory`, events and images stay in the file.
+
+    Raises:
+        InputError: The file is damaged, or what it holds is not valid.
     """
-    return read_stored(path, options, _recording)
+    return read_by(_read_open, path, options)
 
 
-def read_stored(
+def read_by(
+    read_open: Callable[[h5py.File, Path, ReadOptions], Recording],
     path: Path,
     options: ReadOptions,
-    read_open: Callable[[h5py.File, Path, ReadOptions], Recording],
 ) -> Recording:
-    """Read an HDF5 file by `read_open`, and its events and images as `options.in_memory` says."""
-    with reading(str(path)):
+    """Read an HDF5 file by a reader of open files.
+
+    Args:
+        read_open: Reader of an open file, which leaves events and images in it.
+        path: The file.
+        options: Choices of the caller.
+
+    Returns:
+        The recording; with `options.in_memory`, its events and images are read and the file closed.
+    """
+    with reading(path):
         if not options.in_memory:
             return read_open(open_file(path), path, options)
         with open_file(path) as file:
@@ -413,7 +393,7 @@ def read_stored(
 
 
 def _in_memory(recording: Recording) -> Recording:
-    """The recording with its events and images read from their file."""
+    """Read the events and images of a recording from their file."""
     frames = recording.frames
     if frames is not None:
         frames = dataclasses.replace(frames, images=np.asarray(frames.images))
@@ -426,109 +406,82 @@ def is_matlab(path: Path) -> bool:
         return stored.read(6) == b"MATLAB"
 
 
-def _recording(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
+def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
     source, size = str(path), options.size
     with reading(source):
         names = ("format", "version", "name", "width", "height")
         held = ((name, attribute(file, name)) for name in names)
         attributes: dict[str, Any] = {name: value for name, value in held if value is not None}
-    version = attributes.get("version")
-    if attributes.get("format") == "jaxevent" and version != VERSION:
+    is_ours = attributes.get("format") == "jaxevent"
+    if is_ours and attributes.get("version") != VERSION:
         raise InputError(
-            f"{path}: has version {version} of the layout but this jaxevent reads version "
-            f"{VERSION}; update jaxevent"
+            f"{path}: has version {attributes.get('version')} of the layout but this jaxevent "
+            f"reads version {VERSION}; update jaxevent"
         )
-    images = None
-    if isinstance(file.get("frames"), h5py.Group):
-        name = f"{source}: frames/images"
-        images = StoredImages(dataset(file, "frames/images", source), name)
-        if len(images.shape) != 3:
-            raise InputError(f"{name} has shape {images.shape}; store (frames, height, width)")
-    extra = _extra(file, source)
+    extra = _read_extra(file, source)
     if size is None and "width" in attributes and "height" in attributes:
-        with reading(f"{source}: attributes width and height"):
-            width, height = (whole_number(attributes[n], source, n) for n in ("width", "height"))
-            size = (width, height)
+        size = whole_size(attributes["width"], attributes["height"], source)
     if size is None and "events/width" in file and "events/height" in file:
-        with reading(f"{source}: events/width and events/height"):
-            names = ("events/width", "events/height")
-            width, height = (whole_number(array(file, n, source), source, n) for n in names)
-            size = (width, height)
-    if size is None and _is_dsec(file):
-        size = (640, 480)
-    rectify_map = _rectify_map(path) if attributes.get("format") != "jaxevent" else None
+        size = whole_size(
+            *(array(file, f"events/{n}", source) for n in ("width", "height")), source
+        )
+    size = (640, 480) if size is None and _is_dsec(file) else size
+    rectify_map = None if is_ours else _read_rectify_map(path)
     if rectify_map is not None:
         extra["rectify_map"] = rectify_map
         size = size or (rectify_map.shape[1], rectify_map.shape[0])
-    if size is None:
-        raise InputError(
-            f"{path}: has no attributes width and height; give size=(width, height) or --size"
-        )
+    size = sensor_size(f"{path}: has no attributes width and height", size)
     columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
     offset = 0
     if "t_offset" in file:
         offset = whole_number(array(file, "t_offset", source), source, "t_offset")
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
-    unit = InferredUnit("us")
-    states_unit = attributes.get("format") == "jaxevent" or table is not None
+    found, states_unit = MICROSECONDS, is_ours or table is not None
     if states_unit:
-        refuse_time_unit(path, options)
+        options.refuse_time_unit(path)
     if not states_unit or columns["t"].dtype.kind == "f":
-        columns, unit = convert_columns(columns, size, source, options)
-    if unit.name != "us" and offset:
+        found = infer_column_format(columns, size, source, options)
+    if found.unit.name != "us" and offset:
         raise InputError(
-            f"{source}: events/t is in {NAMES[unit.name]} and t_offset in microseconds; store all "
-            "times in integer microseconds"
+            f"{source}: events/t is in {UNITS[found.unit.name]} and t_offset in microseconds; "
+            "store all times in integer microseconds"
         )
-    notes = list(unit.notes)
-    clock = Clock("us", 0, 0, False)
-    if not states_unit:
-        clock = clock_of_columns(columns, unit, source, offset)
+    notes = list(found.unit.notes)
+    events = StoredEvents(columns, size, source, found, offset=offset, ms_to_idx=table)
+    clock = Clock("us", 0, 0, False) if states_unit else events.clock()
 
-    def stamps(name: str, what: str) -> NDArray[np.int64]:
+    def stored_times(name: str, what: str) -> NDArray[np.int64]:
         return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
 
-    frames = poses = imu = camera = triggers = None
-    if images is not None:
-        t, exposure = stamps("frames/t", "frame"), _times(file, "frames/exposure", source)
-        frames = Frames(t, images, exposure) if len(t) else None
+    def arrays(group: str, *names: str) -> list[NDArray]:
+        return [array(file, f"{group}/{name}", source) for name in names]
+
+    parts: dict[str, Any] = {}
+    if isinstance(file.get("frames"), h5py.Group):
+        name = f"{source}: frames/images"
+        images = StoredImages(dataset(file, "frames/images", source), name)
+        if len(images.shape) != 3:
+            raise InputError(f"{name} has shape {images.shape}; store (frames, height, width)")
+        t, exposure = stored_times("frames/t", "frame"), arrays("frames", "exposure")[0]
+        exposure = times(exposure, f"{source}: frames/exposure", "row")
+        parts["frames"] = Frames(t, images, exposure) if len(t) else None
     if isinstance(file.get("camera"), h5py.Dataset):
         with reading(f"{source}: camera"):
-            model = file["camera"].attrs.get("model", "radtan")
-        camera = pinhole(array(file, "camera", source), f"{path}: camera", str(model))
-    if isinstance(file.get("poses"), h5py.Group):
-        t = stamps("poses/t", "pose")
-        position = _vectors(file, "poses/position", (len(t), 3), source)
-        poses = Poses(t, position, _vectors(file, "poses/quaternion", (len(t), 4), source))
-    if isinstance(file.get("imu"), h5py.Group):
-        t = stamps("imu/t", "IMU sample")
-        gyro, acc = (_vectors(file, f"imu/{name}", (len(t), 3), source) for name in ("gyro", "acc"))
-        imu = Imu(t, gyro, acc)
-    if isinstance(file.get("triggers"), h5py.Group):
-        t = stamps("triggers/t", "trigger")
-        edge, channel = (array(file, f"triggers/{n}", source) for n in ("edge", "channel"))
-        fit = edge.shape == channel.shape == t.shape
-        if not fit or not np.isin(edge, (-1, 0, 1)).all() or not np.isin(channel, range(256)).all():
-            raise InputError(
-                f"{path}: triggers need an edge, -1, 0 or 1, and a channel, 0 to 255, for each time"
-            )
-        triggers = Triggers(t, edge.astype(np.int8), channel.astype(np.uint8))
+            model = str(file["camera"].attrs.get("model", "radtan"))
+        parts["camera"] = make_camera(array(file, "camera", source), f"{path}: camera", model)
+    for group, make, what, names in (
+        ("poses", Poses, "pose", ("position", "quaternion")),
+        ("imu", Imu, "IMU sample", ("gyro", "acc")),
+        ("triggers", Triggers, "trigger", ("edge", "channel")),
+    ):
+        if isinstance(file.get(group), h5py.Group):
+            parts[group] = make(stored_times(f"{group}/t", what), *arrays(group, *names))
     name = str(attributes.get("name", path.stem))
-    events = StoredEvents(columns, size, source, offset, table).repaired(options)
-    left_out = {} if frames is not None else _describe_frames(file, path)
+    left_out = {} if parts.get("frames") is not None else _describe_frames(file, path)
     return Recording(
-        name,
-        *size,
-        events,
-        frames,
-        camera,
-        poses,
-        imu,
-        extra,
-        triggers,
-        notes=tuple(notes),
-        left_out=left_out,
-    )
+        name, *size, events.repaired(options), extra=extra, notes=tuple(notes), left_out=left_out,
+        **parts,
+    )  # fmt: skip
 
 
 def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
@@ -545,21 +498,19 @@ def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
 
 
 def _is_dsec(file: Any) -> bool:
-    """Whether a file has the layout of DSEC and VECtor, compressed by Blosc, and no size."""
+    """Return whether a file has the layout of DSEC and VECtor: no size, compressed by Blosc."""
     kinds = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
     for name, kind in kinds.items():
         stored = file.get(f"events/{name}")
         if not isinstance(stored, h5py.Dataset) or stored.dtype != kind:
             return False
-        properties = stored.id.get_create_plist()
-        codes = {properties.get_filter(i)[0] for i in range(properties.get_nfilters())}
-        if _BLOSC not in codes:
+        if _BLOSC_FILTER not in filters_of(stored):
             return False
     return {"ms_to_idx", "t_offset"} <= set(file) and not len(file.attrs)
 
 
-def _rectify_map(path: Path) -> NDArray | None:
-    """Where each pixel of a DSEC camera lies in the rectified image, (height, width, 2)."""
+def _read_rectify_map(path: Path) -> NDArray | None:
+    """Read the places of a DSEC camera's pixels in the rectified image, (height, width, 2)."""
     beside = companions.rectify_map(path)
     if beside is None:
         return None
@@ -576,7 +527,17 @@ def _rectify_map(path: Path) -> NDArray | None:
 def write(
     recording: Recording, path: Path, compression: str | None = None, progress: bool | None = None
 ) -> None:
-    """Write a recording; `jaxevent.io.save` describes the arguments and errors."""
+    """Write a recording, completely or not at all.
+
+    Args:
+        recording: The recording, which is checked first.
+        path: File to write.
+        compression: None or "gzip".
+        progress: Whether to show a progress bar; None shows one on a terminal.
+
+    Raises:
+        InputError: The recording is not valid, or the file cannot be written.
+    """
     if compression not in (None, "gzip"):
         raise InputError(f'{path}: compression {compression!r} is unknown; use None or "gzip"')
     recording.check()
@@ -604,14 +565,14 @@ def write(
                 file["camera"].attrs["model"] = camera.model
         for name, values in recording.extra.items():
             _write(file, f"extra/{name}", values, compression, check)
-        _tell_units(file)
+        _write_units(file)
 
 
-def _tell_units(file: h5py.File) -> None:
+def _write_units(file: h5py.File) -> None:
     for name in ("frames/images", "extra/rgb", *_UNITS):
         if isinstance(stored := file.get(name), h5py.Dataset):
             whole = stored.dtype.kind in "iu"
-            levels = _LEVELS.format(most=np.iinfo(stored.dtype).max if whole else 1)
+            levels = _LEVELS_UNIT.format(most=np.iinfo(stored.dtype).max if whole else 1)
             stored.attrs["unit"] = _UNITS.get(name, levels)
 
 
@@ -626,7 +587,7 @@ def _write_events(
     offset = int(events[:1].t[0]) if count else 0
     last_ms = (int(events[count - 1 :].t[0]) - offset) // 1000 if count else -1
     # Where times go back, reading the block that does so raises the error.
-    is_sparse = not -1 <= last_ms < max(_MOST_MS, 2 * count)
+    is_sparse = not -1 <= last_ms < max(_MAX_TABLE, 2 * count)
     file["t_offset"] = np.int64(offset)
     options = _options(count, compression)
     t, x, y, p = (
@@ -688,18 +649,8 @@ def _options(count: int, compression: str | None) -> dict[str, Any]:
     return {"compression": compression, "shuffle": True, "chunks": (min(count, _CHUNK),)}
 
 
-def _times(file: h5py.File, name: str, source: str) -> NDArray[np.int64]:
-    return times(array(file, name, source), f"{source}: {name}", "row")
-
-
-def _vectors(
-    file: h5py.File, name: str, shape: tuple[int, int], source: str
-) -> NDArray[np.float64]:
-    return vectors(array(file, name, source), shape, source, name)
-
-
-def _strings(stored: h5py.Dataset, source: str) -> NDArray:
-    """Strings, one by one, as many may stand for one place of the file."""
+def _read_strings(stored: h5py.Dataset, source: str) -> NDArray:
+    """Read strings one by one, as many may stand for one place of the file."""
     text, longest = stored.asstr(), 1
     values = np.empty(stored.shape, object)
     for place in np.ndindex(stored.shape):
@@ -709,7 +660,7 @@ def _strings(stored: h5py.Dataset, source: str) -> NDArray:
     return values.astype(np.str_)
 
 
-def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
+def _read_extra(file: h5py.File, source: str) -> dict[str, NDArray]:
     extra: dict[str, NDArray] = {}
     group = file.get("extra")
     if isinstance(group, h5py.Group):
@@ -718,7 +669,7 @@ def _extra(file: h5py.File, source: str) -> dict[str, NDArray]:
             if isinstance(item, h5py.Dataset):
                 item = dataset(file, f"extra/{name}", source)
                 text = h5py.check_string_dtype(item.dtype) is not None and item.dtype.kind == "O"
-                extra[name] = _strings(item, source) if text else np.asarray(item[()])
+                extra[name] = _read_strings(item, source) if text else np.asarray(item[()])
                 held = sum(values.nbytes for values in extra.values())
                 check_unfolded(held, file.id.get_filesize(), f"{source}: extra")
 

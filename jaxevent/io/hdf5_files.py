@@ -23,16 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import check_unfolded, most_unfolded, reading
+from jaxevent.io.checks import check_unfolded, damaged, max_unfolded, reading
 
-_MOST_COMPRESSED = 4096  # times smaller than in memory that any filter makes real events
-_HEAPS = 1 << 24
-_MOST_OBJECTS, _MOST_NAMES = 1000, 4  # looked at for images, and named
+_MAX_COMPRESSION = 4096  # times smaller than in memory that any filter makes real events
+_HEAP_BYTES = 1 << 24  # at either end of a file that are searched for heaps
+_MAX_OBJECTS = 1000  # of a file that are examined for images
+_MAX_NAMES = 4  # of images in a message
 _COPY = (
     "only what a file itself holds is read, so copy all into one file: if you trust it, by "
     "jaxevent convert --trust"
 )
-_trusted = contextvars.ContextVar("trusted", default=False)
+_is_trusted = contextvars.ContextVar("is_trusted", default=False)
 # An attribute that is one string: its type, its space, then its length, heap and place in that. The
 # type and the space are padded in the older format, not in that of HDF5 1.8.
 _STRING = re.compile(
@@ -40,23 +41,24 @@ _STRING = re.compile(
     re.DOTALL,
 )
 _HEAP = re.compile(rb"GCOL\x01\x00\x00\x00")  # `bytes.find` is slow among zeros
-_BEGIN = b"\x89HDF\r\n\x1a\n"
-_BLOCK, _LONGEST = 1 << 18, 64  # bytes that are searched at once; more than either of these has
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_BLOCK = 1 << 18  # bytes that are searched at once
+_MAX_MATCH = 64  # bytes; more than either of the patterns has
 
 
 @contextlib.contextmanager
 def trusting() -> Iterator[None]:
     """Within the block, open files that are made of others: links, external storage, views."""
-    token = _trusted.set(True)
+    token = _is_trusted.set(True)
     try:
         yield
     finally:
-        _trusted.reset(token)
+        _is_trusted.reset(token)
 
 
 def open_file(path: Path) -> h5py.File:
-    """The open file, or `InputError`."""
-    with reading(str(path)):
+    """Open a file, or raise `InputError`."""
+    with reading(path):
         check_heaps(path)
         file = h5py.File(path)
         links: Any = getattr(h5py, "h5l")  # noqa: B009  (its stubs lack it)
@@ -64,14 +66,14 @@ def open_file(path: Path) -> h5py.File:
         link = file.id.links.visit(
             lambda name, info: None if info.type in known else name, info=True
         )
-        if link is not None and not _trusted.get():
+        if link is not None and not _is_trusted.get():
             file.close()
             raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY}")
         return file
 
 
 def attribute(of: Any, name: str) -> Any:
-    """An attribute of a file, group or dataset, None where it has none; text as str.
+    """Read an attribute of a file, group or dataset, text as str; None if there is none.
 
     Only numbers and strings are read: of a damaged type HDF5 2.0 reads memory that is not there.
     """
@@ -89,8 +91,8 @@ def check_heaps(path: Path) -> None:
 
     HDF5 2.0 goes on by the size of each piece, and stays where that is 0 or overflows; for a heap
     that an attribute puts past the end of the file it takes gigabytes of memory first. The heaps
-    of a file's attributes lie near its start or, if written late, its end: `_HEAPS` bytes of both
-    are searched, once for a file as it is.
+    of a file's attributes lie near its start or, if written late, its end: `_HEAP_BYTES` bytes of
+    both are searched, once for a file as it is.
     """
     about = path.stat()
     state = about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
@@ -101,66 +103,77 @@ def check_heaps(path: Path) -> None:
 
 @functools.lru_cache(maxsize=16)
 def search_heaps(path: Path, state: tuple[int, ...]) -> None:
-    """`check_heaps` of a file in some state."""
-    damaged = InputError(f"{path}: a string or its heap is damaged; fetch the file again")
+    """Check the heaps of a file, once for each state of it."""
+    wrong = damaged(f"{path}: a string or its heap is not valid")
     with path.open("rb", buffering=0) as file:
         length = file.seek(0, 2)
         strings = set[bytes]()
-        for begin, end in (0, min(_HEAPS, length)), (max(_HEAPS, length - _HEAPS), length):
+        for begin, end in (
+            (0, min(_HEAP_BYTES, length)),
+            (max(_HEAP_BYTES, length - _HEAP_BYTES), length),
+        ):
             heaps: list[int] = []
             for place, block in _blocks(file, begin, end):
                 strings |= {match[1] for match in _STRING.finditer(block)}
                 heaps += [place + match.start() for match in _HEAP.finditer(block)]
-            if not _come_to_their_end(file, heaps, end):
-                raise damaged
-        base = _base(file, length)
+            if not _all_heaps_end(file, heaps, end):
+                raise wrong
+        base = _find_start(file, length)
         for count, heap, _ in (struct.unpack("<IQI", string) for string in strings):
-            if count and (heap >= length or count > length or _at(file, heap + base, 4) != b"GCOL"):
-                raise damaged
+            if count and (
+                heap >= length or count > length or _read_at(file, heap + base, 4) != b"GCOL"
+            ):
+                raise wrong
 
 
 def _blocks(file: io.FileIO, begin: int, end: int) -> Iterator[tuple[int, memoryview]]:
-    """Bytes of a file from begin to end and where they lie, some of each block in the next one.
+    """Yield blocks of a file from begin to end with their offsets; blocks overlap a little.
 
-    They are overwritten: fresh memory for all of them takes longer than the search.
+    Blocks are overwritten: fresh memory for all of them takes longer than the search.
     """
-    room = memoryview(bytearray(_BLOCK))
-    for place in range(begin, end, _BLOCK - _LONGEST):
+    scratch = memoryview(bytearray(_BLOCK))
+    for place in range(begin, end, _BLOCK - _MAX_MATCH):
         file.seek(place)
-        yield place, room[: file.readinto(room[: end - place])]
+        yield place, scratch[: file.readinto(scratch[: end - place])]
 
 
-def _at(file: io.FileIO, place: int, count: int) -> bytes:
+def _read_at(file: io.FileIO, place: int, count: int) -> bytes:
     file.seek(place)
     return file.read(count) or b""
 
 
-def _base(file: io.FileIO, length: int) -> int:
-    """Where HDF5 begins in a file: at its start, or at a power of two from 512 on."""
+def _find_start(file: io.FileIO, length: int) -> int:
+    """Find the offset of HDF5 in a file: its start, or a power of two from 512 on."""
     places = [0, *(512 << k for k in range(max(length.bit_length() - 9, 0)))]
-    return next((place for place in places if _at(file, place, len(_BEGIN)) == _BEGIN), 0)
+    return next(
+        (place for place in places if _read_at(file, place, len(_HDF5_MAGIC)) == _HDF5_MAGIC), 0
+    )
 
 
-def _come_to_their_end(file: io.FileIO, heaps: list[int], end: int) -> bool:
-    """Whether each heap of strings that begins at one of some places comes to its end.
+def _all_heaps_end(file: io.FileIO, heaps: list[int], end: int) -> bool:
+    """Return whether each heap of strings comes to its end, or goes on beyond `end`.
 
-    Or goes on beyond `end`. Every place is looked at once, as a file of 1 MB can hold 65,536 heaps
-    one inside the other: where one comes to a place of another, it goes on from where that one
-    stopped.
+    Every place is visited once, as a file of 1 MB can hold 65,536 heaps one inside the other: where
+    one comes to a place of another, it goes on from the place at which that one stopped.
+
+    Args:
+        file: The file.
+        heaps: Offsets of the heaps.
+        end: Offset at which the search ends.
     """
-    walks: dict[int, int] = {}  # by place, which heap came by
+    walks: dict[int, int] = {}  # number of the heap that came by, by place
     ends: list[int] = []
     for at in heaps:
         if at + 16 > end:
             continue
-        (size,) = struct.unpack("<Q", _at(file, at + 8, 8))
+        (size,) = struct.unpack("<Q", _read_at(file, at + 8, 8))
         here, stop = at + 16, at + size
         while here + 16 <= min(stop, end):
             before = walks.setdefault(here, len(ends))
             if before < len(ends):
                 here = ends[before]
                 continue
-            index, held = struct.unpack("<H6xQ", _at(file, here, 16))
+            index, held = struct.unpack("<H6xQ", _read_at(file, here, 16))
             need = held if index == 0 else 16 + held + -held % 8
             if not 16 <= need <= stop - here:
                 return False
@@ -170,15 +183,25 @@ def _come_to_their_end(file: io.FileIO, heaps: list[int], end: int) -> bool:
 
 
 def filters_of(stored: h5py.Dataset) -> list[int]:
-    """The numbers of the filters that the chunks of a dataset have gone through."""
+    """Return the numbers of the filters that the chunks of a dataset have gone through."""
     properties = stored.id.get_create_plist()
     return [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
 
 
 def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ()) -> h5py.Dataset:
-    """The dataset of a name, which can be read and is not larger than its bytes allow.
+    """Open a dataset that can be read and is not larger than its bytes allow.
 
-    The caller undoes the filters `undone` itself, if those are all.
+    Args:
+        file: The open file.
+        name: Name of the dataset.
+        source: Name of the file for messages.
+        undone: Filters that the caller undoes itself, if they are all.
+
+    Returns:
+        The dataset.
+
+    Raises:
+        InputError: There is no such dataset, or it cannot be read safely.
     """
     with reading(f"{source}: {name}"):
         found = file.get(name)
@@ -189,7 +212,7 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
         properties = found.id.get_create_plist()
         layout = properties.get_layout()
         if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
-            if _trusted.get():
+            if _is_trusted.get():
                 return found
             raise InputError(f"{source}: {name} is made of other data sets or files; {_COPY}")
         filters = filters_of(found)
@@ -197,50 +220,47 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
         count = found.size or 0
         for code in filters:
             if filters != list(undone) and not h5py.h5z.filter_avail(code):
-                _bring(code, f"{source}: {name}")
+                _load_filter(code, f"{source}: {name}")
         if filters:
             chunk = math.prod(found.chunks or ())
             size = max(count, chunk) * found.dtype.itemsize
             check_unfolded(size, found.file.id.get_filesize(), f"{source}: {name}")
             if h5py.h5z.FILTER_DEFLATE in filters:
                 _check_deflated(found, f"{source}: {name}")
-        held = stored * (_MOST_COMPRESSED if filters else 1)
+        held = stored * (_MAX_COMPRESSION if filters else 1)
         if count * found.dtype.itemsize > held:
-            raise InputError(
-                f"{source}: {name} claims {count} values but holds {stored} bytes; the file is "
-                "damaged or incomplete, so fetch it again"
-            )
+            raise damaged(f"{source}: {name} claims {count} values but holds {stored} bytes")
     return found
 
 
 def find_images(file: h5py.File) -> list[str]:
     """Return the names of datasets that look like images: three or four axes, of 8 or 16 bits.
 
-    Links to other files are not followed, and of large files the first objects are looked at.
+    Links to other files are not followed, and of large files the first objects are examined.
     """
     found: list[str] = []
     seen = 0
 
-    def look(name: str, item: h5py.Dataset | h5py.Group) -> bool | None:
+    def visit(name: str, item: h5py.Dataset | h5py.Group) -> bool | None:
         nonlocal seen
         seen += 1
         if isinstance(item, h5py.Dataset) and not name.startswith("extra/"):
-            # Of a virtual dataset the shape cannot be asked for without following it.
+            # Of a virtual dataset the shape cannot be read without following it.
             is_virtual = item.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
             if not is_virtual and item.dtype in (np.uint8, np.uint16) and item.ndim in (3, 4):
                 found.append(name)
-        return True if seen >= _MOST_OBJECTS else None
+        return True if seen >= _MAX_OBJECTS else None
 
-    file.visititems(look)
+    file.visititems(visit)
     return found
 
 
 def describe_images(file: h5py.File) -> dict[str, str]:
-    """Return what `Recording.left_out` says of images in a file whose frames are not read."""
+    """Return the entry of `Recording.left_out` for images in a file whose frames are not read."""
     names = find_images(file)
     if not names:
         return {}
-    listed = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
+    listed = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
     return {
         "frames": (
             f"{listed} may be images, of another layout or camera; store them as images with times "
@@ -260,20 +280,17 @@ def _check_deflated(stored: h5py.Dataset, source: str) -> None:
     large: list[tuple[int, ...]] = []
 
     def note(chunk: Any) -> None:
-        if 1032 * chunk.size > most_unfolded(length):
+        if 1032 * chunk.size > max_unfolded(length):
             large.append(chunk.chunk_offset)
 
     stored.id.chunk_iter(note)
     for place in large:
         _, data = stored.id.read_direct_chunk(place)
         if len(zlib.decompressobj().decompress(data, whole + 1)) > whole:
-            raise InputError(
-                f"{source}: the chunk at {place} unfolds to more than a chunk; the file is "
-                "damaged, so fetch it again"
-            )
+            raise damaged(f"{source}: the chunk at {place} unfolds to more than a chunk")
 
 
-def _bring(code: int, source: str) -> None:
+def _load_filter(code: int, source: str) -> None:
     """Make the filter of this number known to HDF5, or raise `InputError`."""
     try:
         require("hdf5plugin", "dsec")
@@ -287,7 +304,19 @@ def _bring(code: int, source: str) -> None:
 
 
 def array(file: h5py.File, name: str, source: str) -> NDArray:
-    """A whole dataset in memory."""
+    """Read a whole dataset.
+
+    Args:
+        file: The open file.
+        name: Name of the dataset.
+        source: Name of the file for messages.
+
+    Returns:
+        The values.
+
+    Raises:
+        InputError: There is no such dataset, or it cannot be read safely.
+    """
     found = dataset(file, name, source)
     with reading(f"{source}: {name}"):
         return np.asarray(found[()])

@@ -1,12 +1,21 @@
-"""Series of images with times, stored as files that any program can write.
+"""Images in files that any program can write: single ones, series with times, exposure stacks.
 
 A series is a folder of PNG, JPEG, TIFF or .npy files, taken in the order of their names; or one
 .npy file (images, height, width); or one HDF5 file of the datasets t and image, as `jaxevent
-reconstruct` writes. Integers of 8 or 16 bits and floats are linear intensities. Colours become grey
-(ITU-R 601 luma). Timestamps are lines "t", one per image, or "t name", or "start, end" of each
-exposure, as DSEC has them; where all are whole numbers they are microseconds, otherwise seconds.
-The times of DSEC's images are found where DSEC keeps them (https://dsec.ifi.uzh.ch/data-format):
-images/left/exposure_timestamps.txt, or images/timestamps.txt, of images/left/rectified.
+reconstruct` writes. Integers of 8 or 16 bits and floats are linear intensities. Timestamps are
+lines "t", one per image, or "t name", or "start, end" of each exposure, as DSEC has them; where all
+are whole numbers they are microseconds, otherwise seconds. The times of DSEC's images are found
+where DSEC keeps them (https://dsec.ifi.uzh.ch/data-format): images/left/exposure_timestamps.txt, or
+images/timestamps.txt, of images/left/rectified.
+
+An exposure stack is a folder of PNG, JPEG or TIFF images of 8 bits of one still scene. Exposure
+times (s) are in its file exposures.txt, lines "s name"; or in DSEC's file of the starts and ends of
+exposures; or in the images' own EXIF data. The camera response that comes of a stack is CSV with
+the columns grey, intensity and certainty: evenly spaced grey values from 0 to 1, the intensity of
+each, which never falls, and its certainty, at most 1.
+
+Colours become grey (ITU-R 601 luma). A Bayer pattern names the colours of the upper left 2 x 2
+pixels, row by row: "RGGB".
 """
 
 import contextlib
@@ -14,7 +23,7 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,49 +31,71 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import LUMA, SCALES
+from jaxevent.arrays import LUMA, SCALES, UNITS, to_grey
+from jaxevent.camera import TableResponse
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io import check_unfolded, reading
+from jaxevent.io.checks import check_unfolded, reading
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.output import complete
-from jaxevent.io.time_units import NAMES, unit_of_name
+from jaxevent.io.time_units import unit_of_name
 from jaxevent.recording import microseconds
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
 TIMES = ("timestamps.txt", "images.txt", "timestamp.txt")
-_EXPOSURES = "*exposure_timestamps*.txt"
-_INNER = ("rectified", "distorted")  # folders of images in DSEC's folder of a camera
+STACK_TIMES = "exposures.txt"
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of a 2 x 2 cell, row by row
+_DSEC_EXPOSURES = "*exposure_timestamps*.txt"
+_DSEC_FOLDERS = ("rectified", "distorted")  # folders of images in DSEC's folder of a camera
+_EXIF, _EXPOSURE_TIME = 0x8769, 0x829A  # tags
 _DEEP_COLOUR = re.compile(r"\b(L|LA|RGB\w*|CMYK);16")  # Pillow's name of how pixels are stored
 
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Images at sorted times (us), each read when asked for: `read(row)` is (height, width).
+    """Images at sorted times, each read when needed.
 
-    `exposure` is the length of each image's exposure in us, 0 where unknown; `t` is its middle
-    where it is known. `colour(row)` is (height, width, 3) uint8, red first, or None of an image
-    that is stored otherwise.
+    Attributes:
+        t: (n,) times in us, the middle of the exposure where it is known.
+        exposure: (n,) length of each image's exposure in us, 0 where unknown.
+        read: Function from a row to the image (height, width).
+        colour: Function from a row to the colours (height, width, 3) uint8, red first, or None of
+            an image that is stored otherwise.
+        files: All files of the series.
     """
 
     t: NDArray[np.int64]
     exposure: NDArray[np.int64]
     read: Callable[[int], NDArray[np.float64]]
     colour: Callable[[int], NDArray[np.uint8] | None]
-    files: tuple[Path, ...]  # that hold all this
+    files: tuple[Path, ...]
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """Stored values as linear intensity: (value / white) ** gamma.
+    """Map from stored values to linear intensity: (value / white) ** gamma.
 
-    `white` None: the largest value of integers of 8 or 16 bits, 1 of floats.
+    Attributes:
+        white: Value of intensity 1; None takes the largest value of integers of 8 or 16 bits, and
+            1 of floats.
+        gamma: Exponent.
     """
 
     white: float | int | None = None
     gamma: float | int = 1.0
 
     def intensity(self, image: NDArray, source: str) -> NDArray[np.float64]:
-        """An image as stored, grey (height, width); raises `InputError` naming the `source`."""
+        """Convert an image to intensity.
+
+        Args:
+            image: (height, width) or (height, width, channels) values as stored.
+            source: Name of the image for messages.
+
+        Returns:
+            (height, width) linear intensity.
+
+        Raises:
+            InputError: The image is of another type or shape.
+        """
         kind = image.dtype
         if kind not in (np.uint8, np.uint16) and kind.kind != "f" and self.white is None:
             raise InputError(f"{source}: holds {kind}; give white, the value of intensity 1")
@@ -87,12 +118,12 @@ class Scale:
 
 
 def is_series(path: Path) -> bool:
-    """Whether these are images with times, not a recording."""
+    """Return whether a file or folder holds images with times, not a recording."""
     import h5py
 
     from jaxevent.io import hdf5_files
 
-    with reading(str(path)):
+    with reading(path):
         if path.is_dir():
             images = any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
             return images and not (path / "events.txt").is_file()
@@ -108,33 +139,46 @@ def read_series(
     timestamps: Sequence[str] = TIMES,
     beside: Path | None = None,
 ) -> Series:
-    """The images of a folder or file that exists; see the text of this module.
+    """Read a series of images.
 
-    `timestamps` are names of the file of times, the first that there is in the folder of the images
-    or else in the folder `beside`. Raises `InputError` naming what is wrong.
+    Args:
+        images: A folder or file that exists; see the text of this module.
+        scale: Map from stored values to intensity.
+        timestamps: Possible names of the file of times, in the folder of the images or `beside`.
+        beside: Another folder in which the times may be.
+
+    Returns:
+        The series, whose images are read when needed.
+
+    Raises:
+        InputError: A file is missing or damaged, or times and images do not fit each other.
     """
     if images.is_file() and images.suffix.lower() != ".npy":
-        return _of_hdf5(images, scale)
+        return _read_hdf5_series(images, scale)
     place = images if images.is_dir() else images.parent
     times = _find_timestamps(place, beside, timestamps)
-    (t, exposure), names = _times(times)
+    (t, exposure), names = _read_stamps(times)
     if images.is_file():
-        with reading(str(images)):
+        with reading(images):
             stack = np.load(images, mmap_mode="r", allow_pickle=False)
         _check_count(images, len(stack) if stack.ndim in (3, 4) else 0, times, len(t))
-        return _series(t, exposure, lambda row: stack[row], str(images), (images, times), scale)
+        return _make_series(
+            (t, exposure), lambda row: stack[row], str(images), (images, times), scale
+        )
     if names is None:
         files = sorted(p for p in images.iterdir() if p.suffix.lower() in SUFFIXES)
         _check_count(images, len(files), times, len(t))
     else:
         files = [images / name for name in names]
-    return _series(t, exposure, lambda row: _image(files[row]), str(images), (*files, times), scale)
+    return _make_series(
+        (t, exposure), lambda row: _read_file(files[row]), str(images), (*files, times), scale
+    )
 
 
 def find_exposures(place: Path) -> Path | None:
     """Find the file of the starts and ends of exposures as DSEC names it, of a folder of images."""
-    folders = [place, place.parent] if place.name in _INNER else [place]
-    found = [path for folder in folders for path in sorted(folder.glob(_EXPOSURES))]
+    folders = [place, place.parent] if place.name in _DSEC_FOLDERS else [place]
+    found = [path for folder in folders for path in sorted(folder.glob(_DSEC_EXPOSURES))]
     sides = [side for side in ("left", "right") if side in place.parts]
     of_side = [path for path in found if any(side in path.stem for side in sides)]
     chosen = of_side if len(found) > 1 else found
@@ -146,7 +190,7 @@ def _find_timestamps(place: Path, beside: Path | None, names: Sequence[str]) -> 
     if names is TIMES:
         if (exposures := find_exposures(place)) is not None:
             return exposures
-        if place.name in _INNER:
+        if place.name in _DSEC_FOLDERS:
             folders.append(place.parents[1])
     for path in (folder / name for name in names for folder in folders):
         if path.is_file():
@@ -165,14 +209,14 @@ def _check_count(images: Path, found: int, times: Path, expected: int) -> None:
         )
 
 
-def _series(
-    t: NDArray[np.int64],
-    exposure: NDArray[np.int64],
+def _make_series(
+    stamps: tuple[NDArray[np.int64], NDArray[np.int64]],
     stored: Callable[[int], NDArray],
     source: str,
     files: tuple[Path, ...],
     scale: Scale,
 ) -> Series:
+    t, exposure = stamps
     if not len(t):
         raise InputError(f"{source}: holds no images; give those of the recording")
     if (t[1:] < t[:-1]).any():
@@ -197,7 +241,7 @@ def _series(
     return Series(t, exposure, read, colour, files)
 
 
-def _of_hdf5(path: Path, scale: Scale) -> Series:
+def _read_hdf5_series(path: Path, scale: Scale) -> Series:
     from jaxevent.io import hdf5_files
 
     file = hdf5_files.open_file(path)
@@ -213,22 +257,32 @@ def _of_hdf5(path: Path, scale: Scale) -> Series:
             "each image"
         )
     times = microseconds(t[()], f"{path}: t")
-    unknown = np.zeros_like(times)
-    return _series(times, unknown, lambda row: stored[row], str(path), (path,), scale)
+    return _make_series(
+        (times, np.zeros_like(times)), lambda row: stored[row], str(path), (path,), scale
+    )
 
 
-def _image(path: Path) -> NDArray:
+def _read_file(path: Path) -> NDArray:
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False)
     return read_image(path, str(path))
 
 
-def read_image(file: Any, source: str, grey: bool = False) -> NDArray:
-    """An image of a path or open file, as stored: (height, width), in colour (height, width, 3).
+def read_image(file: Any, source: str) -> NDArray:
+    """Read an image with Pillow.
 
-    Values are uint8, uint16 or float32, and whole numbers of 32 bits become uint16. With `grey`
-    colours become grey (ITU-R 601 luma); transparency is passed over. Raises `InputError` where
-    a value would not be kept: colours of 16 bits, numbers outside 0 to 65535, several images.
+    Args:
+        file: A path, or an open file.
+        source: Name of the file for messages.
+
+    Returns:
+        The image as stored: (height, width), in colour (height, width, 3), red first, and with
+        transparency (height, width, 4). Values are uint8, uint16 or float32; whole numbers of 32
+        bits become uint16.
+
+    Raises:
+        InputError: A value would not be kept: the file holds colours of 16 bits, numbers outside 0
+            to 65535, or several images.
     """
     from PIL import Image
 
@@ -250,88 +304,102 @@ def read_image(file: Any, source: str, grey: bool = False) -> NDArray:
                     "bits, or floats in [0, 1]"
                 )
             return values.astype(np.uint16)
-        if grey or image.mode in ("1", "LA"):
+        if image.mode in ("1", "LA"):
             return np.asarray(image.convert("L"))
         return np.asarray(image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB"))
 
 
-def read_grey_and_colour(file: Any, source: str) -> tuple[NDArray, NDArray[np.uint8] | None]:
-    """An image in grey, as of `read_image`, and its colours (height, width, 3); None of a grey one.
+def gather_frames(
+    images: Iterable[NDArray],
+    decode: Callable[[int], Iterable[NDArray]],
+    label: Callable[[int], str],
+    source: str,
+    in_memory: bool,
+) -> tuple[NDArray | DecodedImages | None, dict[str, Any]]:
+    """Check the frames of a file once, and convert colours to grey.
 
-    `file` is a path or an open file that can be read from its beginning again.
+    Args:
+        images: First pass over all images, each (height, width), or in colour (height, width, 3)
+            with red first.
+        decode: Decoder for later passes: `decode(i)` yields the images from number i on.
+        label: Function from the number of an image to its name for messages.
+        source: Name of the file for messages.
+        in_memory: False leaves the images in their file.
+
+    Returns:
+        Grey images (n, height, width), None if there are none, and the entry of `Recording.extra`
+        for the colours of coloured ones.
+
+    Raises:
+        InputError: An image has another size or type than the first.
     """
-    from PIL import Image
-
-    grey = read_image(file, source, grey=True)
-    with Image.open(file) as image:
-        if image.mode in ("1", "L", "LA", "F") or image.mode.startswith("I"):
-            return grey, None
-        return grey, np.asarray(image.convert("RGB"))
-
-
-def grey_of_bgr(pixels: NDArray) -> NDArray:
-    """Convert blue, green, red (height, width, 3 or 4), OpenCV's order, to grey of their type."""
-    grey = pixels[..., :3] @ LUMA[::-1]
-    return (grey if pixels.dtype.kind == "f" else np.rint(grey)).astype(pixels.dtype)
+    grey: list[NDArray] = []
+    colours: list[NDArray | None] = []
+    first: tuple[Any, Any] = ((0, 0), None)
+    count, are_colours, differ = 0, True, False
+    for image in images:
+        is_colour = image.ndim == 3 and image.dtype == np.uint8
+        are_colours &= is_colour
+        differ |= is_colour and bool((image != image[..., :1]).any())
+        kind = (image.shape[:2], image.dtype)
+        first = first if count else kind
+        if kind != first:
+            (height, width), dtype = first
+            raise InputError(
+                f"{label(count)} is {image.shape[1]}x{image.shape[0]} {image.dtype} but the first "
+                f"image is {width}x{height} {dtype}; all images must have the sensor's size and "
+                "one depth"
+            )
+        if in_memory:
+            grey.append(to_grey(image))
+            colours.append(image if is_colour else None)
+        count += 1
+    if not count:
+        return None, {}
+    if in_memory:
+        return np.stack(grey), kept_colours(colours)
+    shape = (count, *first[0])
+    rgb = DecodedImages(decode, (*shape, 3), np.dtype(np.uint8), source)
+    left = DecodedImages(lambda row: map(to_grey, decode(row)), shape, first[1], source)
+    return left, {"rgb": rgb} if are_colours and differ else {}
 
 
 def read_files(
     files: Sequence[Path], source: str, in_memory: bool
-) -> tuple[NDArray | DecodedImages, dict[str, Any]]:
-    """Read images in files of their own, each checked once.
+) -> tuple[NDArray | DecodedImages | None, dict[str, Any]]:
+    """Read frames in files of their own, each checked once.
 
     Args:
-        files: At least one file, in the order of the images.
+        files: Files in the order of the images.
         source: Name of the folder for messages.
         in_memory: False leaves the images in their files.
 
     Returns:
-        Grey images (images, height, width), and the colours of coloured ones as `Recording.extra`
-        keeps them.
+        Grey images (n, height, width), and the entry of `Recording.extra` for colours.
 
     Raises:
         InputError: An image cannot be read, or has another size or type than the first.
     """
-    shape, kind = (0, 0), np.dtype(np.uint8)
-    grey: list[NDArray] = []
-    colours: list[NDArray[np.uint8] | None] = []
-    stored = unfolded = 0
-    are_colours, differ = True, False
-    for number, file in enumerate(files):
-        with reading(str(file)):
-            image, colour = read_grey_and_colour(file, str(file))
-            stored += file.stat().st_size
-        if number == 0:
-            shape, kind = (image.shape[0], image.shape[1]), image.dtype
-        if image.shape != shape or image.dtype != kind:
-            raise InputError(
-                f"{file}: is {image.shape[1]}x{image.shape[0]} {image.dtype} but the first image "
-                f"is {shape[1]}x{shape[0]} {kind}; all images must have the sensor's size and one "
-                "depth"
-            )
-        are_colours &= colour is not None
-        differ |= colour is not None and bool((colour != colour[..., :1]).any())
-        unfolded += image.nbytes + (0 if colour is None else colour.nbytes)
-        check_unfolded(unfolded, stored, source)
-        if in_memory:
-            grey.append(image)
-            colours.append(colour)
-    if in_memory:
-        return np.stack(grey), kept_colours(colours)
 
-    def left(which: int, shape: tuple[int, ...], kind: np.dtype) -> DecodedImages:
-        def images(row: int) -> Iterator[NDArray]:
-            for file in files[row:]:
-                yield np.asarray(read_grey_and_colour(file, str(file))[which])
+    def decode(row: int) -> Iterator[NDArray]:
+        stored = unfolded = 0
+        for file in files[row:]:
+            with reading(file):
+                image = drop_alpha(read_image(file, str(file)))
+            stored, unfolded = stored + file.stat().st_size, unfolded + image.nbytes
+            check_unfolded(unfolded, stored, source)
+            yield image
 
-        return DecodedImages(images, (len(files), *shape), kind, source)
+    return gather_frames(decode(0), decode, lambda n: f"{files[n]}:", source, in_memory)
 
-    rgb = {"rgb": left(1, (*shape, 3), np.dtype(np.uint8))} if are_colours and differ else {}
-    return left(0, shape, kind), rgb
+
+def drop_alpha(image: NDArray) -> NDArray:
+    """Return an image without its transparency."""
+    return image if image.ndim == 2 else image[..., :3]
 
 
 def kept_colours(images: Sequence[NDArray[np.uint8] | None]) -> dict[str, NDArray[np.uint8]]:
-    """Colours of all frames as `Recording.extra` keeps them: none if one is grey, or all are."""
+    """Return the entry of `Recording.extra` for colours; empty if one frame is grey, or all are."""
     colours = [one for one in images if one is not None]
     if not colours or len(colours) < len(images):
         return {}
@@ -340,11 +408,11 @@ def kept_colours(images: Sequence[NDArray[np.uint8] | None]) -> dict[str, NDArra
 
 
 def read_intensity(path: Path) -> NDArray[np.float32]:
-    """An image of linear intensity (height, width), .npy or TIFF of floats, NaN where unknown."""
+    """Read an image of linear intensity (height, width), .npy or TIFF of floats, NaN: unknown."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; correct the path")
-    with reading(str(path)):
-        image = _image(path)
+    with reading(path):
+        image = _read_file(path)
     if image.ndim != 2 or image.dtype.kind != "f":
         raise InputError(
             f"{path}: is {image.dtype} of shape {image.shape}; store floats (height, width), as "
@@ -354,7 +422,15 @@ def read_intensity(path: Path) -> NDArray[np.float32]:
 
 
 def write_intensity(path: Path, image: NDArray[np.float32]) -> None:
-    """Write an image of linear intensity as .npy or TIFF; raises `InputError` for other names."""
+    """Write an image of linear intensity, completely or not at all.
+
+    Args:
+        path: File to write, .npy or .tif.
+        image: (height, width) intensity.
+
+    Raises:
+        InputError: The name has another ending, or the file cannot be written.
+    """
     from PIL import Image
 
     if path.suffix.lower() not in (".npy", ".tif", ".tiff"):
@@ -367,18 +443,20 @@ def write_intensity(path: Path, image: NDArray[np.float32]) -> None:
             Image.fromarray(image).save(partial, format="TIFF")
 
 
-def _times(path: Path) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64]], list[str] | None]:
-    """The times and exposures (us) of lines "t", "t name" or "start, end", and the names."""
-    lines = [re.split(r"\s*[,;]\s*|\s+", line.strip(), maxsplit=1) for line in _lines(path)]
+def _read_stamps(
+    path: Path,
+) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64]], list[str] | None]:
+    """Read times and exposures (us) of lines "t", "t name" or "start, end", and the names."""
+    lines = [re.split(r"\s*[,;]\s*|\s+", line.strip(), maxsplit=1) for line in _read_lines(path)]
     if len({len(words) for words in lines}) > 1:
         raise InputError(f"{path}: some lines have a name and some have none; give all or none")
     remedy = "give lines 't', 't name' or 'start, end'"
     firsts = [words[0] for words in lines]
     names = [words[1].strip() for words in lines] if lines and len(lines[0]) == 2 else None
     if names is None or not all(re.fullmatch(r"[+-]?[\d.eE+-]+", name) for name in names):
-        times = _parsed(path, firsts, remedy)
+        times = _parse_times(path, firsts, remedy)
         return (times, np.zeros_like(times)), names
-    both = _parsed(path, firsts + names, remedy)
+    both = _parse_times(path, firsts + names, remedy)
     start, end = both[: len(firsts)], both[len(firsts) :]
     if (end < start).any() or (end[:-1] > start[1:]).any():
         raise InputError(
@@ -397,7 +475,7 @@ def read_exposures(place: Path) -> NDArray[np.int64] | None:
     if not path.is_file():
         return None
     with contextlib.suppress(InputError):  # of a file that holds something else
-        exposure = _times(path)[0][1]
+        exposure = _read_stamps(path)[0][1]
         return exposure if exposure.any() else None
     return None
 
@@ -420,7 +498,7 @@ def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.in
     Raises:
         InputError: The file holds something else.
     """
-    lines = [re.sub(r"\s+(?=[\[(])", "", line.strip()) for line in _lines(path)]
+    lines = [re.sub(r"\s+(?=[\[(])", "", line.strip()) for line in _read_lines(path)]
     rows = [re.split(r"\s*[,;]\s*|\s+", line) for line in lines]
     column, unit = 0, None
     if rows and not re.match(r"[+-]?\.?\d", rows[0][0]):
@@ -433,7 +511,7 @@ def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.in
         raise InputError(f"{path}: holds no times; give one in each line")
     words = [row[column] if column < len(row) else "" for row in rows]
     remedy = "give a time in each line, or a table with a column t"
-    times = _parsed(path, words, remedy, unit)
+    times = _parse_times(path, words, remedy, unit)
     if span is not None and unit is None:
         times = _inside(path, words, remedy, times, span)
     if (times[1:] < times[:-1]).any():
@@ -445,7 +523,7 @@ def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.in
 def _inside(
     path: Path, words: Sequence[str], remedy: str, times: NDArray[np.int64], span: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """The times in their usual unit, or in another one that alone puts them in the recording."""
+    """Return times in their usual unit, or in the only one that puts them in the recording."""
 
     def share(t: NDArray[np.int64]) -> float:
         return float(np.mean((t >= span[0]) & (t <= span[1])))
@@ -455,14 +533,14 @@ def _inside(
     fitting = {}
     for unit in SCALES:
         with contextlib.suppress(InputError):
-            t = _parsed(path, words, remedy, unit)
+            t = _parse_times(path, words, remedy, unit)
             if share(t) == 1 and 10 * (t.max() - t.min()) >= span[1] - span[0]:
                 fitting[unit] = t
     if len(fitting) != 1:
         return times
     unit, t = next(iter(fitting.items()))
     warnings.warn(
-        f"{path}: the times are taken as {NAMES[unit]}, since they lie in the recording then; name "
+        f"{path}: the times are taken as {UNITS[unit]}, since they lie in the recording then; name "
         f"the column t_{unit} to be sure",
         InputWarning,
         stacklevel=3,
@@ -470,17 +548,17 @@ def _inside(
     return t
 
 
-def _lines(path: Path) -> list[str]:
-    """The lines of a text file that are neither empty nor comments."""
-    with reading(str(path)):
+def _read_lines(path: Path) -> list[str]:
+    """Read the lines of a text file that are neither empty nor comments."""
+    with reading(path):
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     return [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _parsed(
+def _parse_times(
     path: Path, words: Sequence[str], remedy: str, unit: str | None = None
 ) -> NDArray[np.int64]:
-    """Times in us; without a unit whole numbers, if all are, are us, others seconds."""
+    """Parse times in us; without a unit they are us if all are whole numbers, else seconds."""
     whole = all(re.fullmatch(r"[+-]?\d+", word) for word in words)
     scale = Fraction(SCALES[unit or ("us" if whole else "s")]).limit_denominator(1000)
     times: list[int] = []
@@ -494,3 +572,171 @@ def _parsed(
             )
         times.append(round(value))
     return np.array(times, np.int64)
+
+
+def read_stack(
+    folder: Path, exposures: Sequence[float | int] | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Read an exposure stack.
+
+    Args:
+        folder: The folder of the images.
+        exposures: (n,) exposure times in s in the order of the images' names; None takes those
+            that the folder states.
+
+    Returns:
+        Images (n, height, width) and exposure times (n,) in s.
+
+    Raises:
+        InputError: An image cannot be used, or exposure times are missing or not positive.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder; give the folder of the images")
+    names: list[str] | None = None
+    if exposures is None and (folder / STACK_TIMES).is_file():
+        exposures, names = _read_exposure_list(folder / STACK_TIMES)
+    elif exposures is None and (lengths := read_exposures(folder)) is not None:
+        exposures = (lengths * 1e-6).tolist()
+    files = sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES)
+    files = files if names is None else [folder / name for name in names]
+    if not files:
+        raise InputError(f"{folder}: holds no images; give those of one scene")
+    images = []
+    for file in files:
+        with reading(file):
+            image = to_grey(drop_alpha(read_image(file, str(file))))
+        if image.dtype != np.uint8 or image.shape != np.shape(images[0] if images else image):
+            raise InputError(
+                f"{file}: is {image.dtype} of {image.shape[1]}x{image.shape[0]} pixels; store all "
+                "images with 8 bits and in one size"
+            )
+        images.append(image)
+    if exposures is None:
+        exposures = [_exif_exposure(file) for file in files]
+    if len(exposures) != len(files):
+        raise InputError(
+            f"{folder}: holds {len(files)} images, but {len(exposures)} exposure times are given; "
+            "give one for each, in the order of their names"
+        )
+    seconds = np.asarray(exposures, np.float64)
+    if not (np.isfinite(seconds) & (seconds > 0)).all():
+        raise InputError(f"{folder}: exposure times must be positive, not {seconds.tolist()}")
+    return np.stack(images), seconds
+
+
+def _read_exposure_list(path: Path) -> tuple[list[float], list[str]]:
+    seconds, names = [], []
+    with reading(path):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        time, _, name = line.strip().partition(" ")
+        try:
+            seconds.append(float(time))
+        except ValueError:
+            time = ""
+        if not time or not (path.parent / name.strip()).is_file() or not name.strip():
+            raise InputError(f"{path}: line {number} is {line[:60]!r}; give lines 's name'")
+        names.append(name.strip())
+    return seconds, names
+
+
+def _exif_exposure(file: Path) -> float:
+    """Read the exposure time (s) of an image's EXIF data."""
+    from PIL import Image
+
+    with reading(file), Image.open(file) as image:
+        value = image.getexif().get_ifd(_EXIF).get(_EXPOSURE_TIME)
+    if value is None:
+        raise InputError(
+            f"{file}: does not state its exposure time; give --exposures, or {STACK_TIMES} of "
+            "lines 's name' beside the images"
+        )
+    return float(value)
+
+
+def write_response(path: Path, response: TableResponse) -> None:
+    """Write a camera response as CSV, completely or not at all.
+
+    Args:
+        path: File to write.
+        response: The response.
+    """
+    greys = np.linspace(0, 1, len(response.levels))
+    table = np.stack([greys, np.asarray(response.levels), np.asarray(response.weights)], 1)
+    with complete(path) as partial:
+        np.savetxt(partial, table, "%.9g", ",", header="grey,intensity,certainty", comments="")
+
+
+def read_response(path: Path) -> TableResponse:
+    """Read a camera response from CSV; raises `InputError` for other files."""
+    with reading(path):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    wanted = "grey,intensity,certainty"
+    if not lines or lines[0].replace(" ", "") != wanted:
+        raise InputError(f"{path}: the first line is not '{wanted}'; give a response's CSV")
+    try:
+        table = np.array([[float(one) for one in line.split(",")] for line in lines[1:] if line])
+    except ValueError:
+        raise InputError(f"{path}: holds a line that is not three numbers; mend it") from None
+    even = table.ndim == 2 and table.shape[1] == 3
+    if not even or not np.allclose(table[:, 0], np.linspace(0, 1, len(table)), 0, 1e-6):
+        raise InputError(f"{path}: the grey values are not evenly spaced from 0 to 1; mend them")
+    try:
+        return TableResponse(table[:, 1], table[:, 2])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def bayer_sites(pattern: str) -> dict[str, tuple[int, int]]:
+    """Return the row and column of R, G1, G2 and B in the 2 x 2 cell of a Bayer pattern.
+
+    G1 is the first green, row by row. Raises `InputError` for other patterns.
+    """
+    if pattern not in BAYER_PATTERNS:
+        raise InputError(
+            f"the colour pattern {pattern!r} is not one of {', '.join(BAYER_PATTERNS)}; other "
+            "patterns cannot be split"
+        )
+    greens = iter(("G1", "G2"))
+    names = [next(greens) if letter == "G" else letter for letter in pattern]
+    found = {name: divmod(place, 2) for place, name in enumerate(names)}
+    return {name: found[name] for name in ("R", "G1", "G2", "B")}
+
+
+def demosaic(mosaic: NDArray, pattern: str) -> NDArray[np.floating]:
+    """Interpolate the colours of raw images bilinearly.
+
+    A colour keeps its values at its sites. Elsewhere it is the mean of its 2 or 4 nearest sites, at
+    the border of those that exist.
+
+    Args:
+        mosaic: (n, height, width) raw images.
+        pattern: Bayer pattern, as "RGGB".
+
+    Returns:
+        (n, height, width, 3) colours, red first, floats of the precision of `mosaic`, at least 32
+        bits.
+
+    Raises:
+        InputError: The pattern is not one of `BAYER_PATTERNS`.
+    """
+    import scipy.ndimage  # slow to import
+
+    places = bayer_sites(pattern)
+    shape, dtype = mosaic.shape, np.result_type(np.float32, mosaic)
+    out = np.empty((*shape, 3), dtype)
+    cross = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype)
+    square = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype)
+    for axis, (names, kernel) in enumerate(
+        ((("R",), square), (("G1", "G2"), cross), (("B",), square))
+    ):
+        known = np.zeros(shape[1:], dtype)
+        for name in names:
+            row, column = places[name]
+            known[row::2, column::2] = 1
+        weights = scipy.ndimage.convolve(known, kernel, mode="constant")
+        total = scipy.ndimage.convolve(mosaic * known, kernel[None], mode="constant")
+        out[..., axis] = total / weights
+    return out

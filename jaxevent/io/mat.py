@@ -15,7 +15,7 @@ unless there are three frames. MATLAB's rows and columns (1 x N) become vectors.
 
 In place of `events` there may be four vectors with the names of `columns` (ASL-DVS: ts, x, y, pol),
 as variables or as fields of a struct, or one other array (N, 4) or (4, N), in an order that
-`columns.order_of` tells. Their x and y count from 0 where a 0 occurs, otherwise from 1. The fields
+`columns.order_of` infers. Their x and y count from 0 where a 0 occurs, otherwise from 1. The fields
 of other structs are kept as "struct.field".
 """
 
@@ -30,21 +30,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import to_microseconds
+from jaxevent.arrays import times
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, reading, sensor_size, times
-from jaxevent.io.columns import (
-    as_rows,
-    find,
-    first_and_last,
-    order_of,
-    signed,
-    stated_unit,
-    unsigned_off,
+from jaxevent.io.checks import (
+    ReadOptions,
+    check_unfolded,
+    damaged,
+    image_size,
+    reading,
+    sensor_size,
 )
-from jaxevent.io.decoded import from_columns
-from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import SAMPLE, Clock, InferredUnit, clock_of, infer_unit
+from jaxevent.io.columns import (
+    ColumnEvents,
+    as_rows,
+    find_fields,
+    order_of,
+    read_whole_columns,
+    split_rows,
+)
+from jaxevent.io.time_units import SAMPLE, Clock
 from jaxevent.recording import Events, Frames, Recording
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
@@ -56,18 +60,29 @@ _STRUCT = 2  # class of a struct
 
 
 def read_v5(path: Path, options: ReadOptions) -> Recording:
-    """Read a v5 file. Raises `InputError` for bad input."""
+    """Read a v5 file.
+
+    Args:
+        path: The file.
+        options: Choices of the caller.
+
+    Returns:
+        The recording, in memory.
+
+    Raises:
+        InputError: The file is damaged, or what it holds is not valid.
+    """
     import scipy.io
 
-    with reading(str(path)):
+    with reading(path):
         variables = scipy.io.loadmat(_unpacked(path))
-    return _recording(
+    return _make_recording(
         path, options, {name: v for name, v in variables.items() if not name.startswith("__")}
     )
 
 
 def _unpacked(path: Path) -> BytesIO:
-    """The numeric variables of a file, without compression and checked to be whole.
+    """Copy the numeric variables of a file, without compression and checked to be whole.
 
     SciPy takes the number of a type as an index into its table without looking, and reads on past
     the end of a variable: a damaged file ends the process.
@@ -80,19 +95,17 @@ def _unpacked(path: Path) -> BytesIO:
     while at < len(data):
         kind, size = struct.unpack_from(order + "2I", data, at)
         body = data[at + 8 : at + 8 + size]
+        wrong = damaged(f"{path}: the variable at byte {at} is not valid")
         if len(body) != size or kind not in (_COMPRESSED, _MATRIX):
-            raise InputError(
-                f"{path}: the variable at byte {at} is damaged or cut off; fetch the file again"
-            )
+            raise wrong
         if kind == _COMPRESSED:
             unpacking = zlib.decompressobj()
             (kind, size) = struct.unpack(order + "2I", unpacking.decompress(body, 8))
             check_unfolded(out.tell() + size, len(data), str(path))
             body = unpacking.decompress(unpacking.unconsumed_tail, size + 1)
         if kind != _MATRIX or len(body) != size:
-            raise InputError(f"{path}: the variable at byte {at} is damaged; fetch it again")
-        source = f"{path}: the variable at byte {at}"
-        for part in _numeric_parts(memoryview(body), order, source):
+            raise wrong
+        for part in _numeric_parts(memoryview(body), order, wrong):
             out.write(struct.pack(order + "2I", kind, len(part)))
             out.write(part)
         at += 8 + int(struct.unpack_from(order + "2I", data, at)[1])
@@ -108,56 +121,55 @@ class _Element(NamedTuple):
     stop: int
 
 
-def _elements(body: memoryview, order: str, damaged: InputError) -> Iterator[_Element]:
+def _elements(body: memoryview, order: str, wrong: InputError) -> Iterator[_Element]:
     at = 0
     while at < len(body):
         if len(body) - at < 8:
-            raise damaged
+            raise wrong
         kind, size = struct.unpack_from(order + "2I", body, at)
         start, stop = at + 8, at + 8 + size + -size % 8
         if kind >> 16:  # up to 4 bytes, beside the type
             kind, size, start, stop = kind & 0xFFFF, kind >> 16, at + 4, at + 8
         if start + size > len(body) or (stop == at + 8 and start == at + 4 and size > 4):
-            raise damaged
+            raise wrong
         yield _Element(kind, body[start : start + size], stop)
         at = stop
 
 
 def _numeric_parts(
-    body: memoryview, order: str, source: str, *, is_field: bool = False
+    body: memoryview, order: str, wrong: InputError, *, is_field: bool = False
 ) -> list[bytes]:
-    """The arrays of numbers that a variable is or, as a struct of one element, has as its fields.
+    """Return the arrays of numbers in a variable: itself, or the fields of a lone struct.
 
-    They are the flags, whose lowest byte is the class and whose bit 11 says complex, the sizes, the
-    name, the real and for complex the imaginary numbers; of a struct, in place of numbers, the
+    They are the flags, whose lowest byte is the class and whose bit 11 marks complex, the sizes,
+    the name, the real and for complex the imaginary numbers; of a struct, in place of numbers, the
     length of its fields' names, these, and the fields. Fields become variables of their own, named
-    "struct.field"; structs that are fields themselves are left out. Raises `InputError` where the
-    elements do not fill the variable.
+    "struct.field"; structs that are fields themselves are left out. Raises `wrong` if the elements
+    do not fill the variable.
     """
-    damaged = InputError(f"{source} is damaged; fetch the file again")
-    elements = _elements(body, order, damaged)
+    elements = _elements(body, order, wrong)
     flags = next(elements, None)
     if flags is None or flags.kind != _FLAGS or len(flags.data) != 8:
-        raise damaged
+        raise wrong
     (bits,) = struct.unpack_from(order + "I", flags.data)
     is_struct = bits & 0xFF == _STRUCT
     if bits & 0xFF not in _CLASSES and (is_field or not is_struct):
         return []
     kept = [flags, *elements]
     if [element.kind for element in kept[1:3]] != [_SIZES, _NAME]:
-        raise damaged
+        raise wrong
     numbers = kept[3:]
     if not is_struct:
         is_right = {element.kind for element in numbers} <= _NUMBERS
         if len(numbers) != 1 + bool(bits & 0x800) or not is_right:
-            raise damaged
+            raise wrong
         return [bytes(body)]
     if len(numbers) < 2 or len(numbers[0].data) != 4:
-        raise damaged
+        raise wrong
     (length,) = struct.unpack(order + "I", numbers[0].data)
     joined, fields = bytes(numbers[1].data), numbers[2:]
     if not length or len(joined) % length or any(field.kind != _MATRIX for field in fields):
-        raise damaged
+        raise wrong
     names = [joined[at : at + length].split(b"\0")[0] for at in range(0, len(joined), length)]
     if len(fields) != len(names):  # an array of structs
         return []
@@ -165,26 +177,37 @@ def _numeric_parts(
     for name, field in zip(names, fields, strict=True):
         whole = bytes(kept[2].data) + b"." + name
         if len(field.data):
-            held = _numeric_parts(field.data, order, source, is_field=True)
+            held = _numeric_parts(field.data, order, wrong, is_field=True)
             parts += [_renamed(part, whole, order) for part in held]
     return parts
 
 
 def _renamed(body: bytes, name: bytes, order: str) -> bytes:
-    """An array of numbers with a name: its third element."""
-    elements = [*_elements(memoryview(body), order, InputError("damaged"))]
+    """Replace the name of an array of numbers, its third element."""
+    elements = [*_elements(memoryview(body), order, damaged("it"))]
     held = struct.pack(order + "2I", 1, len(name)) + name + bytes(-len(name) % 8)
     return body[: elements[1].stop] + held + body[elements[2].stop :]
 
 
 def read_v73(path: Path, options: ReadOptions) -> Recording:
-    """Read a v7.3 file. Raises `InputError` for bad input."""
+    """Read a v7.3 file.
+
+    Args:
+        path: The file.
+        options: Choices of the caller.
+
+    Returns:
+        The recording, in memory.
+
+    Raises:
+        InputError: The file is damaged, or what it holds is not valid.
+    """
     import h5py
 
     from jaxevent.io import hdf5_files
 
     variables: dict[str, NDArray] = {}
-    with reading(str(path)), hdf5_files.open_file(path) as file:
+    with reading(path), hdf5_files.open_file(path) as file:
         items: list[tuple[str, Any]] = []
         for name, item in file.items():
             if isinstance(item, h5py.Group) and not name.startswith("#"):
@@ -198,15 +221,15 @@ def read_v73(path: Path, options: ReadOptions) -> Recording:
                     empty = hdf5_files.attribute(dataset, "MATLAB_empty")
                     stored = hdf5_files.array(file, name, str(path))
                     if empty and stored.all():
-                        raise InputError(f"{path}: {name} is said to be empty but has a size")
+                        raise InputError(f"{path}: {name} is marked as empty but has a size")
                     value = np.zeros(stored.astype(int)) if empty else stored.T
                     variables[name.replace("/", ".")] = value
                     held = sum(value.nbytes for value in variables.values())
                     check_unfolded(held, path.stat().st_size, str(path))
-    return _recording(path, options, variables)
+    return _make_recording(path, options, variables)
 
 
-def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
+def _make_recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
     arrays: dict[str, NDArray] = {
         name: value
         for name, value in variables.items()
@@ -221,11 +244,10 @@ def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
     images = arrays.pop("image") if "image" in arrays else None
     if images is not None:
         images = _checked_images(path, images)
-    otherwise = f"{path}: has no image to tell the sensor's size;"
-    told = None if images is None else (images.shape[2], images.shape[1])
-    size = sensor_size(options.size, told, frames=None, otherwise=otherwise)
-    events, unit, clock = _events(path, found, size, options)
-    notes, frames = list(unit.notes), None
+    otherwise = f"{path}: has no image to show the sensor's size"
+    size = sensor_size(otherwise, options.size, image_size(images))
+    events, clock, notes = _read_events(path, found, size, options)
+    frames = None
     if images is not None:
         frames = _frames(path, images, arrays, clock, notes)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
@@ -238,7 +260,7 @@ def _recording(path: Path, options: ReadOptions, variables: dict) -> Recording:
 class _StoredEvents(NamedTuple):
     """Events as stored: columns by name, or in one array whose order may be known.
 
-    `is_layout` says that it is the array of the layout: t x y p, where times are sorted so.
+    `is_layout` marks the array of the layout: t x y p, where times are sorted so.
     """
 
     columns: dict[str, NDArray]
@@ -254,7 +276,7 @@ def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
     structs = sorted({name.partition(".")[0] for name in arrays if "." in name})
     for prefix in ("", *(f"{name}." for name in structs)):
         inside = [name.removeprefix(prefix) for name in arrays if name.startswith(prefix)]
-        if (fields := find(inside)) is not None:
+        if (fields := find_fields(inside)) is not None:
             columns = {key: arrays.pop(prefix + name) for key, name in fields.items()}
             return _StoredEvents(columns, None, fields["t"])
     plain = [
@@ -265,15 +287,15 @@ def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
     return _StoredEvents({}, arrays.pop(plain[0])) if len(plain) == 1 else None
 
 
-def _events(
+def _read_events(
     path: Path, found: _StoredEvents, size: tuple[int, int], options: ReadOptions
-) -> tuple[Events, InferredUnit, Clock]:
+) -> ColumnEvents:
     source = f"{path}: events"
     if found.array is None:
         columns = {name: _vector(value) for name, value in found.columns.items()}
     elif found.array.size == 0:
-        unit = InferredUnit("us")
-        return Events.empty(), unit, clock_of(unit, found.array, ())
+        is_float = found.array.dtype.kind == "f"
+        return ColumnEvents(Events.empty(), Clock("us", 0, 0, is_float), [])
     else:
         rows = as_rows(found.array)
         if rows is None:
@@ -286,22 +308,21 @@ def _events(
         elif not _has_order_of_layout(rows[:SAMPLE]):
             with contextlib.suppress(InputError):  # the first bad value is named
                 order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
-        columns = {name: rows[:, order.index(name)] for name in "txyp"}
-    t, x, y, p = (columns[name] for name in "txyp")
+        columns = split_rows(rows, order)
     # MATLAB counts from 1, and programs that write its files from 0.
-    is_from_0 = not found.is_layout and any((c == 0).any() for c in (x, y))
-    unit = InferredUnit("us")
-    if len({column.shape for column in columns.values()}) == 1 and t.ndim == 1 and len(t):
-        sample = first_and_last(lambda part: {n: columns[n][part] for n in "txyp"}, len(t))
-        stated = stated_unit(found.name_of_t, t)
-        unit = infer_unit(sample, len(t), size, source, options, stated=stated, usual="us")
-    us = to_microseconds(t, unit.name, source, "event")
-    p = signed(p, unsigned_off(p))
-    origin = 0 if is_from_0 else 1
-    events = from_columns((us, x, y, p), size, source, options, origin)
+    is_from_0 = not found.is_layout and any((columns[name] == 0).any() for name in "xy")
+    events = read_whole_columns(
+        columns,
+        size,
+        source,
+        options,
+        name=found.name_of_t,
+        usual="us",
+        origin=0 if is_from_0 else 1,
+    )
     if is_from_0:
-        unit = unit._replace(notes=(*unit.notes, "x and y count from 0, as a 0 occurs"))
-    return events, unit, clock_of(unit, t, us)
+        events.notes.append("x and y count from 0, as a 0 occurs")
+    return events
 
 
 def _has_order_of_layout(rows: NDArray) -> bool:
@@ -310,12 +331,12 @@ def _has_order_of_layout(rows: NDArray) -> bool:
 
 
 def _vector(value: NDArray) -> NDArray:
-    """MATLAB's row or column (1 x N) as a vector."""
+    """Turn MATLAB's row or column (1 x N) into a vector."""
     return value.reshape(-1) if value.size == max(value.shape, default=0) else value
 
 
 def _checked_images(path: Path, images: NDArray) -> NDArray | None:
-    """Images as [frame, y, x]; None of none."""
+    """Check images and return them as [frame, y, x]; None of none."""
     if images.size == 0:
         return None
     if images.dtype.kind == "f" and images.max() > 1:
@@ -346,14 +367,14 @@ def _frames(
 
 
 def _frames_first(images: NDArray, source: str) -> NDArray:
-    """[y, x, frame] as contiguous [frame, y, x]; [y, x] as it is."""
+    """Turn [y, x, frame] into contiguous [frame, y, x]; [y, x] stays as it is."""
     if images.ndim not in (2, 3):
         raise InputError(f"{source} has shape {images.shape}; store grey images as H x W x K")
     return np.ascontiguousarray(np.moveaxis(images, 2, 0) if images.ndim == 3 else images)
 
 
 def _reference(images: NDArray, frames: int, source: str) -> NDArray:
-    """HDR_mat as grey [frame, y, x] or [y, x]."""
+    """Turn HDR_mat into grey [frame, y, x] or [y, x]."""
     colour = images.ndim == 4 or (images.ndim == 3 and images.shape[2] == 3 and frames != 3)
     if colour and images.shape[2] != 3:
         raise InputError(

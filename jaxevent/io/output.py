@@ -1,27 +1,275 @@
-"""Output that appears complete or not at all."""
+"""Output: where it may go, complete or not at all, and a description of how it came to be.
+
+`check_outputs` refuses to write onto an input, onto a file without consent, and where another
+process writes; the command line calls it before any work. Until output is complete it has the name
+of a temporary sibling. Its writer holds a lock on the sibling that ends with the process: a sibling
+without a lock was left behind.
+
+An HDF5 file that jaxevent writes has these attributes of its root, each a text:
+
+    jaxevent_version   the version of jaxevent that wrote the file
+    command            the command line, as a shell takes it
+    inputs             TOML, a table for each file and folder that the command read: see `Command`
+    method, params     the estimator's name, and its parameters as TOML, which `Params.load` takes
+
+A file that is written from Python has no command and no inputs. There is no date: the same command
+on the same inputs writes the same bytes.
+"""
 
 import contextlib
 import contextvars
+import dataclasses
+import functools
+import hashlib
 import inspect
 import io
 import math
+import os
 import re
+import shlex
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+import uuid
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io.description import describe
-from jaxevent.io.places import abandoned, locked, partial_of
+from jaxevent.io import toml
+from jaxevent.io.companions import companions
 from jaxevent.parameters import Parameters
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there is no lock, and the remains of a killed process stay
+    fcntl = None
 
 if TYPE_CHECKING:
     import h5py
+
+CLOCK_UNIT = "us on the recording's clock"  # the unit of times
+_MAX_HASHED = 2_000_000_000  # bytes of a file that are read for its sha256
+_SAMPLE = 1024  # bytes from the middle of a plane
+_MAX_SHRUNK = 0.9  # of a sample: planes that do not get smaller are stored as they are
+_RAW_DEFLATE = -15  # without zlib's header and checksum
+
+
+def check_outputs(
+    outputs: Sequence[Path],
+    inputs: Sequence[Path] = (),
+    *,
+    force: bool = False,
+    inside: Sequence[Path] = (),
+) -> None:
+    """Raise `InputError` for outputs that would cost an input, each other, or an existing file.
+
+    Two names of one file are the same, links included.
+
+    Args:
+        outputs: Files or folders to be written as a whole.
+        inputs: Files or folders that are read, with those that are read beside them.
+        force: Whether existing files, and files in existing folders, are to be replaced.
+        inside: Outputs to be written although they exist, as those of a run that goes on.
+
+    Raises:
+        InputError: An output would cost something.
+    """
+    for number, out in enumerate(outputs):
+        for other in outputs[:number]:
+            if _same(out, other):
+                raise InputError(f"{out}: is named for two outputs; give each a name of its own")
+        for source in inputs:
+            for one in (source, *companions(source)):
+                _check_against(out, one)
+        if out in inside:
+            continue
+        if out.is_file() and not force:
+            raise InputError(f"{out}: exists; choose another name, or replace it with --force")
+        if out.is_dir() and not force and any(out.iterdir()):
+            raise InputError(
+                f"{out}: the folder is not empty; choose another, or replace its files with --force"
+            )
+        if any(_lock_state(partial) == "held" for partial in partials(out)):
+            raise InputError(
+                f"{out}: is being written by another process; wait for it, or choose another name"
+            )
+
+
+def _check_against(out: Path, source: Path) -> None:
+    """Raise `InputError` if writing `out` would cost `source`, or a part of it."""
+    if _same(out, source):
+        raise InputError(f"{out}: is an input too, which would be lost; choose another name")
+    if out.is_dir() and any(_same(out, parent) for parent in _parents(source)):
+        raise InputError(f"{out}: holds the input {source}; choose another folder")
+    there = out.is_file() or (out.is_dir() and any(out.iterdir()))
+    if there and source.is_dir() and any(_same(parent, source) for parent in _parents(out)):
+        raise InputError(f"{out}: is a part of the input {source}; choose another name")
+
+
+def _parents(path: Path) -> Sequence[Path]:
+    return Path(os.path.realpath(path)).parents
+
+
+def _same(one: Path, other: Path) -> bool:
+    try:
+        return os.path.samefile(one, other)
+    except OSError:  # one does not exist yet
+        return os.path.realpath(one) == os.path.realpath(other)
+
+
+def partial_of(path: Path) -> Path:
+    """Return a new name beside `path` for output that is not complete."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+
+
+def is_partial(path: Path) -> bool:
+    """Return whether a name is one of `partial_of`, or that of a moment before."""
+    return re.fullmatch(r"\..+\.[0-9a-f]{12}\.(part|new)", path.name) is not None
+
+
+def partials(path: Path) -> list[Path]:
+    """List the siblings of `path` that hold writes of it which go on, or were broken off."""
+    path = path.absolute()
+    pattern = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{12}}\.part")
+    try:
+        return [one for one in path.parent.iterdir() if pattern.fullmatch(one.name)]
+    except OSError:
+        return []
+
+
+def abandoned(path: Path) -> list[Path]:
+    """List the siblings of `path` whose writer has ended."""
+    return [one for one in partials(path) if _lock_state(one) == "free"]
+
+
+def _lock_state(path: Path) -> str:
+    """Return the lock of a file or folder: "held", "free", or "unknown" without locks."""
+    try:
+        with locked(path) as holds:
+            return "free" if holds else "unknown"
+    except BlockingIOError:
+        return "held"
+    except OSError:  # it was removed
+        return "unknown"
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[bool]:
+    """Hold a lock on an existing file or folder; yield False on a file system without locks.
+
+    Raises `BlockingIOError` if another process holds it.
+    """
+    if fcntl is None:
+        yield False
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        holds = True
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise
+        except OSError:
+            holds = False
+        yield holds
+    finally:
+        os.close(descriptor)
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A command line that is being run.
+
+    Attributes:
+        words: Words of the command line.
+        inputs: Files and folders that it reads.
+    """
+
+    words: Sequence[str]
+    inputs: Sequence[Path]
+
+    @property
+    def line(self) -> str:
+        """The command line, as a shell takes it."""
+        return _printable(shlex.join(self.words))
+
+    @functools.cached_property
+    def described_inputs(self) -> str:
+        """The inputs as TOML, one line each: `"name" = { bytes = 7, sha256 = "..." }`.
+
+        Of a folder it is the sha256 of its files' names and sizes: "name\\tbytes\\n" for each, by
+        rising name. Files above 2 GB have their size alone, and a note on it.
+        """
+        prints = {_printable(str(path)): _fingerprint(path) for path in self.inputs}
+        return "\n".join(f"{toml.key(n)} = {toml.text(about)}" for n, about in prints.items())
+
+
+_running: contextvars.ContextVar[Command | None] = contextvars.ContextVar("running", default=None)
+
+
+@contextlib.contextmanager
+def running(command: Command) -> Iterator[None]:
+    """Describe files that are written within the block as written by a command."""
+    token = _running.set(command)
+    try:
+        yield
+    finally:
+        _running.reset(token)
+
+
+def _describe(
+    file: "h5py.File", method: str | None = None, params: Parameters | None = None
+) -> None:
+    """Set the attributes of an HDF5 file that this module lists."""
+    from jaxevent import __version__
+
+    file.attrs["jaxevent_version"] = __version__
+    if (command := _running.get()) is not None:
+        file.attrs["command"] = command.line
+        file.attrs["inputs"] = command.described_inputs
+    if method is not None:
+        file.attrs["method"] = method
+    if params is not None:
+        file.attrs["params"] = toml.parameters(params)
+
+
+def _fingerprint(path: Path) -> dict[str, Any]:
+    try:
+        if path.is_dir():
+            return _folder_fingerprint(path)
+        if not path.is_file():
+            return {"note": "neither a file nor a folder"}
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > _MAX_HASHED:
+                return {"bytes": size, "note": "no sha256: larger than 2 GB"}
+            return {"bytes": size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+    except OSError as error:  # it was removed; the output is kept
+        return {"note": f"cannot be read any more ({error.strerror or error})"}
+
+
+def _folder_fingerprint(path: Path) -> dict[str, Any]:
+    """Hash the names and sizes of a folder's files, but for those that are being written."""
+    sizes = {
+        (Path(folder) / name).relative_to(path).as_posix(): (Path(folder) / name).lstat().st_size
+        for folder, _, names in os.walk(path)
+        if not is_partial(Path(folder))
+        for name in names
+        if not is_partial(Path(name))
+    }
+    lines = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
+    digest = hashlib.sha256(os.fsencode(lines)).hexdigest()
+    return {"files": len(sizes), "bytes": sum(sizes.values()), "sha256_names_sizes": digest}
+
+
+def _printable(text: str) -> str:
+    """Return a text that HDF5 and TOML can hold, also of names that are not UTF-8."""
+    return os.fsencode(text).decode("utf-8", "backslashreplace")
 
 
 _into_folders = contextvars.ContextVar("into_folders", default=False)
@@ -29,7 +277,7 @@ _into_folders = contextvars.ContextVar("into_folders", default=False)
 
 @contextlib.contextmanager
 def into_folders(allowed: bool) -> Iterator[None]:
-    """Within the block, whether `complete` writes into folders that are not empty.
+    """Set whether `complete` writes into folders that are not empty, within the block.
 
     Files of the same names are replaced then, and numbered ones of the same kind removed, as those
     of a longer series of images. All others stay.
@@ -45,10 +293,16 @@ def into_folders(allowed: bool) -> Iterator[None]:
 def complete(path: Path, directory: bool = False) -> Iterator[Path]:
     """Yield a temporary sibling of `path`, renamed onto `path` if the block succeeds.
 
-    The sibling is an empty file, or an empty directory where `directory` is True. If the block
-    raises, the sibling is removed and `path` is left as it was. An existing file is replaced; an
-    existing directory must be empty, but see `into_folders`. Siblings that a killed process left
-    are removed.
+    If the block raises, the sibling is removed and `path` is left as it was. An existing file is
+    replaced; an existing directory must be empty, but see `into_folders`. Siblings that a killed
+    process left are removed.
+
+    Args:
+        path: File or folder to write.
+        directory: Whether the sibling is an empty directory, not an empty file.
+
+    Yields:
+        The sibling.
 
     Raises:
         InputError: `path` is of the other kind, a directory that is not empty, or cannot be
@@ -117,33 +371,40 @@ def _move_files(new: Path, folder: Path) -> None:
 def complete_hdf5(
     path: Path, method: str | None = None, params: Parameters | None = None
 ) -> Iterator[tuple["h5py.File", Callable[[], None]]]:
-    """An HDF5 file to write, with what `complete` promises, and `check()` for long writers.
+    """Open an HDF5 file to write, which appears complete or not at all, as by `complete`.
 
-    It says of itself what `jaxevent.io.description` lists.
-    Where the disk is full nothing is said before `check()` or the end of the block: HDF5 cannot
-    recover from a failed write, and crashes at exit.
+    A full disk is reported by `check()` or at the end of the block only: HDF5 cannot recover from a
+    failed write, and crashes at exit.
+
+    Args:
+        path: File to write.
+        method: Name of the estimator, for the file's description.
+        params: Its parameters.
+
+    Yields:
+        The open file, and `check()` for long writers.
     """
     import h5py
 
     with complete(path) as partial, partial.open("r+b", buffering=0) as raw:
-        sink = _Sink(raw)
-        with _signals_outside(sink.readinto, sink.write, sink.truncate) as let_signals_in:
+        out = _NeverFailingFile(raw)
+        with _signals_outside(out.readinto, out.write, out.truncate) as let_signals_in:
 
             def check() -> None:
                 let_signals_in()
-                sink.check()
+                out.check()
 
-            with h5py.File(sink, "w") as file:
-                describe(file, method, params)
+            with h5py.File(out, "w") as file:
+                _describe(file, method, params)
                 yield file, check
             check()
 
 
 @contextlib.contextmanager
 def _signals_outside(*callbacks: Callable) -> Iterator[Callable[[], None]]:
-    """Have signals that come while one of these functions runs wait; gives what lets them in.
+    """Delay signals that come while one of the callbacks runs; yield a function that lets them in.
 
-    What a handler raises there would unwind through libhdf5, which crashes. While libhdf5
+    An exception of a handler there would unwind through libhdf5, which crashes. While libhdf5
     compresses, signals are first seen in a callback.
     """
     codes = {inspect.unwrap(getattr(one, "__func__", one)).__code__ for one in callbacks}
@@ -178,7 +439,7 @@ def _signals_outside(*callbacks: Callable) -> Iterator[Callable[[], None]]:
             signal.signal(number, handler)
 
 
-class _Sink:
+class _NeverFailingFile:
     """A file for HDF5 whose writes always seem to succeed."""
 
     def __init__(self, raw: io.FileIO):
@@ -229,16 +490,51 @@ def _refuse(path: Path, directory: bool) -> None:
         raise InputError(f"{path}: exists and is not what is to be written; choose another name")
 
 
+def deflate_shuffled(numbers: NDArray[np.floating]) -> bytes:
+    """Compress numbers as HDF5's filters "shuffle" and "gzip" do, but five times as fast.
+
+    zlib spends most of its time on the bytes of mantissas, which do not get smaller. Here a sample
+    of each byte plane decides whether it is compressed or stored, and only repeated bytes are
+    searched. The result is one zlib stream (experiments/storage.py compares).
+
+    Args:
+        numbers: Floats of a chunk.
+
+    Returns:
+        A chunk of a dataset of their type, with `compression="gzip", shuffle=True`.
+    """
+    size = numbers.dtype.itemsize
+    words = np.ascontiguousarray(numbers).reshape(-1).view(f"u{size}")
+    parts, check = [b"\x78\x01"], 1
+    for k in range(size):
+        plane = (words >> (8 * k)).astype(np.uint8).data
+        compressor = _choose_compressor(plane)
+        flush = zlib.Z_FINISH if k + 1 == size else zlib.Z_FULL_FLUSH
+        parts += [compressor.compress(plane), compressor.flush(flush)]
+        check = zlib.adler32(plane, check)
+    return b"".join([*parts, check.to_bytes(4, "big")])
+
+
+def _choose_compressor(plane: memoryview) -> Any:
+    middle = max(len(plane) // 2 - _SAMPLE // 2, 0)
+    sample = plane[middle : middle + _SAMPLE]
+    trial = _compressor(1)
+    size = len(trial.compress(sample)) + len(trial.flush())
+    return _compressor(int(size < _MAX_SHRUNK * len(sample)))
+
+
+def _compressor(level: int) -> Any:
+    """Make a compressor of raw deflate; level 0 stores."""
+    return zlib.compressobj(level, zlib.DEFLATED, _RAW_DEFLATE, 9, zlib.Z_RLE)
+
+
 def finite(value: float | int) -> float | int | None:
-    """The value, None where JSON has no number."""
+    """Return a number, or None if it is not finite, as JSON has no such number."""
     return value if math.isfinite(value) else None
 
 
 def values_of(params: Parameters) -> dict[str, Any]:
-    """The values as they were given: numbers to 6 digits, lists of them, text, true and false.
-
-    None where JSON has no number.
-    """
+    """Return parameters as JSON holds them: numbers of 6 digits, lists, text, true and false."""
 
     def plain(value: Any) -> Any:
         if value is None or isinstance(value, str | bool | np.bool_):

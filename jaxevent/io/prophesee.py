@@ -22,34 +22,34 @@ at 56 million events/s, checks included. For EVT3 the package evt3 (MIT) is take
 events/s, 17 million with the checks, where expelliarmus doubles the time, evutils drops vectors,
 and both are GPL. It passes over undefined words silently, forgets rows and bases that come before
 the first TIME_HIGH, so that the events after it fall into row or column 0, and misses an overflow
-where the file holds no time near it; so every word is classified here first, what was forgotten or
-missed is told, and the number of events compared. It then equals a decoder that follows the state
-machine word by word on any words. EVT3 and DAT of the same recording (evt3.raw, gen4.dat) agree in
-all 1,218,618 events but for a constant time, EVT2 with an unpacked copy (spinning_dot.npz) in all
-539,481.
+where the file holds no time near it; so every word is classified here first, forgotten and missed
+words are given to it, and the number of events compared. It then equals a decoder that follows the
+state machine word by word on any words. EVT3 and DAT of the same recording (evt3.raw, gen4.dat)
+agree in all 1,218,618 events but for a constant time, EVT2 with an unpacked copy (spinning_dot.npz)
+in all 539,481.
 """
 
 import functools
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import companions, reading
-from jaxevent.io.decoded import BLOCK, Columns, Decoder, Tally, TriggerList, decoded
-from jaxevent.io.options import ReadOptions
+from jaxevent.io import companions, decoded
+from jaxevent.io.checks import ReadOptions, check_whole_records, damaged, reading, sensor_size
+from jaxevent.io.decoded import Columns, Decoder, FirstPass, read_events
 from jaxevent.recording import Recording
 
-_LONGEST_HEADER = 1 << 16
-_DAT_TRIGGERS = 14  # the type of a DAT file's records
+_MAX_HEADER = 1 << 16  # bytes
+_TRIGGER_RECORDS = 14  # the type of a DAT file's records
 _EVT2_TYPES = (0, 1, 8, 10, 14, 15)
 _EVT3_TYPES = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
-_MOST_RESERVED = 16  # different values of words of other types in a block
-_SIZES = (  # of sensors whose files may not tell their size, by the name of Metavision's plugin
+_MAX_RESERVED = 16  # different values of words of other types in a block
+_SIZES = (  # of sensors whose files may not state their size, by the name of Metavision's plugin
     ("gen31", (640, 480)),
     ("gen3", (640, 480)),
     ("gen41", (1280, 720)),
@@ -60,55 +60,65 @@ _SIZES = (  # of sensors whose files may not tell their size, by the name of Met
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read a RAW or DAT file. Raises `InputError` for bad input."""
-    with reading(str(path)):
-        header, start = _header(path)
+    """Read a RAW or DAT file.
+
+    Args:
+        path: The file.
+        options: Choices of the caller.
+
+    Returns:
+        The recording; unless `options.in_memory`, events stay in the file.
+
+    Raises:
+        InputError: The file is damaged or of another format.
+    """
+    with reading(path):
+        header, start = _read_header(path)
         stated = header.get("format", "").partition(";")[0].upper()
         version = stated or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(
             header.get("evt", ""), ""
         )
-        length = path.stat().st_size
-        found = Tally()
-        triggers = TriggerList()
-        if version == "EVT2":
-            decode = functools.partial(_evt2, path, start, found, triggers)
-            width = 4
-        elif version == "EVT21":
-            halves_swapped = _halves_swapped(path, start, header.get("format", ""))
-            decode = functools.partial(_evt21, path, start, halves_swapped, found, triggers)
-            width = 8
+        first_pass = FirstPass()
+        decode: Decoder
+        if version in ("EVT2", "EVT21"):
+            width = 4 if version == "EVT2" else 8
+            is_swapped = width == 8 and _has_swapped_halves(path, start, header.get("format", ""))
+            words = functools.partial(_evt2_words, path, start, width, is_swapped)
+            decode = functools.partial(_decode_evt2, path, words, first_pass)
         elif version == "EVT3":
-            words_from = functools.partial(_words_from, path, start)
-            decode = functools.partial(evt3_events, str(path), words_from, found, triggers)
             width = 2
+            words_from = functools.partial(_evt3_words, path, start)
+            decode = functools.partial(decode_evt3, str(path), words_from, first_pass)
         elif not version and "version" in header:
-            decode, start = _dat(path, start, header, triggers)
             width = 8
+            decode, start = _open_dat(path, start, header, first_pass)
         else:
             raise InputError(
                 f"{path}: has a header like a Prophesee recording's, but its format "
                 f"{(version or header.get('evt', '?'))[:20]!r} is not EVT2, EVT2.1, EVT3 or DAT; "
                 "convert it with Metavision's tools"
             )
-        _whole_words(path, length - start, width)
-        size = options.size or _size(header)
-    if size is None:
-        raise InputError(
-            f"{path}: the header does not tell the sensor's size; give size=(width, height) or "
-            "--size"
-        )
-    events = decoded(decode, size, str(path), options)
-    return Recording(path.stem, *size, events, extra=found.arrays(), triggers=triggers.all())
+        check_whole_records(path, path.stat().st_size - start, width, "a word")
+    otherwise = f"{path}: the header does not state the sensor's size"
+    size = sensor_size(otherwise, options.size, _stated_size(header))
+    events = read_events(decode, size, str(path), options)
+    return Recording(
+        path.stem,
+        *size,
+        events,
+        extra=first_pass.counts(),
+        triggers=first_pass.triggers(),
+    )
 
 
-def _header(path: Path) -> tuple[dict[str, str], int]:
-    """The keys of the header in lower case, and where the data begin.
+def _read_header(path: Path) -> tuple[dict[str, str], int]:
+    """Read the keys of the header, in lower case, and the offset of the data.
 
     Old files have no "% end", and their data may begin with the byte of "%", but hardly go on like
     a line of text.
     """
     with path.open("rb") as file:
-        head = file.read(_LONGEST_HEADER)
+        head = file.read(_MAX_HEADER)
     header: dict[str, str] = {}
     at = 0
     while head.startswith(b"%", at):
@@ -124,7 +134,7 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     return header, at
 
 
-def _size(header: dict[str, str]) -> tuple[int, int] | None:
+def _stated_size(header: dict[str, str]) -> tuple[int, int] | None:
     width = height = ""
     if match := re.fullmatch(r"(\d{1,5})x(\d{1,5})", header.get("geometry", "")):
         width, height = match.groups()
@@ -140,17 +150,8 @@ def _size(header: dict[str, str]) -> tuple[int, int] | None:
     return next((size for name, size in _SIZES if plugin.startswith(name)), None)
 
 
-def _whole_words(path: Path, length: int, width: int) -> None:
-    if length % width:
-        raise InputError(
-            f"{path}: ends inside a word, {length % width} bytes after the last whole one of "
-            f"{width} bytes; the recording was cut off, so fetch it again or drop these bytes: "
-            f"truncate -s -{length % width} FILE"
-        )
-
-
 def _words(path: Path, offset: int, dtype: str, count: int) -> Iterator[tuple[int, Any]]:
-    """Blocks of a file's words, each with its offset in bytes."""
+    """Yield blocks of a file's words, each with its offset in bytes."""
     with path.open("rb") as file:
         file.seek(offset)
         while len(words := np.fromfile(file, dtype, count)):
@@ -158,9 +159,9 @@ def _words(path: Path, offset: int, dtype: str, count: int) -> Iterator[tuple[in
             offset += words.nbytes
 
 
-def _words_from(path: Path, start: int, offset: int | None) -> Iterator[tuple[int, int, NDArray]]:
-    """Blocks of a RAW file's EVT3 words from an offset on, as `evt3_events` takes them."""
-    for at, words in _words(path, start if offset is None else offset, "<u2", BLOCK):
+def _evt3_words(path: Path, start: int, offset: int | None) -> Iterator[tuple[int, int, NDArray]]:
+    """Yield blocks of a RAW file's EVT3 words from an offset on, as `decode_evt3` takes them."""
+    for at, words in _words(path, start if offset is None else offset, "<u2", decoded.BLOCK):
         yield at, at, words
 
 
@@ -170,33 +171,50 @@ def _count_reserved(
     kind: NDArray[np.uint8],
     defined: tuple[int, ...],
     offset: int,
-    found: Tally,
+    first_pass: FirstPass,
 ) -> None:
     """Count words of types that a format reserves, which decoders skip.
 
-    Padding and what newer firmware adds repeat a few values, damaged bytes take any: raises
-    `InputError` for more than `_MOST_RESERVED` of them. `offset` is that of the words in bytes.
+    Padding and additions of newer firmware repeat a few values, damaged bytes take any.
+
+    Args:
+        source: Name of the file for messages.
+        words: (n,) words of a block.
+        kind: (n,) their types.
+        defined: Types that the format defines.
+        offset: Offset of the block in bytes.
+        first_pass: Counts of the file.
+
+    Raises:
+        InputError: Reserved words have more than `_MAX_RESERVED` values.
     """
     known = np.zeros(16, bool)
     known[list(defined)] = True
     reserved = ~known[kind]
     if not reserved.any():
         return
-    if len(np.unique(words[reserved])) > _MOST_RESERVED:
+    if len(np.unique(words[reserved])) > _MAX_RESERVED:
         row = int(np.argmax(reserved))
-        raise InputError(
+        raise damaged(
             f"{source}: the word at byte {offset + row * words.itemsize} has the type "
             f"{int(kind[row]):#x}, which the format reserves, and so have many others of different "
-            "values; the file is damaged, so fetch it again"
+            "values"
         )
-    found.add("reserved_words", int(np.count_nonzero(reserved)), offset)
+    first_pass.count("reserved_words", int(np.count_nonzero(reserved)), offset)
 
 
 def _continued(values: NDArray[np.int64], before: int | None, bits: int) -> NDArray[np.int64]:
-    """Counter values continued over overflows: a fall by more than half the range is one.
+    """Continue the values of a counter over overflows: falls by more than half its range.
 
-    `before` is the continued value before them, None at the start. A counter that steps back over
-    its start goes on below 0.
+    A counter that steps back over its start goes on below 0.
+
+    Args:
+        values: (n,) values as stored.
+        before: Continued value before them; None at the start.
+        bits: Number of bits of the counter.
+
+    Returns:
+        (n,) continued values.
     """
     if before is None:
         before = int(values[0]) if len(values) else 0
@@ -209,43 +227,80 @@ def _continued(values: NDArray[np.int64], before: int | None, bits: int) -> NDAr
 def _timed(
     is_high: NDArray[np.bool_], high: NDArray[np.int64], chosen: NDArray, before: int | None
 ) -> tuple[NDArray[np.int64], int]:
-    """The continued TIME_HIGH that holds at each chosen word, and how many come before any."""
+    """Return the continued TIME_HIGH at each chosen word, and the number of words before any."""
     number = np.cumsum(is_high)[chosen]
     untimed = int(np.count_nonzero(number == 0)) if before is None else 0
     values = np.concatenate([[0 if before is None else before], high])
     return values[number], untimed
 
 
-def _evt2(
-    path: Path, start: int, found: Tally, triggers: TriggerList, state: Any
+class _Evt2Words(NamedTuple):
+    """A block of EVT2 or EVT2.1 words.
+
+    Attributes:
+        offset: Offset of the block in bytes.
+        words: (n,) words as they are counted.
+        heads: (n,) high half of each word, which is all of an EVT2 word.
+        masks: (n,) pixels of a row that have an event; None of EVT2.
+    """
+
+    offset: int
+    words: NDArray
+    heads: NDArray[np.uint32]
+    masks: NDArray[np.uint32] | None
+
+
+def _evt2_words(
+    path: Path, start: int, width: int, is_swapped: bool, offset: int | None
+) -> Iterator[_Evt2Words]:
+    # A word with a mask may hold 32 events.
+    count = decoded.BLOCK if width == 4 else max(1, decoded.BLOCK // 4)
+    for at, words in _words(path, start if offset is None else offset, f"<u{width}", count):
+        if width == 4:
+            yield _Evt2Words(at, words, words, None)
+            continue
+        words = words << 32 | words >> 32 if is_swapped else words
+        high, low = (words >> 32).astype("<u4"), (words & 0xFFFFFFFF).astype("<u4")
+        yield _Evt2Words(at, words, high, low)
+
+
+def _decode_evt2(
+    path: Path,
+    words_from: Callable[[int | None], Iterator[_Evt2Words]],
+    first_pass: FirstPass,
+    state: Any,
 ) -> Iterator[tuple[Any, Columns]]:
-    begin, before = state or (start, None)
-    for offset, words in _words(path, begin, "<u4", BLOCK):
+    begin, before = state or (None, None)
+    for offset, words, heads, masks in words_from(begin):
         state = (offset, before)
-        kind = (words >> 28).astype(np.uint8)
-        _count_reserved(path, words, kind, _EVT2_TYPES, offset, found)
+        kind = (heads >> 28).astype(np.uint8)
+        _count_reserved(path, words, kind, _EVT2_TYPES, offset, first_pass)
         is_high = kind == 8
-        high = _continued((words[is_high] & 0xFFFFFFF).astype(np.int64), before, 28)
-        chosen = np.flatnonzero(kind <= 1)
-        t, untimed = _timed(is_high, high, chosen, before)
-        if untimed:
-            found.add("events_without_time", untimed, offset)
-            chosen, t = chosen[untimed:], t[untimed:]
+        high = _continued((heads[is_high] & 0xFFFFFFF).astype(np.int64), before, 28)
         at = np.flatnonzero(kind == 10)
         when, early = _timed(is_high, high, at, before)
-        found.add("triggers_without_time", early, offset)
-        signals = words[at[early:]]
+        first_pass.count("triggers_without_time", early, offset)
+        signals = heads[at[early:]]
         when = when[early:] << 6 | (signals >> 22 & 0x3F).astype(np.int64)
-        triggers.add(offset, when, signals & 1, signals >> 8 & 0x1F)
+        first_pass.add_triggers(offset, when, signals & 1, signals >> 8 & 0x1F)
+        chosen = np.flatnonzero(kind <= 1)
+        t, untimed = _timed(is_high, high, chosen, before)
         before = int(high[-1]) if len(high) else before
-        words = words[chosen]
-        t = (t << 6) | (words >> 22 & 0x3F)
-        x, y = words >> 11 & 0x7FF, words & 0x7FF
-        yield state, (t, x, y, kind[chosen] == 1)
+        lost = untimed if masks is None else np.bitwise_count(masks[chosen[:untimed]]).sum()
+        first_pass.count("events_without_time", int(lost), offset)
+        chosen, t = chosen[untimed:], t[untimed:]
+        is_on, heads = kind[chosen] == 1, heads[chosen]
+        t = t << 6 | (heads >> 22 & 0x3F)
+        x, y = heads >> 11 & 0x7FF, heads & 0x7FF
+        if masks is not None:
+            pixels = masks[chosen].view(np.uint8).reshape(-1, 4)
+            word, bit = np.nonzero(np.unpackbits(pixels, axis=1, bitorder="little"))
+            t, x, y, is_on = t[word], x[word] + bit, y[word], is_on[word]
+        yield state, (t, x, y, is_on)
 
 
-def _halves_swapped(path: Path, start: int, stated: str) -> bool:
-    """Whether an EVT2.1 file has the high half of each word first, as the IMX636 sends it."""
+def _has_swapped_halves(path: Path, start: int, stated: str) -> bool:
+    """Return whether each EVT2.1 word has its high half first, as the IMX636 sends it."""
     if "endianness=little" in stated:
         return False
     if "endianness=legacy" in stated:
@@ -257,55 +312,19 @@ def _halves_swapped(path: Path, start: int, stated: str) -> bool:
         fits.append(8 in kinds and kinds <= set(_EVT2_TYPES))
     if fits[0] == fits[1]:
         raise InputError(
-            f"{path}: the order of the halves of its EVT2.1 words cannot be told; add "
+            f"{path}: the order of the halves of its EVT2.1 words is not known; add "
             "';endianness=little' or ';endianness=legacy' to the line '% format EVT21'"
         )
     return fits[1]
 
 
-def _evt21(
-    path: Path, start: int, halves_swapped: bool, found: Tally, triggers: TriggerList, state: Any
-) -> Iterator[tuple[Any, Columns]]:
-    begin, before = state or (start, None)
-    # A word may hold 32 events.
-    for offset, words in _words(path, begin, "<u8", max(1, BLOCK // 4)):
-        state = (offset, before)
-        if halves_swapped:
-            words = words << 32 | words >> 32
-        kind = (words >> 60).astype(np.uint8)
-        _count_reserved(path, words, kind, _EVT2_TYPES, offset, found)
-        is_high = kind == 8
-        high = _continued((words[is_high] >> 32 & 0xFFFFFFF).astype(np.int64), before, 28)
-        chosen = np.flatnonzero(kind <= 1)
-        t, untimed = _timed(is_high, high, chosen, before)
-        mask = (words[chosen] & 0xFFFFFFFF).astype("<u4")
-        if untimed:
-            count = int(np.bitwise_count(mask[:untimed]).sum())
-            found.add("events_without_time", count, offset)
-            chosen, mask, t = chosen[untimed:], mask[untimed:], t[untimed:]
-        at = np.flatnonzero(kind == 10)
-        when, early = _timed(is_high, high, at, before)
-        found.add("triggers_without_time", early, offset)
-        signals = words[at[early:]]
-        when = when[early:] << 6 | (signals >> 54 & 0x3F).astype(np.int64)
-        triggers.add(offset, when, signals >> 32 & 1, signals >> 40 & 0x1F)
-        before = int(high[-1]) if len(high) else before
-        bits = np.unpackbits(mask.view(np.uint8).reshape(-1, 4), axis=1, bitorder="little")
-        word, bit = np.nonzero(bits)
-        words = words[chosen]
-        t = (t << 6) | (words >> 54 & 0x3F).astype(np.int64)
-        x = (words >> 43 & 0x7FF).astype(np.int64)[word] + bit
-        y = (words >> 32 & 0x7FF).astype(np.int64)[word]
-        yield state, (t[word], x, y, (kind[chosen] == 1)[word])
-
-
-def _dat(
-    path: Path, start: int, header: dict[str, str], triggers: TriggerList
+def _open_dat(
+    path: Path, start: int, header: dict[str, str], first_pass: FirstPass
 ) -> tuple[Decoder, int]:
     with path.open("rb") as file:
         file.seek(start)
         described = file.read(2)
-    if described == bytes([_DAT_TRIGGERS, 8]):
+    if described == bytes([_TRIGGER_RECORDS, 8]):
         raise InputError(
             f"{path}: holds external triggers only; read the file of events, whose triggers these "
             "are where it is NAME_cd.dat or NAME_td.dat beside NAME_trigger.dat"
@@ -319,16 +338,16 @@ def _dat(
     fields = (14, 14) if header["version"] != "1" else (9, 8)
     beside = companions.triggers(path)
     if beside is not None:
-        _dat_triggers(beside, triggers)
-    return functools.partial(_dat_events, path, start + 2, fields), start + 2
+        _read_dat_triggers(beside, first_pass)
+    return functools.partial(_decode_dat, path, start + 2, fields), start + 2
 
 
-def _dat_events(
+def _decode_dat(
     path: Path, start: int, fields: tuple[int, int], state: Any
 ) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (start, None)
     for_x, for_y = fields
-    for offset, words in _words(path, begin, "<u4", 2 * BLOCK):
+    for offset, words in _words(path, begin, "<u4", 2 * decoded.BLOCK):
         state = (offset, before)
         t, word = words[0::2].astype(np.int64), words[1::2]
         t = _continued(t, before, 32)
@@ -340,32 +359,44 @@ def _dat_events(
         yield state, (t, x, y, p.astype(np.uint8))
 
 
-def _dat_triggers(path: Path, triggers: TriggerList) -> None:
-    """Keep the triggers of a DAT file of them. Raises `InputError` where it is none."""
-    with reading(str(path)):
-        _, start = _header(path)
+def _read_dat_triggers(path: Path, first_pass: FirstPass) -> None:
+    """Keep the triggers of a DAT file of triggers, or raise `InputError` if it is none."""
+    with reading(path):
+        _, start = _read_header(path)
         with path.open("rb") as file:
             file.seek(start)
             described = file.read(2)
-    if described != bytes([_DAT_TRIGGERS, 8]):
+    if described != bytes([_TRIGGER_RECORDS, 8]):
         raise InputError(f"{path}: holds no external triggers (type 0e, 8 bytes); move it away")
-    _whole_words(path, path.stat().st_size - start - 2, 8)
+    check_whole_records(path, path.stat().st_size - start - 2, 8, "a word")
     before = None
-    for offset, words in _words(path, start + 2, "<u4", 2 * BLOCK):
+    for offset, words in _words(path, start + 2, "<u4", 2 * decoded.BLOCK):
         t, signal = _continued(words[0::2].astype(np.int64), before, 32), words[1::2]
         before = int(t[-1])
-        triggers.add(offset, t, signal & 0xF, signal >> 26)
+        first_pass.add_triggers(offset, t, signal & 0xF, signal >> 26)
 
 
-def _add_triggers(
-    triggers: TriggerList,
+def _add_evt3_triggers(
+    first_pass: FirstPass,
     offset: int,
     words: NDArray,
     kind: NDArray,
-    told: dict[int, int],
+    last: dict[int, int],
     high: int | None,
 ) -> int | None:
-    """Keep a block's triggers; `high` is the continued high time before it, returned after it."""
+    """Keep the triggers of a block of EVT3 words.
+
+    Args:
+        first_pass: Triggers of the file.
+        offset: Offset of the block in bytes.
+        words: (n,) words.
+        kind: (n,) their types.
+        last: Latest word of each type before the block.
+        high: Continued high time before the block.
+
+    Returns:
+        The continued high time after the block.
+    """
     is_high = kind == 8
     values = (words[is_high] & 0xFFF).astype(np.int64)
     if len(values):
@@ -377,48 +408,56 @@ def _add_triggers(
     # The low time that holds at each: of the last word of time before it, 0 after a high one.
     clock = np.flatnonzero((kind == 6) | is_high)
     low = np.where(kind[clock] == 6, words[clock] & 0xFFF, 0).astype(np.int64)
-    low = np.concatenate([[told.get(6, 0) & 0xFFF], low])[np.searchsorted(clock, at)]
+    low = np.concatenate([[last.get(6, 0) & 0xFFF], low])[np.searchsorted(clock, at)]
     when = (when << 12 | low)[early:]
     signals = words[at[early:]]
-    triggers.add(offset, when, signals & 1, signals >> 8 & 0xF)
+    first_pass.add_triggers(offset, when, signals & 1, signals >> 8 & 0xF)
     return int(values[-1]) if len(values) else high
 
 
 def _moved_base(base: int, kind: NDArray) -> int:
-    """The word of a base of vectors after a block, with the x to which its vectors moved it."""
+    """Return the word of a base of vectors after a block, whose vectors have moved its x."""
     since = np.flatnonzero(kind == 3)[-1] if (kind == 3).any() else 0
     steps = int(12 * np.sum(kind[since:] == 4) + 8 * np.sum(kind[since:] == 5))
     # Only a damaged vector, refused as outside the sensor, or the end of a row exceeds 0x7FF.
     return base & ~0x7FF | min((base & 0x7FF) + steps, 0x7FF)
 
 
-def evt3_events(
+def decode_evt3(
     source: str,
     words_from: Callable[[Any], Iterator[tuple[int, Any, NDArray]]],
-    found: Tally,
-    triggers: TriggerList,
+    first_pass: FirstPass,
     state: Any,
 ) -> Iterator[tuple[Any, Columns]]:
-    """Decode EVT3, wherever its words are stored: a `Decoder` but for its first arguments.
+    """Decode EVT3 of any container: a `Decoder` but for its first arguments.
 
-    `words_from(place)` iterates over the words (n,) uint16 from a place on, None is the start: the
-    offset in bytes of a block of them, its place, the block. Events without a time are counted in
-    `found`, triggers kept in `triggers`.
+    Args:
+        source: Name of the file for messages.
+        words_from: Function from a place, None at the start, to an iterator over blocks of words:
+            offset in bytes, place, and words (n,) uint16 of each block.
+        first_pass: Triggers, and counts of events and triggers without a time.
+        state: State before the first block; None at the start.
+
+    Yields:
+        The state before each block, and its columns.
+
+    Raises:
+        InputError: The words are damaged.
     """
     evt3: Any = require("evt3", "prophesee")
 
-    # What an event needs to have been told before: the row 0, the base of a vector 3, the high time
-    # 8. `last` holds the latest word of each, of the base the x to which vectors moved it, and the
-    # low time 6 unless a high one, which sets it to 0, came after it.
+    # An event needs earlier words: the row 0, the base of a vector 3, the high time 8. `last` holds
+    # the latest word of each, of the base the x to which vectors moved it, and the low time 6
+    # unless a high one, which sets it to 0, came after it.
     begin, last, first_t = state or (None, {}, None)
     last = dict(last)
     decoder = evt3.Decoder(2048, 2048)
     decoder.feed(np.array([last[key] for key in (8, 6, 0, 3) if key in last], "<u2").tobytes())
     shift, clock_high = 0, None
     for offset, place, words in words_from(begin):
-        told = dict(last)
+        known = dict(last)
         kind = (words >> 12).astype(np.uint8)
-        _count_reserved(source, words, kind, _EVT3_TYPES, offset, found)
+        _count_reserved(source, words, kind, _EVT3_TYPES, offset, first_pass)
         data = words & 0xFFF
         data[kind == 5] &= 0xFF
         numbers = np.where(kind == 2, 1, 0).astype(np.uint8)
@@ -440,33 +479,32 @@ def evt3_events(
         if 3 in last:
             last[3] = _moved_base(last[3], kind)
         if unplaced.any():
-            found.add("events_without_time", int(numbers[unplaced].sum()), offset)
+            first_pass.count("events_without_time", int(numbers[unplaced].sum()), offset)
             numbers[unplaced] = 0
             words = np.where(unplaced, np.uint16(0xE000), words)
         if state is None:
-            clock_high = _add_triggers(triggers, offset, words, kind, told, clock_high)
+            clock_high = _add_evt3_triggers(first_pass, offset, words, kind, known, clock_high)
         highs = np.flatnonzero(kind == 8)
         if len(highs):
             times = words[highs].astype(np.int64) & 0xFFF
-            before = told[8] & 0xFFF if 8 in told else times[0]
+            before = known[8] & 0xFFF if 8 in known else times[0]
             wraps = highs[np.diff(times, prepend=before) < -0x800]
             # The decoder takes a fall as an overflow only from nearly the highest to nearly the
             # lowest value; a file with few events may not hold these.
             words = np.insert(words, np.repeat(wraps, 2), np.tile([0x8FFF, 0x8000], len(wraps)))
-        if 8 not in told and 8 in last:
+        if 8 not in known and 8 in last:
             # What came before the first TIME_HIGH counts too, but the decoder forgets it.
-            kept = [0x8000 | times[0], *(told[key] for key in (0, 3) if key in told)]
+            kept = [0x8000 | times[0], *(known[key] for key in (0, 3) if key in known)]
             words = np.concatenate([np.array(kept, "<u2"), words])
         events = decoder.feed(words.tobytes())
         if len(events.t) != int(numbers.sum(dtype=np.int64)):
-            raise InputError(
+            raise damaged(
                 f"{source}: {int(numbers.sum(dtype=np.int64)):,} events stand in the words from "
-                f"byte {offset} on but {len(events.t):,} were decoded; the file is damaged, so "
-                "fetch it again"
+                f"byte {offset} on but {len(events.t):,} were decoded"
             )
         t = events.t.astype(np.int64)
         if len(t) and first_t is not None:
             # The decoder has not seen the overflows before this block.
             shift, first_t = first_t - int(t[0]), None
         t += shift
-        yield (place, told, int(t[0]) if len(t) else None), (t, events.x, events.y, events.p)
+        yield (place, known, int(t[0]) if len(t) else None), (t, events.x, events.y, events.p)

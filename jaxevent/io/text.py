@@ -18,6 +18,7 @@ keeps their colours.
 import re
 import zipfile
 from codecs import BOM_UTF8
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,23 +27,48 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.utils import CallbackIOWrapper
 
-from jaxevent.arrays import to_microseconds
 from jaxevent.errors import InputError
-from jaxevent.io import check_unfolded, find_event_texts, pinhole, reading, sensor_size
-from jaxevent.io.columns import find, first_and_last, is_time, signed, stated_unit, unsigned_off
-from jaxevent.io.decoded import from_columns
-from jaxevent.io.images import kept_colours, read_grey_and_colour
-from jaxevent.io.options import ReadOptions
-from jaxevent.io.time_units import clock_of, infer_unit, unit_of_name
+from jaxevent.io.checks import (
+    ReadOptions,
+    check_unfolded,
+    image_size,
+    make_camera,
+    reading,
+    sensor_size,
+)
+from jaxevent.io.columns import find_fields, is_time, read_whole_columns
+from jaxevent.io.images import drop_alpha, gather_frames, read_image
+from jaxevent.io.time_units import unit_of_name
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 
+def find_event_texts(names: Sequence[str]) -> list[str]:
+    """Return the texts of events among the names in a zip.
+
+    They are all events.txt, or else a text of any name that is the only file, as of rpg_e2vid.
+    """
+    found = [name for name in names if name.rpartition("/")[2] == "events.txt"]
+    files = [name for name in names if not name.endswith("/") and not name.startswith("__MACOSX/")]
+    return found or (files if len(files) == 1 and files[0].endswith(".txt") else [])
+
+
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read a folder or zip. Raises `InputError` for bad input."""
+    """Read a folder or zip.
+
+    Args:
+        path: The folder or zip.
+        options: Choices of the caller.
+
+    Returns:
+        The recording, in memory.
+
+    Raises:
+        InputError: A file is missing or damaged, or what it holds is not valid.
+    """
     if path.is_dir():
         return _read(path, path, options)
-    with reading(str(path)), zipfile.ZipFile(path) as archive:
+    with reading(path), zipfile.ZipFile(path) as archive:
         inside = [name for name in find_event_texts(archive.namelist()) if name.count("/") <= 1]
         if len(inside) != 1:
             raise InputError(
@@ -57,54 +83,50 @@ def _read(
     path: Path, root: Path | zipfile.Path, options: ReadOptions, name: str = "events.txt"
 ) -> Recording:
     source = f"{path}: {name}"
-    stamps, unit_of_stamps, images, colours = _images(path, root)
-    columns, header, names = _table(
+    stamps, unit_of_stamps, images, extra = _read_images(path, root)
+    columns, header, names = _read_numbers(
         root / name, source, "t x y p", header="width height", progress=options.progress
     )
     otherwise = (
-        f"{source}: neither a first line 'width height' nor an image tells the sensor's size;"
+        f"{source}: neither a first line 'width height' nor an image shows the sensor's size"
     )
-    told = header or (None if images is None else (images.shape[2], images.shape[1]))
-    size = sensor_size(options.size, told, frames=None, otherwise=otherwise)
-    fields = find(names) or {name: name for name in "txyp"}
-    t, x, y, p = (columns[names.index(fields[name])] for name in "txyp")
-    stated = stated_unit(fields["t"], t)
-    sample = first_and_last(lambda rows: {"t": t[rows], "x": x[rows], "y": y[rows]}, len(t))
-    unit = infer_unit(sample, len(t), size, source, options, stated=stated, usual="s")
-    is_known = stated is not None or options.time_unit is not None
-    if unit.name == "s" and not is_known and _are_whole(t):
+    size = sensor_size(otherwise, options.size, header, image_size(images))
+    fields = find_fields(names) or {name: name for name in "txyp"}
+    held = {key: columns[names.index(fields[key])] for key in "txyp"}
+    events, clock, notes = read_whole_columns(
+        held, size, source, options, name=fields["t"], usual="s"
+    )
+    is_known = unit_of_name(fields["t"]) is not None or options.time_unit is not None
+    if clock.unit == "s" and not is_known and _are_whole(held["t"]):
         raise InputError(
             f"{source}: all times are whole numbers, but those of this layout are seconds; write "
             "seconds with decimals, or give the unit, time_unit= or --time-unit"
         )
-    notes = list(unit.notes)
-    us = to_microseconds(t, unit.name, source, "event")
-    events = from_columns((us, x, y, signed(p, unsigned_off(p))), size, source, options)
-    clock = clock_of(unit, t, us)
+
+    def table(name: str, layout: str, what: str) -> tuple[NDArray[np.int64], NDArray] | None:
+        """Read times in us and further columns of a file beside the events."""
+        if not (root / f"{name}.txt").is_file():
+            return None
+        source = f"{path}: {name}.txt"
+        (t, *values), _, _ = _read_numbers(root / f"{name}.txt", source, layout)
+        return clock.read(t, source, what, notes, usual="s"), np.stack(values, axis=1)
 
     frames = poses = imu = camera = None
     if images is not None:
-        source = f"{path}: images.txt"
-        at = clock.read(stamps, source, "image", notes, usual="s", stated=unit_of_stamps)
+        at = clock.read(
+            stamps, f"{path}: images.txt", "image", notes, usual="s", stated=unit_of_stamps
+        )
         frames = Frames(at, images, np.zeros_like(at))
-    if (root / "groundtruth.txt").is_file():
-        source = f"{path}: groundtruth.txt"
-        (t, *pose), _, _ = _table(root / "groundtruth.txt", source, "t px py pz qx qy qz qw")
-        pose = np.stack(pose, axis=1)
-        at = clock.read(t, source, "pose", notes, usual="s")
-        poses = Poses(at, pose[:, :3], pose[:, 3:])
-    if (root / "imu.txt").is_file():
-        source = f"{path}: imu.txt"
-        (t, *sample), _, _ = _table(root / "imu.txt", source, "t ax ay az gx gy gz")
-        sample = np.stack(sample, axis=1)
-        at = clock.read(t, source, "IMU sample", notes, usual="s")
-        imu = Imu(at, gyro=sample[:, 3:], acc=sample[:, :3])
+    if (found := table("groundtruth", "t px py pz qx qy qz qw", "pose")) is not None:
+        poses = Poses(found[0], found[1][:, :3], found[1][:, 3:])
+    if (found := table("imu", "t ax ay az gx gy gz", "IMU sample")) is not None:
+        imu = Imu(found[0], gyro=found[1][:, 3:], acc=found[1][:, :3])
     if (root / "calib.txt").is_file():
         source = f"{path}: calib.txt"
-        values, _, _ = _table(root / "calib.txt", source, "fx fy cx cy k1 k2 p1 p2 k3")
-        camera = pinhole(np.concatenate(values), source)
+        values, _, _ = _read_numbers(root / "calib.txt", source, "fx fy cx cy k1 k2 p1 p2 k3")
+        camera = make_camera(np.concatenate(values), source)
     return Recording(
-        path.stem, *size, events, frames, camera, poses, imu, colours, notes=tuple(notes)
+        path.stem, *size, events, frames, camera, poses, imu, extra, notes=tuple(notes)
     )
 
 
@@ -112,14 +134,14 @@ def _are_whole(t: NDArray) -> bool:
     return len(t) > 1 and bool((t == np.rint(t)).all()) and t[0] != t[-1]
 
 
-def _table(
+def _read_numbers(
     file: Path | zipfile.Path,
     source: str,
     layout: str,
     header: str | None = None,
     progress: bool | None = None,
 ) -> tuple[list[NDArray[np.float64]], tuple[int, int] | None, list[str]]:
-    """Read a file of numbers: its columns, finite float64, their names, and its header.
+    """Read the columns of a file of numbers, finite float64, its header and the columns' names.
 
     Lines before the numbers that are blank, start with # or hold letters are passed over. One with
     the names of events names the columns, which otherwise are those of the layout.
@@ -130,7 +152,7 @@ def _table(
     with reading(source), file.open("rb") as lines:
         while line := lines.readline().removeprefix(BOM_UTF8):
             words = _words(line)
-            if header is not None and len(words) == len(names) and find(words):
+            if header is not None and len(words) == len(names) and find_fields(words):
                 names = words
             elif header is not None and len(fields := line.split()) == len(header.split()):
                 if not all(field.isdigit() and int(field) for field in fields):
@@ -182,7 +204,7 @@ def _table(
 
 
 def _words(line: bytes) -> list[str]:
-    """The words of a line that may be a comment; a unit belongs to its name: "t [s] x y p"."""
+    """Split a line that may be a comment into words; a unit belongs to its name: "t [s] x y p"."""
     text = line.decode("utf-8", "replace").lstrip("#% ")
     return re.sub(r"\s+(?=[\[(])", "", text).split()
 
@@ -192,18 +214,16 @@ def _are_names(words: list[str]) -> bool:
     return bool(words) and not any(re.match(r"[+-]?\.?\d|nan|inf", w, re.I) for w in words)
 
 
-def _images(
+def _read_images(
     path: Path, root: Path | zipfile.Path
-) -> tuple[NDArray, str | None, NDArray | None, dict[str, NDArray[np.uint8]]]:
-    """The times of the frames, as stored, the unit in their name, the frames, and the colours."""
-    none = np.empty(0), None, None, dict[str, NDArray[np.uint8]]()
+) -> tuple[NDArray, str | None, Any, dict[str, Any]]:
+    """Read the times of the frames, as stored, the unit in their name, the frames and colours."""
     if not (root / "images.txt").is_file():
-        return none
+        return np.empty(0), None, None, {}
     source = f"{path}: images.txt"
     with reading(source):
         lines = (root / "images.txt").read_text(encoding="utf-8-sig").splitlines()
-    stamps, unit, images, colours, unfolded = [], None, [], [], 0
-    seen, stored = set(), 0 if path.is_dir() else path.stat().st_size
+    stamps, names, unit = [], [], None
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -213,32 +233,30 @@ def _images(
             continue
         try:
             stamps.append(float(fields[0]))
-            name = fields[1].strip()
+            names.append(fields[1].strip())
         except (ValueError, IndexError):
             raise InputError(
                 f"{source}: line {number} is {line[:60]!r}; each line must be 't path'"
             ) from None
-        image, colour = _image(path, root, name)
-        images.append(image)
-        colours.append(colour)
-        if path.is_dir() and name not in seen:
-            seen.add(name)
-            stored += (path / name).stat().st_size
-        unfolded += image.nbytes + (0 if colour is None else colour.nbytes)
-        check_unfolded(unfolded, stored, source)
-        if images[-1].shape != images[0].shape or images[-1].dtype != images[0].dtype:
-            raise InputError(
-                f"{path}: {name} is {_kind(images[-1])} but the first image is "
-                f"{_kind(images[0])}; all images must have the sensor's size and one depth"
-            )
-    if not images:
-        return none
-    return np.array(stamps), unit, np.stack(images), kept_colours(colours)
+
+    def decode(row: int) -> Iterator[NDArray]:
+        unfolded, seen, stored = 0, set(), 0 if path.is_dir() else path.stat().st_size
+        for name in names[row:]:
+            image = _read_image(path, root, name)
+            if path.is_dir() and name not in seen:
+                seen.add(name)
+                stored += (path / name).stat().st_size
+            unfolded += image.nbytes
+            check_unfolded(unfolded, stored, source)
+            yield image
+
+    images, extra = gather_frames(
+        decode(0), decode, lambda n: f"{path}: {names[n]}", source, in_memory=True
+    )
+    return np.array(stamps), unit, images, extra
 
 
-def _image(
-    path: Path, root: Path | zipfile.Path, name: str
-) -> tuple[NDArray, NDArray[np.uint8] | None]:
+def _read_image(path: Path, root: Path | zipfile.Path, name: str) -> NDArray:
     if name.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", name):
         raise InputError(f"{path}: images.txt names {name}, outside the recording; copy it inside")
     file = root / name
@@ -248,8 +266,4 @@ def _image(
             "its line"
         )
     with reading(f"{path}: {name}"), file.open("rb") as stream:
-        return read_grey_and_colour(stream, f"{path}: {name}")
-
-
-def _kind(image: NDArray) -> str:
-    return f"{image.shape[1]}x{image.shape[0]} {image.dtype}"
+        return drop_alpha(read_image(stream, f"{path}: {name}"))

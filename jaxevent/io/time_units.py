@@ -25,17 +25,16 @@ mends both. Of numbers of the same kind as the event times, the unit of these co
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import SCALES, to_microseconds
+from jaxevent.arrays import SCALES, UNITS, check_resolution, time_step, to_microseconds
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io.options import ReadOptions
+from jaxevent.io.checks import ReadOptions
 
-NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 FEWEST_EVENTS = 300
 SAMPLE = 1 << 16  # events from which order, unit and signs are inferred
 _FEWEST_REPETITIONS = 100  # intervals between events of one pixel
@@ -43,11 +42,8 @@ _BURST = 0.01  # of the mean interval, or of the sample; of independent events i
 _DOUBT = 2.7  # nats by which an undoubted unit exceeds the next
 _SUPERIORITY = 1.0  # nats by which a unit must exceed the usual one
 _CONTRADICTION = 8.0  # nats by which another unit must exceed a stated one for a warning
-_COARSEST_US = 1000.0  # rounding of a type that is refused
-_FEWEST_STEPS = 64  # of a rounded type within the span of the events
 _LONGEST_US = 1e12  # of a recording with times that have decimals: 11.6 days
 _GAP = 1000.0  # times the sum of all other steps that a gap lasts
-_LARGEST_US = 2.0**62  # beyond which times are refused in any case
 _INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
 _LITTLE, _MUCH = 0.02, 0.5  # intersection over union of the spans of two clocks
 
@@ -79,7 +75,7 @@ class InferredUnit(NamedTuple):
 
     Attributes:
         name: "s", "ms", "us" or "ns".
-        notes: What `Recording.notes` says of it.
+        notes: Sentences for `Recording.notes` on how it was found.
     """
 
     name: str
@@ -146,7 +142,7 @@ def infer_unit(
         size: (width, height) of the sensor in pixels.
         source: Name of the file for messages.
         options: Their `time_unit`, where given, is taken.
-        stated: Unit that the file states, and the words for how ("the name 't_ns'").
+        stated: Unit that the file states, and the words for how it does ("the name 't_ns'").
         usual: Unit of the layout; None has microseconds for whole numbers, seconds for others.
 
     Returns:
@@ -157,9 +153,9 @@ def infer_unit(
             than 11.6 days.
     """
     t = sample["t"]
-    if t.ndim != 1 or t.dtype.kind not in "iuf" or not len(t):
+    if t.dtype.kind not in "iuf" or not len(t):
         return InferredUnit(options.time_unit or (stated[0] if stated else usual or "us"))
-    numbers = _Numbers.of(sample, count, size)
+    numbers = _Numbers.from_sample(sample, count, size)
     expected = usual or _convention(numbers)
     scores = {unit: numbers.score(unit, usual) for unit in SCALES}
     best = max(scores, key=lambda unit: scores[unit])
@@ -170,11 +166,11 @@ def infer_unit(
         unit = options.time_unit
     elif stated is not None:
         unit = stated[0]
-        notes.append(f"event times are {NAMES[unit]}, by {stated[1]}")
+        notes.append(f"event times are {UNITS[unit]}, by {stated[1]}")
         if known and scores[best] > scores[unit] + _CONTRADICTION:
             doubt = (
-                f"{source}: event times are {NAMES[unit]} by {stated[1]}, but "
-                f"{numbers.describe(unit)}; as {NAMES[best]} {numbers.describe(best)}: if the "
+                f"{source}: event times are {UNITS[unit]} by {stated[1]}, but "
+                f"{numbers.describe(unit)}; as {UNITS[best]} {numbers.describe(best)}: if the "
                 f"name is wrong, give time_unit={best!r} or --time-unit {best}"
             )
     elif not known:
@@ -185,23 +181,25 @@ def infer_unit(
             and not _is_impossible(numbers.median, best)
         ):
             unit = best
-            notes.append(f"event times are taken as {NAMES[unit]}, by their magnitude")
+            notes.append(f"event times are taken as {UNITS[unit]}, by their magnitude")
             doubt = _doubt(source, numbers, unit, expected)
     else:
         unit = best if scores[best] > scores[expected] + _SUPERIORITY else expected
         after = max((u for u in scores if u != unit), key=lambda u: scores[u])
         is_doubtful = scores[unit] < scores[after] + _DOUBT
         if unit != expected or is_doubtful:
-            notes.append(f"event times are taken as {NAMES[unit]}, since {numbers.describe(unit)}")
+            notes.append(f"event times are taken as {UNITS[unit]}, since {numbers.describe(unit)}")
             doubt = _doubt(source, numbers, unit, expected if unit != expected else after)
     scale = SCALES[unit]
     if options.time_unit is None and numbers.has_decimals and numbers.span * scale > _LONGEST_US:
         raise InputError(
-            f"{source}: the times are numbers with decimals, so {NAMES[unit]}, but span "
+            f"{source}: the times are numbers with decimals, so {UNITS[unit]}, but span "
             f"{numbers.span * scale / 86400e6:.0f} days; store them as integer microseconds, or "
             "give their unit, time_unit= or --time-unit"
         )
-    notes += _resolution(numbers, unit, source)
+    spread = (numbers.rounding, numbers.span, numbers.largest)
+    note = check_resolution(spread, numbers.count, unit, source)
+    notes += [] if note is None else [f"event {note}"]
     if doubt:
         _warn(doubt)
     return InferredUnit(unit, tuple(notes))
@@ -213,8 +211,8 @@ def _warn(text: str) -> None:
 
 def _doubt(source: str, numbers: "_Numbers", unit: str, other: str) -> str:
     return (
-        f"{source}: no unit of the event times is stated; {NAMES[unit]} are taken, since "
-        f"{numbers.describe(unit)}, while as {NAMES[other]} {numbers.describe(other)}; give "
+        f"{source}: no unit of the event times is stated; {UNITS[unit]} are taken, since "
+        f"{numbers.describe(unit)}, while as {UNITS[other]} {numbers.describe(other)}; give "
         f"time_unit={unit!r} or --time-unit {unit} to confirm, or the right unit"
     )
 
@@ -230,10 +228,12 @@ class _Numbers(NamedTuple):
     repetition: float | None
     digits: int | None  # decimal places, negative for multiples of ten; None for any number
     is_float: bool
-    rounding: float  # distance between neighbouring numbers of the type
+    rounding: float  # distance between neighbouring numbers, as of `time_step`
 
     @classmethod
-    def of(cls, sample: Mapping[str, NDArray], count: int, size: tuple[int, int]) -> "_Numbers":
+    def from_sample(
+        cls, sample: Mapping[str, NDArray], count: int, size: tuple[int, int]
+    ) -> "_Numbers":
         pixels = max(size[0] * size[1], 1)
         kept = np.isfinite(sample["t"])
         stored = sample["t"][kept]
@@ -265,11 +265,12 @@ class _Numbers(NamedTuple):
             repetition,
             _digits(stored),
             not whole,
-            _rounding(stored, largest),
+            time_step(stored),
         )
 
     @property
     def has_decimals(self) -> bool:
+        """True if some time is not a whole number."""
         return self.is_float and (self.digits is None or self.digits > 0)
 
     def rate(self, unit: str) -> float:
@@ -277,6 +278,7 @@ class _Numbers(NamedTuple):
         return self.count / (self.pixels * self.span * SCALES[unit] * 1e-6)
 
     def describe(self, unit: str) -> str:
+        """Describe the recording as it would be under a unit."""
         seconds = self.span * SCALES[unit] * 1e-6
         rate = f", {self.rate(unit):.2g} events per pixel and second" if seconds else ""
         return f"they last {seconds:.3g} s{rate}"
@@ -367,7 +369,7 @@ def _digits(values: NDArray) -> int | None:
         t = values.astype(np.float64)
         error = 2 * np.spacing(np.abs(values).max()).astype(np.float64)
         for n in range(10):
-            # Numbers that are whole only within an error of half a step say nothing.
+            # Numbers that are whole only within an error of half a step show nothing.
             if n and error * 10.0**n > 0.05:
                 return None
             scaled = t * 10.0**n
@@ -383,46 +385,6 @@ def _digits(values: NDArray) -> int | None:
     if not whole.any():
         return 0
     return -next((n for n in range(9, 0, -1) if not (whole % 10**n).any()), 0)
-
-
-def _rounding(values: NDArray, largest: float) -> float:
-    """Return the distance between neighbouring numbers near the largest value of a type.
-
-    Numbers of a wider type that all are numbers of 32 bits were rounded to these before.
-    """
-    if values.dtype.kind != "f":
-        return 0.0
-    spacing = float(np.spacing(values.dtype.type(largest)))
-    if values.dtype.itemsize > 4 and len(values) > 16 and largest < 3e38:
-        decimals = values[values != np.rint(values)]
-        if len(decimals) > 16 and (decimals.astype(np.float32) == decimals).all():
-            coarse = float(np.spacing(np.float32(largest)))
-            # Multiples of a large binary fraction, such as halves, are numbers of any type.
-            if (decimals * 1024 != np.rint(decimals * 1024)).any():
-                return coarse
-    return spacing
-
-
-def _resolution(numbers: _Numbers, unit: str, source: str) -> list[str]:
-    """Return a note on times rounded by their type; `InputError` where that loses them."""
-    rounding, largest = (value * SCALES[unit] for value in (numbers.rounding, numbers.largest))
-    if rounding <= 1 or numbers.count < 2 or largest >= _LARGEST_US:
-        return []
-    steps = numbers.span / numbers.rounding
-    few = numbers.count >= FEWEST_EVENTS and steps < _FEWEST_STEPS
-    if rounding >= _COARSEST_US or few:
-        raise InputError(
-            f"{source}: the type of the event times cannot resolve them: as {NAMES[unit]} its "
-            f"numbers near {_short(largest)} are {_short(rounding)} apart; store integer "
-            "microseconds or 64-bit floats, counted from the start of the recording"
-        )
-    return [f"event times are rounded by their type to {_short(rounding)}"]
-
-
-def _short(us: float) -> str:
-    if us < 1e3:
-        return f"{us:.3g} us"
-    return f"{us / 1e3:.3g} ms" if us < 1e6 else f"{us / 1e6:.10g} s"
 
 
 class Clock(NamedTuple):
@@ -456,7 +418,7 @@ class Clock(NamedTuple):
             values: (n,) times as stored.
             source: Name of the file for messages.
             what: "image", "pose" or the like.
-            notes: A note is appended where the unit is not the usual one.
+            notes: Notes of the recording, to which one on an unusual unit is added.
             usual: Unit of the layout; None has us for integers, s for floats.
             stated: Unit that the file states.
 
@@ -464,26 +426,26 @@ class Clock(NamedTuple):
             (n,) int64 us.
         """
         unit = stated or usual or ("s" if values.dtype.kind == "f" else "us")
-        as_usual = to_microseconds(values, unit, source, what)
-        if stated is not None or self.last <= self.first or len(as_usual) < 2:
-            return as_usual
+        in_usual = to_microseconds(values, unit, source, what)
+        if stated is not None or self.last <= self.first or len(in_usual) < 2:
+            return in_usual
         is_alike = self.unit != unit and self.is_float == (values.dtype.kind == "f")
         if is_alike and self._fits(values, self.unit):
             return to_microseconds(values, self.unit, source, what)
         if self._fits(values, unit):
-            return as_usual
+            return in_usual
         others = {other: self._overlap(values, other) for other in SCALES if other != unit}
         # The unit of the events first, where several would do.
         best = max(others, key=lambda u: (others[u] > _MUCH / 2, u == self.unit, others[u]))
         if others[best] <= _MUCH / 2 or not self._has_plausible_intervals(values, best):
-            return as_usual
-        note = f"{what} times are taken as {NAMES[best]}, on the clock of the events"
+            return in_usual
+        note = f"{what} times are taken as {UNITS[best]}, on the clock of the events"
         is_new = note not in notes
         notes += [note] * is_new
         if best != self.unit and is_new:
             _warn(
-                f"{source}: {note}; as {NAMES[unit]}, the usual unit, they would not fit the "
-                f"events: write whole microseconds, or {NAMES[unit]}, to be sure"
+                f"{source}: {note}; as {UNITS[unit]}, the usual unit, they would not fit the "
+                f"events: write whole microseconds, or {UNITS[unit]}, to be sure"
             )
         return to_microseconds(values, best, source, what)
 
@@ -511,9 +473,3 @@ class Clock(NamedTuple):
 
 def _ends(values: NDArray, unit: str) -> tuple[float, float]:
     return float(values.min()) * SCALES[unit], float(values.max()) * SCALES[unit]
-
-
-def clock_of(unit: InferredUnit, stored: NDArray, t: Sequence[int] | NDArray) -> Clock:
-    """Return the clock of events with the times `t` (us), which are `stored` in a unit."""
-    first, last = (int(t[0]), int(t[-1])) if len(t) else (0, 0)
-    return Clock(unit.name, first, last, stored.dtype.kind == "f")

@@ -1,4 +1,4 @@
-"""Tables written as TOML, with all digits."""
+"""Tables as TOML, with all digits."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from jaxevent.parameters import Parameters
 
 
 def parameters(params: Parameters) -> str:
-    """Lines `name = value`: physical values."""
+    """Format parameters as lines `name = value` of physical values."""
     lines = []
     for name, value in params.values().items():
         if name in params.numbers:
@@ -22,7 +22,7 @@ def parameters(params: Parameters) -> str:
 
 
 def dump(table: Mapping[str, Any]) -> str:
-    """A configuration as TOML."""
+    """Format a configuration as TOML."""
     lines = [f"{key(k)} = {text(v)}" for k, v in table.items() if k != "method"]
     for entry in table.get("method", []):
         lines += ["", "[[method]]", *(f"{key(k)} = {text(v)}" for k, v in entry.items())]
@@ -30,11 +30,12 @@ def dump(table: Mapping[str, Any]) -> str:
 
 
 def key(name: str) -> str:
+    """Format a key."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else text(name)
 
 
 def text(value: Any) -> str:
-    """A value as TOML writes it."""
+    """Format a value."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key(k)} = {text(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):

@@ -16,36 +16,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import times
 from jaxevent.errors import InputError
-from jaxevent.io import checked_events, times
-from jaxevent.io.columns import of_records
+from jaxevent.io.checks import check_events
+from jaxevent.io.columns import record_fields
 from jaxevent.recording import Recording
 
 EVENTS: np.dtype = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
 
 
 def from_dataset(dataset: Any, size: tuple[int, ...] | None = None) -> Iterator[Recording]:
-    """Each item of a data set as a recording, in turn.
+    """Make a recording of each item of a data set, in turn.
 
     Args:
-        dataset: What has a length, items and a `sensor_size`, as data sets of tonic do.
-        size: (width, height), where `sensor_size` does not tell it.
+        dataset: A data set of tonic: it has a length, items and a `sensor_size`.
+        size: (width, height) in px, where `sensor_size` is None.
+
+    Yields:
+        The recordings.
 
     Raises:
         InputError: The size is not known, or an item is not valid.
     """
-    told = size or getattr(dataset, "sensor_size", None)
+    size = size or getattr(dataset, "sensor_size", None)
     for number in range(len(dataset)):
-        yield from_item(dataset[number], told, f"{type(dataset).__name__} {number}")
+        yield from_item(dataset[number], size, f"{type(dataset).__name__} {number}")
 
 
 def from_item(item: Any, size: tuple[int, ...] | None, name: str = "tonic") -> Recording:
-    """An item of a data set as a recording.
+    """Make a recording of an item of a data set.
 
     Args:
         item: (events, target), or events alone.
         size: tonic's `sensor_size`, or (width, height).
-        name: Of the recording.
+        name: Name of the recording.
 
     Returns:
         A recording whose `extra["target"]` is the target, where that is numbers or text.
@@ -57,19 +61,25 @@ def from_item(item: Any, size: tuple[int, ...] | None, name: str = "tonic") -> R
     records = np.asarray(records)
     if size is None:
         raise InputError(f"{name}: its sensor_size is None; give size=(width, height)")
-    fields = of_records(records, name)
-    t = times(fields["t"], name, "event", scale=1.0)
+    t, x, y, p = (records[field] for field in record_fields(records, name).values())
     sensor = (int(size[0]), int(size[1]))
-    events = checked_events(t, fields["x"], fields["y"], fields["p"], sensor, name)
+    events = check_events(times(t, name, "event", scale=1.0), x, y, p, sensor, name)
     extra = {"target": np.asarray(target)} if _is_plain(target) else {}
     return Recording(name, *sensor, events, extra=extra)
 
 
 def to_item(recording: Recording, target: Any = None) -> tuple[NDArray, Any]:
-    """A recording's events as tonic's structured array, and the target.
+    """Make an item of tonic of a recording.
 
-    Without `target` it is `extra["target"]`, or None. Raises `InputError` for coordinates above
-    32,767, which tonic's int16 does not hold.
+    Args:
+        recording: The recording.
+        target: The target; None takes `extra["target"]`.
+
+    Returns:
+        The events as tonic's structured array, and the target or None.
+
+    Raises:
+        InputError: The sensor has coordinates above 32,767, which tonic's int16 does not hold.
     """
     if max(recording.width, recording.height) > 1 << 15:
         raise InputError(

@@ -15,7 +15,7 @@
 `load` takes poses from these files, as `Recording.poses`. `read_images` gives, by name as
 `Recording.extra` keeps them, `depth` (n, H, W) in m with its times `depth_t` (n,), `disparity`
 (n, H, W) in px with `disparity_t` (n,), and `flow` (n, 2, H, W), x and y in px, with `flow_t`
-(n, 2), from when to when. All times are us. Images stay in their files until they are asked for.
+(n, 2), from when to when. All times are us. Images stay in their files until they are needed.
 DSEC's disparity and flow are those of the rectified image, see `rectify_map`, and NaN where
 unknown; what else is unknown is as stored.
 
@@ -31,8 +31,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import times
 from jaxevent.errors import InputError, require
-from jaxevent.io import companions, reading, times
+from jaxevent.io import companions
+from jaxevent.io.checks import reading
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import StoredImages
 from jaxevent.io.hdf5_files import array, dataset, open_file
@@ -40,54 +42,73 @@ from jaxevent.recording import Poses
 
 
 def read_poses(path: Path, camera: str) -> Poses | None:
-    """Poses of a camera in the world; `camera` is its group in the file, as "davis/left"."""
+    """Read the poses of a camera in the world from a file beside a recording.
+
+    Args:
+        path: File of the recording.
+        camera: Group of the camera in that file, as "davis/left".
+
+    Returns:
+        The poses; None if there is no such file.
+
+    Raises:
+        InputError: The file is damaged.
+    """
     for file in companions.truth(path):
-        with reading(str(file)):
+        with reading(file):
             if file.name.endswith("_gt.hdf5"):
-                return _poses_mvsec(file, camera)
+                return _read_poses_mvsec(file, camera)
             if file.name.endswith("_pose_gt.h5") and camera == "prophesee/left":
-                return _poses_m3ed(file)
+                return _read_poses_m3ed(file)
     return None
 
 
 def read_images(path: Path, side: str = "left") -> dict[str, Any]:
-    """Depth and flow of the left or right camera, by name; empty where there are none.
+    """Read depth, disparity and flow of a camera from files beside a recording.
 
-    Raises `InputError` where they are damaged.
+    Args:
+        path: File of the recording.
+        side: "left" or "right".
+
+    Returns:
+        Images and their times by name; empty if there are none.
+
+    Raises:
+        InputError: A file is damaged.
     """
     found: dict[str, Any] = {}
     for file in companions.truth(path):
-        with reading(str(file)):
+        with reading(file):
             if file.name.endswith("_gt.hdf5"):
-                found |= _images_mvsec(file, f"davis/{side}")
+                found |= _open_images_mvsec(file, f"davis/{side}")
             elif file.name.endswith("_depth_gt.h5"):
-                found |= _depth_m3ed(file, side)
+                found |= _open_depth_m3ed(file, side)
             elif file.name == "forward_timestamps.txt" and side == "left":
-                found |= _flow_dsec(file)
+                found |= _open_flow_dsec(file)
             elif file.name == "timestamps.txt" and side == "left":
-                found |= _disparity_dsec(file)
+                found |= _open_disparity_dsec(file)
     return found
 
 
-def _poses_mvsec(file: Path, camera: str) -> Poses | None:
+def _read_poses_mvsec(file: Path, camera: str) -> Poses | None:
     with open_file(file) as opened:
         if f"{camera}/pose" not in opened:
             return None
         t = times(array(opened, f"{camera}/pose_ts", str(file)), str(file), "pose")
-        return _poses(t, array(opened, f"{camera}/pose", str(file)), f"{file}: {camera}/pose")
+        return _make_poses(t, array(opened, f"{camera}/pose", str(file)), f"{file}: {camera}/pose")
 
 
-def _poses_m3ed(file: Path) -> Poses:
+def _read_poses_m3ed(file: Path) -> Poses:
     with open_file(file) as opened:
         stamps = array(opened, "ts", str(file))
         matrices = array(opened, "Cn_T_C0", str(file))
     t = times(stamps, str(file), "pose", scale=1.0)
     if matrices.shape[1:] == (4, 4):
         matrices = np.linalg.inv(matrices.astype(float))
-    return _poses(t, matrices, f"{file}: Cn_T_C0")
+    return _make_poses(t, matrices, f"{file}: Cn_T_C0")
 
 
-def _poses(t: NDArray[np.int64], matrices: NDArray, source: str) -> Poses:
+def _make_poses(t: NDArray[np.int64], matrices: NDArray, source: str) -> Poses:
     from scipy.spatial.transform import Rotation
 
     if matrices.shape != (len(t), 4, 4) or not np.isfinite(matrices).all():
@@ -99,7 +120,7 @@ def _poses(t: NDArray[np.int64], matrices: NDArray, source: str) -> Poses:
     return Poses(t, matrices[:, :3, 3].astype(float), quaternion)
 
 
-def _stored(opened: Any, name: str, axes: int, count: int, file: Path) -> StoredImages:
+def _open_images(opened: Any, name: str, axes: int, count: int, file: Path) -> StoredImages:
     images = dataset(opened, name, str(file))
     if images.ndim != axes or len(images) != count or images.dtype.kind not in "iuf":
         raise InputError(
@@ -109,13 +130,13 @@ def _stored(opened: Any, name: str, axes: int, count: int, file: Path) -> Stored
     return StoredImages(images, f"{file}: {name}")
 
 
-def _images_mvsec(file: Path, camera: str) -> dict[str, Any]:
+def _open_images_mvsec(file: Path, camera: str) -> dict[str, Any]:
     opened = open_file(file)
     found: dict[str, Any] = {}
     for name, axes, key in (("depth_image_raw", 3, "depth"), ("flow_dist", 4, "flow")):
         if f"{camera}/{name}" in opened:
             t = times(array(opened, f"{camera}/{name}_ts", str(file)), str(file), key)
-            found[key] = _stored(opened, f"{camera}/{name}", axes, len(t), file)
+            found[key] = _open_images(opened, f"{camera}/{name}", axes, len(t), file)
             found[f"{key}_t"] = t
     if "flow" in found:
         t = found["flow_t"]
@@ -124,24 +145,24 @@ def _images_mvsec(file: Path, camera: str) -> dict[str, Any]:
     return found
 
 
-def _depth_m3ed(file: Path, side: str) -> dict[str, Any]:
+def _open_depth_m3ed(file: Path, side: str) -> dict[str, Any]:
     opened = open_file(file)
     name = f"depth/prophesee/{side}"
     if name not in opened:
         return {}
     t = times(array(opened, "ts", str(file)), str(file), "depth", scale=1.0)
-    return {"depth": _stored(opened, name, 3, len(t), file), "depth_t": t}
+    return {"depth": _open_images(opened, name, 3, len(t), file), "depth_t": t}
 
 
-def _flow_dsec(stamps: Path) -> dict[str, Any]:
+def _open_flow_dsec(stamps: Path) -> dict[str, Any]:
     t = np.loadtxt(stamps, np.int64, delimiter=",", ndmin=2)
-    flow = _images_dsec(stamps, "forward", t, (2,), _flow_of)
+    flow = _open_images_dsec(stamps, "forward", t, (2,), _flow_of)
     return {} if flow is None else {"flow": flow, "flow_t": t}
 
 
-def _disparity_dsec(stamps: Path) -> dict[str, Any]:
+def _open_disparity_dsec(stamps: Path) -> dict[str, Any]:
     t = np.loadtxt(stamps, np.int64, ndmin=1)
-    disparity = _images_dsec(stamps, "event", t, (), _disparity_of)
+    disparity = _open_images_dsec(stamps, "event", t, (), _disparity_of)
     return {} if disparity is None else {"disparity": disparity, "disparity_t": t}
 
 
@@ -154,14 +175,14 @@ def _disparity_of(stored: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(stored > 0, stored / 256, np.nan)
 
 
-def _images_dsec(
+def _open_images_dsec(
     stamps: Path,
     name: str,
     t: NDArray[np.int64],
     parts: tuple[int, ...],
     value: Callable[[NDArray[np.float32]], NDArray[np.float32]],
 ) -> DecodedImages | None:
-    """The images of a folder beside their times, (n, *parts, H, W); None where it has none."""
+    """Open the images of a folder beside their times, (n, *parts, H, W); None if it has none."""
     from PIL import Image
 
     folder = stamps.parent / name
@@ -178,14 +199,14 @@ def _images_dsec(
         width, height = first.size
     shape = (height, width, 3) if parts else (height, width)
     return DecodedImages(
-        lambda row: (value(_stored_png(image, shape)).astype(np.float32) for image in images[row:]),
+        lambda row: (value(_read_png(image, shape)).astype(np.float32) for image in images[row:]),
         (len(images), *parts, height, width),
         np.dtype(np.float32),
         str(folder),
     )
 
 
-def _stored_png(image: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _read_png(image: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
     # Of images with colours Pillow reads 8 of the 16 bits.
     cv2 = require("cv2", "vision")
     stored = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io.bayer import PATTERNS as PATTERNS
-from jaxevent.io.bayer import demosaic, sites
+from jaxevent.io.images import BAYER_PATTERNS, bayer_sites, demosaic
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
+PATTERNS = BAYER_PATTERNS
 REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
 _HIDDEN = 1e-3  # what a frame counts where it does not show a point, so that something does
 _SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
@@ -195,7 +195,7 @@ def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Rec
     Raises:
         InputError: The pattern is unknown, or the width or height is odd.
     """
-    places = sites(pattern)
+    places = bayer_sites(pattern)
     if recording.width % 2 or recording.height % 2:
         raise InputError(
             f"{recording.name}: the {recording.width}x{recording.height} sensor has an odd side, "
@@ -258,7 +258,7 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     Raises:
         InputError: The pattern is unknown, a channel is missing, or shapes differ.
     """
-    places = sites(pattern)
+    places = bayer_sites(pattern)
     missing = [name for name in places if name not in images]
     if missing:
         raise InputError(f"the channel {missing[0]} is missing; give R, G1, G2 and B")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit
-from jaxevent.codegen.host import evaluated
+from jaxevent.codegen.graph import evaluate_function
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments, allocate_aligned
 from jaxevent.reconstruction.stream import EdgeCounts, Stream
 from jaxevent.recording import Recording
@@ -181,7 +181,7 @@ class FrameImages:
 
     def response(self) -> NDArray:
         """Return the intensities of 256 evenly spaced grey values."""
-        return evaluated(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
+        return evaluate_function(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
 
     def tables(self) -> NDArray:
         """Return grey value, intensity and certainty of every whole number of an image."""
@@ -192,7 +192,7 @@ class FrameImages:
 
     def values(self, images: NDArray) -> NDArray:
         """Return grey values, intensities and certainties [3, ...] of images in [0, 1]."""
-        made = [evaluated(table, images).astype(self.dtype) for table in self._tables]
+        made = [evaluate_function(table, images).astype(self.dtype) for table in self._tables]
         return np.stack(made)
 
     def read(self, used: slice, capacity: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:

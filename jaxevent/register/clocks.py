@@ -1,6 +1,8 @@
-"""The offset of two clocks, from when frames and events change."""
+"""Clocks of two cameras: their offset, and stamps by external triggers."""
 
+import dataclasses
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +10,10 @@ from scipy import ndimage
 from scipy.signal import correlate
 
 from jaxevent.errors import InputError
-from jaxevent.recording import Recording
+from jaxevent.recording import Frames, Recording
 from jaxevent.register.frames import event_span, log_image
+from jaxevent.register.geometry import Registration
+from jaxevent.register.refinement import refine
 
 _CANDIDATES = 4  # offsets that are tried
 _CELLS = 64  # to the width of an image, where clocks are compared
@@ -19,24 +23,33 @@ _BLOCK = 128  # steps of that raster held at a time
 def clock_offsets(
     recording: Recording, other: Recording, search: float | int | None = None
 ) -> list[float]:
-    """Offsets (s) at which the frames' changes go with the events', the likeliest first.
+    """Return offsets of the clocks at which frames and events change together, the likeliest first.
 
     Both are reduced to about 64 x 48 cells on a raster of half a frame: the change of ln intensity
-    from a frame to the next, and ON minus OFF events of as long a time. Two things are correlated
-    at every lag (Pearson's r of what overlaps; Padfield, CVPR 2010): how large the changes are, the
-    logarithm of the mean of their absolute values at two smoothnesses, for which the cameras need
-    not look the same way; and, counted twice, the smoothed changes at places as they are, for which
-    they should, roughly. Up to four maxima of the sum with half the best one or more, and 0 where
-    clocks may be the same. Right to about half a frame, which is enough for `refine`.
+    from a frame to the next, and ON minus OFF events of as long a time. Two signatures are
+    correlated at every lag (Pearson's r of the overlap; Padfield, CVPR 2010): the size of the
+    changes, the logarithm of the mean of their absolute values at two smoothnesses, for which the
+    cameras may look in different directions; and, weighted twice, the smoothed changes at places,
+    for which they should look roughly alike. Offsets are right to about half a frame, enough for
+    `refine`.
 
-    `search` (s) bounds the offset; by default the overlap is at least half the shorter recording.
-    Raises `InputError` if no offset lets them overlap.
+    Args:
+        recording: Events of the event camera.
+        other: Frames of the other camera.
+        search: Largest offset, s. By default at least half the shorter recording overlaps.
+
+    Returns:
+        Offsets (s) to add to the frames' time stamps: up to four maxima of the sum of correlations
+        with half the largest or more, and 0 if the clocks may be the same.
+
+    Raises:
+        InputError: No offset lets the recordings overlap.
     """
     assert other.frames is not None
     t = other.frames.t
     step = max(float(np.median(np.diff(t))) / 2, 1.0)
     begin, _ = event_span(recording)
-    both = [_changes_of_events(recording, step), _changes_of_frames(other)]
+    both = [_event_signatures(recording, step), _frame_signatures(other)]
     middle, along = (t[1:] + t[:-1]) / 2, begin + step * (np.arange(len(both[0])) + 1)
     across = np.arange(middle[0], middle[-1] + 1e-3, step)
     if len(across) < 6 or len(along) < 6:
@@ -73,7 +86,7 @@ def clock_offsets(
 
 
 def _signature(change: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What is compared of changes (times, rows, cells): two sizes, then places, (times, ...)."""
+    """Return the signature (times, n) of changes (times, rows, cells): two sizes, then places."""
     smooth: list[NDArray] = [
         ndimage.gaussian_filter(change, (0, sigma, sigma)) for sigma in (1.5, 4)
     ]
@@ -87,14 +100,14 @@ def _signature(change: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _cells(width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-    """The row and the column of cells of pixel rows and columns, and the number of rows."""
+    """Return the cell rows and columns of pixel rows and columns, and the number of cell rows."""
     rows = max(1, round(height * _CELLS / width))
     down = np.minimum(np.arange(height) * _CELLS // width, rows - 1)
     return down, np.arange(width) * _CELLS // width, rows
 
 
-def _changes_of_frames(other: Recording) -> NDArray[np.float64]:
-    """The signature of the change of ln intensity from each frame to the next."""
+def _frame_signatures(other: Recording) -> NDArray[np.float64]:
+    """Return signatures of the change of ln intensity from each frame to the next."""
     assert other.frames is not None
     down, along, rows = _cells(other.width, other.height)
     place = (down[:, None] * _CELLS + along).ravel()
@@ -111,8 +124,8 @@ def _changes_of_frames(other: Recording) -> NDArray[np.float64]:
     return np.concatenate(out)
 
 
-def _changes_of_events(recording: Recording, step: float) -> NDArray[np.float64]:
-    """The same of 0.2 (ON - OFF) per pixel in windows of two steps (us), a step apart."""
+def _event_signatures(recording: Recording, step: float) -> NDArray[np.float64]:
+    """Return signatures of 0.2 (ON - OFF) per pixel in windows of two steps (us), a step apart."""
     down, along, rows = _cells(recording.width, recording.height)
     begin, end = event_span(recording)
     steps, out = int((end - begin) / step) + 1, []
@@ -132,7 +145,7 @@ def _changes_of_events(recording: Recording, step: float) -> NDArray[np.float64]
 def _correlate(
     one: NDArray[np.float64], two: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pearson's correlation and the number of values that overlap, at every lag.
+    """Return Pearson's correlation and the number of values that overlap, at every lag.
 
     Entry k: two[i] lies on one[i + k - (len(two) - 1)].
     """
@@ -149,3 +162,155 @@ def _correlate(
     enough = (aa > 1e-9 * n) & (bb > 1e-9 * n)
     r = (ab - a * b / n) / np.sqrt(np.where(enough, aa * bb, 1))
     return np.where(enough, r, 0), n
+
+
+Edge = Literal["auto", "rising", "falling", "exposure"]
+_MATCHED = 0.5  # of the frames that must have a trigger
+
+
+def trigger_times(
+    recording: Recording, edge: Edge = "auto", channel: int | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the times of a recording's triggers, and the exposures that they show.
+
+    Args:
+        recording: A recording with external triggers.
+        edge: "rising" and "falling" select the triggers of that edge. "exposure" takes a signal
+            that is high while the shutter is open: times are halfway from a rising edge to the
+            falling one after it. "auto" is "exposure" if both edges occur, else all triggers.
+        channel: Channel of the triggers, needed if there are several.
+
+    Returns:
+        Times (n,), us, and exposures (n,), us, 0 if unknown.
+
+    Raises:
+        InputError: There are no such triggers.
+    """
+    triggers = recording.triggers
+    if triggers is None or not len(triggers):
+        missing = recording.describe_left_out("triggers")
+        raise InputError(
+            f"{recording.name}: holds no external triggers{missing}; leave out --triggers"
+        )
+    channels = np.unique(triggers.channel)
+    if channel is None and len(channels) > 1:
+        raise InputError(
+            f"{recording.name}: holds triggers of the channels {', '.join(map(str, channels))}; "
+            "choose one with --channel"
+        )
+    if channel is not None and channel not in channels:
+        raise InputError(
+            f"{recording.name}: holds no triggers of the channel {channel} but of "
+            f"{', '.join(map(str, channels))}; choose one of these"
+        )
+    if channel is not None:
+        triggers = triggers[triggers.channel == channel]
+    if edge == "auto":
+        both = {0, 1} <= set(np.unique(triggers.edge).tolist())
+        edge = "exposure" if both else "auto"
+    if edge == "auto":
+        t = triggers.t
+    elif edge != "exposure":
+        t = triggers.t[triggers.edge == (edge == "rising")]
+    else:
+        opens = np.flatnonzero((triggers.edge[:-1] == 1) & (triggers.edge[1:] == 0))
+        exposure = triggers.t[opens + 1] - triggers.t[opens]
+        t = triggers.t[opens] + exposure // 2
+        if len(t):
+            return t, exposure
+    if not len(t):
+        raise InputError(
+            f"{recording.name}: holds no triggers for {edge!r}; choose the edges that `jaxevent "
+            "info` shows"
+        )
+    return t, np.zeros(len(t), np.int64)
+
+
+def match_triggers(
+    stamps: NDArray[np.int64], triggers: NDArray[np.int64], offset: float | int
+) -> NDArray[np.intp]:
+    """Match each frame to the trigger nearest to its stamp plus the offset.
+
+    From the middle frame on, at which `offset` holds, the offset is that of the frame before, so
+    that clocks may drift apart. A frame has none if the nearest one is half a frame away or more,
+    or another frame's.
+
+    Args:
+        stamps: (frames,) sorted stamps, us.
+        triggers: (n,) sorted times of triggers, us.
+        offset: Seconds to add to the stamps.
+
+    Returns:
+        (frames,) indices of triggers, -1 for none.
+    """
+    found, taken = np.full(len(stamps), -1), set()
+    if len(stamps) < 2 or not len(triggers):
+        return found
+    half = np.median(np.diff(stamps)) / 2
+    middle = len(stamps) // 2
+    for rows in (range(middle, len(stamps)), range(middle - 1, -1, -1)):
+        ahead = offset * 1e6
+        if rows.step < 0 and found[middle] >= 0:
+            ahead = float(triggers[found[middle]] - stamps[middle])
+        for row in rows:
+            wanted = stamps[row] + ahead
+            after = int(np.searchsorted(triggers, wanted))
+            near = [place for place in (after - 1, after) if 0 <= place < len(triggers)]
+            place = min(near, key=lambda place: abs(triggers[place] - wanted))
+            if abs(triggers[place] - wanted) < half and place not in taken:
+                found[row] = place
+                taken.add(place)
+                ahead = float(triggers[place] - stamps[row])
+    return found
+
+
+def stamp_by_triggers(
+    recording: Recording,
+    other: Recording,
+    found: Registration,
+    edge: Edge = "auto",
+    channel: int | None = None,
+    *,
+    lag: float | int | None = None,
+) -> tuple[Recording, Registration]:
+    """Give another camera's frames the stamps of the event camera's triggers.
+
+    Own stamps may jitter and drift; triggers are on the events' clock. There remains the lag from
+    a trigger to mid-exposure. Frames without a trigger are left out.
+
+    Args:
+        recording: Recording with external triggers.
+        other: Frames of the other camera.
+        found: Registration by the frames' own stamps (`estimate`), whose offset is right to
+            less than half a frame.
+        edge: Edges to take, as in `trigger_times`.
+        channel: Channel of the triggers, needed if there are several.
+        lag: Seconds from a trigger to mid-exposure; refined (`refine`) unless given.
+
+    Returns:
+        The frames with their new stamps, and a registration with the lag as its offset.
+
+    Raises:
+        InputError: Fewer than half of the frames have a trigger.
+    """
+    assert other.frames is not None
+    t, exposure = trigger_times(recording, edge, channel)
+    place = match_triggers(other.frames.t, t, found.offset)
+    rows = np.flatnonzero(place >= 0)
+    if len(rows) < max(3, _MATCHED * len(place)):
+        raise InputError(
+            f"{other.name}: only {len(rows)} of its {len(place)} frames have a trigger, of "
+            f"{len(t)}; choose other edges or another channel, or leave out --triggers"
+        )
+    kept = other.with_frames(rows)
+    assert kept.frames is not None
+    own = kept.frames.exposure
+    stamped = Frames.of_checked(
+        t[place[rows]], kept.frames.images, np.where(own > 0, own, exposure[place[rows]])
+    )
+    kept = dataclasses.replace(kept, frames=stamped)
+    if lag is not None:
+        return kept, dataclasses.replace(found, offset=float(lag))
+    start = np.median(other.frames.t[rows] - stamped.t) * 1e-6 + found.offset
+    refined = refine(recording, kept, float(start), found.grid)
+    return kept, dataclasses.replace(refined, homography=found.homography)

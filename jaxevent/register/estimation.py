@@ -1,4 +1,4 @@
-"""Registration of two recordings: what is not known is estimated."""
+"""Registration of two recordings: estimation of its unknown parts."""
 
 import dataclasses
 import math
@@ -10,9 +10,9 @@ from jaxevent.errors import InputError
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
 from jaxevent.register.clocks import clock_offsets
-from jaxevent.register.geometry import Grid, check_homography, grid_between
-from jaxevent.register.match import match
-from jaxevent.register.refinement import AGREE, Registration, refine
+from jaxevent.register.features import match_frames
+from jaxevent.register.geometry import Grid, Registration, check_homography, recording_grid
+from jaxevent.register.refinement import MIN_AGREEMENT, refine
 
 
 def estimate(
@@ -25,31 +25,41 @@ def estimate(
     search: float | int | None = None,
     progress: bool | None = None,
 ) -> Registration:
-    """How another camera's frames fit the events: what is not given is estimated.
+    """Estimate the registration of another camera's frames to the events.
 
-    Without `grid` and `homography` (3, 3) a homography is, that of a distant or flat scene:
-    features (SIFT, Lowe 2004) of frames, and of their differences, are matched with those of what
-    the events alone say of the same times (`jaxevent.high_pass`, and their sums), RANSAC (Barath et
+    Without `grid` and `homography` a homography is estimated, that of a distant or flat scene:
+    features (SIFT, Lowe 2004) of frames, and of their differences, are matched with those of images
+    of the events alone at the same times (`jaxevent.high_pass`, and their sums), RANSAC (Barath et
     al., MAGSAC++, CVPR 2020) finds the homography of most of them, and `refine`, which needs no
-    features, makes it sub-pixel. Only this needs OpenCV, the extra "vision". The
-    cameras must have moved, or the scene.
+    features, makes it sub-pixel. Only this needs OpenCV, the extra "vision". The cameras must have
+    moved, or the scene.
 
-    Without `offset` (s, added to the frames' time stamps) the clocks are compared: offsets are
-    tried at which the frames change when the events say so (`clock_offsets`), up to `search` s
-    either way, by default wherever the recordings overlap by half, and the best one is refined
+    Without `offset` the clocks are compared (`clock_offsets`), and the best offset is refined
     together with the homography, or alone. A given grid, homography or offset is kept as it is.
 
-    Simulated rigs of 2.5 decades (`experiments/register.py`): 0.04 to 0.16 px rms, clock to 0.6 ms
-    or, where images move 20 to 40 px/s, to 2.4 ms. Where frames clip most of what moves (4.5
-    decades) up to 1.1 px and 15 ms were seen: take a recording of a scene that frames resolve.
+    Errors on simulated rigs are in the results (`experiments/register.py`). Take a recording of a
+    scene that frames resolve: where they clip most moving edges, the result is worse.
 
-    Raises `InputError` for too few matches, and if the changes of frames and events do not agree in
-    the end: correlation below 0.25.
+    Args:
+        recording: Events of the event camera.
+        other: Frames of the other camera.
+        grid: Grid (height, width, 2) of a calibrated rig.
+        homography: (3, 3), from the event camera's pixels to the other's.
+        offset: Seconds to add to the frames' time stamps.
+        search: Largest offset to try, s. By default half of the recordings overlaps.
+        progress: Whether to show progress; by default on a terminal.
+
+    Returns:
+        The registration.
+
+    Raises:
+        InputError: There are too few matches, or changes of frames and events do not agree in the
+            end: their correlation is below 0.25.
     """
     _check_request(recording, other, offset, search)
     if homography is not None:
         homography = check_homography(homography)
-        grid = grid_between(recording, other, homography)
+        grid = recording_grid(recording, other, homography)
     if grid is not None and np.isnan(grid).all():
         raise InputError(
             f"{other.name}: shows nothing that the event camera sees; correct the calibration, the "
@@ -72,7 +82,11 @@ def estimate(
     for candidate in offsets:
         try:
             with stage("match features", progress):
-                starts = None if grid is not None else match(recording, other, candidate, progress)
+                starts = (
+                    None
+                    if grid is not None
+                    else match_frames(recording, other, candidate, progress)
+                )
             with stage("refine", progress):
                 now = refine(
                     recording, other, candidate, grid, starts, keep_offset=offset is not None
@@ -82,12 +96,12 @@ def estimate(
             continue
         if best is None or (now.agreement or 0) > (best.agreement or 0):
             best = now
-        if (now.agreement or 0) > 2 * AGREE:
+        if (now.agreement or 0) > 2 * MIN_AGREEMENT:
             break
     if best is None:
         assert problem is not None
         raise problem
-    if (best.agreement or 0) < AGREE:
+    if (best.agreement or 0) < MIN_AGREEMENT:
         raise InputError(
             f"{other.name}: what its frames show and the events do not agree, the correlation of "
             f"their changes is {best.agreement:.2f}; give what is known of the offset, homography "

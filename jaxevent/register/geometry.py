@@ -1,10 +1,11 @@
-"""Where a camera's pixels look: grids, homographies and lenses.
+"""Grids, homographies and lenses: the other camera's pixel for each of the event camera.
 
-A *grid* (height, width, 2) says at which x, y of the other camera's images each pixel of the event
-camera looks, NaN where it does not see the same. Pixel centres are whole numbers. Homographies map
+A *grid* (height, width, 2) holds for each pixel of the event camera the x, y in the other camera's
+images, NaN where that does not see the same. Pixel centres are whole numbers. Homographies map
 places of the event camera to places of the other one, [u, v, w] = H [x, y, 1].
 """
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -13,10 +14,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import reading
+from jaxevent.io.checks import reading
 from jaxevent.recording import Recording
 
 Grid = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Registration:
+    """Registration of another camera's frames to the events.
+
+    Attributes:
+        grid: (height, width, 2) x, y in the other camera's images, px.
+        offset: Seconds to add to its time stamps.
+        homography: (3, 3) homography of the grid, if it has one.
+        agreement: Correlation, over pixels and frames, of the change of ln intensity between frames
+            with that by the events; None if nothing was estimated.
+    """
+
+    grid: Grid
+    offset: float
+    homography: NDArray[np.float64] | None = None
+    agreement: float | None = None
 
 
 def homography_grid(
@@ -26,20 +45,30 @@ def homography_grid(
     camera: PinholeCamera | None = None,
     other_camera: PinholeCamera | None = None,
 ) -> Grid:
-    """The grid (height, width, 2) of a homography (3, 3), see the module.
+    """Return the grid (height, width, 2) of a homography.
 
-    `size` and `other` are (width, height) of the event camera and of the other one, `camera` and
-    `other_camera` the calibrations whose distortion is undone, None for none. Raises `InputError`
-    for a matrix that is no homography.
+    Args:
+        homography: (3, 3), from undistorted pixels of the event camera to those of the other one.
+        size: (width, height) of the event camera, px.
+        other: (width, height) of the other camera, px.
+        camera: Calibration of the event camera, whose distortion is undone.
+        other_camera: Calibration of the other camera, likewise.
+
+    Returns:
+        x, y in the other camera's images, px, NaN outside.
+
+    Raises:
+        InputError: The matrix is no homography.
     """
-    at = move(check_homography(homography), straight_pixels(camera, size))
-    return keep_inside(bend(other_camera, at), other).reshape(*size[::-1], 2)
+    at = apply_homography(check_homography(homography), undistorted_pixels(camera, size))
+    return mask_outside(distort(other_camera, at), other).reshape(*size[::-1], 2)
 
 
 def read_homography(path: str | Path) -> NDArray[np.float64]:
-    """A homography from text: three lines of three numbers, parted by commas or spaces.
+    """Read a homography from text: three lines of three numbers, separated by commas or spaces.
 
-    Raises `InputError` for other contents.
+    Raises:
+        InputError: The file has other contents.
     """
 
     with reading(str(path)):
@@ -57,9 +86,17 @@ def read_homography(path: str | Path) -> NDArray[np.float64]:
 
 
 def read_depth(given: float | int | Path, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Depth in m: a number, or the path of an .npy file of (height, width), `size` transposed.
+    """Read depth in m.
 
-    Raises `InputError` for anything else.
+    Args:
+        given: A number, or the path of an .npy file of (height, width).
+        size: (width, height) of the event camera, px.
+
+    Returns:
+        Depth, () or (height, width).
+
+    Raises:
+        InputError: The file has other contents.
     """
 
     if not isinstance(given, Path):
@@ -73,17 +110,19 @@ def read_depth(given: float | int | Path, size: tuple[int, int]) -> NDArray[np.f
     return depth.astype(np.float64)
 
 
-def seen(grid: Grid) -> float:
-    """The part of the event camera's pixels that the other camera sees."""
+def coverage(grid: Grid) -> float:
+    """Return the fraction of the event camera's pixels that the other camera sees."""
     return float(np.mean(~np.isnan(grid[..., 0])))
 
 
-def grid_between(recording: Recording, other: Recording, homography: NDArray[np.float64]) -> Grid:
+def recording_grid(recording: Recording, other: Recording, homography: NDArray[np.float64]) -> Grid:
+    """Return the grid of a homography between the cameras of two recordings."""
     size, seen = (recording.width, recording.height), (other.width, other.height)
     return homography_grid(homography, size, seen, recording.camera, other.camera)
 
 
 def check_homography(values: ArrayLike) -> NDArray[np.float64]:
+    """Return a homography (3, 3) with H[2, 2] = 1, or raise `InputError`."""
     H = np.asarray(values, np.float64)
     if H.shape != (3, 3) or not np.isfinite(H).all() or abs(np.linalg.det(H)) < 1e-12:
         raise InputError(
@@ -93,14 +132,15 @@ def check_homography(values: ArrayLike) -> NDArray[np.float64]:
     return H / H[2, 2] if abs(H[2, 2]) > 1e-12 else H
 
 
-def move(H: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (n, 2) under a homography, NaN behind its horizon."""
+def apply_homography(H: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map positions (n, 2), px, by a homography, NaN behind its horizon."""
     seen = at @ H[:, :2].T + H[:, 2]
     w = seen[:, 2:] * np.sign(H[2, 2] if H[2, 2] else 1)
     return seen[:, :2] / np.where(w > 1e-9, seen[:, 2:], np.nan)
 
 
 def check_camera(camera: PinholeCamera) -> None:
+    """Raise `InputError` for focal lengths that are not positive."""
     if not (0 < camera.fx < math.inf and 0 < camera.fy < math.inf):
         raise InputError(
             f"a camera of focal lengths {camera.fx} and {camera.fy} px is not possible; give the "
@@ -108,48 +148,50 @@ def check_camera(camera: PinholeCamera) -> None:
         )
 
 
-def straighten(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (n, 2) in px without the distortion."""
+def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return positions (n, 2), px, without the distortion."""
     if camera is None or not camera.is_distorted:
         return at.astype(np.float64)
-    from jaxevent.egomotion.geometry import undistorted
+    from jaxevent.egomotion.geometry import undistort
 
-    straight, f = undistorted(camera, at[:, 0], at[:, 1])
+    straight, f = undistort(camera, at[:, 0], at[:, 1])
     return straight / f * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
-def straight_pixels(camera: PinholeCamera | None, size: tuple[int, int]) -> NDArray[np.float64]:
+def undistorted_pixels(camera: PinholeCamera | None, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the undistorted positions (height * width, 2), px, of a camera's pixels."""
     y, x = np.mgrid[: size[1], : size[0]].astype(np.float64)
-    return straighten(camera, np.stack([x.ravel(), y.ravel()], 1))
+    return undistort(camera, np.stack([x.ravel(), y.ravel()], 1))
 
 
-def rays(camera: PinholeCamera, size: tuple[int, int]) -> NDArray[np.float64]:
-    at = (straight_pixels(camera, size) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+def pixel_rays(camera: PinholeCamera, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return rays (height * width, 3) of depth 1 through a camera's pixels."""
+    at = (undistorted_pixels(camera, size) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return np.concatenate([at, np.ones((len(at), 1))], 1)
 
 
-def bend(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (n, 2) in px with the distortion; NaN where the radial part has turned back."""
+def distort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return positions (n, 2), px, with the distortion; NaN where its radial part turns back."""
     if camera is None or not camera.is_distorted:
         return at
     return camera.distort((at - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
 
 
 def project(camera: PinholeCamera, X: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where places (n, 3) are seen, (n, 2) in px; NaN behind the camera."""
+    """Project points (n, 3) to (n, 2), px; NaN behind the camera."""
     Z = np.where(X[:, 2:] > 1e-9, X[:, 2:], np.nan)
     straight = X[:, :2] / Z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return bend(camera, straight)
+    return distort(camera, straight)
 
 
-def keep_inside(at: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """The same with NaN outside an image, whose outermost pixels' centres are its edge."""
+def mask_outside(at: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Set positions (n, 2) outside an image to NaN; its outermost pixels' centres are its edge."""
     seen = (at >= -1e-6) & (at <= np.array(size) - 1 + 1e-6)
     return np.where(seen.all(1, keepdims=True), at, np.nan)
 
 
-def step_size(grid: NDArray[np.float64]) -> float:
-    """Pixels of the other camera to a step of the grid, the median; 1 where none are seen."""
+def pixel_scale(grid: NDArray[np.float64]) -> float:
+    """Return the median number of the other camera's pixels per step of a grid; 1 without any."""
     if min(grid.shape[:2]) < 2:
         return 1.0
     across = grid[:-1, 1:] - grid[:-1, :-1]

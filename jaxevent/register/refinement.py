@@ -1,4 +1,4 @@
-"""Registrations made sub-pixel and sub-millisecond: alignment of what changes."""
+"""Refinement of a registration, to a fraction of a pixel and a millisecond, by images of change."""
 
 import contextlib
 import dataclasses
@@ -16,37 +16,22 @@ from jaxevent.recording import Recording
 from jaxevent.register.frames import event_span, log_image
 from jaxevent.register.geometry import (
     Grid,
-    bend,
+    Registration,
+    apply_homography,
     check_homography,
-    grid_between,
-    keep_inside,
-    move,
-    step_size,
-    straight_pixels,
+    distort,
+    mask_outside,
+    pixel_scale,
+    recording_grid,
+    undistorted_pixels,
 )
 
-_SMOOTHINGS = (4.0, 2.0, 1.2)  # px of the event camera by which changes are smoothed, in turn
-_STEPS = 12  # Gauss-Newton steps of a smoothing at most
-_PAIRS = 32  # pairs of frames that are compared
-_MOST_PIXELS = 40_000  # of a pair that are compared
-_KNOWN = 0.75  # of a smoothed change that unclipped pixels tell, where it counts
-AGREE = 0.25  # correlation of changes below which a registration is refused
-
-
-@dataclasses.dataclass(frozen=True)
-class Registration:
-    """How another camera's frames fit the events.
-
-    `grid` as the module says; `offset` (s) is added to their time stamps; `homography` (3, 3) where
-    the grid is that of one. `agreement` is the correlation, over pixels and frames, of the change
-    of ln intensity between frames with what the events say of it (1: all the same), None where
-    nothing was estimated.
-    """
-
-    grid: Grid
-    offset: float
-    homography: NDArray[np.float64] | None = None
-    agreement: float | None = None
+_SMOOTHINGS_PX = (4.0, 2.0, 1.2)  # px of the event camera by which changes are smoothed, in turn
+_MAX_STEPS = 12  # Gauss-Newton steps of a smoothing at most
+_N_PAIRS = 32  # pairs of frames that are compared
+_MAX_PIXELS = 40_000  # of a pair that are compared
+_MIN_KNOWN = 0.75  # weight of unclipped pixels in a smoothed change that counts
+MIN_AGREEMENT = 0.25  # correlation of changes below which a registration is refused
 
 
 def refine(
@@ -58,23 +43,34 @@ def refine(
     *,
     keep_offset: bool = False,
 ) -> Registration:
-    """Make an offset (s), and a homography unless a `grid` is given, sub-ms and sub-pixel.
+    """Refine an offset, and a homography unless a grid is given, to a fraction of a ms and a pixel.
 
-    Between two frames ln intensity changes by D, and by what the events say of the same time: with
-    W the place that a pixel sees and o the offset,
+    Between two frames ln intensity changes by D. With W the position that a pixel sees and o the
+    offset, events of the same time give
 
         D(W(x; h)) = a ON(x; o) - b OFF(x; o) + const,
 
     ON and OFF being the numbers of events from one mid-exposure to the other. h, o and the
     thresholds a, b minimise the sum of squares over pixels and 32 pairs of frames, under Huber's
     weights, by Gauss-Newton steps from coarse to fine (smoothed by 4, 2 and 1.2 px): alignment as
-    that of Evangelidis and Psarakis, PAMI 2008, but of images of change, in which both cameras
-    measure the same, so that the lag of a reconstruction has no part in it. Clipped pixels do not
-    count. The homography is moved by the places of the image's corners.
+    that of Evangelidis and Psarakis, PAMI 2008, but of images of change. Both cameras measure these
+    alike, so the lag of a reconstruction has no part in it. Clipped pixels do not count. The
+    homography is moved by the positions of the image's corners.
 
-    Takes a start within about 5 px and half a frame; of several `homographies` (3, 3) the one
-    with which the changes agree best is. Raises `InputError` if frames and events share
-    nothing to compare.
+    Args:
+        recording: Events of the event camera.
+        other: Frames of the other camera.
+        offset: Offset of the clocks to begin with, s, right to half a frame.
+        grid: Grid (height, width, 2) of a calibrated rig, which is kept.
+        homographies: Homographies (3, 3) to begin with, right to about 5 px; the one with which
+            changes agree best is refined.
+        keep_offset: Whether the offset is kept.
+
+    Returns:
+        The refined registration.
+
+    Raises:
+        InputError: Frames and events share nothing to compare.
     """
     if (grid is None) == (not homographies):
         raise InputError("give either a grid or homographies to start from")
@@ -84,28 +80,28 @@ def refine(
         problem = _Alignment(recording, other, grid, H, keep_offset)
         at = np.append(problem.corners, float(offset))
         with contextlib.suppress(InputError):
-            problem.choose(float(offset))
-            tries.append((problem.fit(at, _SMOOTHINGS[0]).agreement, H, problem, at))
+            problem.choose_pairs(float(offset))
+            tries.append((problem.fit(at, _SMOOTHINGS_PX[0]).agreement, H, problem, at))
     if not tries:
         raise InputError(
             f"{other.name}: with the offset {offset:g} s its frames show too little, unclipped, of "
             "what the events show to compare them; give another offset, homography or calibration"
         )
     agreement, H, problem, at = max(tries, key=lambda one: one[0])
-    for sigma in _SMOOTHINGS:
+    for sigma in _SMOOTHINGS_PX:
         at, agreement = problem.solve(at, sigma)
-        if agreement < AGREE / 2:  # hopeless; those that are right begin above a half
+        if agreement < MIN_AGREEMENT / 2:  # hopeless; those that are right begin above a half
             break
     if H is not None:
         H = problem.homography(at)
-        grid = grid_between(recording, other, H)
+        grid = recording_grid(recording, other, H)
     assert grid is not None
     return Registration(grid, float(at[-1]), H, float(agreement))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """What is compared at a place: (values, ...) of all pairs, and how well it fits."""
+    """Linear model of the changes of all pairs, and its fit."""
 
     X: NDArray[np.float64]  # (values, 3): ON, OFF and 1
     D: NDArray[np.float64]  # (values,)
@@ -127,43 +123,44 @@ class _Alignment:
         homography: NDArray[np.float64] | None,
         keep_offset: bool,
     ):
+        assert other.frames is not None
         self.recording, self.other, self.keep_offset = recording, other, keep_offset
+        self.frames = other.frames
         self.size = recording.width, recording.height
         width, height = self.size
         self.shape = other.height, other.width
-        self.finest = max(1, math.ceil(math.sqrt(width * height / _MOST_PIXELS)))
+        self.finest = max(1, math.ceil(math.sqrt(width * height / _MAX_PIXELS)))
         self.stride = self.finest
         self.fixed = None if grid is None or homography is not None else grid
         self.corners = np.empty(0)
-        self.frame = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        self.outline = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
         if homography is not None:
-            self.corners = move(homography, self.frame).ravel()
-        self.pixels = straight_pixels(recording.camera, self.size).reshape(height, width, 2)
-        self.pairs: NDArray[np.intp] | None = None
+            self.corners = apply_homography(homography, self.outline).ravel()
+        self.pixels = undistorted_pixels(recording.camera, self.size).reshape(height, width, 2)
+        self.pairs = np.empty((0, 2), np.intp)
         self._near: tuple[float, list] | None = None
         self._images: tuple[Any, Any] = None, None
 
     def homography(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The homography that moves the image's corners to at[:8] (Hartley, Zisserman, 4.1)."""
+        """Return the homography that maps the corners to at[:8] (Hartley & Zisserman, 4.1)."""
         rows, values = [], []
-        for (x, y), (u, v) in zip(self.frame, at[:8].reshape(4, 2), strict=True):
+        for (x, y), (u, v) in zip(self.outline, at[:8].reshape(4, 2), strict=True):
             rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
             values += [u, v]
         return np.append(np.linalg.solve(np.array(rows), values), 1.0).reshape(3, 3)
 
-    def places(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the compared pixels look, (n, 2), NaN outside."""
+    def positions(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the positions (n, 2), px, that the compared pixels see, NaN outside."""
         s = self.stride
         if self.fixed is not None:
             return self.fixed[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
         pixels = self.pixels[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
-        seen = bend(self.other.camera, move(self.homography(at), pixels))
-        return keep_inside(seen, (self.other.width, self.other.height))
+        seen = distort(self.other.camera, apply_homography(self.homography(at), pixels))
+        return mask_outside(seen, (self.other.width, self.other.height))
 
-    def choose(self, offset: float) -> None:
-        """The pairs of frames: those with the most events, with about an event per pixel each."""
-        assert self.other.frames is not None
-        t = self.other.frames.t + round(offset * 1e6)
+    def choose_pairs(self, offset: float) -> None:
+        """Choose the pairs of frames with the most events, with about an event per pixel each."""
+        t = self.frames.t + round(offset * 1e6)
         begin, end = event_span(self.recording)
         inside = np.flatnonzero((t >= begin) & (t <= end))
         if len(inside) < 2:
@@ -176,34 +173,39 @@ class _Alignment:
         apart = int(np.clip(round(1 / each), 1, max(1, (len(inside) - 1) // 4)))
         first = np.arange(0, len(inside) - apart, max(1, apart // 2))
         # Those that show something, of all times: translation is an offset if motion is the same.
-        clear = np.array([self._clear(int(k)) for k in inside])
+        clear = np.array([self._unclipped_share(int(k)) for k in inside])
         worth = (index[first + apart] - index[first]) * np.minimum(
             clear[first], clear[first + apart]
         )
         first = first[worth >= 0.2 * worth.max()]
-        first = first[np.unique(np.linspace(0, len(first) - 1, _PAIRS).astype(int))]
+        first = first[np.unique(np.linspace(0, len(first) - 1, _N_PAIRS).astype(int))]
         self.pairs = np.stack([inside[first], inside[first + apart]], 1)
         self.apart = float(np.median(t[self.pairs[:, 1]] - t[self.pairs[:, 0]]))
         self._near, self._images = None, (None, None)
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019, lives as long as one estimate
-    def _clear(self, row: int) -> float:
-        """The part of a frame that is not clipped."""
+    def _unclipped_share(self, row: int) -> float:
+        """Return the share of a frame's pixels that are not clipped."""
         return float(log_image(self.other, row)[1].mean())
 
-    def fired(self, offset: float, sigma: float) -> NDArray[np.float64]:
-        """ON and OFF events of each pair, (pairs, n, 2), smoothed.
+    def event_changes(self, offset: float, sigma: float) -> NDArray[np.float64]:
+        """Return smoothed numbers of ON and OFF events of each pair, (pairs, n, 2).
 
-        An event tells that a threshold has been crossed since the pixel's last one, so counts lag
+        An event shows that a threshold has been crossed since the pixel's last one, so counts lag
         behind intensity by half a threshold, in slow scenes by tens of ms. Each event therefore
         counts evenly over the time since the one before it, or until the one after it if that is
-        shorter, where both are of its polarity.
+        shorter, if both are of its polarity.
+
+        Args:
+            offset: Offset of the clocks, s.
+            sigma: Smoothing, px of the event camera.
         """
-        assert self.other.frames is not None and self.pairs is not None
-        t = self.other.frames.t[self.pairs] + offset * 1e6
+        t = self.frames.t[self.pairs] + offset * 1e6
         width, height = self.size
         s, out = self.stride, []
-        for (begin, end), (place, first, last) in zip(t, self._crossings(offset), strict=True):
+        for (begin, end), (place, first, last) in zip(
+            t, self._event_intervals(offset), strict=True
+        ):
             within = np.minimum(last, end) - np.maximum(first, begin)
             part = np.clip(within / (last - first), 0, 1)
             counts = np.bincount(place, part, 2 * width * height).reshape(2, height, width)
@@ -211,13 +213,12 @@ class _Alignment:
             out.append(smooth[::-1, s // 2 :: s, s // 2 :: s].reshape(2, -1).T)
         return np.stack(out).astype(np.float64)
 
-    def _crossings(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Of each pair's events the place and polarity, and from when to when they count (us)."""
+    def _event_intervals(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
+        """Return place and polarity of each pair's events, and begin and end (us) of each."""
         if self._near is None or abs(offset - self._near[0]) * 1e6 > self.apart / 2:
-            assert self.other.frames is not None and self.pairs is not None
             width, height = self.size
             found = []
-            for begin, end in self.other.frames.t[self.pairs] + round(offset * 1e6):
+            for begin, end in self.frames.t[self.pairs] + round(offset * 1e6):
                 around = (begin - 2 * self.apart, end + 2 * self.apart)
                 rows = slice(*(self.recording.events.index(int(one)) for one in around))
                 events = self.recording.events[rows]
@@ -233,23 +234,27 @@ class _Alignment:
             self._near = offset, found
         return self._near[1]
 
-    def shown(self, at: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-        """D, its two slopes and how far it counts at the places, (pairs, n, 4)."""
-        where = self.places(at)
+    def frame_changes(self, at: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+        """Return D, its gradient and its weight at the compared positions, (pairs, n, 4).
+
+        Args:
+            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            sigma: Smoothing, px of the event camera.
+        """
+        where = self.positions(at)
         part = self.pixels[self.stride // 2 :: self.stride, self.stride // 2 :: self.stride]
-        scale = step_size(where.reshape(part.shape)) / self.stride
-        images = self._smoothed(sigma, scale)
+        scale = pixel_scale(where.reshape(part.shape)) / self.stride
+        images = self._smoothed_changes(sigma, scale)
         inside = ~np.isnan(where[:, 0])
         values = _bilinear(np.where(inside[:, None], where, 0), self.shape) @ images
         values = values.reshape(len(where), -1, 4).swapaxes(0, 1)
         values[..., 3] *= inside
         return values
 
-    def _smoothed(self, sigma: float, scale: float) -> NDArray[np.float64]:
-        """D of each pair, its slopes and where it is known: (other pixels, pairs * 4)."""
+    def _smoothed_changes(self, sigma: float, scale: float) -> NDArray[np.float64]:
+        """Return D of each pair, its gradient and if it is known, (other pixels, pairs * 4)."""
         blur = sigma * scale
         if self._images[0] is None or abs(math.log(self._images[0] / blur)) > 0.1:
-            assert self.pairs is not None
             images = []
             for one, two in self.pairs:
                 (low, known), (high, well) = (log_image(self.other, int(k)) for k in (one, two))
@@ -257,17 +262,17 @@ class _Alignment:
                 change = (high - low).astype(np.float32) * good
                 weight = ndimage.gaussian_filter(good, blur)
                 D = ndimage.gaussian_filter(change, blur) / np.maximum(weight, 0.1)
-                known = (weight > _KNOWN).astype(np.float32)
+                known = (weight > _MIN_KNOWN).astype(np.float32)
                 images += [D, np.gradient(D, axis=1), np.gradient(D, axis=0), known]
             self._images = blur, np.stack([one.ravel() for one in images], 1).astype(np.float64)
         return self._images[1]
 
     def solve(self, at: NDArray[np.float64], sigma: float) -> tuple[NDArray[np.float64], float]:
-        """Gauss-Newton steps until they are small; the place and the correlation there."""
-        self.choose(float(at[-1]))
-        self.stride = max(self.finest, int(sigma / 1.3))  # smooth images say the same next door
+        """Take Gauss-Newton steps until they are small; return the unknowns and the correlation."""
+        self.choose_pairs(float(at[-1]))
+        self.stride = max(self.finest, int(sigma / 1.3))  # neighbours in smooth images are alike
         fit = self.fit(at, sigma)
-        for _ in range(_STEPS):
+        for _ in range(_MAX_STEPS):
             step, moved = self.step(at, sigma, fit), None
             for _ in range(4):
                 now = self.fit(at + step, sigma)
@@ -283,15 +288,15 @@ class _Alignment:
         return at, fit.agreement
 
     def fit(self, at: NDArray[np.float64], sigma: float) -> _Fit:
-        """The thresholds at a place, and the correlation of changes under Huber's weights."""
-        D, slope_x, slope_y, counts = np.moveaxis(self.shown(at, sigma), -1, 0)
+        """Fit the thresholds at given unknowns, and correlate changes under Huber's weights."""
+        D, slope_x, slope_y, counts = np.moveaxis(self.frame_changes(at, sigma), -1, 0)
         use = counts > 0.99
         if use.sum() < 100:
             raise InputError(
                 f"{self.other.name}: shows too little of what the events show, unclipped, to "
                 "compare them; correct the calibration or homography, or give other frames"
             )
-        X = self.fired(float(at[-1]), sigma)[use]
+        X = self.event_changes(float(at[-1]), sigma)[use]
         X, D = np.concatenate([X, np.ones((len(X), 1))], -1), D[use]
         weight, b = np.ones(len(D)), np.zeros(3)
         for _ in range(3):
@@ -303,22 +308,29 @@ class _Alignment:
         return _Fit(X, D, np.stack([slope_x[use], slope_y[use]], -1), use, weight, b, agreement)
 
     def step(self, at: NDArray[np.float64], sigma: float, fit: _Fit) -> NDArray[np.float64]:
-        """The Gauss-Newton step from a place, at most as long as the smoothing can bear.
+        """Return the Gauss-Newton step from given unknowns, limited by the smoothing.
 
         D + D' dh = X(o) b + (X' b) do + X db is linear in dh, do and b + db.
+
+        Args:
+            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            sigma: Smoothing, px.
+            fit: Fit at these unknowns.
         """
         offset, free = float(at[-1]), len(at) - 1
         columns = [fit.X]
         if not self.keep_offset:
             delta = min(self.apart / 8, 2000.0) * 1e-6
-            later, earlier = (self.fired(offset + d, sigma)[fit.use] for d in (delta, -delta))
+            later, earlier = (
+                self.event_changes(offset + d, sigma)[fit.use] for d in (delta, -delta)
+            )
             columns.append(((later - earlier) @ fit.b[:2] / (2 * delta))[:, None])
         pixel, eps = np.nonzero(fit.use)[1], 0.01
         for k in range(free):
             ahead, back = at.copy(), at.copy()
             ahead[k] += eps
             back[k] -= eps
-            move = np.nan_to_num((self.places(ahead) - self.places(back)) / (2 * eps))
+            move = np.nan_to_num((self.positions(ahead) - self.positions(back)) / (2 * eps))
             columns.append(-(fit.slope * move[pixel]).sum(-1, keepdims=True))
         found = _least_squares(np.concatenate(columns, 1), fit.D, fit.weight)[3:]
         step = np.zeros(len(at))
@@ -330,7 +342,7 @@ class _Alignment:
 
 
 def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
-    """The matrix (n, pixels) of bilinear interpolation at places x, y (n, 2)."""
+    """Return the matrix (n, pixels) of bilinear interpolation at positions x, y (n, 2)."""
     height, width = shape
     i = np.clip(np.floor(at).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
     u, v = (at - i).T
@@ -345,7 +357,7 @@ def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
 def _least_squares(
     A: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The weighted least-squares solution; columns that are 0 or the others' copies get 0."""
+    """Solve weighted least squares; columns that are 0 or copies of others get 0."""
     size = np.sqrt((weight[:, None] * A**2).sum(0)) + 1e-30
     A = A / size
     W = weight[:, None] * A
@@ -355,6 +367,7 @@ def _least_squares(
 def _correlate_weighted(
     a: NDArray[np.float64], b: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> float:
+    """Return Pearson's correlation of two vectors under weights."""
     total = weight.sum()
     a, b = (one - (weight * one).sum() / total for one in (a, b))
     size = math.sqrt(float((weight * a * a).sum() * (weight * b * b).sum()))

@@ -12,19 +12,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.io import calibration, pinhole
+from jaxevent.io import calibration
+from jaxevent.io.checks import make_camera
 from jaxevent.parameters import read_toml
-from jaxevent.register.geometry import Grid, check_camera, keep_inside, project, rays
+from jaxevent.register.geometry import Grid, check_camera, mask_outside, pixel_rays, project
 
 
 @dataclasses.dataclass(frozen=True)
 class Rig:
     """Calibration of an event camera and another one.
 
-    A place X (m) in the event camera's axes (x to the right, y down, z forward) is
-    rotation @ X + translation in the other's: `rotation` (3, 3), `translation` (3,) in m.
-    Raises `InputError` for a matrix that is no rotation and for focal lengths that are not
-    positive.
+    A point X (m) in the event camera's axes (x to the right, y down, z forward) is
+    rotation @ X + translation in the other's.
+
+    Attributes:
+        events: The event camera.
+        frames: The other camera.
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) m.
+
+    Raises:
+        InputError: The matrix is no rotation, or a focal length is not positive.
     """
 
     events: PinholeCamera
@@ -61,7 +69,7 @@ class Rig:
         cameras: tuple[str, str] | None = None,
         sizes: tuple[tuple[int, int], tuple[int, int]] | None = None,
     ) -> "Rig":
-        """A rig from a camchain of Kalibr (YAML, needs the extra `ros`) or a file of TOML.
+        """Read a rig from a camchain of Kalibr (YAML, needs the extra `ros`) or a file of TOML.
 
             [events]                                  # default: the recording's, `events`
             camera = [fx, fy, cx, cy, k1, k2, p1, p2, k3]    # px, Brown-Conrady; or the first four
@@ -80,12 +88,15 @@ class Rig:
                 would do.
             sizes: (width, height) in px of the event camera and of the other one.
 
+        Returns:
+            The rig.
+
         Raises:
-            InputError: The file is missing or damaged, or does not tell both cameras.
+            InputError: The file is missing or damaged, or does not hold both cameras.
         """
 
         if Path(path).suffix.lower() in calibration.SUFFIXES:
-            return cls._of_chain(Path(path), cameras, sizes)
+            return cls._from_camchain(Path(path), cameras, sizes)
         if cameras is not None:
             raise InputError(
                 f"{path}: only a camchain in YAML names its cameras; leave out cameras"
@@ -106,7 +117,7 @@ class Rig:
             numbers = np.ravel(_check_numbers(values, f"{path}: [{name}] camera"))
             if len(numbers) == 4:
                 numbers = np.concatenate([numbers, np.zeros(5)])
-            return pinhole(numbers, f"{path}: [{name}] camera")
+            return make_camera(numbers, f"{path}: [{name}] camera")
 
         own, other = camera("events") or events, camera("frames")
         if own is None or other is None:
@@ -126,14 +137,15 @@ class Rig:
             raise InputError(f"{path}: {error}") from None
 
     @classmethod
-    def _of_chain(
+    def _from_camchain(
         cls,
         path: Path,
         cameras: tuple[str, str] | None,
         sizes: tuple[tuple[int, int], tuple[int, int]] | None,
     ) -> "Rig":
+        """Read a rig from a camchain; see `read`."""
         found = calibration.read_cameras(path)
-        own, other = cameras or _pair(path, found, sizes)
+        own, other = cameras or _choose_cameras(path, found, sizes)
         for name in (own, other):
             if name not in found:
                 raise InputError(f"{path}: has no camera {name!r}; give two of {', '.join(found)}")
@@ -157,7 +169,7 @@ class Rig:
         depth: ArrayLike | float | int = math.inf,
         plane: tuple[float | int, float | int, float | int, float | int] | None = None,
     ) -> Grid:
-        """Where each pixel's view lies in the other camera's images.
+        """Return the grid that maps each pixel of the event camera to the other one's images.
 
         Hartley and Zisserman, Multiple View Geometry, 2nd ed., sections 6.1 and 7.4: the pixel's
         distortion is undone, its ray X = Z (x, y, 1) ends at `depth`, and X is projected.
@@ -166,17 +178,20 @@ class Rig:
             size: (width, height) of the event camera.
             other: (width, height) of the other one.
             depth: Z in m in the event camera, one number or (height, width); infinite: so far
-                that the translation does not matter, NaN: not known. What is hidden from the other
+                that the translation does not matter, NaN: not known. Occlusion in the other
                 camera by something nearer is not noticed.
             plane: (a, b, c, d): the scene is a X + b Y + c Z = d, m, in the event camera's axes,
                 instead of `depth`.
+
+        Returns:
+            The grid (height, width, 2), px, NaN outside the other camera's images.
 
         Raises:
             InputError: The depth is of another shape or not positive, the plane is none, or the
                 distortion of the event camera has no inverse in its image.
         """
         width, height = size
-        ray = rays(self.events, size)
+        ray = pixel_rays(self.events, size)
         if plane is not None:
             normal, distance = np.asarray(plane[:3], np.float64), float(plane[3])
             if not np.isfinite(plane).all() or not normal.any() or distance == 0:
@@ -197,15 +212,15 @@ class Rig:
         ahead = Z > 0
         # X / Z, so that infinite depth is no special case.
         seen = ray @ self.rotation.T + self.translation / np.where(ahead, Z, np.nan)[:, None]
-        return keep_inside(project(self.frames, seen), other).reshape(height, width, 2)
+        return mask_outside(project(self.frames, seen), other).reshape(height, width, 2)
 
 
-def _pair(
+def _choose_cameras(
     path: Path,
     found: Mapping[str, calibration.CalibratedCamera],
     sizes: tuple[tuple[int, int], tuple[int, int]] | None,
 ) -> tuple[str, str]:
-    """The names of the event camera and the other one of a file, by their sizes."""
+    """Return the names of the event camera and the other one of a camchain, by their sizes."""
     if len(found) < 2:
         raise InputError(f"{path}: holds one camera, {', '.join(found)}; give two of one camchain")
     pairs = [
@@ -229,6 +244,7 @@ def _pair(
 
 
 def _check_numbers(values: Any, where: str) -> NDArray[np.float64]:
+    """Return finite numbers as an array, or raise `InputError` that names their place."""
     try:
         numbers = np.array(values, np.float64)
     except (TypeError, ValueError):

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxevent.errors import InputError
-from jaxevent.io.output import complete
-from jaxevent.io.places import check, locked
+from jaxevent.io.output import check_outputs, complete, locked
 from jaxevent.parameters import Parameters
 from jaxevent.show.report import flatten, markdown_table, means
 
@@ -117,7 +116,7 @@ def check_folder(
     """Raise `InputError` if files of these names cannot be written into a folder safely.
 
     Inputs are never overwritten. Existing files are only if they may be replaced, or if the folder
-    is of a run that continues: the caller's own. See `jaxevent.io.places.check`.
+    is of a run that continues: the caller's own. See `jaxevent.io.output.check_outputs`.
 
     Args:
         folder: The folder.
@@ -127,7 +126,7 @@ def check_folder(
         own: Whether the folder is of a run that continues.
     """
     files = [folder / name for name in names]
-    check(files, inputs, force=replace, inside=files if own else ())
+    check_outputs(files, inputs, force=replace, inside=files if own else ())
 
 
 def write_rows(

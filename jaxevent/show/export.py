@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import THREADS
 from jaxevent.errors import InputError
-from jaxevent.io.deflate import shuffled
-from jaxevent.io.description import CLOCK
-from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, ImageSequence
@@ -58,7 +56,7 @@ def within(
 
 RARE = 1e-3  # of the pixels: fewer do not tell what range images use
 
-# Chunks of one image, read by every HDF5 library; `deflate` writes them faster than h5py.
+# Chunks of one image, read by every HDF5 library; `deflate_shuffled` writes them faster than h5py.
 _SMALLER = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 Colours = Callable[[NDArray], NDArray] | None  # what `colour_video` returns; None: grey
@@ -97,7 +95,7 @@ def write_hdf5(
     with complete_hdf5(out, video.estimator.name, video.params) as (file, check):
         file.attrs["recording"] = name
         file["t"] = times.astype("i8")
-        file["t"].attrs["unit"] = CLOCK
+        file["t"].attrs["unit"] = CLOCK_UNIT
         fields = {
             field: file.create_dataset(field, shape, "f4", chunks=(1, *shape[1:]), **_SMALLER)
             for field in units
@@ -110,7 +108,11 @@ def write_hdf5(
             # One batch is compressed while the next one is made.
             for batch, values in _batches(video, times, colours):
                 jobs = [
-                    (fields[field], row + n, pool.submit(shuffled, np.asarray(image, "<f4")))
+                    (
+                        fields[field],
+                        row + n,
+                        pool.submit(deflate_shuffled, np.asarray(image, "<f4")),
+                    )
                     for field, images in values.items()
                     for n, image in enumerate(images)
                 ]

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.blob.tables import COLUMNS, TABLE_UNITS, UNITS, table_columns
 from jaxevent.errors import InputError
-from jaxevent.io.description import CLOCK
-from jaxevent.io.output import complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Times, microseconds
 
@@ -41,7 +40,7 @@ def write_tracks(
     8) and `times` (rows,), say one row per event. CSV has the columns t (s), id, the state x, y,
     vx, vy, lambda1, lambda2, theta, q and their standard deviations sigma_x ... sigma_q. HDF5 has t
     (rows,) int64 us, id (rows,), mean (rows, 8) and covariance (rows, 8, 8), with the attributes
-    `columns` and `units`, and says what `jaxevent.io.description` lists. Raises `InputError` for
+    `columns` and `units`, and says what `jaxevent.io.output` lists. Raises `InputError` for
     another suffix and shapes that do not fit.
     """
     with track_writer(path) as write:
@@ -108,7 +107,7 @@ def _hdf5_writer(
         yield append
         if "t" not in file:
             append(*no_rows())
-        for name, unit in (("t", CLOCK), ("id", "1")):
+        for name, unit in (("t", CLOCK_UNIT), ("id", "1")):
             file[name].attrs["unit"] = unit
         for name, unit in (("mean", "units"), ("covariance", "units[i] units[j]")):
             file[name].attrs["columns"], file[name].attrs["units"] = COLUMNS, UNITS
@@ -134,7 +133,7 @@ def quantity_writer(
         none = np.empty(0, np.int64)
         append(none, none, none, *[np.empty(0)] * 4)
         yield append
-        units = (CLOCK, "1", "1", "1/s", "1/s", "m", "m")
+        units = (CLOCK_UNIT, "1", "1", "1/s", "1/s", "m", "m")
         for name, unit in zip(QUANTITIES, units, strict=True):
             file[name].attrs["unit"] = unit
 

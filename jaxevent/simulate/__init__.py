@@ -1,4 +1,4 @@
-"""Recordings with known truth: events and frames of HDR scenes, or of ordinary video.
+"""Simulated recordings with known truth: events and frames of HDR scenes, or of ordinary video.
 
     panorama = jaxevent.simulate.scene("lake")
     recording = jaxevent.simulate.simulate(jaxevent.simulate.Pan(panorama, speed="fast"))
@@ -21,15 +21,16 @@ A camera that moves in a rigid world:
     truth.twist(recording.events.t)  # T and Omega of the camera at every event
 """
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.simulate.blobs import (
     BLOB_SCENES,
     Approach,
     Circle,
     Line,
     Lissajous,
-    Motion,
     RandomWalk,
     Target,
+    TargetMotion,
     Truth,
     blob_scene,
     simulate_blobs,
@@ -43,10 +44,10 @@ from jaxevent.simulate.motion import (
     Texture,
     World,
     frame_events,
+    make_texture,
     motion_scene,
     planar_motion,
     simulate_motion,
-    texture_of,
 )
 from jaxevent.simulate.objects import Objects
 from jaxevent.simulate.scenes import FITTING, SCENES, TESTING, Pan, Source, scene
@@ -65,7 +66,6 @@ __all__ = [
     "Clip",
     "Line",
     "Lissajous",
-    "Motion",
     "MovingCamera",
     "Objects",
     "Pan",
@@ -74,17 +74,19 @@ __all__ = [
     "Sensor",
     "Source",
     "Target",
+    "TargetMotion",
     "Texture",
     "Truth",
     "World",
     "blob_scene",
     "frame_events",
     "from_video",
+    "make_texture",
     "motion_scene",
     "planar_motion",
     "scene",
     "simulate",
     "simulate_blobs",
     "simulate_motion",
-    "texture_of",
 ]
+__getattr__ = renamed_names(__name__)

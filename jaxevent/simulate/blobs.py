@@ -20,48 +20,51 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.parameters import suggest_name
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Events, Recording, Times
+from jaxevent.simulate.scenes import parse_seconds
 
 Pair = tuple[float | int, float | int]
 Shape = Literal["gaussian", "ring", "uniform", "disc"]
-BACKGROUND = -1  # the source of events that no target made
-_DELTA = 1e-6  # s, of the central difference that gives a heading's rate
+BACKGROUND = -1  # source of background events
+_DELTA_S = 1e-6  # of the central difference for a heading's rate
 
 
 @runtime_checkable
-class Motion(Protocol):
+class TargetMotion(Protocol):
     """A target's state as a function of time."""
 
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """States (times, 8) at times (s) from 0 on."""
+        """Return the states (times, 8) at times (s) from 0 on."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Steady:
-    """Targets of constant size (px) that start at the angle theta (rad) and spin (rad/s)."""
+class _ConstantSize:
+    """Base of targets of constant size (px), initial angle theta (rad) and spin (rad/s)."""
 
     size: Pair = (10.0, 5.0)
     theta: float | int = 0.0
     spin: float | int = 0.0
 
     def path(self, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions (px) and velocities (px/s), each (times, 2)."""
+        """Return positions (px) and velocities (px/s), each (times, 2), at times (s)."""
         raise NotImplementedError
 
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the states (times, 8) at times (s)."""
         size = np.broadcast_to(np.asarray(self.size, np.float64), (len(t), 2))
         turn = np.stack([self.theta + self.spin * t, np.full_like(t, self.spin)], 1)
         return np.concatenate([*self.path(t), size, turn], 1)
 
 
 @dataclasses.dataclass(frozen=True)
-class Lissajous(_Steady):
-    """p = centre + amplitude sin(2 pi frequency t + phase), each a pair for x and y.
+class Lissajous(_ConstantSize):
+    """Motion along a Lissajous curve: p = centre + amplitude sin(2 pi frequency t + phase).
 
-    Centre and amplitude are in px, frequency in Hz, phase in rad.
+    Each is a pair for x and y. Centre and amplitude are in px, frequency in Hz, phase in rad.
     """
 
     centre: Pair
@@ -77,8 +80,8 @@ class Lissajous(_Steady):
 
 
 @dataclasses.dataclass(frozen=True)
-class Line(_Steady):
-    """p = start (px) + velocity (px/s) t."""
+class Line(_ConstantSize):
+    """Motion at constant velocity: p = start (px) + velocity (px/s) t."""
 
     start: Pair
     velocity: Pair = (0.0, 0.0)
@@ -89,9 +92,11 @@ class Line(_Steady):
 
 
 @dataclasses.dataclass(frozen=True)
-class Circle(_Steady):
-    """A circle of `radius` (px) at `rate` (rad/s) from the angle `phase`; y being downwards, a
-    positive rate is clockwise."""
+class Circle(_ConstantSize):
+    """Motion along a circle of `radius` (px) at `rate` (rad/s) from the angle `phase`.
+
+    As y is downwards, a positive rate is clockwise.
+    """
 
     centre: Pair
     radius: float | int
@@ -110,8 +115,8 @@ class Circle(_Steady):
 class Approach:
     """A target at (X, Y) = `point` (m), whose depth is distance - speed t - acceleration t^2 / 2.
 
-    It is seen at centre + focal point / depth (px) and has lambda_i = size_factor focal extent_i /
-    depth for its `extent` (m) along two axes, the first of which has the angle theta (rad). The
+    Its image is at centre + focal point / depth (px). Its lambda_i is size_factor focal extent_i /
+    depth, for its `extent` (m) along two axes, the first of which has the angle theta (rad). The
     inverse time to contact is (speed + acceleration t) / depth.
     """
 
@@ -126,9 +131,11 @@ class Approach:
     theta: float | int = 0.0
 
     def depth(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the depth (times,) in m at times (s)."""
         return self.distance - self.speed * t - self.acceleration * t**2 / 2
 
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the states (times, 8) at times (s)."""
         depth, closing = self.depth(t)[:, None], (self.speed + self.acceleration * t)[:, None]
         offset = self.focal * np.asarray(self.point) / depth
         size = self.size_factor * self.focal * np.asarray(self.extent) / depth
@@ -138,7 +145,7 @@ class Approach:
 
 @dataclasses.dataclass(frozen=True)
 class RandomWalk:
-    """A path drawn from the filters' own model, for `duration` s from the state `start`.
+    """A random path of the filters' own model, for `duration` s from the state `start`.
 
     Velocity and spin are Wiener processes of densities Q_v (px^2/s^3) and Q_q (rad^2/s^3),
     position and angle their integrals plus Wiener processes of densities Q_p (px^2/s) and Q_theta
@@ -172,6 +179,7 @@ class RandomWalk:
             )
 
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the states (times, 8) at times (s)."""
         h = self.step
         integral, rate, wander, log_size = self._grid
         k = np.clip(np.floor(t / h).astype(int), 0, len(rate) - 2)
@@ -181,17 +189,20 @@ class RandomWalk:
         (s0, v0), (s1, v1) = ((integral[i], rate[i]) for i in (k, k + 1))
         c2, c3 = 3 * (s1 - s0) - h * (2 * v0 + v1), 2 * (s0 - s1) + h * (v0 + v1)
         chord = wander[k] + a * (wander[k + 1] - wander[k])
-        place = s0 + a * (h * v0 + a * (c2 + a * c3)) + chord
+        position = s0 + a * (h * v0 + a * (c2 + a * c3)) + chord
         slope = v0 + a * (2 * c2 + 3 * a * c3) / h
         size = np.exp(log_size[k] + a * (log_size[k + 1] - log_size[k]))
         return np.concatenate(
-            [place[:, :2], slope[:, :2], size, place[:, 2:], slope[:, 2:]], axis=1
+            [position[:, :2], slope[:, :2], size, position[:, 2:], slope[:, 2:]], axis=1
         )
 
     @functools.cached_property
     def _grid(self) -> tuple[NDArray[np.float64], ...]:
-        """Of x, y and theta: the integral of the rate, the rate and the Wiener part (steps + 1, 3);
-        and the logarithm of the two sizes (steps + 1, 2)."""
+        """The path on the grid of steps.
+
+        The integral of the rate, the rate and the Wiener part of x, y and theta, (steps + 1, 3)
+        each; and the logarithm of the two sizes (steps + 1, 2).
+        """
         h, steps = self.step, math.ceil(self.duration / self.step - 1e-9)
         rng = np.random.default_rng(self.seed)
         first = np.asarray(self.start, np.float64)
@@ -201,12 +212,14 @@ class RandomWalk:
         change = white * math.sqrt(h) * n1
         gain = white * h**1.5 * (n1 / 2 + n2 / math.sqrt(12))
 
-        def summed(start: NDArray, steps: NDArray) -> NDArray[np.float64]:
+        def accumulate(start: NDArray, steps: NDArray) -> NDArray[np.float64]:
             return np.concatenate([start[None], start + np.cumsum(steps, axis=0)])
 
-        rate = summed(first[[2, 3, 7]], change)
-        integral = summed(first[[0, 1, 6]], rate[:-1] * h + gain)
-        wander = summed(np.zeros(3), np.sqrt(np.array([self.Q_p, self.Q_p, self.Q_theta]) * h) * n3)
+        rate = accumulate(first[[2, 3, 7]], change)
+        integral = accumulate(first[[0, 1, 6]], rate[:-1] * h + gain)
+        wander = accumulate(
+            np.zeros(3), np.sqrt(np.array([self.Q_p, self.Q_p, self.Q_theta]) * h) * n3
+        )
         log_size = np.empty((steps + 1, 2))
         log_size[0] = np.log(first[4:6])
         noise = math.sqrt(self.Q_lambda * h) * rng.normal(size=(steps, 2))
@@ -220,21 +233,24 @@ class RandomWalk:
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """Something that moves and makes `rate` events per second, those outside the sensor included.
+    """A moving target that makes `rate` events per second, those outside the sensor included.
 
-    `shape` is the distribution of the events about the centre. Those of a "gaussian", a "ring" (an
-    elliptic line), and a "uniform" ellipse have the standard deviations lambda1, lambda2 of the
-    motion; their polarity is random. A "disc" makes events at the leading and the trailing edge:
-    on its rim, of the radius sqrt(3/2) lambda1, in proportion to |cos| of the angle to the
-    heading, ON in front if it is `bright`. Then lambda2 = lambda1 / sqrt(2), theta is the heading
-    and q its rate, whatever the motion says of them.
+    `shape` is the distribution of the events about the centre. The events of a "gaussian", a "ring"
+    (an elliptic line), and a "uniform" ellipse have the standard deviations lambda1, lambda2 of the
+    motion; their polarity is random. A "disc" makes events at the leading and the trailing edge: on
+    its rim, of the radius sqrt(3/2) lambda1, in proportion to |cos| of the angle to the heading, ON
+    in front if it is `bright`. Its lambda2 is lambda1 / sqrt(2), theta is the heading and q its
+    rate; those of the motion are ignored.
 
     With `flicker` (Hz) the events come in bursts, ON at the start of a period and OFF in its
     middle, whose rate decays with the time constant `burst` (s); `rate` is still the mean. There
-    are no events in `dropouts`, pairs of times (s). Raises `InputError` for impossible values.
+    are no events in `dropouts`, pairs of times (s).
+
+    Raises:
+        InputError: A value is not possible.
     """
 
-    motion: Motion
+    motion: TargetMotion
     rate: float | int
     shape: str = "gaussian"
     bright: bool = True
@@ -256,7 +272,7 @@ class Target:
             raise InputError(f"the drop-outs {self.dropouts} are not pairs of a start and an end")
 
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The true state (times, 8) at times (s); that of the events, for every shape."""
+        """Return the true states (times, 8) of the events at times (s)."""
         state = self.motion.state(t)
         if self.shape != "disc":
             return state
@@ -268,21 +284,29 @@ class Target:
         # Density |cos| / 4 of the angle on the rim: E cos^2 = 2/3 and E sin^2 = 1/3.
         state[:, 5] = state[:, 4] / math.sqrt(2)
         state[:, 6] = np.unwrap(heading(t))
-        turn = heading(t + _DELTA) - heading(t - _DELTA)
-        state[:, 7] = (np.mod(turn + np.pi, 2 * np.pi) - np.pi) / (2 * _DELTA)
+        turn = heading(t + _DELTA_S) - heading(t - _DELTA_S)
+        state[:, 7] = (np.mod(turn + np.pi, 2 * np.pi) - np.pi) / (2 * _DELTA_S)
         return state
 
     def visible(self, t: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether times (s) are outside all drop-outs."""
-        seen = np.ones(t.shape, bool)
+        """Return which times (s) are outside all drop-outs."""
+        visible = np.ones(t.shape, bool)
         for begin, end in self.dropouts:
-            seen &= ~((begin <= t) & (t < end))
-        return seen
+            visible &= ~((begin <= t) & (t < end))
+        return visible
 
     def events(
         self, duration: float | int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Times (s), positions (events, 2) (px) and polarities, in no order."""
+        """Draw the events.
+
+        Args:
+            duration: Length of the simulation, s.
+            rng: Source of random numbers.
+
+        Returns:
+            Times (events,), s, positions (events, 2), px, and polarities (events,), unsorted.
+        """
         count = rng.poisson(self.rate * duration)
         if self.flicker:
             edge = rng.integers(0, max(1, math.ceil(2 * self.flicker * duration)), count)
@@ -291,8 +315,8 @@ class Target:
         else:
             t = rng.uniform(0, duration, count)
             on = rng.random(count) < 0.5
-        seen = self.visible(t) & (t < duration)
-        t, on = t[seen], on[seen]
+        kept = self.visible(t) & (t < duration)
+        t, on = t[kept], on[kept]
         state = self.state(t)
         u, front = self._offsets(len(t), rng)
         if self.shape == "disc":
@@ -305,7 +329,7 @@ class Target:
     def _offsets(
         self, count: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Offsets (count, 2) of unit covariance along the axes; and which are in front."""
+        """Draw offsets (count, 2) of unit covariance along the axes; return which are in front."""
         if self.shape == "gaussian":
             offsets = rng.normal(size=(count, 2))
         elif self.shape == "disc":
@@ -321,43 +345,37 @@ class Target:
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What is true of a simulated recording.
+    """The truth of a simulated recording: `truth(times)` gives the states (times, targets, 8).
 
-    `truth(times)` gives the states (times, targets, 8). `source` (events,) is the target of each
-    event, -1 for background; t (events,) in s and xi (events, 2) in px are the events before they
-    were rounded to microseconds and pixels. Rounding to pixels adds 1/12 px^2 to the variances of
-    the events' positions, which the true lambda does not contain.
+    Rounding of events to pixels adds 1/12 px^2 to the variances of their positions, which the true
+    lambda does not contain.
     """
 
     targets: tuple[Target, ...]
-    duration: float | int
-    source: NDArray[np.int64]
-    t: NDArray[np.float64]
-    xi: NDArray[np.float64]
+    duration: float | int  # s
+    source: NDArray[np.int64]  # (events,), the target of each event, -1 for background
+    t: NDArray[np.float64]  # (events,), s, before rounding to microseconds
+    xi: NDArray[np.float64]  # (events, 2), px, before rounding to pixels
 
     def __call__(self, times: Times) -> NDArray[np.float64]:
-        """States (times, targets, 8) at integers (us) or floats (s) from 0 to the duration.
+        """Return the states of all targets.
 
-        Raises `InputError` for other times.
+        Args:
+            times: (times,) integers (us) or floats (s) from 0 to the duration.
+
+        Returns:
+            (times, targets, 8).
+
+        Raises:
+            InputError: A time is outside the recording.
         """
-        t = self._seconds(times)
+        t = parse_seconds(times, self.duration)
         return np.stack([target.state(t) for target in self.targets], 1)
 
     def visible(self, times: Times) -> NDArray[np.bool_]:
-        """Whether a target makes events, (times, targets): False in its drop-outs."""
-        t = self._seconds(times)
+        """Return which targets make events, (times, targets): False in their drop-outs."""
+        t = parse_seconds(times, self.duration)
         return np.stack([target.visible(t) for target in self.targets], 1)
-
-    def _seconds(self, times: Times) -> NDArray[np.float64]:
-        rounded = np.atleast_1d(microseconds(times))
-        given = np.atleast_1d(np.asarray(times))
-        t = np.asarray(given if given.dtype.kind == "f" else rounded * 1e-6, np.float64)
-        if ((rounded < 0) | (rounded > math.ceil(self.duration * 1e6))).any():
-            raise InputError(
-                f"the truth is known from 0 to {self.duration} s, not at {t.min()} to {t.max()} s; "
-                "integers are microseconds, floats seconds"
-            )
-        return t
 
 
 def simulate_blobs(
@@ -368,13 +386,26 @@ def simulate_blobs(
     seed: int = 0,
     name: str = "blobs",
 ) -> tuple[Recording, Truth]:
-    """Events of the targets on a sensor of size (width, height) for `duration` s, and the truth.
+    """Simulate the events of targets; deterministic in `seed`.
 
-    `noise` is the rate of background events (1/s, over the whole sensor), uniform in place and
-    time, of random polarity. Times are rounded to microseconds, positions to pixels; what falls
-    outside the sensor is lost. Deterministic in `seed`: a target's events do not depend on the
-    targets after it, nor on the noise. Raises `InputError` for settings that are not possible, a
-    target whose state is not finite or whose size is not positive, and if there is no event.
+    Times are rounded to microseconds, positions to pixels; events outside the sensor are lost. A
+    target's events do not depend on the targets after it, nor on the noise.
+
+    Args:
+        targets: The targets.
+        size: Width and height of the sensor, px.
+        duration: Length of the recording, s.
+        noise: Rate of background events over the whole sensor, 1/s; they are uniform in space and
+            time, of random polarity.
+        seed: Seed of all random numbers.
+        name: Name of the recording.
+
+    Returns:
+        The recording and its truth.
+
+    Raises:
+        InputError: A setting is not possible, a target's state is not finite or its size not
+            positive, or there is no event.
     """
     targets = tuple(targets)
     width, height = size
@@ -495,7 +526,7 @@ def _walk(
     return [Target(walk, rate)], (2000, 2000), float(duration), 0.0
 
 
-# Of `_cars`, to the left, in front and to the right: m from the middle, m, m/s and m/s^2.
+# Of `_cars`, left, in front, right: offset (m), distance (m), speed (m/s), acceleration (m/s^2).
 CARS = ((-3.2, 22.0, 2.0, 2.0), (0.0, 18.0, 0.5, 0.0), (3.0, 14.0, 3.5, 0.0))
 
 _SCENES: dict[str, Callable[..., Scene]] = {
@@ -514,31 +545,41 @@ BLOB_SCENES = tuple(_SCENES)
 
 
 def blob_scene(name: str, seed: int = 0, **settings: Any) -> tuple[Recording, Truth]:
-    """A scene of `BLOB_SCENES` by name, as `simulate_blobs` gives it.
-
-    `rate` is that of each target, in events/s.
+    """Simulate a scene of `BLOB_SCENES` by name.
 
     - lissajous: one blob of (10, 5) px, to 2000 px/s, turning at 4 rad/s, 1.5 s (rate, noise);
-    - noise: the same in background events of `ratio` times its rate (ratio, rate);
+    - noise: lissajous in background events of `ratio` times its rate (ratio, rate);
     - growing: from 17 m to 5 m at 8 m/s, 0.24 m wide, focal length 1000 px, size factor 1/4, so
       that lambda1 grows from 3.5 to 12 px (rate);
     - ttc: two lights 1.4 m apart from 20 m to 8 m in 3.45 s, 1 / TTC from 0.08 to 0.67 1/s (rate,
       ratio of background events);
-    - cars: the two lights each, 1.4 m apart and 0.2 m wide, of three cars in lanes side by side for
-      2 s, 0 and 1 of the left, 2 and 3 of the middle, 4 and 5 of the right one; 1 / TTC from 0.09
-      to 0.43, from 0.028 to 0.029 and from 0.25 to 0.5 1/s (rate, ratio of background events);
+    - cars: three cars in lanes side by side for 2 s, with two lights each, 1.4 m apart and 0.2 m
+      wide: targets 0 and 1 left, 2 and 3 in the middle, 4 and 5 right; 1 / TTC from 0.09 to 0.43,
+      from 0.028 to 0.029 and from 0.25 to 0.5 1/s (rate, ratio of background events);
     - disc: leading and trailing edges on the path of lissajous (rate, radius);
     - crossing: two blobs that pass each other at 0.3 s, 1200 px/s relative, `offset` px apart
       (offset, rate, speed of each);
     - dropout: lissajous without events from `at` for `length` s (length, at, rate);
-    - flock: `count` blobs of (6, 4) px, the k-th seen from k `stagger` s on (count, rate, ratio,
-      stagger);
+    - flock: `count` blobs of (6, 4) px, the k-th visible from k `stagger` s on (count, rate,
+      ratio, stagger);
     - walk: a `RandomWalk` of (10, 5) px on 2000 x 2000 pixels (duration, rate, walk_seed, Q_p,
       Q_v, ...).
 
-    Raises `InputError` for an unknown name.
+    Args:
+        name: Name of the scene.
+        seed: Seed of all random numbers.
+        **settings: Those in brackets; `rate` is that of each target, events/s.
+
+    Returns:
+        The recording and its truth.
+
+    Raises:
+        InputError: The name is unknown.
     """
     if name not in _SCENES:
         raise InputError(f"there is no scene {name!r}; {suggest_name(name, BLOB_SCENES)}")
     targets, size, duration, noise = _SCENES[name](**settings)
     return simulate_blobs(targets, size, duration, noise, seed, name)
+
+
+__getattr__ = renamed_names(__name__)

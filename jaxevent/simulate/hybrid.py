@@ -1,6 +1,6 @@
-"""A simulated sensor that records events and frames of the same scene, and the truth behind them.
+"""A simulated sensor that records events and frames of the same scene, with the truth.
 
-Events follow the contrast threshold model with what real pixels add to it: mismatched thresholds, a
+Events follow the contrast threshold model with the faults of real pixels: mismatched thresholds, a
 dead time after each event, background events and hot pixels. Frames are exposed, sent through a
 camera response that clips, disturbed by noise and quantised. Times are on the events' clock, which
 starts at 0. What is not simulated: the photoreceptor's finite bandwidth, bus congestion.
@@ -9,22 +9,24 @@ starts at 0. What is not simulated: the photoreceptor's finite bandwidth, bus co
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import Response, SCurve
 from jaxevent.codegen import njit_noalloc
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate.scenes import Source
 
-# Samples of a block, and the longest and shortest time (s) between two.
-_BLOCK, _LONGEST, _SHORTEST = 32, 4e-3, 1e-4
+_BLOCK_SAMPLES = 32
+_MAX_STEP_S, _MIN_STEP_S = 4e-3, 1e-4  # between samples
 _QUANTILE = 0.95  # of the pixels whose change between samples is kept below half a threshold
-_MARGIN = 2.5  # grey levels from either end within which a frame says nothing (read noise)
-_FIRST_TRUTH = 0.2  # s, so that estimators have settled
-_EXPOSURE_TARGET, _GAIN_RANGE = 0.45, 16.0  # mean grey that automatic exposure seeks
+_MARGIN = 2.5  # grey levels from either end in which a frame counts as clipped (read noise)
+_FIRST_TRUTH_S = 0.2  # so that estimators have settled
+_TARGET_GREY, _GAIN_RANGE = 0.45, 16.0  # of automatic exposure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,9 +34,11 @@ class Sensor:
     """Settings of a simulated hybrid sensor; the defaults are like a DAVIS. Times in seconds.
 
     Thresholds are changes of ln(I + dark_offset). Intensity 1 is the frames' white. With
-    `auto_exposure`, frame k sees the intensity times a gain, which follows the mean of frame k - 1.
-    `response` is None for the cropping S-curve `camera.SCurve()`. Raises `InputError` for values
-    that no sensor can have.
+    `auto_exposure`, frame k shows the intensity times a gain, which follows the mean of frame
+    k - 1. `response` is None for the cropping S-curve `camera.SCurve()`.
+
+    Raises:
+        InputError: A value is not possible.
     """
 
     c_on: float | int = 0.20  # ln intensity
@@ -98,23 +102,32 @@ SENSORS = {
 def simulate(
     source: Source, sensor: Sensor | None = None, seed: int = 0, name: str = "simulated"
 ) -> Recording:
-    """Record a source with a sensor (default: `Sensor()`); deterministic in `seed`.
+    """Record a source with a sensor; deterministic in `seed`.
 
     Frame stamps are mid-exposure, `sensor.clock_offset` too early. `extra` holds
 
     - hdr (T, H, W) float32, hdr_t (T,) int64 us: true intensity, the frames' white being 1, at
       random times from 0.2 s on, none at a frame's stamp;
     - response, certainty (256,): intensity and weight of each grey level, for `TableResponse`;
-    - clip (2,): intensities within 2.5 grey levels of either end, beyond which frames say nothing;
+    - clip (2,): intensities 2.5 grey levels from either end, beyond which frames are clipped;
     - gain (frames,): a frame's intensity is response[grey] / gain, 1 without automatic exposure.
       Frames are kept as the camera gave them: on a common scale each frame would clip at another
-      grey level, and saturated pixels could no longer be told from measured ones;
+      grey level, and saturated pixels could not be distinguished from measured ones;
     - hot (pixels, 2): x and y of the hot pixels;
     - c_on, c_off, mismatch, dark_offset, refractory, background_rate, read_noise, clock_offset:
       the sensor's settings, scalars.
 
-    Raises `InputError` for a source with fewer than two frames or intensities that are not
-    positive.
+    Args:
+        source: The scene.
+        sensor: The sensor; None: `Sensor()`.
+        seed: Seed of all noise.
+        name: Name of the recording.
+
+    Returns:
+        The recording.
+
+    Raises:
+        InputError: The source has fewer than two frames, or intensities that are not positive.
     """
     sensor = Sensor() if sensor is None else sensor
     width, height = source.size
@@ -125,14 +138,15 @@ def simulate(
         c * np.maximum(1 + sensor.mismatch * rng.normal(size=width * height), 0.3)
         for c in (sensor.c_on, sensor.c_off)
     )
-    events, hot = _events(source, sensor, on, off, rng, np.random.default_rng(noise_seed), name)
+    rngs = rng, np.random.default_rng(noise_seed)
+    events, hot = _simulate_events(source, sensor, (on, off), rngs, name)
     images, gain = expose(source.intensity, stamps, sensor, np.random.default_rng(frame_seed))
 
     frames_t = stamps - round(sensor.clock_offset * 1e6)
     hdr_t = _truth_times(source.duration, sensor, frames_t, np.random.default_rng(truth_seed))
     hdr = np.stack([source.intensity(float(t)) for t in hdr_t * 1e-6]).astype(np.float32)
 
-    response = response_of(sensor)
+    response = sensor_response(sensor)
     levels = np.arange(256) / 255
     ends = np.array([_MARGIN, 255 - _MARGIN]) / 255
     extra: dict[str, NDArray] = {
@@ -154,12 +168,24 @@ def simulate(
     return Recording(name, width, height, events, frames, extra=extra).check()
 
 
-def response_of(sensor: Sensor) -> Response:
+def sensor_response(sensor: Sensor) -> Response:
+    """Return the response of a sensor's frames."""
     return SCurve() if sensor.response is None else sensor.response
 
 
 def frame_times(duration: float | int, sensor: Sensor) -> NDArray[np.int64]:
-    """True mid-exposure times (us) of all frames whose exposure fits into `duration` (s)."""
+    """Return the true mid-exposure times of a sensor's frames.
+
+    Args:
+        duration: Length of the scene, s.
+        sensor: The sensor.
+
+    Returns:
+        (frames,) us, of all frames whose exposure fits.
+
+    Raises:
+        InputError: Fewer than two frames fit.
+    """
     count = math.floor((duration - sensor.exposure) * sensor.frame_rate + 1e-9) + 1
     if not math.isfinite(duration) or count < 2:
         raise InputError(
@@ -177,11 +203,19 @@ def expose(
     rng: np.random.Generator,
     gain: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Frames (frames, ...) of linear light(t), grey or colour, and their gains (frames,).
+    """Expose frames.
 
-    `gain` overrides automatic exposure.
+    Args:
+        light: A function from a time (s) to linear intensity (...), grey or colour.
+        stamps: (frames,) mid-exposure times, us.
+        sensor: The sensor.
+        rng: Source of noise.
+        gain: (frames,) gains; None: by automatic exposure, or 1.
+
+    Returns:
+        Frames (frames, ...), and their gains (frames,).
     """
-    response = response_of(sensor)
+    response = sensor_response(sensor)
     within = (np.arange(sensor.exposure_samples) + 0.5) / sensor.exposure_samples - 0.5
     images, gains, factor = [], [], 1.0
     for k, stamp in enumerate(stamps):
@@ -197,7 +231,7 @@ def expose(
         images.append(np.rint(noisy).clip(0, 255).astype(np.uint8))
         gains.append(factor)
         if sensor.auto_exposure and gain is None:
-            step = (_EXPOSURE_TARGET / max(grey.mean(), 0.05)) ** 0.3
+            step = (_TARGET_GREY / max(grey.mean(), 0.05)) ** 0.3
             factor = min(max(factor * step, 1 / _GAIN_RANGE), _GAIN_RANGE)
     return np.stack(images), np.array(gains)
 
@@ -205,7 +239,7 @@ def expose(
 def _truth_times(
     duration: float | int, sensor: Sensor, stamps: NDArray[np.int64], rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    begin = min(_FIRST_TRUTH, duration / 2)
+    begin = min(_FIRST_TRUTH_S, duration / 2)
     count = max(1, int((duration - begin) * sensor.truth_rate + 1e-9))
     cell = (duration - begin) / count
     t = begin + (np.arange(count) + rng.uniform(0.05, 0.95, count)) * cell
@@ -216,7 +250,7 @@ def _truth_times(
 def _samples(
     source: Source, sensor: Sensor, name: str
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Blocks of times (us) and ln(I + dark_offset) (samples, pixels); the ends are shared.
+    """Yield blocks of times (us) and ln(I + dark_offset) (samples, pixels); ends are shared.
 
     The next step is chosen from the last one's largest change (`_QUANTILE` of the pixels): half a
     threshold, and at most twice or half the last step.
@@ -233,29 +267,49 @@ def _samples(
 
     aim = min(sensor.c_on, sensor.c_off) / 2
     rank = int(_QUANTILE * (source.size[0] * source.size[1] - 1))
-    t, step = 0.0, _SHORTEST
+    t, step = 0.0, _MIN_STEP_S
     times, levels = [t], [level(t)]
     while t < source.duration:
         t = min(t + step, source.duration)
         times.append(t)
         levels.append(level(t))
         change = np.partition(np.abs(levels[-1] - levels[-2]), rank)[rank]
-        step = min(max(step * min(max(aim / (change + 1e-12), 0.5), 2.0), _SHORTEST), _LONGEST)
-        if len(times) == _BLOCK or t >= source.duration:
+        step = min(max(step * min(max(aim / (change + 1e-12), 0.5), 2.0), _MIN_STEP_S), _MAX_STEP_S)
+        if len(times) == _BLOCK_SAMPLES or t >= source.duration:
             yield np.array(times) * 1e6, np.array(levels)
             times, levels = times[-1:], levels[-1:]
 
 
-def _events(
+class _Pixels(NamedTuple):
+    """Pixels of a sensor while events are simulated, each (pixels,)."""
+
+    on: NDArray[np.float64]  # thresholds, ln intensity
+    off: NDArray[np.float64]
+    reference: NDArray[np.float64]  # level at the last event; updated
+    ready: NDArray[np.float64]  # us, end of the dead time; updated
+
+
+class _NoiseEvents(NamedTuple):
+    """Background events, pixel by pixel."""
+
+    t: NDArray[np.float64]  # (events,), us
+    p: NDArray[np.bool_]  # (events,)
+    following: NDArray[np.int64]  # (pixels,), the next event of each pixel; updated
+    stop: NDArray[np.int64]  # (pixels,), the end of its events
+
+
+def _simulate_events(
     source: Source,
     sensor: Sensor,
-    on: NDArray[np.float64],
-    off: NDArray[np.float64],
-    rng: np.random.Generator,
-    noise_rng: np.random.Generator,
+    thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
+    rngs: tuple[np.random.Generator, np.random.Generator],
     name: str,
 ) -> tuple[Events, NDArray[np.int64]]:
-    """The events, and x, y of the hot pixels."""
+    """Simulate the events, and draw x, y of the hot pixels.
+
+    `thresholds` are of ON and OFF events, (pixels,) each; `rngs` draw pixels and noise events.
+    """
+    (on, off), (rng, noise_rng) = thresholds, rngs
     width, height = source.size
     pixels = width * height
     hot = np.sort(rng.choice(pixels, round(sensor.hot_fraction * pixels), replace=False))
@@ -271,21 +325,18 @@ def _events(
     # The sensor has been on for some time: the level at the last event is anywhere between the
     # thresholds.
     phase = rng.uniform(-on, off)
-    reference, ready = np.empty(0), np.full(pixels, -1.0)
-    following = first[:-1].copy()
-    parts = []
+    state = _Pixels(on, off, np.empty(0), np.full(pixels, -1.0))
+    noise = _NoiseEvents(noise_t, noise_p, first[:-1].copy(), first[1:])
+    refractory, parts = round(sensor.refractory * 1e6), []
     for times, levels in _samples(source, sensor, name):
-        if not len(reference):
-            reference = levels[0] + phase
+        if not len(state.reference):
+            state = state._replace(reference=levels[0] + phase)
         # Every crossing takes at least a threshold of the way that the level goes.
         way = np.abs(np.diff(levels, axis=0)).sum(0) / np.minimum(on, off)
-        room = int(np.floor(way).sum()) + 2 * pixels + len(noise_t)
-        t, pixel, p = (np.empty(room, kind) for kind in (np.int64, np.int32, np.bool_))
-        used = _cross(
-            times, levels, on, off, round(sensor.refractory * 1e6), reference, ready,
-            noise_t, noise_p, following, first[1:], t, pixel, p,
-        )  # fmt: skip
-        parts.append((t[:used].copy(), pixel[:used].copy(), p[:used].copy()))
+        most = int(np.floor(way).sum()) + 2 * pixels + len(noise_t)
+        out = tuple(np.empty(most, kind) for kind in (np.int64, np.int32, np.bool_))
+        used = _cross_thresholds(times, levels, state, noise, refractory, out)
+        parts.append([column[:used].copy() for column in out])
     t, pixel, p = (np.concatenate(column) for column in zip(*parts, strict=True))
     if sensor.jitter:
         late = noise_rng.normal(0, sensor.jitter * 1e6, len(t))
@@ -298,15 +349,15 @@ def _events(
 
 
 @njit_noalloc
-def _cross(
-    times, levels, on, off, refractory, reference, ready, noise_t, noise_p, following, last,
-    out_t, out_pixel, out_p,
-):  # fmt: skip
-    """Events of one block, pixel by pixel; moves `reference`, `ready` and `following` on.
+def _cross_thresholds(times, levels, pixels, noise, refractory, out):
+    """Write the events of one block, pixel by pixel, and return their number.
 
     Between samples the level is linear in time. After an event at t the pixel is dead until
     t + refractory, and its reference is then the level at that time: the change during it is lost.
     """
+    on, off, reference, ready = pixels
+    noise_t, noise_p, following, stop = noise
+    out_t, out_pixel, out_p = out
     n = 0
     for i in range(levels.shape[1]):
         for k in range(len(times) - 1):
@@ -318,7 +369,7 @@ def _cross(
                         break
                     t = ready[i]
                     reference[i] = levels[k, i] + slope * (t - times[k])
-                # The next crossing of this stretch, if any, or a noise event before it.
+                # The next crossing before the next sample, if any, or a noise event before it.
                 at, rises = np.inf, True
                 if slope > 0:
                     at = times[k] + (reference[i] + on[i] - levels[k, i]) / slope
@@ -326,9 +377,9 @@ def _cross(
                     at = times[k] + (reference[i] - off[i] - levels[k, i]) / slope
                     rises = False
                 at = max(at, t)
-                while following[i] < last[i] and noise_t[following[i]] < t:
+                while following[i] < stop[i] and noise_t[following[i]] < t:
                     following[i] += 1  # fell into the dead time
-                if following[i] < last[i] and noise_t[following[i]] < at:
+                if following[i] < stop[i] and noise_t[following[i]] < at:
                     at, rises = noise_t[following[i]], noise_p[following[i]]
                     if at <= end:
                         following[i] += 1
@@ -343,3 +394,6 @@ def _cross(
                 t = at
                 ready[i] = stamp + refractory if refractory > 0 else at
     return n
+
+
+__getattr__ = renamed_names(__name__)

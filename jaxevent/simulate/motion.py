@@ -1,19 +1,19 @@
-"""A camera that moves in a rigid, textured world, with the truth of its twist and of depth.
+"""A camera that moves in a rigid, textured world, with the true twist and depth.
 
     recording, truth = motion_scene("texture", motion="varying", seed=3)
     truth.twist(0.2)   # T (1, 3) in m/s and Omega (1, 3) in rad/s, the camera's own
     truth.depth(0.2)   # (height, width) in m
 
 Camera axes are x to the right, y down, z forward; the world's are the camera's at time 0. Pixel
-centres are whole numbers. `frame_events` is the egomotion thesis' own generator instead: events
-are differences of images 50 us apart.
+centres are whole numbers. `frame_events` is the generator of the egomotion thesis: events are
+differences of images 50 us apart.
 """
 
 import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,21 +21,23 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.parameters import suggest_name
-from jaxevent.recording import Events, Poses, Recording, Times, microseconds
+from jaxevent.recording import Events, Poses, Recording, Times
 from jaxevent.simulate.hybrid import SENSORS, Sensor, simulate
+from jaxevent.simulate.scenes import parse_seconds
 
 Six = tuple[float | int, float | int, float | int, float | int, float | int, float | int]
 Three = tuple[float | int, float | int, float | int]
 Change = Literal["constant", "linear", "varying"]
 _NONE: Six = (0, 0, 0, 0, 0, 0)
 
-_STEP = 5e-4  # s, of the integration of poses
-_POSE_RATE = 200.0  # Hz, of a recording's ground truth
+_STEP_S = 5e-4  # of the integration of poses
+_POSE_RATE_HZ = 200.0  # of a recording's ground truth
 _TEXELS = 512
-_FADE = 16.0  # texels from a wall's edge within which its texture fades
-# Few frames of one instant each; no more truth images than one.
+_FADE_TEXELS = 16.0  # from a wall's edge, within which its texture fades
+# Few frames of one instant each, and one image of the truth.
 _IDEAL = dataclasses.replace(
     SENSORS["ideal"], frame_rate=25.0, exposure=1e-3, exposure_samples=1, truth_rate=1e-3
 )
@@ -43,10 +45,13 @@ _IDEAL = dataclasses.replace(
 
 @dataclasses.dataclass(frozen=True)
 class CameraMotion:
-    """Twists mean + slope t + amplitude sin(2 pi frequency t + phase), six numbers each.
+    """A camera's twist mean + slope t + amplitude sin(2 pi frequency t + phase), six numbers each.
 
     They are T (m/s) and Omega (rad/s) of the camera, in its own axes; frequency is in Hz, phase in
-    rad. The pose at time 0 is the identity. Raises `InputError` for numbers that are not finite.
+    rad. The pose at time 0 is the identity.
+
+    Raises:
+        InputError: A number is not finite.
     """
 
     mean: Six
@@ -66,24 +71,24 @@ class CameraMotion:
             object.__setattr__(self, field.name, tuple(value.tolist()))
 
     def twist(self, t: NDArray[np.floating]) -> NDArray[np.float64]:
-        """T and Omega, (times, 6), at times (s)."""
+        """Return T (m/s) and Omega (rad/s), (times, 6), at times (s)."""
         t = np.asarray(t, np.float64)[:, None]
         turn = 2 * np.pi * np.asarray(self.frequency) * t + np.asarray(self.phase)
         swing = np.asarray(self.amplitude) * np.sin(turn)
         return np.asarray(self.mean) + np.asarray(self.slope) * t + swing
 
     def pose(self, t: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Camera-to-world poses (times, 4, 4) at times (s) from 0 on, to about 1e-11."""
+        """Return camera-to-world poses (times, 4, 4) at times (s) from 0 on, to about 1e-11."""
         t = np.asarray(t, np.float64)
-        k = np.floor(t / _STEP).astype(int)
+        k = np.floor(t / _STEP_S).astype(int)
         grid = self._grid(1 << int(k.max(initial=0)).bit_length())
-        return grid[k] @ self._steps(k * _STEP, t - k * _STEP)
+        return grid[k] @ self._steps(k * _STEP_S, t - k * _STEP_S)
 
     def _steps(self, t: NDArray[np.floating], h: NDArray[np.floating]) -> NDArray[np.float64]:
-        """P(t)^-1 P(t + h): Magnus' series for dP/dt = P X, to fourth order, by Gauss' points."""
-        far = math.sqrt(3) / 6
+        """Return P(t)^-1 P(t + h), by the Magnus series for dP/dt = P X, to fourth order."""
+        gauss = math.sqrt(3) / 6  # of the two points of Gauss' quadrature from the middle
         (v1, w1), (v2, w2) = (
-            np.split(self.twist(t + (0.5 + s * far) * h), 2, axis=-1) for s in (-1, 1)
+            np.split(self.twist(t + (0.5 + s * gauss) * h), 2, axis=-1) for s in (-1, 1)
         )
         # h (X1 + X2) / 2 + sqrt(3) / 12 h^2 [X1, X2], as vectors.
         h, bend = h[:, None], math.sqrt(3) / 12 * h[:, None] ** 2
@@ -93,8 +98,8 @@ class CameraMotion:
 
     @functools.cache  # noqa: B019, motions are small and few
     def _grid(self, count: int) -> NDArray[np.float64]:
-        """Poses at the times 0, _STEP, ..., (count + 1,)."""
-        steps = self._steps(np.arange(count) * _STEP, np.full(count, _STEP))
+        """Return the poses (count + 1, 4, 4) at the times 0, _STEP_S, ..."""
+        steps = self._steps(np.arange(count) * _STEP_S, np.full(count, _STEP_S))
         poses = [np.eye(4)]
         for step in steps:
             poses.append(poses[-1] @ step)
@@ -111,10 +116,25 @@ def planar_motion(
     frequency: float | int = 2.0,
     phase: float | int = 0.0,
 ) -> CameraMotion:
-    """A motion before a wall at `depth` (m) that moves the whole image with the same velocity.
+    """Make a motion before a wall that moves the whole image with one velocity.
 
-    U = velocity + slope t + amplitude sin(2 pi frequency t + phase), in px/s and px/s^2, with the
-    focal length in px: T = -U depth / f. Raises `InputError` as `CameraMotion` does.
+    The velocity U = velocity + slope t + amplitude sin(2 pi frequency t + phase) is that of the
+    translation T = -U depth / f.
+
+    Args:
+        velocity: Along x and y, px/s.
+        depth: Distance of the wall, m.
+        focal: Focal length, px.
+        slope: Along x and y, px/s^2.
+        amplitude: Along x and y, px/s.
+        frequency: Of both, Hz.
+        phase: Of both, rad.
+
+    Returns:
+        The motion.
+
+    Raises:
+        InputError: A number is not finite.
     """
 
     def six(pair: tuple[float | int, float | int]) -> Six:
@@ -127,17 +147,25 @@ def planar_motion(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Texture:
-    """ln intensity over a plane: periodic cubic splines through `level` (rows, columns).
+    """A texture of a plane: periodic cubic splines through samples of ln intensity.
 
-    `grain` is the size of a texel in m. For events without aliasing, texels should not be seen
-    smaller than pixels and `level` be smooth over about two texels.
+    For events without aliasing, the image of a texel should be no smaller than a pixel, and `level`
+    smooth over about two texels.
     """
 
-    level: NDArray[np.float64]
-    grain: float | int
+    level: NDArray[np.float64]  # (rows, columns), ln intensity
+    grain: float | int  # size of a texel, m
 
     def __call__(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-        """ln intensity at places (m) on the plane, `u` along the rows."""
+        """Return the ln intensity of points on the plane.
+
+        Args:
+            u: (n,) coordinates along the rows, m.
+            v: (n,) coordinates along the columns, m.
+
+        Returns:
+            (n,) ln intensity.
+        """
         at = np.stack([v, u]) / self.grain
         return map_coordinates(self._spline, at, order=3, mode="grid-wrap", prefilter=False)
 
@@ -146,16 +174,26 @@ class Texture:
         return spline_filter(np.asarray(self.level, np.float64), 3, mode="grid-wrap")
 
 
-def texture_of(
+def make_texture(
     kind: str, grain: float | int, seed: int = 0, contrast: float | int = 1.0
 ) -> Texture:
-    """A texture by name, of 512 x 512 texels; `contrast` is the range of ln intensity.
+    """Make a texture of 512 x 512 texels by name.
 
     - noise: blobs of about 12 texels, dense;
     - shapes: discs and rectangles of 10 to 45 texels on even ground, sparse;
     - plain: constant.
 
-    Raises `InputError` for an unknown name or a grain that is not positive.
+    Args:
+        kind: Name of the texture.
+        grain: Size of a texel, m.
+        seed: Seed of all random numbers.
+        contrast: Range of ln intensity.
+
+    Returns:
+        The texture.
+
+    Raises:
+        InputError: The name is unknown, or the grain is not positive.
     """
     kinds = ("noise", "shapes", "plain")
     if kind not in kinds:
@@ -186,40 +224,59 @@ def texture_of(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Patch:
-    """A flat, opaque shape: an ellipse or a rectangle of half axes `half` (m) about `centre` (m).
+    """A flat, opaque ellipse or rectangle.
 
-    Its axes are the world's x and y, turned by the rotation vector `turn` (rad).
+    Its axes are the world's x and y, turned by the rotation vector `turn`.
     """
 
-    centre: Three
-    half: tuple[float | int, float | int]
+    centre: Three  # m
+    half: tuple[float | int, float | int]  # half axes, m
     texture: Texture
     base: float | int = 0.0  # ln intensity added to the texture's
-    turn: Three = (0.0, 0.0, 0.0)
+    turn: Three = (0.0, 0.0, 0.0)  # rad
     ellipse: bool = True
+
+
+class _Rays(NamedTuple):
+    """Rays of the pixels from a camera, which advance by 1 in depth."""
+
+    centre: NDArray[np.float64]  # (3,), of the camera, m
+    direction: NDArray[np.float64]  # (n, 3)
+    length: NDArray[np.float64]  # (n,)
+    pixel: float | int  # angle of a pixel, 1 / f
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """The inside of a box from `lower` to `upper` (m), in which the camera is, and patches in it.
+    """The inside of a box, in which the camera is, and patches in it.
 
-    All walls have the same texture, which fades near their edges. Patches are seen before the
-    walls, and each before those that come ahead of it in `patches`: give the farthest first. Their
-    outlines are drawn out over a pixel.
+    All walls have the same texture, which fades near their edges. Patches hide the walls, and each
+    hides those before it in `patches`: give the farthest first. Their outlines are blurred over a
+    pixel.
     """
 
-    lower: Three
+    lower: Three  # m
     upper: Three
     texture: Texture
     patches: tuple[Patch, ...] = ()
 
-    def seen(
+    seen = RenamedAttribute("render")
+
+    def render(
         self, centre: NDArray[np.float64], ray: NDArray[np.float64], pixel: float | int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """ln intensity and depth (n,) along rays (n, 3) that advance by 1 in depth.
+        """Render the world along rays.
 
-        `pixel` is the angle of a pixel, 1 / f. Raises `InputError` where the camera has left the
-        box.
+        Args:
+            centre: (3,) position of the camera, m.
+            ray: (n, 3) directions that advance by 1 in depth.
+            pixel: Angle of a pixel, 1 / f.
+
+        Returns:
+            ln intensity (n,) and depth (n,), m.
+
+        Raises:
+            InputError: The camera has left the box.
         """
         lower, upper = np.asarray(self.lower, np.float64), np.asarray(self.upper, np.float64)
         if not ((lower < centre) & (centre < upper)).all():
@@ -236,33 +293,30 @@ class World:
         first, second = np.array([1, 0, 0])[axis], np.array([2, 2, 1])[axis]
         rows = np.arange(len(hit))
         edge = np.minimum(hit - lower, upper - hit)
-        edge = np.minimum(edge[rows, first], edge[rows, second]) / (_FADE * self.texture.grain)
+        edge = np.minimum(edge[rows, first], edge[rows, second]) / (
+            _FADE_TEXELS * self.texture.grain
+        )
         # Rows and columns of a wall are the world's axes; on walls before and behind x and y.
         u, v = hit[rows, np.where(axis == 2, 0, first)], hit[rows, np.where(axis == 2, 1, second)]
-        level = self.texture(u, v) * _smooth(edge)
-        size = np.sqrt(np.einsum("ni,ni->n", ray, ray))
+        level = self.texture(u, v) * _smooth_step(edge)
+        rays = _Rays(centre, ray, np.sqrt(np.einsum("ni,ni->n", ray, ray)), pixel)
         for patch in self.patches:
-            self._before(patch, centre, ray, size, pixel, level, depth)
+            self._draw_patch(patch, rays, level, depth)
         return level, depth
 
     @staticmethod
-    def _before(
-        patch: Patch,
-        centre: NDArray[np.float64],
-        ray: NDArray[np.float64],
-        size: NDArray[np.float64],
-        pixel: float | int,
-        level: NDArray[np.float64],
-        depth: NDArray[np.float64],
+    def _draw_patch(
+        patch: Patch, rays: _Rays, level: NDArray[np.float64], depth: NDArray[np.float64]
     ) -> None:
-        """Draw a patch over `level` and `depth`; `size` is the rays' length."""
+        """Draw a patch over `level` and `depth` (n,)."""
+        centre, ray, length, pixel = rays
         across, down, normal = Rotation.from_rotvec(patch.turn).as_matrix().T
         towards = np.asarray(patch.centre) - centre
-        # Only rays that meet the sphere about the patch, drawn out by two pixels.
+        # Only rays that meet the sphere about the patch, enlarged by two pixels.
         away = float(np.linalg.norm(towards))
         sine = math.hypot(*patch.half) / away + 2 * pixel
         along = ray @ (towards / away)
-        close = along > math.sqrt(max(1 - sine * sine, 0)) * size
+        close = along > math.sqrt(max(1 - sine * sine, 0)) * length
         near = np.flatnonzero(close if sine < 1 else np.ones(len(ray), bool))
         facing = ray[near] @ normal
         reach = towards @ normal / np.where(facing == 0, 1e-300, facing)
@@ -278,7 +332,7 @@ class World:
             inside = (1 - radius) / np.maximum(slope, 1e-9)
         else:
             inside = np.minimum(a - abs(u), b - abs(v))
-        cover = _smooth(inside / (reach * pixel * 2) + 0.5)
+        cover = _smooth_step(inside / (reach * pixel * 2) + 0.5)
         some = cover > 0
         near, cover, reach = near[some], cover[some], reach[some]
         own = patch.base + patch.texture(u[some], v[some])
@@ -286,27 +340,29 @@ class World:
         depth[near] = np.where(cover > 0.5, reach, depth[near])
 
 
-def _smooth(a: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth_step(a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return 0 below 0, 1 above 1, and a cubic between."""
     a = np.clip(a, 0, 1)
     return a * a * (3 - 2 * a)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MovingCamera:
-    """A camera in a world, a `Source` for `simulate`, and the truth of its motion.
+    """A camera in a world, a `Source` for `simulate`, with the truth of its motion.
 
-    `size` is (width, height), `duration` in s. The lens is `lens`, or one without distortion, of
-    the focal length `focal` (px), whose principal point is the middle of the image. Times of the
-    truth are integers (us) or floats (s) from 0 to the duration; `InputError` is raised for others,
-    and for a lens whose distortion has no inverse in the image.
+    Times of the truth are integers (us) or floats (s) from 0 to the duration.
+
+    Raises:
+        InputError: A time is outside the duration, or the distortion of the lens has no inverse in
+            the image.
     """
 
     world: World
     motion: CameraMotion
-    size: tuple[int, int] = (240, 180)
-    focal: float | int = 200.0
-    duration: float | int = 0.5
-    lens: PinholeCamera | None = None
+    size: tuple[int, int] = (240, 180)  # width, height, px
+    focal: float | int = 200.0  # px, of a lens without distortion, centred in the image
+    duration: float | int = 0.5  # s
+    lens: PinholeCamera | None = None  # instead of `focal`
 
     @property
     def camera(self) -> PinholeCamera:
@@ -318,75 +374,66 @@ class MovingCamera:
         return PinholeCamera(f, f, (width - 1) / 2, (height - 1) / 2)
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
-        """Linear intensity (height, width) at t seconds."""
-        return np.exp(self._seen(float(t))[0])
+        """Return the linear intensity (height, width) at t seconds."""
+        return np.exp(self._render(float(t))[0])
 
     def depth(self, time: Times) -> NDArray[np.float64]:
-        """True depth (height, width) in m at one time."""
-        return self._seen(float(self._seconds(time)[0]))[1]
+        """Return the true depth (height, width) in m at one time."""
+        return self._render(float(parse_seconds(time, self.duration)[0]))[1]
 
     def twist(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """True T (times, 3) in m/s and Omega (times, 3) in rad/s."""
-        twist = self.motion.twist(self._seconds(times))
+        """Return the true T (times, 3) in m/s and Omega (times, 3) in rad/s."""
+        twist = self.motion.twist(parse_seconds(times, self.duration))
         return twist[:, :3], twist[:, 3:]
 
     def velocity(self, times: Times) -> NDArray[np.float64]:
-        """True flow (times, 2) in px/s at the principal point: all over the image in planar motion.
+        """Return the true flow (times, 2) in px/s at the principal point.
 
-        Its depth is that on the optical axis.
+        In planar motion it is that of the whole image.
         """
-        t = self._seconds(times)
+        t = parse_seconds(times, self.duration)
         twist = self.motion.twist(t)
         axis = np.array([0.0, 0.0, 1.0])
         depth = np.empty(len(t))
         for k, pose in enumerate(self.motion.pose(t)):
             ray = (pose[:3, :3] @ axis)[None]
-            depth[k] = self.world.seen(pose[:3, 3], ray, 1 / self._f)[1][0]
+            depth[k] = self.world.render(pose[:3, 3], ray, 1 / self._f)[1][0]
         turn = np.stack([-twist[:, 4], twist[:, 3]], 1)
         return self._f * (turn - twist[:, :2] / depth[:, None])
 
     def pose(self, times: Times) -> NDArray[np.float64]:
-        """True camera-to-world poses (times, 4, 4)."""
-        return self.motion.pose(self._seconds(times))
+        """Return the true camera-to-world poses (times, 4, 4)."""
+        return self.motion.pose(parse_seconds(times, self.duration))
 
-    def poses(self, rate: float | int = _POSE_RATE) -> Poses:
-        """Poses as a recording holds them, `rate` per second."""
+    def poses(self, rate: float | int = _POSE_RATE_HZ) -> Poses:
+        """Return the poses of a recording, `rate` per second."""
         count = math.floor(self.duration * rate + 1e-9) + 1
         t = np.rint(np.arange(count) / rate * 1e6).astype(np.int64)
         pose = self.motion.pose(t * 1e-6)
         return Poses(t, pose[:, :3, 3], Rotation.from_matrix(pose[:, :3, :3]).as_quat())
 
-    def _seen(self, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _render(self, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return ln intensity and depth (height, width) at t seconds."""
         pose = self.motion.pose(np.array([t]))[0]
-        level, depth = self.world.seen(pose[:3, 3], self._rays @ pose[:3, :3].T, 1 / self._f)
+        level, depth = self.world.render(pose[:3, 3], self._rays @ pose[:3, :3].T, 1 / self._f)
         return level.reshape(self.size[::-1]), depth.reshape(self.size[::-1])
 
     @functools.cached_property
     def _rays(self) -> NDArray[np.float64]:
         width, height = self.size
         y, x = np.mgrid[:height, :width].reshape(2, -1)
-        seen = self.camera.normalise(x, y)
-        if np.isnan(seen).any():
+        direction = self.camera.normalise(x, y)
+        if np.isnan(direction).any():
             raise InputError(
                 f"the lens {self.camera} has no inverse in an image of {width}x{height} pixels; "
                 "give a longer focal length or less distortion"
             )
-        return np.concatenate([seen, np.ones((len(x), 1))], 1)
+        return np.concatenate([direction, np.ones((len(x), 1))], 1)
 
     @property
     def _f(self) -> float:
         """The focal length of both axes (px), their geometric mean."""
         return math.sqrt(self.camera.fx * self.camera.fy)
-
-    def _seconds(self, times: Times) -> NDArray[np.float64]:
-        rounded = np.atleast_1d(microseconds(times))
-        given = np.atleast_1d(np.asarray(times))
-        if ((rounded < 0) | (rounded > math.ceil(self.duration * 1e6))).any():
-            raise InputError(
-                f"the motion is known from 0 to {self.duration} s, not at {rounded.min()} to "
-                f"{rounded.max()} us; integers are microseconds, floats seconds"
-            )
-        return np.asarray(given if given.dtype.kind == "f" else rounded * 1e-6, np.float64)
 
 
 def simulate_motion(
@@ -394,32 +441,47 @@ def simulate_motion(
 ) -> Recording:
     """Record a moving camera, with its calibration and its poses at 200 Hz; see `simulate`.
 
-    The sensor's default is ideal: thresholds of 0.2, no dead time and no noise, stamps to the
-    microsecond; intensity is taken to change linearly within steps in which 95 % of the pixels
-    change by half a threshold or less, 0.1 ms or longer. It takes 25 frames/s, each of one instant.
-    Intensity 1 is even ground. Deterministic in `seed`, which draws where between the thresholds a
-    pixel starts, and the noise of other sensors.
+    The ideal sensor has thresholds of 0.2, no dead time and no noise, stamps to the microsecond,
+    and 25 frames/s of one instant each. Intensity changes linearly within steps in which 95 % of
+    the pixels change by half a threshold or less, 0.1 ms or longer. Intensity 1 is even ground.
+    Deterministic in `seed`, which draws the level between the thresholds at which a pixel starts,
+    and the noise of other sensors.
+
+    Args:
+        source: The camera.
+        sensor: The sensor; None: an ideal one.
+        seed: Seed of all random numbers.
+        name: Name of the recording.
+
+    Returns:
+        The recording.
+
+    Raises:
+        InputError: The camera leaves the world.
     """
     recording = simulate(source, _IDEAL if sensor is None else sensor, seed, name)
     return dataclasses.replace(recording, camera=source.camera, poses=source.poses())
 
 
-_GRAIN = 0.012  # m: 1 px at 2.4 m and f = 200 px
+_GRAIN_M = 0.012  # 1 px at 2.4 m and f = 200 px
 
 
 def _room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
+    """Return corners and texture of a room whose front wall is at a depth (m)."""
     lower: Three = (-3.5, -3.5, -3.0)
-    return lower, (3.5, 3.5, depth), texture_of(kind, _GRAIN, seed)
+    return lower, (3.5, 3.5, depth), make_texture(kind, _GRAIN_M, seed)
 
 
-def _scattered(
+def _scatter_patches(
     rng: np.random.Generator, kinds: Sequence[str], count: int, half: tuple[float, float]
 ) -> tuple[Patch, ...]:
-    """Patches at 1.4 to 3 m within 75 degrees of the axis, the farthest first.
+    """Scatter patches at 1.4 to 3 m within 75 degrees of the axis, the farthest first.
 
     Their half axes are `half` times their distance.
     """
-    textures = [texture_of(kind, _GRAIN * 0.7, int(rng.integers(1 << 30)), 1.0) for kind in kinds]
+    textures = [
+        make_texture(kind, _GRAIN_M * 0.7, int(rng.integers(1 << 30)), 1.0) for kind in kinds
+    ]
     distance = np.sort(rng.uniform(1.4, 3.0, count))[::-1]
     patches = []
     for k, r in enumerate(distance):
@@ -429,7 +491,7 @@ def _scattered(
         sine = math.sqrt(1 - cosine**2)
         direction = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
         x, y, z = (r * direction).tolist()
-        # It faces the camera, but for some 20 degrees.
+        # It faces the camera within about 20 degrees.
         facing = Rotation.align_vectors([direction], [[0, 0, 1]])[0]
         turn = facing * Rotation.from_rotvec(rng.normal(0, 0.25, 3))
         a, b = (rng.uniform(*half, 2) * r).tolist()
@@ -441,7 +503,8 @@ def _scattered(
     return tuple(patches)
 
 
-def _unit(rng: np.random.Generator, dimensions: int = 3) -> NDArray[np.float64]:
+def _random_direction(rng: np.random.Generator, dimensions: int = 3) -> NDArray[np.float64]:
+    """Draw a unit vector."""
     v = rng.normal(size=dimensions)
     return v / np.linalg.norm(v)
 
@@ -451,18 +514,19 @@ def _six(T: ArrayLike, Omega: ArrayLike) -> Six:
     return a, b, c, d, e, f
 
 
-def _drawn(rng: np.random.Generator, motion: str, speed: float, rate: float) -> CameraMotion:
-    """A motion of the mean |T| = speed and |Omega| = rate in random directions."""
-    T, Omega = speed * _unit(rng), rate * _unit(rng)
+def _draw_motion(rng: np.random.Generator, motion: str, speed: float, rate: float) -> CameraMotion:
+    """Draw a motion of the mean |T| = speed and |Omega| = rate in random directions."""
+    T, Omega = speed * _random_direction(rng), rate * _random_direction(rng)
     if motion == "constant":
         return CameraMotion(_six(T, Omega))
     if motion == "linear":
         return CameraMotion(
-            _six(0.5 * T, 0.5 * Omega), _six(2 * speed * _unit(rng), 2 * rate * _unit(rng))
+            _six(0.5 * T, 0.5 * Omega),
+            _six(2 * speed * _random_direction(rng), 2 * rate * _random_direction(rng)),
         )
     return CameraMotion(
         _six(T, Omega),
-        amplitude=_six(0.6 * speed * _unit(rng), 0.6 * rate * _unit(rng)),
+        amplitude=_six(0.6 * speed * _random_direction(rng), 0.6 * rate * _random_direction(rng)),
         frequency=_six(*rng.uniform(1, 2, (2, 3))),
         phase=_six(*rng.uniform(0, 2 * np.pi, (2, 3))),
     )
@@ -484,12 +548,12 @@ def motion_scene(
     speed: float | int | None = None,
     lens: PinholeCamera | None = None,
 ) -> tuple[Recording, MovingCamera]:
-    """A scene of `MOTION_SCENES` by name, recorded by an ideal event camera, and its truth.
+    """Record a scene of `MOTION_SCENES` by name; deterministic in `seed`.
 
     - planar: a wall at 2 m that moves in a random direction through the image, of `texture`
       "noise" (default) or "shapes", at `speed` px/s, 200 by default; linear: from half of that,
       gaining 3 times `speed` per second; varying: speed (1 + sin(2 pi 2 Hz t) / 2);
-    - rotation: "texture" seen by a camera that only turns, by default at `speed` = 2 rad/s;
+    - rotation: "texture" with a camera that only turns, by default at `speed` = 2 rad/s;
     - wall: a wall at 2 m in a room 7 m wide, of `texture` "noise" by default: little parallax;
     - shapes: 60 plain shapes at 1.4 to 3 m before a plain wall at 3.2 m;
     - texture: 24 textured patches at 1.4 to 3 m before a textured wall at 3.2 m.
@@ -498,27 +562,42 @@ def motion_scene(
     1.8 rad/s, in random directions. "varying" motion adds sinusoids of 1 to 2 Hz to each component
     of T and Omega, with vectors of amplitudes of random direction and 60 % of the mean's length;
     "linear" starts at half the drawn motion and changes in a random direction by twice its length
-    per second. `lens` is that of `MovingCamera`. Deterministic in `seed`.
+    per second.
 
-    Raises `InputError` for an unknown name or motion, and where the camera leaves the world.
+    Args:
+        name: Name of the scene.
+        motion: "constant", "linear" or "varying".
+        seed: Seed of all random numbers.
+        size: Width and height, px.
+        focal: Focal length, px.
+        duration: Length, s.
+        sensor: The sensor; None: an ideal one.
+        texture: Name of the texture, see `make_texture`; None: that of the scene.
+        speed: Speed, in the scene's unit; None: that of the scene.
+        lens: Lens of the camera; None: one without distortion.
+
+    Returns:
+        The recording, and the camera with the truth.
+
+    Raises:
+        InputError: The name or the motion is unknown, or the camera leaves the world.
     """
     if name not in MOTION_SCENES:
         raise InputError(f"there is no scene {name!r}; {suggest_name(name, MOTION_SCENES)}")
     if motion not in get_args(Change):
         raise InputError(f"there is no motion {motion!r}; {suggest_name(motion, get_args(Change))}")
-    names = MOTION_SCENES.index(name)
-    rng = np.random.default_rng([seed, names])
+    rng = np.random.default_rng([seed, MOTION_SCENES.index(name)])
     texture_seed = int(rng.integers(1 << 30))
     if name == "planar":
-        pace = 200.0 if speed is None else float(speed)
-        direction = _unit(rng, 2)
+        mean_speed = 200.0 if speed is None else float(speed)
+        direction = _random_direction(rng, 2)
 
         def pair(factor: float | int) -> tuple[float, float]:
-            x, y = (factor * pace * direction).tolist()
+            x, y = (factor * mean_speed * direction).tolist()
             return x, y
 
         world = World(
-            (-50, -50, -1), (50, 50, 2), texture_of(texture or "noise", 2 / focal, texture_seed)
+            (-50, -50, -1), (50, 50, 2), make_texture(texture or "noise", 2 / focal, texture_seed)
         )
         moved = {
             "constant": lambda: planar_motion(pair(1), 2, focal),
@@ -531,16 +610,16 @@ def motion_scene(
         patches = ()
         if name != "wall":
             patches = (
-                _scattered(rng, ("plain",), 60, (0.05, 0.16))
+                _scatter_patches(rng, ("plain",), 60, (0.05, 0.16))
                 if name == "shapes"
-                else _scattered(rng, ("noise", "shapes"), 24, (0.1, 0.24))
+                else _scatter_patches(rng, ("noise", "shapes"), 24, (0.1, 0.24))
             )
         world = World(*room, patches)
         if name == "rotation":
-            moved = _drawn(rng, motion, 0.0, 2.0 if speed is None else float(speed))
+            moved = _draw_motion(rng, motion, 0.0, 2.0 if speed is None else float(speed))
         else:
-            pace = rng.uniform(0.6, 1.0) if speed is None else float(speed)
-            moved = _drawn(rng, motion, pace, rng.uniform(0.4, 1.8))
+            mean_speed = rng.uniform(0.6, 1.0) if speed is None else float(speed)
+            moved = _draw_motion(rng, motion, mean_speed, rng.uniform(0.4, 1.8))
     source = MovingCamera(world, moved, size, focal, duration, lens)
     return simulate_motion(source, sensor, seed, f"{name} {motion}"), source
 
@@ -556,21 +635,32 @@ def frame_events(
     seed: int = 0,
     name: str = "frame generator",
 ) -> tuple[Recording, NDArray[np.float64]]:
-    """Events of the egomotion thesis' generator (appendix B), and the true velocities in px/s.
+    """Simulate events with the generator of the egomotion thesis (appendix B).
 
-    `flow` (frames, 2) is the image velocity in px/frame, frames being `step` us apart: at frame k
-    the image shows what the one before showed, moved by flow[k]. A pixel whose value changes by
-    more than `threshold` between frames makes one event, at the later frame's time (k + 1) step
-    (B.11). The large `image` (rows, columns) of values is sampled directly, bilinearly, as a torus;
-    the start is drawn by `seed`. Default: 512 x 512 pixels of smooth noise, of deviation 0.5.
-    `noise` adds random events, as many per frame as that times the number of pixels. The second
-    result (frames, 2) is flow / step. Size is (width, height).
+    At frame k the image is that of the frame before, moved by flow[k]. A pixel whose value changes
+    by more than the threshold between frames makes one event, at the later frame's time (k + 1)
+    step (B.11). The large image is sampled bilinearly, as a torus, from a random start.
 
     Corrected against the print: the weights of B.10 are those of the nearer neighbours, and the
     upper neighbour is the lower one plus 1, without which whole-numbered places have no weight;
     I_t is not warped from I_(t-1), which blurs it more with every frame.
 
-    Raises `InputError` for settings that are not possible, and if there is no event.
+    Args:
+        flow: (frames, 2) image velocity, px/frame.
+        image: (rows, columns) values; None: 512 x 512 pixels of smooth noise, of standard deviation
+            0.5.
+        size: Width and height of the sensor, px.
+        threshold: Least change of an event.
+        step: Time between frames, us.
+        noise: Random events per pixel and frame, 0 to 1.
+        seed: Seed of all random numbers.
+        name: Name of the recording.
+
+    Returns:
+        The recording, and the true velocities (frames, 2), px/s.
+
+    Raises:
+        InputError: A setting is not possible, or there is no event.
     """
     flow = np.asarray(flow, np.float64)
     width, height = size
@@ -590,11 +680,11 @@ def frame_events(
     if image.ndim != 2 or not np.isfinite(image).all():
         raise InputError(f"{name}: the image of shape {image.shape} is not finite (rows, columns)")
     begin = rng.integers(0, image.shape[::-1])
-    place = begin - np.concatenate([np.zeros((1, 2)), np.cumsum(flow, axis=0)])
+    position = begin - np.concatenate([np.zeros((1, 2)), np.cumsum(flow, axis=0)])
     y, x = np.mgrid[:height, :width]
-    before = _bilinear(image, x + place[0, 0], y + place[0, 1])
+    before = _bilinear(image, x + position[0, 0], y + position[0, 1])
     parts = []
-    for k, (px, py) in enumerate(place[1:], start=1):
+    for k, (px, py) in enumerate(position[1:], start=1):
         now = _bilinear(image, x + px, y + py)
         change = now - before
         if noise:
@@ -616,7 +706,10 @@ def frame_events(
 def _bilinear(
     image: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """B.10: v = d2 (d0 v0 + d1 v1) + d3 (d0 v2 + d1 v3), d0 = i_p - x, d1 = x - i_m."""
+    """Sample an image by B.10.
+
+    v = d2 (d0 v0 + d1 v1) + d3 (d0 v2 + d1 v3), d0 = i_p - x, d1 = x - i_m.
+    """
     height, width = image.shape
     i, j = np.floor(x).astype(int), np.floor(y).astype(int)
     d1, d3 = x - i, y - j
@@ -624,3 +717,6 @@ def _bilinear(
     upper = (1 - d1) * image[j_m, i_m] + d1 * image[j_m, i_p]
     lower = (1 - d1) * image[j_p, i_m] + d1 * image[j_p, i_p]
     return (1 - d3) * upper + d3 * lower
+
+
+__getattr__ = renamed_names(__name__)

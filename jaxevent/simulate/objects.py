@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
+from jaxevent.deprecated import warn_renamed
 from jaxevent.errors import InputError
 
 # Signed distance (px) of points x, y from a shape's edge, negative inside; distances are of the
 # nearest straight part, which differs from the true one only outside of corners.
 Distance = Callable[[NDArray, NDArray, float], NDArray]
 
-_TILE = 256  # px after which a texture repeats
-# A texture's parts: standard deviation (px) of the Gaussian that each is made of, and its weight.
-_GRAINS = ((1.5, 0.4), (4.0, 0.8), (12.0, 0.6))
-_MARGIN = 2  # px around an object that are drawn
+_TILE_PX = 256  # after which a texture repeats
+# Layers of a texture: standard deviation (px) of the Gaussian that each is made of, and its weight.
+_LAYERS = ((1.5, 0.4), (4.0, 0.8), (12.0, 0.6))
+_MARGIN_PX = 2  # around an object, in which it is drawn
 
 
 def _disc(x: NDArray, y: NDArray, r: float) -> NDArray:
@@ -47,35 +48,57 @@ SHAPES: tuple[Distance, ...] = (_disc, _box, _triangle, _diamond, _cross)
 
 
 class Surface(NamedTuple):
-    """The background, or an object: its texture moves with it."""
+    """The background or an object, with a texture that moves with it."""
 
     distance: Distance | None  # None: everywhere
     radius: float  # px
-    middle: NDArray[np.floating]  # (2,), x and y that it moves about, px
-    swing: NDArray[np.floating]  # (2,), px
+    middle: NDArray[np.floating]  # (2,), x and y of the middle of its motion, px
+    swing: NDArray[np.floating]  # (2,), amplitude along x and y, px
     rate: NDArray[np.floating]  # (2,), rad/s
     phase: NDArray[np.floating]  # (2,), rad
     spline: NDArray[np.floating]  # coefficients of a texture of unit variance
     light: float  # mean intensity
-    contrast: float  # by which intensity differs from it at most
+    contrast: float  # largest deviation of the intensity from it
 
-    def place(self, t: float | int) -> NDArray[np.floating]:
-        """Where it is at t seconds, x and y in pixels."""
+    def position(self, t: float | int) -> NDArray[np.floating]:
+        """Return x and y (px) at t seconds, (2,)."""
         return self.middle + self.swing * np.sin(self.rate * t + self.phase)
 
+    def place(self, t: float | int) -> NDArray[np.floating]:
+        """Return `position`; the old name of the method."""
+        warn_renamed("Surface.place", "Surface.position")
+        return self.position(t)
+
     def velocity(self, t: float | int) -> NDArray[np.floating]:
-        """px/s."""
+        """Return the velocity (px/s) at t seconds, (2,)."""
         return self.swing * self.rate * np.cos(self.rate * t + self.phase)
 
     def covers(self, x: NDArray, y: NDArray, t: float | int) -> NDArray[np.bool_]:
-        """Whether points of the image lie on it."""
+        """Return which points of the image lie on the surface.
+
+        Args:
+            x: (n,) columns, px; broadcast with `y`.
+            y: (n,) rows, px.
+            t: Time, s.
+
+        Returns:
+            (n,), True where the surface is.
+        """
         if self.distance is None:
             return np.ones(np.broadcast(x, y).shape, bool)
-        px, py = self.place(t)
+        px, py = self.position(t)
         return self.distance(x - px, y - py, self.radius) < 0
 
     def intensity(self, x: NDArray, y: NDArray) -> NDArray[np.float64]:
-        """Of points by their offsets from its place."""
+        """Return the intensity of points of the surface.
+
+        Args:
+            x: (n,) offsets from its position along x, px; broadcast with `y`.
+            y: (n,) offsets along y, px.
+
+        Returns:
+            (n,) linear intensity.
+        """
         at = np.broadcast_arrays(y, x)
         grain = map_coordinates(self.spline, at, order=3, mode="grid-wrap", prefilter=False)
         return self.light + self.contrast * np.tanh(grain)
@@ -85,19 +108,22 @@ class Surface(NamedTuple):
 class Objects:
     """Five textured objects before a moving background: a `Source` whose optical flow is known.
 
-    A disc, a box, a triangle, a diamond and a cross swing about places of their own, sideways and
-    up and down at different rates, so that they are always accelerated. The speed of each, its root
+    A disc, a box, a triangle, a diamond and a cross swing about different points, sideways and up
+    and down at different rates, so that they are always accelerated. The speed of each, its root
     mean square over time, is drawn within `spread` of `speed`; the background's is the part
-    `background` of `speed`.
-    Nearer objects hide farther ones. Edges cover pixels in part. Intensities lie between 0.1 and
-    0.9, which frames show without clipping. Deterministic in `seed`.
+    `background` of `speed`. Nearer objects hide farther ones. Edges cover pixels in part.
+    Intensities lie between 0.1 and 0.9, which frames show without clipping. Deterministic in
+    `seed`.
 
     Surfaces are numbered: 0 is the background, higher ones are nearer. Flow and displacement are
-    those of the surface at a pixel's middle, x before y. Raises `InputError` for fewer than 32x32
-    pixels, a negative speed or background, or a spread outside [0, 1).
+    those of the surface at a pixel's middle, x before y.
+
+    Raises:
+        InputError: There are fewer than 32x32 pixels, the speed or background is negative, or the
+            spread is outside [0, 1).
     """
 
-    size: tuple[int, int] = (160, 120)  # width, height
+    size: tuple[int, int] = (160, 120)  # width, height, px
     duration: float | int = 1.0  # s
     speed: float | int = 90.0  # px/s
     spread: float | int = 0.6
@@ -118,15 +144,15 @@ class Objects:
             )
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
-        """Linear intensity (height, width) at t seconds."""
+        """Return the linear intensity (height, width) at t seconds."""
         y, x = self._grid
         image: Any = None
         for surface in self.surfaces:
-            px, py = surface.place(t)
+            px, py = surface.position(t)
             if surface.distance is None:
                 image = surface.intensity(x - px, y - py)
                 continue
-            reach = surface.radius + _MARGIN
+            reach = surface.radius + _MARGIN_PX
             rows, columns = (
                 slice(max(int(p - reach), 0), max(int(p + reach) + 2, 0)) for p in (py, px)
             )
@@ -138,7 +164,7 @@ class Objects:
         return image
 
     def visible(self, t: float | int) -> NDArray[np.int64]:
-        """The number of the surface that each pixel shows, (height, width), at t seconds."""
+        """Return the number of the surface that each pixel shows, (height, width), at t seconds."""
         y, x = self._grid
         number = np.zeros((self.size[1], self.size[0]), np.int64)
         for k, surface in enumerate(self.surfaces):
@@ -146,20 +172,25 @@ class Objects:
         return number
 
     def flow(self, t: float | int) -> NDArray[np.floating]:
-        """Velocity in px/s of what each pixel shows at t seconds, (height, width, 2)."""
+        """Return the optical flow (height, width, 2) at t seconds, px/s."""
         return np.array([surface.velocity(t) for surface in self.surfaces])[self.visible(t)]
 
     def displacement(
         self, t0: float | int, t1: float | int
     ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-        """By how many pixels what each pixel shows at t0 has moved at t1, and whether it is hidden.
+        """Return the displacement of the points that pixels show, between two times.
 
-        The displacement is (height, width, 2). Hidden, (height, width), are points that at t1 lie
-        behind a nearer surface or outside the image.
+        Args:
+            t0: Time at which pixels show the points, s.
+            t1: Time to which they move, s.
+
+        Returns:
+            Displacements (height, width, 2), px, and which points (height, width) are hidden at t1,
+            behind a nearer surface or outside the image.
         """
         y, x = self._grid
         number = self.visible(t0)
-        moves = np.array([one.place(t1) - one.place(t0) for one in self.surfaces])[number]
+        moves = np.array([one.position(t1) - one.position(t0) for one in self.surfaces])[number]
         x, y = x + moves[..., 0], y + moves[..., 1]
         width, height = self.size
         hidden = (x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5)
@@ -174,17 +205,17 @@ class Objects:
         size = np.array(self.size, float)
         shapes: list[Distance | None] = [None, *(SHAPES[k] for k in rng.permutation(len(SHAPES)))]
         # Middles about a ring, from where all objects come across one another.
-        around = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(len(SHAPES)) / len(SHAPES)
+        angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(len(SHAPES)) / len(SHAPES)
         lights = rng.permutation(np.linspace(0.3, 0.7, len(SHAPES)))
         surfaces = []
         for k, shape in enumerate(shapes):
             swing = size * rng.uniform(0.15, 0.25, 2)
-            pace = self.speed * rng.uniform(1 - self.spread, 1 + self.spread)
+            speed = self.speed * rng.uniform(1 - self.spread, 1 + self.spread)
             middle, light, contrast = (size - 1) / 2, 0.5, 0.25
             if shape is None:
-                pace = self.speed * self.background
+                speed = self.speed * self.background
             else:
-                turn = np.array([np.cos(around[k - 1]), np.sin(around[k - 1])])
+                turn = np.array([np.cos(angles[k - 1]), np.sin(angles[k - 1])])
                 middle, light, contrast = middle + 0.22 * size * turn, lights[k - 1], 0.2
             surfaces.append(
                 Surface(
@@ -193,7 +224,7 @@ class Objects:
                     middle,
                     swing,
                     # The mean square of a sine is a half, and there are two of them.
-                    pace / swing,
+                    speed / swing,
                     rng.uniform(0, 2 * np.pi, 2),
                     _texture(rng),
                     float(light),
@@ -204,15 +235,15 @@ class Objects:
 
     @functools.cached_property
     def _grid(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """y (height, 1) and x (1, width) of the pixels."""
+        """Rows (height, 1) and columns (1, width) of the pixels."""
         width, height = self.size
         return np.arange(height)[:, None] * 1.0, np.arange(width)[None] * 1.0
 
 
 def _texture(rng: np.random.Generator) -> NDArray[np.floating]:
-    """Spline coefficients of noise of unit variance, fine and coarse."""
-    noise = np.zeros((_TILE, _TILE))
-    for deviation, weight in _GRAINS:
+    """Draw the spline coefficients of a texture of unit variance, fine and coarse."""
+    noise = np.zeros((_TILE_PX, _TILE_PX))
+    for deviation, weight in _LAYERS:
         grain = gaussian_filter(rng.normal(size=noise.shape), deviation, mode="wrap")
         noise += weight * grain / grain.std()
     return spline_filter(noise / noise.std(), 3, mode="grid-wrap")

@@ -1,7 +1,8 @@
-"""Scenes of high dynamic range and a camera that moves over them, with the truth at any time."""
+"""Scenes of high dynamic range, a camera that moves over them, and the protocol of sources."""
 
 import dataclasses
 import functools
+import math
 import zlib
 from collections.abc import Callable
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -12,25 +13,46 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter, uniform_filter
 
 from jaxevent.errors import InputError
+from jaxevent.recording import Times, microseconds
 
 Speed = Literal["slow", "fast"]
 
-# Pixels per second at the image centre; the speed wanders by a third about it.
+# px/s at the image centre; the speed varies by a third about it.
 SPEEDS = {"slow": 30.0, "fast": 300.0}
 
-# The lens: a Gaussian point spread (px) and a wide one, its glare, that takes a part of the light.
-_BLUR, _GLARE_BLUR, _GLARE = 1.1, 12.0, 2e-4
+# The lens: a Gaussian point spread, and a wide one, its glare, with a part of the light.
+_BLUR_PX, _GLARE_PX, _GLARE_SHARE = 1.1, 12.0, 2e-4
 # A second blur, of the logarithm: linear blur alone leaves a step of 10 in ln I 4.5 / px steep.
-_LOG_BLUR = 1.0
-_EDGES: Any = (
-    "reflect",
-    "wrap",
-)  # beyond a panorama's edges: mirrored vertically, round horizontally
+_LOG_BLUR_PX = 1.0
+# Beyond a panorama's edges: mirrored vertically, periodic horizontally.
+_EDGES: Any = ("reflect", "wrap")
+
+
+def parse_seconds(times: Times, duration: float | int) -> NDArray[np.float64]:
+    """Convert times to seconds, and check that the truth is known then.
+
+    Args:
+        times: (T,) integer us or float s.
+        duration: Length of the simulation, s.
+
+    Returns:
+        (T,) s.
+
+    Raises:
+        InputError: A time is outside the simulation.
+    """
+    us, given = np.atleast_1d(microseconds(times)), np.atleast_1d(np.asarray(times))
+    if ((us < 0) | (us > math.ceil(duration * 1e6))).any():
+        raise InputError(
+            f"the truth is known from 0 to {duration} s, not at {us.min()} to {us.max()} us; "
+            "integers are microseconds, floats seconds"
+        )
+    return np.asarray(given if given.dtype.kind == "f" else us * 1e-6, np.float64)
 
 
 @runtime_checkable
 class Source(Protocol):
-    """What the simulated sensor looks at."""
+    """A scene for the simulated sensor."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -43,12 +65,12 @@ class Source(Protocol):
         ...
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
-        """Linear intensity, positive, (height, width), at t seconds; 1 is the frames' white."""
+        """Return the linear intensity (height, width) at t seconds, positive; 1 is white."""
         ...
 
 
 class _Canvas:
-    """ln intensity being painted; its left and right edges meet.
+    """A canvas of ln intensity, whose left and right edges meet.
 
     Lengths are in pixels of a canvas of height 512, and scale with its height.
     """
@@ -64,7 +86,7 @@ class _Canvas:
     def noise(
         self, slope: float | int, longest: float | int = 200.0, stretch: float | int = 1.0
     ) -> NDArray:
-        """Periodic noise of unit variance; its amplitude falls as frequency^-slope.
+        """Draw periodic noise of unit variance; its amplitude falls as frequency^-slope.
 
         Waves longer than `longest` are damped; `stretch` > 1 draws it out horizontally.
         """
@@ -78,21 +100,23 @@ class _Canvas:
         return noise / noise.std()
 
     def away(self, x: float | int, y: float | int) -> tuple[NDArray, NDArray]:
-        """Offsets of every pixel from a point, the short way round."""
+        """Return the offsets of every pixel from a point, the short way round."""
         return (self.x - x + self.columns / 2) % self.columns - self.columns / 2, self.y - y
 
     def skyline(self, at: float | int, rough: float | int) -> NDArray:
-        """A periodic curve y(x) about `at` with deviation `rough`."""
+        """Draw a periodic curve y(x) about `at` with deviation `rough`."""
         wave = np.cumsum(self.noise(1.2, 300)[0])
         wave = wave - np.linspace(0, wave[-1], len(wave))
         return at + rough * (wave - wave.mean()) / wave.std()
 
     def paint(self, where: NDArray, level: float | NDArray) -> None:
+        """Set the level of some pixels."""
         self.level = np.where(where, level, self.level)
 
     def box(
         self, x: float | int, y: float | int, width: float | int, height: float | int
     ) -> NDArray:
+        """Return the mask of a box about a point."""
         dx, dy = self.away(x, y)
         return (abs(dx) < width / 2) & (abs(dy) < height / 2)
 
@@ -103,13 +127,13 @@ class _Canvas:
         self.level = np.logaddexp(self.level, level - 2 * np.log(np.maximum(r, 1)) * (1 + r / 12))
 
     def places(self, count: int, low: float | int = 0.0, high: float | int = 512.0):
-        """Points spread over the width, between two heights."""
+        """Draw points spread over the width, between two heights."""
         x = (np.arange(count) + self.rng.uniform(0.28, 0.72, count)) * self.columns / count
         return list(zip(x.tolist(), self.rng.uniform(low, high, count).tolist(), strict=True))
 
 
 def _room(c: _Canvas) -> None:
-    """A living room: windows on bright outdoors, shaded walls, dark furniture, a lamp."""
+    """Paint a living room: windows on bright outdoors, shaded walls, dark furniture, a lamp."""
     c.level = -2.4 + 0.5 * c.noise(1.7) + 0.9 * np.cos(2 * np.pi * (c.y - 160) / 512)
     outside = 3.6 + 0.5 * c.noise(1.3, 60)
     for x, y in c.places(4, 120, 200):
@@ -127,7 +151,7 @@ def _room(c: _Canvas) -> None:
 
 
 def _forest(c: _Canvas) -> None:
-    """Tree trunks and leaves before a bright sky, spots of sun on dark ground."""
+    """Paint tree trunks and leaves before a bright sky, spots of sun on dark ground."""
     c.level = 4.2 - c.y / 90 + 0.4 * c.noise(1.8, 80)
     c.paint(c.noise(2.3, 110) > c.y / 300 - 0.4, -2.0 + 0.4 * c.noise(1.6, 40))
     c.paint(c.y > c.skyline(360, 8), -3.6 + 0.5 * c.noise(1.6, 50, 3))
@@ -141,7 +165,7 @@ def _forest(c: _Canvas) -> None:
 
 
 def _mountain(c: _Canvas) -> None:
-    """Sunny sky over ridges and a city, dark grass and a road in front."""
+    """Paint a sunny sky over ridges and a city, dark grass and a road in front."""
     x, y = c.places(1, 60, 90)[0]
     c.level = 3.0 + 0.5 * c.noise(2.0, 150, 2) - 0.3 * np.cos(2 * np.pi * c.y / 512)
     c.glow(x, y, 14, 6.0)
@@ -156,7 +180,7 @@ def _mountain(c: _Canvas) -> None:
 
 
 def _lake(c: _Canvas) -> None:
-    """Clouds and their reflection on rippled water, dark trees on the far shore and in front."""
+    """Paint clouds and their reflection on rippled water, dark trees behind and in front."""
     cloud = c.noise(1.9, 120, 2)
     c.level = 1.4 + 1.1 * np.tanh(1.3 * cloud) + 0.2 * c.noise(1.6, 30)
     trees = c.skyline(210, 14) + 7 * c.noise(1.2, 16)[0]
@@ -173,7 +197,7 @@ def _lake(c: _Canvas) -> None:
 
 
 def _night(c: _Canvas) -> None:
-    """A street at night: lit windows, lamps and signs between nearly black walls."""
+    """Paint a street at night: lit windows, lamps and signs between nearly black walls."""
     c.level = -5.6 + 0.3 * c.noise(1.6, 200)
     houses = np.linspace(0, c.columns, 9)
     for left, right in zip(houses[:-1], houses[1:], strict=True):
@@ -194,7 +218,7 @@ def _night(c: _Canvas) -> None:
 
 
 def _tunnel(c: _Canvas) -> None:
-    """The mouth of a tunnel, blinding outdoors, rows of tiles and weak lamps inside."""
+    """Paint the mouth of a tunnel, blinding outdoors, rows of tiles and weak lamps inside."""
     c.level = -5.0 + 0.35 * c.noise(1.4, 60)
     joint = ((c.y % 26 < 2.2) | ((c.x + 17 * (c.y // 26)) % 34 < 2.2)) & (c.y < 340)
     c.paint(joint, c.level - 1.0)
@@ -211,7 +235,7 @@ def _tunnel(c: _Canvas) -> None:
     c.paint(c.box(0, 440, 2 * c.columns, 3) & (c.x % 42 < 22), -0.8)
 
 
-# What is painted, and the part of it that is brighter than the frames' white.
+# Functions that paint, and the part of the scene that is brighter than the frames' white.
 _SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
     "room": (_room, 0.10),
     "forest": (_forest, 0.30),
@@ -221,21 +245,28 @@ _SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
     "tunnel": (_tunnel, 0.13),
 }
 SCENES = tuple(_SCENES)
-FITTING, TESTING = SCENES[:2], SCENES[2:]  # for tuning parameters, and for judging them
+FITTING, TESTING = SCENES[:2], SCENES[2:]  # for fits of parameters, and for held-out scores
 
 
 def scene(
     name: str | int, decades: float | int = 4.5, size: tuple[int, int] = (480, 320)
 ) -> NDArray[np.float64]:
-    """A textured panorama of high dynamic range: linear intensity, (height, width).
+    """Paint a textured panorama of high dynamic range; deterministic.
 
-    `name` is one of `SCENES`, or a whole number, which chooses among them and seeds a variant.
-    `decades` is the range of luminance (base-10 logarithm) between the darkest and the brightest
-    0.1 %. Intensity 1 is the frames' white: a part of the scene that is fixed for each name, 6 to
-    32 %, is brighter. It is band-limited to about 1.5 pixels, for sampling between pixels. Its left
-    and right edges meet. `size` is (width, height), at least 64 each. Deterministic.
+    Intensity 1 is the frames' white: a part of the scene that is fixed for each name, 6 to 32 %, is
+    brighter. The panorama is band-limited to about 1.5 pixels, for sampling between pixels. Its
+    left and right edges meet.
 
-    Raises `InputError` for an unknown name and for decades or sizes that are not usable.
+    Args:
+        name: One of `SCENES`, or a whole number, which chooses among them and seeds a variant.
+        decades: Range of luminance between the darkest and the brightest 0.1 %, base-10 logarithm.
+        size: Width and height, px, at least 64 each.
+
+    Returns:
+        (height, width) linear intensity.
+
+    Raises:
+        InputError: The name is unknown, or decades or size are not possible.
     """
     if isinstance(name, int):
         kind, seed = SCENES[name % len(SCENES)], name
@@ -255,10 +286,10 @@ def scene(
     draw(canvas)
     light = np.exp(canvas.level)
     sharp, glare = (
-        gaussian_filter(light, width, mode=_EDGES) for width in (_BLUR, _GLARE_BLUR * canvas.unit)
+        gaussian_filter(light, width, mode=_EDGES) for width in (_BLUR_PX, _GLARE_PX * canvas.unit)
     )
-    level = np.log((1 - _GLARE) * sharp + _GLARE * glare)
-    level = gaussian_filter(level, _LOG_BLUR, mode=_EDGES)
+    level = np.log((1 - _GLARE_SHARE) * sharp + _GLARE_SHARE * glare)
+    level = gaussian_filter(level, _LOG_BLUR_PX, mode=_EDGES)
     darkest, white, brightest = np.quantile(level, [0.001, 1 - bright, 0.999])
     return np.exp((level - white) * (decades * np.log(10) / (brightest - darkest)))
 
@@ -269,11 +300,13 @@ class Pan:
 
     The heading swings by 2 rad about left or right within 1.6 s and the speed by a third, 20 to
     40 px/s ("slow") or 200 to 400 px/s ("fast"), or about a number given in px/s; the camera rolls
-    by 5 degrees and zooms by 4 %.
-    Of 64 random places it starts where its way is most evenly bright (I > 1), dark (I < 0.05) and
-    between. ln intensity is interpolated by cubic splines; beyond the panorama's edges it is
-    repeated sideways and mirrored up and down. Deterministic in `seed`.
-    Raises `InputError` for a panorama that is not positive or an unknown speed.
+    by 5 degrees and zooms by 4 %. Of 64 random starts that one is taken whose path is most evenly
+    bright (I > 1), dark (I < 0.05) and between. ln intensity is interpolated by cubic splines;
+    beyond the panorama's edges it is repeated sideways and mirrored up and down. Deterministic in
+    `seed`.
+
+    Raises:
+        InputError: The panorama is not positive, or the speed is unknown.
     """
 
     panorama: NDArray[np.float64]
@@ -293,6 +326,7 @@ class Pan:
             )
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
+        """Return the linear intensity (height, width) at t seconds."""
         width, height = self.size
         (x, y), roll, zoom = self.pose(t)
         across = (np.arange(width) - (width - 1) / 2) * zoom
@@ -302,13 +336,13 @@ class Pan:
         return np.exp(map_coordinates(self._spline, at, order=3, mode="grid-wrap", prefilter=False))
 
     def pose(self, t: float | int) -> tuple[NDArray[np.float64], float, float]:
-        """Where the image centre looks (x, y in pixels), roll (rad) and zoom, at t seconds."""
+        """Return the point at the image centre (x, y, px), roll (rad) and zoom at t seconds."""
         sway = 2 * np.pi * t / 2.3 + self._phases[2]
         return self._path(t), 0.09 * float(np.sin(sway)), 1 + 0.04 * float(np.cos(sway))
 
     @functools.cached_property
     def _spline(self) -> NDArray[np.float64]:
-        return spline_filter(np.log(self._round), 3, mode="grid-wrap")
+        return spline_filter(np.log(self._torus), 3, mode="grid-wrap")
 
     @functools.cached_property
     def _phases(self) -> NDArray[np.float64]:
@@ -317,28 +351,28 @@ class Pan:
     @functools.cached_property
     def _path(self) -> Callable[[float], NDArray[np.float64]]:
         t = np.linspace(0, self.duration, max(8, int(self.duration * 200)))
-        bearing, swing, _, pace = self._phases
+        bearing, swing, _, phase = self._phases
         bearing = 0.0 if bearing < np.pi else np.pi
         mean = SPEEDS[self.speed] if isinstance(self.speed, str) else self.speed
-        speed = mean * (1 + np.sin(2 * np.pi * t / 1.1 + pace) / 3)
+        speed = mean * (1 + np.sin(2 * np.pi * t / 1.1 + phase) / 3)
         heading = bearing + 2 * np.sin(2 * np.pi * t / 1.6 + swing)
         velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
         path = CubicSpline(t, velocity).antiderivative()
-        begin = self._begin(path(t[::20]))
-        return lambda time: begin + path(time)
+        start = self._choose_start(path(t[::20]))
+        return lambda time: start + path(time)
 
     @functools.cached_property
-    def _round(self) -> NDArray[np.float64]:
+    def _torus(self) -> NDArray[np.float64]:
         """The panorama and its mirror image: a torus without a seam."""
         return np.vstack([self.panorama, self.panorama[::-1]])
 
-    def _begin(self, path: NDArray[np.float64]) -> NDArray[np.float64]:
-        height, width = self._round.shape
+    def _choose_start(self, path: NDArray[np.float64]) -> NDArray[np.float64]:
+        height, width = self._torus.shape
         places = np.random.default_rng([self.seed, 1]).uniform(0, [width, height / 2], (64, 2))
         x, y = np.rint(places[:, None] + path).astype(int).T
         view: Any = self.size[::-1]
         bright, dark = (
             uniform_filter(part.astype(float), view, mode="wrap")[y % height, x % width].mean(0)
-            for part in (self._round > 1, self._round < 0.05)
+            for part in (self._torus > 1, self._torus < 0.05)
         )
         return places[np.argmax(np.min([bright, dark, 1 - bright - dark], axis=0))]

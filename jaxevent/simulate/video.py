@@ -1,4 +1,4 @@
-"""Recordings made of ordinary video: artificial HDR data as in the AKF paper's supplement, 4.2."""
+"""Recordings of ordinary video: artificial HDR data as in the AKF paper's supplement, 4.2."""
 
 import dataclasses
 import functools
@@ -21,8 +21,8 @@ from jaxevent.errors import InputError, require
 from jaxevent.recording import Recording
 from jaxevent.simulate.hybrid import Sensor, expose, frame_times, simulate
 
-_MOST_PIXELS = 200_000_000  # of all frames; 7 bytes each
-_IMAGE_RATE = 30.0  # frames per second of a folder of images
+_MAX_PIXELS = 200_000_000  # of all frames; 7 bytes each
+_FOLDER_RATE_HZ = 30.0  # of a folder of images
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 
 _LEVEL = np.arange(256) / 255
@@ -31,7 +31,7 @@ _LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055)
 _REC709 = np.array([0.2126, 0.7152, 0.0722])
 
 
-class _Cropped(Response):
+class _CroppedResponse(Response):
     """An S-curve over intensities from `dark` to 1 instead of from 0 to 1."""
 
     curve: SCurve
@@ -51,8 +51,8 @@ class _Cropped(Response):
 class Clip:
     """Video frames as a `Source`; light changes linearly from each frame to the next.
 
-    Objects fade between frames rather than move, so that what crosses more than a pixel or two per
-    frame should be filmed at a higher rate. Darkness is half the light of level 1, never 0.
+    Objects fade between frames rather than move, so video of motion above a pixel or two per frame
+    needs a higher rate. Darkness is half the light of level 1, never 0.
     """
 
     images: NDArray[np.uint8]  # (frames, height, width, 3), sRGB
@@ -61,19 +61,21 @@ class Clip:
 
     @property
     def size(self) -> tuple[int, int]:
+        """Width and height, px."""
         return self.images.shape[2], self.images.shape[1]
 
     @property
     def duration(self) -> float:
+        """Length, s."""
         return (len(self.images) - 1) / self.rate
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
-        """Luminance (height, width) at t seconds."""
+        """Return the luminance (height, width) at t seconds."""
         k, u = self._between(t)
         return (1 - u) * self._luminance[k].astype(float) + u * self._luminance[k + 1]
 
     def colour(self, t: float | int) -> NDArray[np.float64]:
-        """Intensity of red, green and blue, (height, width, 3), at t seconds."""
+        """Return the intensity of red, green and blue, (height, width, 3), at t seconds."""
         k, u = self._between(t)
         light = (1 - u) * _LINEAR[self.images[k]] + u * _LINEAR[self.images[k + 1]]
         return light / self.white
@@ -104,13 +106,13 @@ def from_video(
 ) -> Recording:
     """Record a video with a simulated sensor of low dynamic range; the video is the HDR truth.
 
-    The sRGB video is made linear, and its Rec. 709 luminance seen by a camera that crops: it
+    The sRGB video is made linear, and its Rec. 709 luminance is recorded by a camera that crops: it
     resolves the levels from `cut` to 255 - `cut` of linear light (the paper's data use 30, 50, 80,
     100 and 115). Intensity stays proportional to light, as events need it: 1 is the level
-    255 - `cut`, and what is darker than cut / (255 - cut) or brighter than 1 is cropped. Beyond
-    what `simulate` tells, `extra` holds
+    255 - `cut`. Light below cut / (255 - cut) or above 1 is cropped. Beside the arrays of
+    `simulate`, `extra` holds
 
-    - rgb (frames, H, W, 3) uint8: each frame in colour, as the same camera sees it;
+    - rgb (frames, H, W, 3) uint8: each frame in colour, of the same camera;
     - cut, and white: the linear light, of the video's 1, that is intensity 1.
 
     Args:
@@ -120,10 +122,13 @@ def from_video(
         cut: Levels cropped at either end, 0 to 127.
         speed: Plays the video faster (> 1) or slower (< 1).
         max_size: Longer side (pixels) to which larger videos are scaled down.
-        rate: Frames per second instead of what the file says (a folder: 30), before `speed`.
+        rate: Frames per second, before `speed`; None: as in the file, 30 for a folder.
         start: First second of the video used.
         stop: Last second used; None for its end.
-        seed: Of all noise.
+        seed: Seed of all noise.
+
+    Returns:
+        The recording.
 
     Raises:
         InputError: The file is missing, no video or too long, holds fewer than two frames in the
@@ -143,10 +148,10 @@ def from_video(
     curve = SCurve(cut)
     if not path.exists():
         raise InputError(f"{path}: there is no such file or folder; correct the path")
-    read = _folder if path.is_dir() else _video
+    read = _read_folder if path.is_dir() else _read_video
     images, found = read(path, max_size, rate, start, stop)
     clip = Clip(images, found * speed, (255 - cut) / 255)
-    sensor = dataclasses.replace(sensor, response=_Cropped(curve, cut / (255 - cut)))
+    sensor = dataclasses.replace(sensor, response=_CroppedResponse(curve, cut / (255 - cut)))
     recording = simulate(clip, sensor, seed, path.stem)
     stamps = frame_times(clip.duration, sensor)
     noise = np.random.default_rng([seed, 1])
@@ -156,7 +161,7 @@ def from_video(
 
 
 def _stack(path: Path, images: Iterator[Image.Image], max_size: int) -> NDArray[np.uint8]:
-    """Images of one size as (frames, height, width, 3), scaled down to `max_size`."""
+    """Stack images of one size, (frames, height, width, 3), scaled down to `max_size`."""
     frames, given = [], None
     for image in images:
         if given not in (None, image.size):
@@ -167,7 +172,7 @@ def _stack(path: Path, images: Iterator[Image.Image], max_size: int) -> NDArray[
         given = image.size
         shrink = min(1, max_size / max(given))
         size = max(1, round(given[0] * shrink)), max(1, round(given[1] * shrink))
-        if (len(frames) + 1) * size[0] * size[1] > _MOST_PIXELS:
+        if (len(frames) + 1) * size[0] * size[1] > _MAX_PIXELS:
             raise InputError(
                 f"{path}: is too long, over {len(frames)} frames of {size[0]}x{size[1]}; choose a "
                 "part with start and stop, or a smaller max_size"
@@ -181,16 +186,16 @@ def _stack(path: Path, images: Iterator[Image.Image], max_size: int) -> NDArray[
     return np.stack(frames)
 
 
-def _video(
+def _read_video(
     path: Path,
     max_size: int,
     rate: float | int | None,
     start: float | int,
     stop: float | int | None,
 ) -> tuple[NDArray[np.uint8], float]:
-    """Frames (frames, height, width, 3) and frames per second."""
+    """Read the frames (frames, height, width, 3) of a video, and frames per second."""
     program = require("imageio_ffmpeg", "video").get_ffmpeg_exe()
-    # PPM images tell their size after rotation, the log tells the rate. -t is the input's time.
+    # PPM images have their size after rotation, the log has the rate. -t is the input's time.
     part = ["-ss", str(start)] + ([] if stop is None else ["-t", str(stop - start)])
     wanted = "-map 0:v:0 -f image2pipe -c:v ppm -pix_fmt rgb24 pipe:1".split()
     command = [program, "-nostdin", "-hide_banner", "-nostats", *part, "-i", path.absolute()]
@@ -211,14 +216,14 @@ def _video(
             ffmpeg.kill()
             ffmpeg.communicate()
         log.seek(0)
-        told = re.search(r"Output #0.*?Video:.*?([\d.]+) fps", log.read().decode("latin1"), re.S)
-    if rate is None and told is None:
-        raise InputError(f"{path}: does not tell its frames per second; give rate")
-    return images, float(told[1] if rate is None and told else rate or 0)
+        rates = re.search(r"Output #0.*?Video:.*?([\d.]+) fps", log.read().decode("latin1"), re.S)
+    if rate is None and rates is None:
+        raise InputError(f"{path}: has no number of frames per second; give rate")
+    return images, float(rates[1] if rate is None and rates else rate or 0)
 
 
 def _portable_pixmaps(stream: IO[bytes]) -> Iterator[Image.Image]:
-    """Binary PPM images of 8 bit, one after the other."""
+    """Yield binary PPM images of 8 bit."""
     while stream.readline() == b"P6\n":
         width, height = (int(number) for number in stream.readline().split())
         stream.readline()
@@ -227,15 +232,15 @@ def _portable_pixmaps(stream: IO[bytes]) -> Iterator[Image.Image]:
             yield Image.frombytes("RGB", (width, height), pixels)
 
 
-def _folder(
+def _read_folder(
     path: Path,
     max_size: int,
     rate: float | int | None,
     start: float | int,
     stop: float | int | None,
 ) -> tuple[NDArray[np.uint8], float]:
-    """The same, of a folder of images."""
-    found = float(_IMAGE_RATE if rate is None else rate)
+    """Read a folder of images as `_read_video` reads a video."""
+    found = float(_FOLDER_RATE_HZ if rate is None else rate)
 
     def order(file: Path) -> list[str | int]:
         parts = re.split(r"(\d+)", file.name)

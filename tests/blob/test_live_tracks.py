@@ -79,7 +79,7 @@ def test_states_are_those_of_the_whole_however_it_is_divided():
         for chunk in chunked(recording, seed):
             live.add(chunk)
             number += len(chunk)
-            held.append(len(live._tail.held()))
+            held.append(len(live._tail.retained()))
             if number and len(held) % 5 == 0:
                 compare(live(live.stop), whole, live.stop, known)
         assert number == len(recording.events) and max(held) < 64 + 300
@@ -172,7 +172,7 @@ def test_noise_that_is_left_out_is_not_held():
     live.add(dataclasses.replace(near, x=near.x + np.arange(9, dtype=np.uint16) % 3))
     for row in range(0, number, 100):
         live.add(events[row : row + 100])
-        assert len(live._tail.held()) < 250
+        assert len(live._tail.retained()) < 250
 
 
 def test_what_cannot_be_added_is_said():

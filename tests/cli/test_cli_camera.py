@@ -12,8 +12,7 @@ from PIL import Image
 import jaxevent
 from jaxevent import cli
 from jaxevent.camera import TableResponse, estimate_response, merge_exposures
-from jaxevent.io.exposures import read_response
-from jaxevent.io.images import read_intensity
+from jaxevent.io.images import read_intensity, read_response
 
 SECONDS = 0.002 * 2.0 ** np.arange(7)
 CAMERA = TableResponse(np.linspace(0, 1, 1001) ** 2.2)

@@ -13,8 +13,8 @@ from noise import ONE, small, write_config
 
 import jaxevent
 from jaxevent import cli
-from jaxevent.egomotion.truth import known
-from jaxevent.io import output, places
+from jaxevent.egomotion.truth import known_motion
+from jaxevent.io import output
 from jaxevent.register.geometry import read_homography
 from jaxevent.runs import results
 from jaxevent.runs.blob_positions import read_positions
@@ -217,7 +217,7 @@ def test_what_another_process_writes_is_refused(folder, capsys):
     with output.complete(folder / "a.h5"):
         fails(capsys, ["convert", "source.h5", "a.h5", "--force"], "another process")
     assert state(folder).keys() == before.keys() | {folder / "a.h5"}
-    assert not places.partials(folder / "a.h5")
+    assert not output.partials(folder / "a.h5")
 
 
 def test_a_fit_has_its_folder_alone(folder, capsys):
@@ -297,6 +297,6 @@ def test_a_byte_order_mark_is_no_reason_to_refuse(folder):
     recording = jaxevent.load(place, (10, 10))
     assert recording.events[:].t.tolist() == [100_000, 500_000]
     assert float(jaxevent.akf.Params.load(place / "params.toml").c_on) == pytest.approx(0.25)
-    assert known(recording, "planar", place / "motion.csv").t.tolist() == [0, 1_000_000]
+    assert known_motion(recording, "planar", place / "motion.csv").t.tolist() == [0, 1_000_000]
     assert len(read_positions(place / "positions.csv").t) == 2
     assert read_homography(place / "homography.csv").tolist() == np.eye(3).tolist()

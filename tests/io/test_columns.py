@@ -16,7 +16,7 @@ from commands import fails
 import jaxevent
 from jaxevent import cli
 from jaxevent.errors import InputError
-from jaxevent.io.columns import find
+from jaxevent.io.columns import find_fields
 
 SIZE = (50, 40)
 COUNT = 500
@@ -95,7 +95,7 @@ def test_arrays_in_which_no_order_fits_are_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize("bits", [8, 16, 32, 64])
 def test_minus_one_without_its_sign(bits, tmp_path):
-    """As v2e writes its HDF5: -1 in uint32 is 4294967295."""
+    """HDF5 of v2e holds -1 in uint32, which is 4294967295."""
     c = columns(3)
     p = np.where(c["p"] == 1, 1, -1).astype(f"i{bits // 8}").view(f"u{bits // 8}")
     stored = c | {"p": p}
@@ -209,13 +209,13 @@ def test_names_above_poses_are_passed_over(tmp_path):
 
 
 def test_names_of_columns():
-    assert find(["x", "y", "pol", "t_ns"]) == {"t": "t_ns", "x": "x", "y": "y", "p": "pol"}
-    assert find(["t", "t_ns", "x", "y", "on"])["t"] == "t"
-    assert find(["t_us", "t_ns", "x", "y", "on"])["t"] == "t_us"
-    assert find(["t", "ts", "x", "y", "p"]) is None
-    assert find(["x", "y", "p"]) is None
+    assert find_fields(["x", "y", "pol", "t_ns"]) == {"t": "t_ns", "x": "x", "y": "y", "p": "pol"}
+    assert find_fields(["t", "t_ns", "x", "y", "on"])["t"] == "t"
+    assert find_fields(["t_us", "t_ns", "x", "y", "on"])["t"] == "t_us"
+    assert find_fields(["t", "ts", "x", "y", "p"]) is None
+    assert find_fields(["x", "y", "p"]) is None
     units = ["x [px]", "y_px", "t [us]", "polarity (1)"]
-    assert find(units) == dict(zip("xytp", units, strict=True))
+    assert find_fields(units) == dict(zip("xytp", units, strict=True))
 
 
 # Parquet and Feather
@@ -230,12 +230,12 @@ def table_of(c: dict) -> Any:
 @pytest.mark.parametrize("group", [COUNT, 130, 64])
 def test_parquet_is_read_by_groups_of_rows(group, tmp_path, monkeypatch):
     parquet = pytest.importorskip("pyarrow.parquet")
-    from jaxevent.io import columns as tables
+    from jaxevent.io import decoded
 
     c = columns(9)
     parquet.write_table(table_of(c), tmp_path / "a.parquet", row_group_size=group)
     assert_read(tmp_path / "a.parquet", c)
-    monkeypatch.setattr(tables, "BLOCK", 90)
+    monkeypatch.setattr(decoded, "BLOCK", 90)
     read: list[int] = []
     whole = parquet.ParquetFile.read_row_group
     monkeypatch.setattr(

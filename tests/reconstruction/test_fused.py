@@ -28,8 +28,8 @@ from test_reconstruction import (
 
 import jaxevent
 from jaxevent import codegen
-from jaxevent.codegen import numeric
-from jaxevent.codegen.host import HostProgram, run
+from jaxevent.codegen import functions
+from jaxevent.codegen.graph import ParameterProgram, evaluate_jaxpr
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.compensated.images import instant_smoother
 from jaxevent.reconstruction.engine import bands, room
@@ -241,17 +241,21 @@ def test_which_compiler_serves(float32):
 def test_functions_of_single_precision():
     x = np.concatenate([np.linspace(-87, 88, 3001), [0, 1e-30, 1e-7, -1e-7]]).astype(np.float32)
     exact = np.exp(x.astype(float))
-    assert max(abs(numeric.exp32(v) / e - 1) for v, e in zip(x, exact, strict=True)) < 2e-7
+    assert max(abs(functions.exp32(v) / e - 1) for v, e in zip(x, exact, strict=True)) < 2e-7
     positive = np.geomspace(1e-37, 1e38, 3001).astype(np.float32)
     for v, e in zip(positive, np.log(positive.astype(float)), strict=True):
-        assert abs(numeric.log32(v) - e) <= 2e-7 * max(abs(e), 1e-3)
+        assert abs(functions.log32(v) - e) <= 2e-7 * max(abs(e), 1e-3)
     for v in np.array([-0.9, -1e-3, -1e-9, 0, 1e-9, 1e-4, 0.3, 7, 1e9], np.float32):
-        assert numeric.log1p32(v) == pytest.approx(np.log1p(float(v)), rel=3e-7)
-        assert numeric.logistic32(v) == pytest.approx(1 / (1 + np.exp(-float(v))), rel=3e-7)
+        assert functions.log1p32(v) == pytest.approx(np.log1p(float(v)), rel=3e-7)
+        assert functions.logistic32(v) == pytest.approx(1 / (1 + np.exp(-float(v))), rel=3e-7)
     inf, nan = np.float32(np.inf), np.float32(np.nan)
-    assert numeric.exp32(inf) == inf and numeric.exp32(-inf) == 0 and np.isnan(numeric.exp32(nan))
-    assert numeric.log32(np.float32(0)) == -inf and numeric.log32(inf) == inf
-    assert np.isnan(numeric.log32(np.float32(-1))) and np.isnan(numeric.log32(nan))
+    assert (
+        functions.exp32(inf) == inf
+        and functions.exp32(-inf) == 0
+        and np.isnan(functions.exp32(nan))
+    )
+    assert functions.log32(np.float32(0)) == -inf and functions.log32(inf) == inf
+    assert np.isnan(functions.log32(np.float32(-1))) and np.isnan(functions.log32(nan))
 
 
 def test_numbers_of_parameters_are_found_without_compiling():
@@ -264,7 +268,7 @@ def test_numbers_of_parameters_are_found_without_compiling():
 
     closed = jax.make_jaxpr(numbers)(2.3, -0.4)
     for given_numbers in ((2.3, -0.4), (9.0, 0.7)):
-        made = run(closed, [np.asarray(v) for v in given_numbers])
+        made = evaluate_jaxpr(closed, [np.asarray(v) for v in given_numbers])
         for one, other in zip(made, numbers(*given_numbers), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-12)
 
@@ -273,15 +277,15 @@ def test_numbers_of_parameters_are_found_without_compiling():
 
     x, i = np.random.default_rng(0).random((4, 5, 6)), np.array([[0, 3], [1, 1], [-1, 2]])
     for one, other in zip(
-        run(jax.make_jaxpr(places)(x, i), [x, i]), places(x, jnp.asarray(i)), strict=True
+        evaluate_jaxpr(jax.make_jaxpr(places)(x, i), [x, i]), places(x, jnp.asarray(i)), strict=True
     ):
         np.testing.assert_array_equal(one, other)
-    program = HostProgram()
+    program = ParameterProgram()
     first = program.add_input(np.asarray(2.0))
     greater = jax.make_jaxpr(lambda x: x > 1)(2.0).eqns[0]
     program.decided += program.add(greater, [first, np.asarray(1.0)])
-    assert program.again([np.asarray(3.0)]) is not None
-    assert program.again([np.asarray(0.5)]) is None
+    assert program.evaluate([np.asarray(3.0)]) is not None
+    assert program.evaluate([np.asarray(0.5)]) is None
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def test_images_are_those_of_what_was_added(frames):
             live.add_frame(int(recording.frames.t[given]), image, 3000)
             given += 1
         live.add(chunk)
-        held = max(held, len(live._events.held()))
+        held = max(held, len(live._events.retained()))
         if row in (0, 450, 1150):
             compare(live, so_far(recording, row + 50, given), params, [live.start, live.stop])
     # Two windows remain, and with frames what the last two or three of them bound.
@@ -97,7 +97,7 @@ def test_the_tail_keeps_its_numbers():
     for row in range(0, 400, 50):
         tail.add(events[row : row + 50])
     tail.drop(120)
-    assert (len(tail), tail.dropped, len(tail.held())) == (400, 120, 280)
+    assert (len(tail), tail.dropped, len(tail.retained())) == (400, 120, 280)
     assert tail[:1].t[0] == events.t[0] and tail.index(int(events.t[200])) <= 200
     np.testing.assert_array_equal(tail[130:170].t, events.t[130:170])
     with pytest.raises(IndexError):

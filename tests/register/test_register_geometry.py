@@ -9,7 +9,7 @@ from rigs import ONE, OTHER, RIG, SIZE, TWO, turned
 from jaxevent import register
 from jaxevent.camera import PinholeCamera
 from jaxevent.register import Rig
-from jaxevent.register.geometry import rays
+from jaxevent.register.geometry import pixel_rays
 
 
 @pytest.mark.parametrize("plane", [(0.0, 0.0, 1.0, 2.0), (0.3, -0.2, 1.0, 1.5)])
@@ -55,7 +55,7 @@ def test_grid_between_fisheyes_is_that_of_opencv():
 
 def test_a_depth_map_is_the_plane_and_far_away_the_translation_does_not_matter():
     plane = (0.3, -0.2, 1.0, 1.5)
-    ray = rays(ONE, SIZE)
+    ray = pixel_rays(ONE, SIZE)
     depth = (1.5 / (ray @ np.array(plane[:3]))).reshape(96, 128)
     of_map = RIG.grid(SIZE, OTHER, depth=depth)
     np.testing.assert_allclose(of_map, RIG.grid(SIZE, OTHER, plane=plane), atol=1e-9)

@@ -7,12 +7,12 @@ from scipy.ndimage import gaussian_filter
 
 from jaxevent import register
 from jaxevent.errors import InputError
-from jaxevent.register import Registration, Warped
-from jaxevent.register.warp import largest_rectangle
+from jaxevent.register import Registration, ResampledImages
+from jaxevent.register.frames import largest_rectangle
 
 
 def ramp(width: int, height: int) -> np.ndarray:
-    """An image that tells its coordinates: x + 1000 y."""
+    """An image of its coordinates: x + 1000 y."""
     y, x = np.mgrid[:height, :width]
     return (x + 1000.0 * y)[None]
 
@@ -21,7 +21,7 @@ def test_warped_ramps_are_the_grid():
     grid = RIG.grid(SIZE, OTHER, depth=2.0)
     inside = (grid > 2) & (grid < [197, 147])
     grid = np.where(np.all(inside, axis=-1, keepdims=True), grid, np.nan)
-    image = np.asarray(Warped(ramp(*OTHER), grid, np.nan))[0]
+    image = np.asarray(ResampledImages(ramp(*OTHER), grid, np.nan))[0]
     np.testing.assert_allclose(image, grid[..., 0] + 1000 * grid[..., 1], atol=1e-6)
 
 
@@ -29,7 +29,7 @@ def test_where_the_other_camera_resolves_more_pixels_are_means():
     rng = np.random.default_rng(0)
     fine = rng.random((1, 90, 120))
     grid = np.moveaxis(np.mgrid[:30, :40], 0, -1)[..., ::-1] * 3.0 + 1
-    (image,) = np.asarray(Warped(fine, grid))
+    (image,) = np.asarray(ResampledImages(fine, grid))
     means = fine[0].reshape(30, 3, 40, 3).mean((1, 3))
     np.testing.assert_allclose(image[1:-1, 1:-1], means[1:-1, 1:-1], atol=1e-9)
 
@@ -38,20 +38,20 @@ def test_clipped_pixels_stay_clipped_and_nothing_overshoots():
     image = np.full((1, 20, 20), 100, np.uint8)
     image[:, :, 10:] = 255
     grid = np.moveaxis(np.mgrid[:20, :19], 0, -1)[..., ::-1] + np.array([0.4, 0.0])
-    grey = np.asarray(Warped(image, grid)).reshape(20, 19)
+    grey = np.asarray(ResampledImages(image, grid)).reshape(20, 19)
     assert grey.dtype == np.uint8
     # A tenth more of the neighbour than 0.4 by the cubic; the others are between 100 and 255.
     np.testing.assert_array_equal(np.unique(grey[:, :9]), [100])
     assert 150 < int(grey[0, 9]) < 170 and (grey[:, 10:] == 255).all()
-    more = np.asarray(Warped(image, grid + np.array([0.2, 0.0])))[0]
+    more = np.asarray(ResampledImages(image, grid + np.array([0.2, 0.0])))[0]
     assert more[0, 9] == 255
 
 
-def test_warped_images_are_read_when_asked_for():
+def test_resampled_images_are_lazy():
     images = np.random.default_rng(0).integers(0, 255, (5, 20, 30, 3), dtype=np.uint8)
     grid = np.full((4, 6, 2), np.nan)
     grid[:, :3] = 7.25
-    lazy = Warped(images, grid, fill=9)
+    lazy = ResampledImages(images, grid, fill=9)
     assert lazy.shape == (5, 4, 6, 3) and lazy.dtype == np.uint8 and len(lazy) == 5
     whole = np.asarray(lazy)
     assert (whole[:, :, 3:] == 9).all()
@@ -81,20 +81,22 @@ def test_registered_views_are_the_rendered_ones(near):
     worst = []
     for t in (0.1, 0.5):
         images = other.intensity(t)[None]
-        (image,) = np.asarray(Warped(images, grid, np.nan))
+        (image,) = np.asarray(ResampledImages(images, grid, np.nan))
         worst += shifts(np.log(image), np.log(source.intensity(t)), 24)
     assert len(worst) >= 8
     assert np.linalg.norm(worst, axis=1).max() < 0.1
     # The check sees what it is for: a wall 10 % farther away is off by half a pixel.
     grid = rig.grid(source.size, other.size, plane=(0, 0, 1, 2.2))
-    (image,) = np.asarray(Warped(other.intensity(0.1)[None], grid, np.nan))
+    (image,) = np.asarray(ResampledImages(other.intensity(0.1)[None], grid, np.nan))
     off = shifts(np.log(image), np.log(source.intensity(0.1)), 24)
     assert np.linalg.norm(np.mean(off, 0)) > 0.3
 
 
 def test_registered_frames_have_the_events_clock():
     recording, other = small(9)
-    both = register.registered(recording, other, Registration(part_grid(), -5.0 - 0.04)).check()
+    both = register.apply_registration(
+        recording, other, Registration(part_grid(), -5.0 - 0.04)
+    ).check()
     # Those more than a frame away are left out: of -40, -20, ..., 120 ms the first.
     np.testing.assert_array_equal(both.frames.t, np.arange(-20_000, 120_001, 20_000)[:-1])
     assert (both.frames.exposure == 3_000).all()
@@ -104,15 +106,17 @@ def test_registered_frames_have_the_events_clock():
     assert np.asarray(both.frames.images)[:, 0].tolist() == [[0, 0, 100, 100, 100, 0, 100, 100]] * 7
     assert both.extra["kept"] is recording.extra["kept"]
     with pytest.raises(InputError, match="give the offset"):
-        register.registered(recording, other, Registration(part_grid(), 1.0))
+        register.apply_registration(recording, other, Registration(part_grid(), 1.0))
     with pytest.raises(InputError, match="nothing that the event camera sees"):
-        register.registered(recording, other, Registration(part_grid() * np.nan, -5.0))
+        register.apply_registration(recording, other, Registration(part_grid() * np.nan, -5.0))
 
 
 def test_a_crop_is_a_smaller_recording():
     recording, other = small()
     H = np.array([[1.0, 0.1, 2], [0, 1, 3], [0, 0, 1]])
-    both = register.registered(recording, other, Registration(part_grid(), -5.0, H), crop=True)
+    both = register.apply_registration(
+        recording, other, Registration(part_grid(), -5.0, H), crop=True
+    )
     both.check()
     assert (both.width, both.height) == (6, 5)
     assert (both.camera.cx, both.camera.cy) == (2.0, 2.0)

@@ -38,7 +38,7 @@ def test_poses_integrate_the_twist():
 
 
 def test_truth_from_the_recorded_poses():
-    box = sim.texture_of("noise", 0.05)
+    box = sim.make_texture("noise", 0.05)
     world = sim.World((-5, -5, -5), (5, 5, 5), box)
     for motion, tolerance in ((sim.CameraMotion(SWINGING.mean), 1e-6), (SWINGING, 2e-2)):
         source = sim.MovingCamera(world, motion, SIZE, 50, duration=0.3)
@@ -69,7 +69,7 @@ def test_images_fit_poses_and_depth():
     there = (point @ moved[:3, :3].T + moved[:3, 3]).reshape(-1, 3)
     assert there[:, 2].min() > 0
     ray = there / there[:, 2:]
-    level, seen = source.world.seen(P1[:3, 3], ray @ P1[:3, :3].T, 1 / f)
+    level, seen = source.world.render(P1[:3, 3], ray @ P1[:3, :3].T, 1 / f)
     same = np.abs(seen - there[:, 2]) < 1e-6
     assert same.mean() > 0.85  # others are hidden at one of the two times
     difference = np.abs(level - np.log(source.intensity(0.05)).ravel())[same]
@@ -81,7 +81,7 @@ def test_images_fit_poses_and_depth():
 
 def test_planar_velocity():
     motion = sim.planar_motion((100, -60), 2, 200, slope=(30, 20), amplitude=(40, 10), phase=0.4)
-    world = sim.World((-9, -9, -1), (9, 9, 2), sim.texture_of("noise", 0.01))
+    world = sim.World((-9, -9, -1), (9, 9, 2), sim.make_texture("noise", 0.01))
     source = sim.MovingCamera(world, motion, SIZE)
     t = np.array([0.0, 0.13, 0.5])
     wave = np.sin(2 * np.pi * 2 * t + 0.4)[:, None]
@@ -99,7 +99,7 @@ def test_flow_at_the_principal_point_of_general_motion():
     _, source = sim.motion_scene("wall", seed=1, size=SIZE, focal=50, duration=0.1)
     h, t = 1e-4, 0.05
     P = source.pose(np.array([t - h, t, t + h]))
-    axis = source.world.seen(P[1, :3, 3], P[1, :3, 2][None], 1 / 50)[1][0] * np.array([0, 0, 1.0])
+    axis = source.world.render(P[1, :3, 3], P[1, :3, 2][None], 1 / 50)[1][0] * np.array([0, 0, 1.0])
     point = P[1, :3, :3] @ axis + P[1, :3, 3]
     x = []
     for pose in (P[0], P[2]):
@@ -236,13 +236,13 @@ def test_what_is_not_possible():
     with pytest.raises(InputError, match="outside the world"):
         sim.motion_scene("wall", size=(16, 12), speed=500, duration=0.1)
     with pytest.raises(InputError, match="no texture"):
-        sim.texture_of("nois", 0.1)
+        sim.make_texture("nois", 0.1)
     with pytest.raises(InputError, match="slope of a camera's motion"):
         sim.CameraMotion(SWINGING.mean, slope=(np.nan, 0, 0, 0, 0, 0))
     with pytest.raises(InputError, match="finite px/frame"):
         sim.frame_events(np.zeros(3))
     source = sim.MovingCamera(
-        sim.World((-1, -1, -1), (1, 1, 1), sim.texture_of("noise", 0.1)), SWINGING, (16, 12), 20
+        sim.World((-1, -1, -1), (1, 1, 1), sim.make_texture("noise", 0.1)), SWINGING, (16, 12), 20
     )
     with pytest.raises(InputError, match="known from 0"):
         source.twist(0.6)

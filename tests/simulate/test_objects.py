@@ -50,7 +50,8 @@ def test_one_object_is_drawn_as_an_oracle_draws_it(number):
     t = 0.37
     image = objects.intensity(t)
     behind = kept[0].intensity(
-        np.arange(48)[None] - kept[0].place(t)[0], np.arange(40)[:, None] - kept[0].place(t)[1]
+        np.arange(48)[None] - kept[0].position(t)[0],
+        np.arange(40)[:, None] - kept[0].position(t)[1],
     )
     shares = np.empty((40, 48))
     expected = np.empty((40, 48))
@@ -112,7 +113,7 @@ def test_flow_is_that_of_the_surface_at_a_pixel():
         number = objects.visible(t)
         for k, surface in enumerate(objects.surfaces):
             h = 1e-5
-            slope = (surface.place(t + h) - surface.place(t - h)) / (2 * h)
+            slope = (surface.position(t + h) - surface.position(t - h)) / (2 * h)
             own = objects.flow(t)[number == k]
             np.testing.assert_allclose(own, np.broadcast_to(slope, own.shape), atol=1e-4)
 

@@ -437,7 +437,7 @@ def test_unfit_video_is_refused(film, name, options, said):
 
 
 def test_too_long_videos_are_refused(film, monkeypatch):
-    monkeypatch.setattr("jaxevent.simulate.video._MOST_PIXELS", 5 * 48 * 32)
+    monkeypatch.setattr("jaxevent.simulate.video._MAX_PIXELS", 5 * 48 * 32)
     with pytest.raises(jaxevent.InputError, match="too long, over 5 frames of 48x32; choose a"):
         sim.from_video(film / "film.mp4")
     assert sim.from_video(film / "film.mp4", stop=0.18).width == 48

@@ -13,13 +13,12 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.states import canonical
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import own_params, predict, stands_still
-from jaxevent.codegen.expressions import Graph, value_of
-from jaxevent.codegen.host import HostProgram
-from jaxevent.codegen.loops import Kernels, Loop, LoopWriter, Program, translate
-from jaxevent.codegen.text import Numbers
+from jaxevent.codegen.graph import Graph, ParameterProgram, constant_value
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import TracedProgram, translate_function
+from jaxevent.codegen.write import ModuleText, Writer
 
 OUT = {"x": X, "P": P, "F": F, "mean": MEAN, "covariance": COVARIANCE}  # places in `work`
-NO_LOOP = Loop("i", "count", ())
 
 
 class _Reading(NamedTuple):
@@ -44,9 +43,9 @@ class _Reading(NamedTuple):
         return {"mean": mean, "covariance": covariance}
 
 
-def program_of(filter: Filter, params: TrackerParams, of: Kernel, dtype: np.dtype) -> Program:
-    """The functions, translated; raises `Untranslatable`."""
-    host, graph, reading = HostProgram(), Graph(), _Reading(filter)
+def program_of(filter: Filter, params: TrackerParams, of: Kernel, dtype: np.dtype) -> TracedProgram:
+    """The functions, translated; raises `TranslationError`."""
+    host, graph, reading = ParameterProgram(), Graph(), _Reading(filter)
     for leaf in jax.tree.leaves(params):
         host.add_input(np.asarray(leaf))
 
@@ -60,34 +59,34 @@ def program_of(filter: Filter, params: TrackerParams, of: Kernel, dtype: np.dtyp
         "canonical": (reading.canonical, {"x": shape(8), "P": shape(8, 8)}),
     }
     made = {
-        name: translate(function, params, given, graph, host, single=True)
+        name: translate_function(function, params, given, graph, host, single=True)
         for name, (function, given) in functions.items()
     }
-    return Program(made, host, of.layout, dtype)
+    return TracedProgram(made, host, of.layout, dtype)
 
 
-def write(program: Program) -> tuple[str, Numbers]:
+def write(program: TracedProgram) -> ModuleText:
     """The text of a program's module."""
     work = {"dt.0": ("work", "row", DT), "silence.0": ("work", "row", SILENCE)}
     for name, size in (("x", 8), ("P", 64)):
         work |= {f"{name}.{k}": ("work", "row", OUT[name] + k) for k in range(size)}
-    writer, out = LoopWriter(program.layout.places() | work), []
+    writer, out = Writer(program, program.layout.places() | work), []
     for name, function in program.functions.items():
         store = {}
         for key in function.results:
             what, number = key.split(".")
             store[key] = f"work[{OUT[what] + int(number)}] = {{}}"
-        lines = writer.body(name, function, store, NO_LOOP)
+        lines = writer.body(name, function, store)
         widths = len(program.layout.cells), len(program.layout.whole)
         out.append(
             FUNCTION.format(
                 name=name, body="\n".join(lines), width=widths[0], whole_width=widths[1]
             )
         )
-    return writer.module("What is read of a target (`jaxevent.blob.engine`).", program, out)
+    return writer.module("What is read of a target (`jaxevent.blob.engine`).", out, program.layout)
 
 
-def blocks_of(program: Program) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def blocks_of(program: TracedProgram) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The 8 numbers of a target in an order, and where blocks of it begin.
 
     Numbers of two blocks have no covariance and do not pass into each other.
@@ -96,7 +95,7 @@ def blocks_of(program: Program) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     tied = np.eye(8, dtype=bool)
     for i, j in itertools.product(range(8), range(8)):
         entries = moved[f"P.{8 * i + j}"], passed.get(f"F.{8 * i + j}")
-        tied[i, j] |= any(node is not None and value_of(node) != 0 for node in entries)
+        tied[i, j] |= any(node is not None and constant_value(node) != 0 for node in entries)
     tied |= tied.T
     for k in range(8):
         tied |= tied[:, k, None] & tied[k]
@@ -106,17 +105,15 @@ def blocks_of(program: Program) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return order, np.append(begins, 8)
 
 
-_kernels = Kernels(Functions, write, most=4000)
+_kernels = KernelCache(Functions, write, max_nodes=4000)
 
 
 def functions_of(
     filter: Filter, params: TrackerParams, of: Kernel, dtype: np.dtype
 ) -> tuple[Functions, NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """The functions with their numbers, and `blocks_of`; raises `Untranslatable`."""
+    """The functions with their numbers, and `blocks_of`; raises `TranslationError`."""
     leaves, tree = jax.tree.flatten(params)
     own = tuple(name for name in of.layout.cells if name.startswith("slot.own"))
     key = filter, tree, tuple(np.shape(leaf) for leaf in leaves), own, dtype, len(of.layout.cells)
-    program, functions, numbers = _kernels.get(
-        key, params, lambda: program_of(filter, params, of, dtype)
-    )
-    return functions, numbers, *blocks_of(program)
+    made = _kernels.get(key, params, lambda: program_of(filter, params, of, dtype))
+    return made.functions, made.numbers, *blocks_of(made.program)

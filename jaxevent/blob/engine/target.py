@@ -37,37 +37,34 @@ from jaxevent.blob.targets import (
     start_gate,
     update_slot,
 )
-from jaxevent.codegen.expressions import Graph, Untranslatable
-from jaxevent.codegen.host import HostProgram
-from jaxevent.codegen.loops import (
-    MARK,
-    Function,
-    Kernels,
-    Loop,
-    LoopWriter,
-    Program,
-    leaves_of,
-    numbers_of,
-    translate,
+from jaxevent.codegen.graph import Graph, ParameterProgram, TranslationError
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import (
+    ELEMENTS,
+    TracedFunction,
+    TracedProgram,
+    name_leaves,
+    name_numbers,
+    translate_function,
 )
-from jaxevent.codegen.text import Numbers, Place
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
 
-FUNCTION = """@callback(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **HOW)
+FUNCTION = """@cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **OPTIONS)
 def {name}(cells, whole, work, marks, numbers, target, row, room, count):
     of_cells, of_whole = target * {width}, target * {whole_width}
 {body}
 
 
 """
-ALONE = """@numba.njit(**LOOP)
+ALONE = """@numba.njit(**LOOP_OPTIONS)
 def alone_0(work, numbers, row, room, count):
     for i in range(count):
 {body}
 
 
 """
-EVENTS = Loop("i", "count", ("work", "marks", "row", "room", "count"))
-TARGETS_OF_EVENT = Loop("k", "count", ("work", "marks", "row", "room", "count"))
+EVENTS = ElementLoop("i", "count", ("work", "marks", "row", "room", "count"))
+TARGETS_OF_EVENT = ElementLoop("k", "count", ("work", "marks", "row", "room", "count"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +74,7 @@ class Layout:
     cells: dict[str, int]
     whole: dict[str, int]
 
-    def places(self) -> dict[str, Place]:
+    def places(self) -> dict[str, Address]:
         """Where the numbers are read."""
         places = {name: ("cells", "of_cells", at) for name, at in self.cells.items()}
         return places | {name: ("whole", "of_whole", at) for name, at in self.whole.items()}
@@ -89,7 +86,7 @@ class Layout:
 
 
 @dataclasses.dataclass(frozen=True)
-class TargetProgram(Program):
+class TargetProgram(TracedProgram):
     """The functions of a filter's target."""
 
     slot: Any  # the shapes of one target
@@ -151,12 +148,12 @@ class _Target(NamedTuple):
 def program_of(
     filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
 ) -> TargetProgram:
-    """The functions of one target, translated; raises `Untranslatable`.
+    """The functions of one target, translated; raises `TranslationError`.
 
     `own` are a target's own numbers, `owned` says whether events have owners.
     """
     single = params.events_per_step == 1
-    host, graph, target = HostProgram(), Graph(), _Target(filter, single)
+    host, graph, target = ParameterProgram(), Graph(), _Target(filter, single)
     for leaf in jax.tree.leaves(params):
         host.add_input(np.asarray(leaf))
 
@@ -166,7 +163,7 @@ def program_of(
     owns = {name: shape() for name in own}
     times, flag = shape(kind=np.int32), shape(kind=bool)
     slot = jax.eval_shape(target.slot, params, owns, shape(2), shape(), times, flag)
-    events = MARK if not single else 1
+    events = ELEMENTS if not single else 1
     batch = jax.eval_shape(Batch, shape(events, 2), shape(events), shape(events))
     owner = shape(events, 2, kind=np.int32) if owned else None
     valid = shape(events, kind=bool)
@@ -175,7 +172,7 @@ def program_of(
     looked = jax.eval_shape(lambda p, v: target.ahead(p, **v)["ahead"], params, seen)
     now = jax.eval_shape(lambda p, v: target.expected(p, **v)["now"], params,
         {"slot": slot, "stop": times})  # fmt: skip
-    shared = {"held": shape(MARK, kind=bool), "density": shape(MARK)}
+    shared = {"held": shape(ELEMENTS, kind=bool), "density": shape(ELEMENTS)}
     functions = {
         "start": (target.start, {"slot": slot, "xi": shape(2), "size": shape()}, True),
         "solo": (target.solo, seen, single),
@@ -193,7 +190,7 @@ def program_of(
         ),
     }  # fmt: skip
     made = {
-        name: translate(function, params, values, graph, host, alone)
+        name: translate_function(function, params, values, graph, host, alone)
         for name, (function, values, alone) in functions.items()
     }
     layout = _layout({"slot": slot, "ahead": looked, "now": now})
@@ -209,11 +206,11 @@ def _layout(trees: dict[str, Any]) -> Layout:
     """The driver's own numbers first, then all others of one target."""
     cells, whole = ({name: k for k, name in enumerate(names)} for names in (CELLS, WHOLE))
     for name, tree in trees.items():
-        for leaf_name, leaf in leaves_of(name, tree).items():
-            if MARK in leaf.shape:
+        for leaf_name, leaf in name_leaves(name, tree).items():
+            if ELEMENTS in leaf.shape:
                 continue
             real = leaf.dtype.kind == "f"
-            for number in numbers_of(leaf_name, leaf):
+            for number in name_numbers(leaf_name, leaf):
                 (cells if real else whole).setdefault(number, len(cells if real else whole))
     return Layout(cells, whole)
 
@@ -254,7 +251,7 @@ def _of_targets(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _branches(
-    writer: LoopWriter, program: TargetProgram, function: Function, stores: dict[str, str]
+    writer: Writer, program: TargetProgram, function: TracedFunction, stores: dict[str, str]
 ) -> list[str]:
     """The lines of a step of one event, which is the target's or leaves it as it is.
 
@@ -272,25 +269,25 @@ def _branches(
     return writer.branches(truth, cases, stores)
 
 
-def write(program: TargetProgram) -> tuple[str, Numbers]:
+def write(program: TargetProgram) -> ModuleText:
     """The text of a program's module."""
     read, store = _elements(program.single)
     places, stores = program.layout.places(), program.layout.stores()
-    writer = LoopWriter(places | read)
+    writer = Writer(program, places | read)
     out = []
     for name, function in program.functions.items():
         if name == "alone":
-            writer.places, to = _of_targets("row", "i")
+            writer.addresses, to = _of_targets("row", "i")
             lines = writer.lines([*function.results.values()], 8)
             for key, node in function.results.items():
                 lines.append(f"        {to[key].format(writer.name(node))}")
             writer.loops.append(ALONE.format(body="\n".join(lines)))
             lines = ["    alone_0(work, numbers, row, room, count)"]
         elif name == "share":
-            writer.places, to = _of_targets(f"{TARGETS} + {ROWS} * k", "row")
+            writer.addresses, to = _of_targets(f"{TARGETS} + {ROWS} * k", "row")
             lines = writer.body(name, function, to, TARGETS_OF_EVENT)
         else:
-            writer.places = places | read
+            writer.addresses = places | read
             changed = {
                 key: text
                 for key, text in (stores | store).items()
@@ -309,7 +306,9 @@ def write(program: TargetProgram) -> tuple[str, Numbers]:
                 whole_width=len(program.layout.whole),
             )
         )
-    return writer.module("The functions of one target (`jaxevent.blob.engine`).", program, out)
+    return writer.module(
+        "The functions of one target (`jaxevent.blob.engine`).", out, program.layout
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -322,21 +321,19 @@ class Kernel:
     slot: Any  # the shapes of one target
 
 
-_kernels = Kernels(Functions, write, most=4000)
+_kernels = KernelCache(Functions, write, max_nodes=4000)
 
 
 def kernel_of(
     filter: Filter, params: TrackerParams, own: dict[str, Any], owned: bool, dtype: np.dtype
 ) -> Kernel:
-    """The kernel of a filter with its parameters; raises `Untranslatable`."""
+    """The kernel of a filter with its parameters; raises `TranslationError`."""
     if params.association == "authors":
-        raise Untranslatable('association = "authors"')
+        raise TranslationError('association = "authors"')
     leaves, tree = jax.tree.flatten(params)
     key = filter, tree, tuple(np.shape(leaf) for leaf in leaves), tuple(own), owned, dtype
-    program, functions, numbers = _kernels.get(
-        key, params, lambda: program_of(filter, params, own, owned, dtype)
-    )
-    return Kernel(functions, program.layout, numbers, program.slot)
+    made = _kernels.get(key, params, lambda: program_of(filter, params, own, owned, dtype))
+    return Kernel(made.functions, made.places, made.numbers, made.program.slot)
 
 
 def shares_apart(filter: Filter) -> bool:

@@ -18,8 +18,8 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Packing, Stretch
 from jaxevent.blob.steps import Filter
 from jaxevent.blob.targets import Slots
-from jaxevent.codegen.host import run as run_on_host
-from jaxevent.codegen.loops import leaves_of, numbers_of
+from jaxevent.codegen.graph import evaluate_jaxpr
+from jaxevent.codegen.trace import name_leaves, name_numbers
 
 
 @functools.lru_cache(maxsize=16)
@@ -31,7 +31,7 @@ def _beginning(filter: Filter, tree: Any, kinds: tuple[jax.ShapeDtypeStruct, ...
 
 
 class FusedRun:
-    """Tracks through a packing's chunks by a filter's kernel; raises `Untranslatable`."""
+    """Tracks through a packing's chunks by a filter's kernel; raises `TranslationError`."""
 
     def __init__(self, filter: Filter, params: TrackerParams, packing: Packing):
         self.dtype = np.dtype(jnp.result_type(float))
@@ -45,8 +45,8 @@ class FusedRun:
         )  # fmt: skip
         layout = self._kernel.layout
         self._columns: list[tuple[bool, NDArray[np.int64], tuple[int, ...], np.dtype]] = []
-        for name, leaf in leaves_of("slot", self._kernel.slot).items():
-            names = numbers_of(name, leaf)
+        for name, leaf in name_leaves("slot", self._kernel.slot).items():
+            names = name_numbers(name, leaf)
             real = leaf.dtype.kind == "f"
             places = layout.cells if real else layout.whole
             columns = np.array([places[number] for number in names], np.int64)
@@ -61,7 +61,7 @@ class FusedRun:
         given = [np.asarray(leaf) for leaf in leaves]
         kinds = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in given)
         closed, told = _beginning(self._filter, tree, kinds)
-        return jax.tree.unflatten(told, run_on_host(closed, given))
+        return jax.tree.unflatten(told, evaluate_jaxpr(closed, given))
 
     def follow(self, state: State, features: Features) -> tuple[State, Log]:
         """The state at the end, with births and deaths."""

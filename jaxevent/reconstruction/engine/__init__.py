@@ -9,5 +9,5 @@ and every image while a band's pixels are in the processor's cache. `video` puts
 as `Video` does.
 
 What rests on parameters alone is computed in NumPy (`host`), and conditions among it choose what
-the kernel holds. What has no translation raises `Untranslatable`, and the scan serves.
+the kernel holds. What has no translation raises `TranslationError`, and the scan serves.
 """

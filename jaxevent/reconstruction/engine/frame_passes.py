@@ -84,7 +84,7 @@ def _shares(layout: BandLayout, width: int, height: int) -> NDArray:
 
 
 class FramePasses:
-    """A smoother's kernel for a recording; raises `Untranslatable`."""
+    """A smoother's kernel for a recording; raises `TranslationError`."""
 
     def __init__(
         self,
@@ -108,10 +108,8 @@ class FramePasses:
     def use(self, params: Any) -> None:
         """Go on with other parameters."""
         exposed = self.clock.exposed
-        kernel = smoother_kernel(
-            self._method, params, self._fixed, exposed, self.dtype, self.layout.stride,
-            self._directions,
-        )  # fmt: skip
+        layout = exposed, self.dtype, self.layout.stride
+        kernel = smoother_kernel(self._method, params, self._fixed, layout, self._directions)
         if self._program is not kernel.program:
             self._program, self.spare = kernel.program, queue.SimpleQueue()
         self.kernel, self.places = kernel, _places(kernel.program, self.layout, exposed)

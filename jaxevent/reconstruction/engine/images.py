@@ -20,7 +20,7 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
@@ -28,13 +28,13 @@ from jaxevent.locks import TurnLock
 from jaxevent.reconstruction.engine.loop import Images
 from jaxevent.reconstruction.engine.passes import DividedRecording, Passes
 from jaxevent.reconstruction.engine.pixel import Directions
-from jaxevent.reconstruction.engine.video import wants_kernel, without_kernel
+from jaxevent.reconstruction.engine.video import serves_images
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 
-IN_TURN = dispatch.use_synchronous_dispatch()  # whether kernels may be called from within programs
+IS_SYNCHRONOUS = dispatch.use_synchronous_dispatch()  # so that programs may call kernels
 
 _held: "weakref.WeakValueDictionary[int, Divided]" = weakref.WeakValueDictionary()
 _numbers = itertools.count()
@@ -44,7 +44,7 @@ class Divided(abc.ABC):
     """A recording divided among bands, with the kernels that have passed over it.
 
     What is of one method, precision and size is equal: programs that JAX compiles for one serve
-    all. Which one is meant is told by its number, when they run. Raises `Untranslatable` unless
+    all. Which one is meant is told by its number, when they run. Raises `TranslationError` unless
     there are kernels for the images and their derivatives.
     """
 
@@ -81,7 +81,7 @@ class Divided(abc.ABC):
 
     @abc.abstractmethod
     def check(self, params: Any, directions: Directions) -> None:
-        """Raise `Untranslatable` unless there are kernels for images and these derivatives."""
+        """Raise `TranslationError` unless there are kernels for images and these derivatives."""
 
     @abc.abstractmethod
     def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> Images:
@@ -116,7 +116,7 @@ class DividedEvents(Divided):
     def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> Images:
         kernel = self.recording.kernel(self.method, params, self.clock_offset, directions)
         passes = self._passes.get(directions)
-        if passes is None or passes.kernel.source is not kernel.source:
+        if passes is None or passes.kernel.places is not kernel.places:
             passes = Passes(kernel, self.recording.layout, self.dtype)
             self._passes[directions] = passes
         passes.kernel = kernel
@@ -173,22 +173,20 @@ def prepared_by_kernel(
 
     See `Filter.prepare_images`. Raises `InputError` where numba is asked for what it cannot do.
     """
-    elsewhere = compiler is None and has_accelerator()
-    if elsewhere or not (wants_kernel(compiler, jax.local_devices()) and IN_TURN):
-        return None
-    if "rho_ref" in params.followed:
+    serves = serves_images(jax.local_devices()) and not has_accelerator()
+    backend = choose_backend(compiler, serves)
+    if backend == "xla" or not IS_SYNCHRONOUS or "rho_ref" in params.followed:
         return None
     method.check(recording)
     method.check_clocks(recording, params)
     times = sorted_times(times)
     if not extrapolate:
         method.check_span(recording, times, params)
-    try:
+
+    def make() -> FusedImages:
         return FusedImages.of(kind(method, recording, times, params), len(times))
-    except Untranslatable as reason:
-        if compiler == "numba":
-            raise without_kernel(method.name, reason) from reason
-        return None
+
+    return make_kernel(method.name, compiler, serves, make)
 
 
 def _evaluate(

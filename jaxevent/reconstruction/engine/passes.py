@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import run_over_rows
-from jaxevent.codegen.expressions import Untranslatable
+from jaxevent.codegen.graph import TranslationError, evaluate_arrays
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.engine.bands import BandLayout
 from jaxevent.reconstruction.engine.entering import steps_of
-from jaxevent.reconstruction.engine.kernel import Kernel, kernel_of, program_of
+from jaxevent.reconstruction.engine.kernel import kernel_of
 from jaxevent.reconstruction.engine.loop import (
     Bands,
     FrameRows,
@@ -56,8 +56,8 @@ class DividedRecording:
     """Cuts a recording into windows whose events are divided among bands of rows.
 
     `events` bounds a window's events; None: one window is the whole, for images with derivatives.
-    `factors` (2, pixels) are those of single pixels' ON and OFF thresholds. Raises `Untranslatable`
-    for what kernels cannot do.
+    `factors` (2, pixels) are those of single pixels' ON and OFF thresholds. Raises
+    `TranslationError` for what kernels cannot do.
     """
 
     def __init__(
@@ -71,9 +71,9 @@ class DividedRecording:
         smaller = filtering and events is None
         layout = BandLayout.of(recording.width, recording.height, smaller)
         if layout is None:
-            raise Untranslatable(f"a sensor {recording.width} pixels wide")
+            raise TranslationError(f"a sensor {recording.width} pixels wide")
         if recording.stop - recording.start >= NEVER:
-            raise Untranslatable("a recording of over a year")
+            raise TranslationError("a recording of over a year")
         whole = max(len(recording.events), 1)
         self.recording, self.layout, self._factors = recording, layout, factors
         self.windows = WindowedRecording(
@@ -105,21 +105,19 @@ class DividedRecording:
         params: Any,
         clock_offset: Any,
         directions: Directions = Directions(),  # noqa: B008
-    ) -> Kernel:
+    ) -> Any:
         """The kernel of a method, for this recording's frames.
 
         `clock_offset` is the one that the recording was divided for.
         """
         fixed, clock = self.fixed(clock_offset), self.windows.clock
-        return kernel_of(
-            method, method.frame_model, params, fixed, clock.exposed, self.dtype,
-            self.layout.stride, directions,
-        )  # fmt: skip
+        layout = clock.exposed, self.dtype, self.layout.stride
+        return kernel_of(method, params, fixed, layout, directions)
 
     def check(self, method: Any, params: Any, clock_offset: Any, directions: Directions) -> None:
-        """Raise `Untranslatable` if there can be no such kernel."""
-        fixed, exposed = self.fixed(clock_offset), self.windows.clock.exposed
-        program_of(method, method.frame_model, params, fixed, exposed, self.dtype, directions)
+        """Raise `TranslationError` if there can be no such kernel."""
+        layout = self.windows.clock.exposed, self.dtype, self.layout.stride
+        kernel_of(method, params, self.fixed(clock_offset), layout, directions, compiled=False)
 
     def fixed(self, clock_offset: Any) -> dict[str, NDArray]:
         """What is known with the parameters."""
@@ -210,8 +208,8 @@ class Held:
 class Passes:
     """A kernel, and what its bands remember from one pass over events to the next."""
 
-    def __init__(self, kernel: Kernel, layout: BandLayout, dtype: np.dtype):
-        fields, bands = kernel.source.fields, len(layout.edges) - 1
+    def __init__(self, kernel: Any, layout: BandLayout, dtype: np.dtype):
+        fields, bands = kernel.places, len(layout.edges) - 1
         self.kernel, self.layout, self.dtype = kernel, layout, dtype
         places, stride = fields.places, layout.stride
         self._memory = Memory(
@@ -235,7 +233,7 @@ class Passes:
     ) -> None:
         """Pass over the window's events before a time (us since the recording's start)."""
         kernel = self.kernel
-        places = kernel.source.fields.places
+        places = kernel.places.places
         if enter[0] >= 0:
             self._steps = steps_of(places, window.line, window.frames, enter)
         given = Given(
@@ -250,8 +248,8 @@ class Passes:
 
     def room(self, times: int, pixels: int) -> Images:
         """Where images go, and derivatives of those that have any."""
-        shape, source = (times, pixels), self.kernel.source
-        slopes = np.empty((*shape, len(source.outputs), source.lanes), self.dtype)
+        shape, fields = (times, pixels), self.kernel.places
+        slopes = np.empty((*shape, len(fields.outputs), fields.lanes), self.dtype)
         mean, variance = np.empty(shape, self.dtype), np.empty(shape, self.dtype)
         return Images(mean, variance, np.empty(shape, np.uint8), slopes)
 
@@ -276,8 +274,7 @@ class Passes:
 
     def _start(self, window: Window) -> None:
         """The state at the recording's start, with its derivatives."""
-        line, source = window.line, self.kernel.source
-        fields, memory = source.fields, self._memory
+        line, fields, memory = window.line, self.kernel.places, self._memory
         stretch = int(np.searchsorted(line.start, 0, "right")) - 1
         self.run(window, -NEVER, enter=(stretch, 0))
         uniform = line.uniform[stretch]
@@ -286,20 +283,24 @@ class Passes:
             "blend": -line.mid[stretch] * line.blend_rate[stretch],
         }
 
+        addresses = fields.addresses()
+
         def known(name: str) -> Any:
             if name in position:
                 return position[name]
             if name in fields.cells:
                 return fields.of_bands(name, memory.cells, memory.whole)
-            return uniform[fields.uniform(name)]
+            return uniform[addresses[name][2]]
 
-        records = fields.records(memory.cells)
-        state = self.kernel.start(int(line.variant[stretch]), known)
+        records, program = fields.records(memory.cells), self.kernel.program
+        start = program.start[int(line.variant[stretch])]
+        made = evaluate_arrays([*start.values()], known, self.kernel.values, program.dtype)
+        state = dict(zip(start, made, strict=True))
         for name, values in state.items():
             if name.startswith("state"):
                 fields.of_bands(name, memory.cells, memory.whole)[:] = values
                 continue
             leaf, _, direction = name.removeprefix("slope").partition("_")
-            place = source.states.get(int(leaf))
+            place = fields.states.get(int(leaf))
             if place is not None:
                 records[:, :, place + int(direction)] = values

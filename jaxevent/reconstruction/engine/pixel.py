@@ -15,10 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.expressions import Graph, Level, Node, Untranslatable, needed, value_of
-from jaxevent.codegen.host import HostProgram
-from jaxevent.codegen.translate import Known, OfParameters, Translation, Value
-from jaxevent.reconstruction.engine.slopes import Slopes, slopes_of
+from jaxevent.codegen.derivative import Slopes, slopes_of
+from jaxevent.codegen.graph import (
+    Graph,
+    Level,
+    Node,
+    ParameterProgram,
+    TranslationError,
+    constant_value,
+    dependencies,
+)
+from jaxevent.codegen.trace import Constant, ParameterValue, Translation, Value
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
 
 ROWS = 3
@@ -73,6 +80,15 @@ class Directions(NamedTuple):
         """The numbers of a vector of derivatives: as many as processors take at once."""
         count = len(self.numbers)
         return -(-count // 8) * 8 if count > 4 else 4
+
+    def seeds(self, params: Any) -> Any:
+        """The directions in the parameters, each leaf with an axis of directions in front."""
+        leaves, tree = jax.tree.flatten(params)
+        count = len(self.numbers)
+        seeds = [np.zeros((count, *np.shape(leaf)), np.asarray(leaf).dtype) for leaf in leaves]
+        for d, (leaf, number) in enumerate(self.numbers):
+            seeds[leaf].reshape(count, -1)[d, number] = 1
+        return jax.tree.unflatten(tree, seeds)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +161,7 @@ def traced(
     dtype: Any,
     directions: Directions = Directions(),  # noqa: B008
 ) -> Traced:
-    """Trace a method; raises `Untranslatable` if its functions fail for so little."""
+    """Trace a method; raises `TranslationError` if its functions fail for so little."""
     given = _abstract(exposed, dtype)
 
     def frames_of(v: dict[str, Any]) -> FrameFeatures:
@@ -187,7 +203,7 @@ def traced(
         closed = jax.make_jaxpr(function)(*arguments)
     except Exception as error:  # whatever a method's functions raise
         about = f"its functions fail for one pixel and three frames: {error}"
-        raise Untranslatable(about.partition("\n")[0]) from error
+        raise TranslationError(about.partition("\n")[0]) from error
     names = [(f"parameter{k}", np.shape(p)) for k, p in enumerate(jax.tree.leaves(params))]
     names += [(name, given[name].shape) for name in sorted(given)]
     kinds = [np.dtype(leaf.dtype) for leaf in jax.tree.leaves(state)]
@@ -245,7 +261,7 @@ def _replaced(trees: tuple[Any, Any], numbers: Any, v: Any) -> tuple[Any, Any, A
 class PixelProgram:
     """All that a method computes at one pixel."""
 
-    host: HostProgram
+    host: ParameterProgram
     traced: Traced
     tables: list[list[Node]]  # of each variant: what its slots hold
     start: list[dict[str, Node]]  # of each variant: the state at the start, by name
@@ -255,6 +271,11 @@ class PixelProgram:
     excess: list[Node]  # what a segment of an exposure adds to the frame's totals
     slopes: Slopes | None  # of "state0", ..., "mean" and "variance"
 
+    @property
+    def dtype(self) -> np.dtype:
+        """Kind of real numbers."""
+        return self.traced.dtype
+
 
 class PixelTranslation(Translation):
     """Translates what is said of one pixel.
@@ -263,22 +284,22 @@ class PixelTranslation(Translation):
     collected in `slots`. Sums over segments (`segment_cells`) become inputs "total".
     """
 
-    def __init__(self, graph: Graph, host: HostProgram):
+    def __init__(self, graph: Graph, host: ParameterProgram):
         super().__init__(graph, host)
         self.slots: list[Node] = []
         self.excess: list[Node] = []  # what a segment adds to the sums
 
-    def special(self, eqn: Any, values: list[Value]) -> NDArray | None:
+    def translate_special(self, eqn: Any, values: list[Value]) -> NDArray | None:
         return self._sum_over_segments(values) if eqn.primitive.name == "scatter-add" else None
 
     def _apply(self, eqn: Any, args: list[Node], kind: str) -> Node:
         # Kernels see events alone, and none of these has the polarity 0.
         polarity = args[0].op == "input" and args[0].args == ("polarity",)
-        if polarity and eqn.primitive.name in ("eq", "ne") and value_of(args[1]) == 0:
+        if polarity and eqn.primitive.name in ("eq", "ne") and constant_value(args[1]) == 0:
             return self.graph.constant(eqn.primitive.name == "ne")
         return super()._apply(eqn, args, kind)
 
-    def placed(self, found: NDArray, kind: str) -> NDArray:
+    def translate_lookup(self, found: NDArray, kind: str) -> NDArray:
         """What is looked up where points lie: known when the piece begins."""
         out = np.empty(found.shape, object)
         for place in np.ndindex(*found.shape):
@@ -290,23 +311,23 @@ class PixelTranslation(Translation):
     def _sum_over_segments(self, values: list[Value]) -> NDArray:
         """Sums [..., cells] of updates [..., 1]."""
         start, cells, updates = values
-        if not isinstance(start, Known) or start.value.any():
-            raise Untranslatable("a sum that begins with numbers")
+        if not isinstance(start, Constant) or start.value.any():
+            raise TranslationError("a sum that begins with numbers")
         index, added = np.ravel(self.nodes(cells)), self.nodes(updates)
         ours = len(index) == 1 and index[0].args == ("segment_cell",) and added.shape[-1:] == (1,)
         if not ours or start.value.shape[:-1] != added.shape[:-1]:
-            raise Untranslatable("a sum other than that over an exposure's segments")
+            raise TranslationError("a sum other than that over an exposure's segments")
         out = np.empty(start.value.shape, object)
         for place in np.ndindex(*added.shape[:-1]):
             node: Any = added[(*place, 0)]
-            if value_of(node) != 0 and node not in self.excess:
+            if constant_value(node) != 0 and node not in self.excess:
                 self.excess.append(node)
             for row in range(start.value.shape[-1]):
                 out[(*place, row)] = self._total(node, row)
         return out
 
     def _total(self, node: Node, row: int) -> Node:
-        if value_of(node) == 0:
+        if constant_value(node) == 0:
             return node
         return self.graph.input(f"total{row}_{self.excess.index(node)}", "f", Level.TABLE)
 
@@ -314,7 +335,7 @@ class PixelTranslation(Translation):
 def _substituted(results: dict[str, Node], known: dict[Node, Node], graph: Graph) -> Any:
     """The same results with other nodes in place of some, in their simplest form."""
     new = dict(known)
-    for node in needed([*results.values()]):
+    for node in dependencies([*results.values()]):
         if node not in new and any(new.get(a, a) is not a for a in node.args if _is_node(a)):
             args = tuple(new.get(a, a) if _is_node(a) else a for a in node.args)
             new[node] = graph.apply(node.op, args, node.kind)
@@ -326,7 +347,7 @@ def _is_node(value: Any) -> bool:
 
 
 def _slots(results: dict[str, Node]) -> list[Node]:
-    return [node for node in needed([*results.values()]) if node.op == "slot"]
+    return [node for node in dependencies([*results.values()]) if node.op == "slot"]
 
 
 def _unfolded(results: dict[str, Node], table: list[Node], graph: Graph) -> dict[str, Node]:
@@ -337,16 +358,16 @@ def _unfolded(results: dict[str, Node], table: list[Node], graph: Graph) -> dict
 
 
 def translated(traced: Traced, params: Any, fixed: dict[str, NDArray]) -> PixelProgram:
-    """The program of a traced method; raises `Untranslatable`.
+    """The program of a traced method; raises `TranslationError`.
 
     `fixed` are further numbers known with the parameters.
     """
-    graph, host = Graph(), HostProgram()
+    graph, host = Graph(), ParameterProgram()
     moving = {f"parameter{leaf}" for leaf, _ in traced.directions.numbers}
     known: dict[str, Value] = {}
-    for name, value in host_inputs(traced, params, fixed).items():
+    for name, value in sorted(host_inputs(params, fixed, traced.directions).items()):
         change = name.startswith("seed")
-        known[name] = OfParameters(host.add_input(value), name not in moving, change)
+        known[name] = ParameterValue(host.add_input(value), name not in moving, change)
     tables, starts, outs, excess, changes = [], [], None, [], set()
     for variant in variants(traced.exposed):
         translation = PixelTranslation(graph, host)
@@ -354,7 +375,7 @@ def translated(traced: Traced, params: Any, fixed: dict[str, NDArray]) -> PixelP
         start, rest = _named(traced, [translation.nodes(v) for v in made])
         starts.append(_unfolded(start, translation.slots, graph))
         if outs is not None and (outs, excess) != (rest, translation.excess):
-            raise Untranslatable("functions of a point that differ between pieces")
+            raise TranslationError("functions of a point that differ between pieces")
         outs, excess = rest, translation.excess
         tables.append(translation.slots)
         changes |= translation.changes
@@ -371,14 +392,13 @@ def translated(traced: Traced, params: Any, fixed: dict[str, NDArray]) -> PixelP
     return PixelProgram(host, traced, tables, starts, after, image, variance, excess, slopes)
 
 
-def host_inputs(traced: Traced, params: Any, fixed: dict[str, NDArray]) -> dict[str, NDArray]:
+def host_inputs(
+    params: Any, fixed: dict[str, NDArray], directions: Directions
+) -> dict[str, NDArray]:
     """The numbers that a host program begins with."""
     leaves = {f"parameter{k}": np.asarray(p) for k, p in enumerate(jax.tree.leaves(params))}
-    seeds = {name: np.zeros(s, traced.dtype) for name, s in traced.names if name[:4] == "seed"}
-    numbers = traced.directions.numbers
-    for d, (leaf, number) in enumerate(numbers):
-        seeds[f"seed{leaf}"].reshape(len(numbers), -1)[d, number] = 1
-    return {**leaves, **fixed, **seeds}
+    seeds = jax.tree.leaves(directions.seeds(params)) if directions.numbers else []
+    return {**leaves, **fixed, **{f"seed{k}": seed for k, seed in enumerate(seeds)}}
 
 
 def _named(traced: Traced, made: list[NDArray]) -> tuple[dict[str, Node], dict[str, Node]]:
@@ -406,7 +426,7 @@ def _without_zeros(
     zero = graph.constant(0.0)
 
     def nothing(node: Node) -> bool:
-        return value_of(node) == 0
+        return constant_value(node) == 0
 
     empty = {s: zero for s in _slots(outs) if all(nothing(t[s.args[0]]) for t in tables)}
     outs = _substituted(outs, empty, graph)
@@ -458,7 +478,7 @@ def _inputs(graph: Graph, traced: Traced, variant: Variant, fixed: dict[str, Val
         if name in fixed:
             return fixed[name]
         if name in ("piece", "frame"):
-            return Known(np.asarray(getattr(variant, name)), placed=True)
+            return Constant(np.asarray(getattr(variant, name)), at_point=True)
         if name in PAIRS:
             return nodes(shape, counts(name))
         if name in ("grey", "intensity", "certainty"):

@@ -48,7 +48,7 @@ def stretches_of(clock: Clock, recording: Recording, events: int) -> list[Stretc
 class SmoothedVideo(ImageSequence[P]):
     """Images of a smoother, made by a kernel; as `Video` in all else.
 
-    Raises `Untranslatable` where there is no kernel for the method.
+    Raises `TranslationError` where there is no kernel for the method.
 
     Args:
         window_events: Most events of a stretch of frames, if it has more than one frame.

@@ -8,18 +8,23 @@ kept of every frame (`ROW`, and what images need beside them).
 import dataclasses
 import functools
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.expressions import Graph, Node, Untranslatable, needed, value_of
-from jaxevent.codegen.host import HostProgram, Programs, once
-from jaxevent.codegen.loops import Function, leaves_of, translate
-from jaxevent.codegen.modules import module_of
-from jaxevent.codegen.text import Numbers, Place, Writer, import_functions
+from jaxevent.codegen.graph import (
+    Graph,
+    Node,
+    ParameterProgram,
+    TranslationError,
+    constant_value,
+    dependencies,
+)
+from jaxevent.codegen.module import CompiledProgram, KernelCache
+from jaxevent.codegen.trace import TracedFunction, name_leaves, translate_function
+from jaxevent.codegen.write import Address, ModuleText, Writer
 from jaxevent.reconstruction.engine.frame_loop import FrameFunctions
 from jaxevent.reconstruction.engine.pixel import Directions
 from jaxevent.reconstruction.video import ImageMethod
@@ -59,25 +64,9 @@ class SmoothingMethod(ImageMethod, Protocol):
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]: ...
 
 
-HEAD = '''"""The functions of a smoother (`jaxevent.reconstruction.engine.smoothing`)."""
-
-import numpy as np
-from numba import types
-
-from jaxevent.codegen.blocks import block
-from jaxevent.codegen.kept import callback
-{imports}
-
-REAL, STRIDE = np.{real}, {stride}
-I, D, F = types.int64, types.float64, types.{real}
-CELLS, MARKS = types.CPointer(F), types.CPointer(types.uint8)
-HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
-{constants}
-'''
-
 PIXELS = """
 
-@callback(types.void(CELLS, CELLS, I, I, I, D, D, D), **HOW)
+@cfunc(types.void(CELLS, CELLS, I, I, I, D, D, D), **OPTIONS)
 def {name}(cells, numbers, row, begin, end, a, b, c):
     u0, u1, u2 = REAL(a), REAL(b), REAL(c)
 {loops}
@@ -88,8 +77,8 @@ PIXELS_LOOP = """    for z in range(begin, end):
 
 IMAGES = """
 
-@callback(
-    types.void(CELLS, CELLS, I, I, I, I, D, D, D, CELLS, CELLS, MARKS, CELLS, I, I), **HOW
+@cfunc(
+    types.void(CELLS, CELLS, I, I, I, I, D, D, D, CELLS, CELLS, MARKS, CELLS, I, I), **OPTIONS
 )
 def {name}(
     cells, numbers, row, rows, width, padded, a, b, c, mean, variance, valid, slopes, size, at,
@@ -106,7 +95,7 @@ IMAGES_LOOP = """        for column in range(width):
 
 EXCESS = """
 
-@callback(types.void(D, D, F, F, CELLS, CELLS), **HOW)
+@cfunc(types.void(D, D, F, F, CELLS, CELLS), **OPTIONS)
 def excess(share64, edge64, on, off, numbers, out):
     share, edge = REAL(share64), REAL(edge64)
 {lines}
@@ -117,8 +106,8 @@ def excess(share64, edge64, on, off, numbers, out):
 class FrameProgram:
     """A smoother's functions as expressions."""
 
-    functions: dict[str, Function]
-    host: HostProgram
+    functions: dict[str, TracedFunction]
+    host: ParameterProgram
     work: tuple[str, ...]  # names of the numbers of the frame that a pass has come to
     row: tuple[str, ...]  # names of the numbers that are kept of every frame
     dtype: np.dtype
@@ -131,33 +120,7 @@ class FrameProgram:
     def uses(self, name: str) -> bool:
         """Whether the functions read a number."""
         nodes = [n for f in self.functions.values() for n in f.results.values()]
-        return any(n.op == "input" and n.args == (f"{name}.0",) for n in needed(nodes))
-
-
-@dataclasses.dataclass(frozen=True)
-class FrameKernel:
-    """A smoother compiled for the host, with the numbers of its parameters."""
-
-    functions: FrameFunctions
-    program: FrameProgram
-    numbers: NDArray
-
-
-class FrameWriter(Writer):
-    """Writes functions whose numbers lie where `places` says, or are read by its texts."""
-
-    def __init__(self, places: dict[str, Place]):
-        super().__init__()
-        self.places, self.texts = places, dict[str, str]()
-
-    def place(self, node: Node) -> Place | None:
-        if node.op != "input" or node.args[0] in self.texts:
-            return None
-        return self.places.get(node.args[0])
-
-    def input(self, node: Node) -> str:
-        text = self.texts.get(node.args[0])
-        return super().input(node) if text is None else text
+        return any(n.op == "input" and n.args == (f"{name}.0",) for n in dependencies(nodes))
 
 
 def slope_of(name: str, direction: int) -> str:
@@ -194,18 +157,8 @@ def with_slopes(function: Callable[..., dict[str, Any]]) -> Callable[..., dict[s
     return both
 
 
-def _seeds(params: Any, directions: Directions) -> Any:
-    """The directions in the parameters."""
-    leaves, tree = jax.tree.flatten(params)
-    count = len(directions.numbers)
-    seeds = [np.zeros((count, *np.shape(leaf)), np.asarray(leaf).dtype) for leaf in leaves]
-    for d, (leaf, number) in enumerate(directions.numbers):
-        seeds[leaf].reshape(count, -1)[d, number] = 1
-    return jax.tree.unflatten(tree, seeds)
-
-
 def _known(params: Any, fixed: dict[str, Any], directions: Directions) -> Any:
-    return (params, fixed, _seeds(params, directions)) if directions.numbers else (params, fixed)
+    return (params, fixed, directions.seeds(params)) if directions.numbers else (params, fixed)
 
 
 def _translated(
@@ -216,11 +169,11 @@ def _translated(
     dtype: np.dtype,
     directions: Directions,
 ) -> FrameProgram:
-    graph, host, known = Graph(), HostProgram(), _known(params, fixed, directions)
+    graph, host, known = Graph(), ParameterProgram(), _known(params, fixed, directions)
     for leaf in jax.tree.leaves(known):
         host.add_input(np.asarray(leaf))
     shape = jax.ShapeDtypeStruct((1, 1), dtype)
-    functions, of = method.pixel_functions(exposed), dict[str, Function]()
+    functions, of = method.pixel_functions(exposed), dict[str, TracedFunction]()
 
     def tree(names: tuple[str, ...]) -> dict[str, Any]:
         return dict.fromkeys(names, shape)
@@ -235,7 +188,7 @@ def _translated(
         kept = jax.eval_shape(lambda v: frame(**v), given | {"state": state})["kept"]
     except Exception as error:  # whatever a method's functions raise
         about = f"its functions fail for one pixel: {error}"
-        raise Untranslatable(about.partition("\n")[0]) from error
+        raise TranslationError(about.partition("\n")[0]) from error
     # In an order in which it is known which derivatives are always 0 (`dead`).
     wanted = {
         "excess": tree(("share", "edge", "on", "off")),
@@ -257,36 +210,36 @@ def _translated(
             moving = {key: tree for key, tree in values.items() if key in MOVING}
             slopes = jax.tree.map(lambda v: jax.ShapeDtypeStruct((count, 1, 1), v.dtype), moving)
             function, values = with_slopes(function), {**values, "slopes": slopes}
-        of[name] = translate(
+        of[name] = translate_function(
             function, known, values, graph, host, single=True, seeds=seeds, zeros=dead
         )
         if name in ("excess", "move", "clipped"):
             dead |= {
                 key
                 for key, node in of[name].results.items()
-                if value_of(node) == 0 and key.startswith(NEVER_CARRIED)
+                if constant_value(node) == 0 and key.startswith(NEVER_CARRIED)
             }
-    row = (*ROW, *(leaf for leaf in leaves_of("kept", kept)))
+    row = (*ROW, *(leaf for leaf in name_leaves("kept", kept)))
     program = FrameProgram(of, host, WORK, row, dtype, directions)
     work = [s for n in WORK if n.partition(".")[0] in MOVING for s in program.slopes(n)]
     row_slopes = [s for n in row for s in program.slopes(n) if _number(s) not in dead]
     return dataclasses.replace(program, work=(*WORK, *work), row=(*row, *row_slopes))
 
 
-def _write(program: FrameProgram, stride: int) -> tuple[str, Numbers]:
-    """The text of a program's module, for bands of `stride` pixels."""
-    places: dict[str, Place] = {
+def _write(program: FrameProgram, stride: int) -> ModuleText:
+    """Write the module of a program, for bands of `stride` pixels."""
+    places: dict[str, Address] = {
         _number(n): ("cells", index, i * stride)
         for index, names in (("z", program.work), ("k", program.row))
         for i, n in enumerate(names)
     }
-    writer, parts = FrameWriter(places), list[str]()
+    writer, parts = Writer(program, places), list[str]()
     for name, function in program.functions.items():
         uniform = {f"{n}.0": f"u{i}" for i, n in enumerate(UNIFORM.get(name, ()))}
         if "here.0" in uniform:
             uniform["here.0"] += " != 0"
         of_segment = {f"{n}.0": n for n in ("share", "edge", "on", "off")}
-        writer.texts = of_segment if name == "excess" else uniform
+        writer.addresses = {**places, **(of_segment if name == "excess" else uniform)}
         results = function.results
         stored = {key: node for key, node in results.items() if key in places}
         if name in ("show", "before"):
@@ -300,23 +253,17 @@ def _write(program: FrameProgram, stride: int) -> tuple[str, Numbers]:
             texts = {key: "{}[{} + {}]".format(*places[key]) for key in stored}
             loops = _loops(stored, texts, writer, PIXELS_LOOP, 8)
             parts.append(PIXELS.format(name=name, loops=loops))
-    numbers, constants = writer.finish(program.host.values)
-    head = HEAD.format(
-        imports=import_functions(program.dtype),
-        real=program.dtype.name,
-        stride=stride,
-        constants="\n".join(constants),
-    )
-    return head + "".join(parts), numbers
+    about = "The functions of a smoother (`jaxevent.reconstruction.engine`)."
+    return writer.module(about, parts, None, program.dtype)
 
 
 def _number(name: str) -> str:
-    """The name of a single number as `loops.translate` gives it."""
+    """The name of a single number as `loops.translate_function` gives it."""
     leaf, _, direction = name.partition(":")
     return f"{leaf}.{direction or 0}"
 
 
-def _images(name: str, program: FrameProgram, writer: FrameWriter) -> str:
+def _images(name: str, program: FrameProgram, writer: Writer) -> str:
     """A function of images, and of their derivatives."""
     results, directions = program.functions[name].results, program.directions
     images = {n: results[f"image.{n}.0"] for n in ("mean", "covariance", "valid")}
@@ -337,7 +284,7 @@ def _images(name: str, program: FrameProgram, writer: FrameWriter) -> str:
 
 
 def _loops(
-    wanted: dict[str, Node], texts: dict[str, str], writer: FrameWriter, loop: str, indent: int
+    wanted: dict[str, Node], texts: dict[str, str], writer: Writer, loop: str, indent: int
 ) -> str:
     """Loops over pixels that store results: derivatives, one direction each, then the rest.
 
@@ -360,31 +307,24 @@ def _loops(
     return "\n".join(out)
 
 
-_programs: dict[Any, Programs] = {}  # with their modules by stride
+_kernels = KernelCache(FrameFunctions, _write)
 
 
 def smoother_kernel(
     method: SmoothingMethod,
     params: Any,
     fixed: dict[str, Any],
-    exposed: bool,
-    dtype: np.dtype,
-    stride: int,
+    layout: tuple[bool, np.dtype, int],
     directions: Directions = Directions(),  # noqa: B008
-) -> FrameKernel:
-    """The kernel of a smoother with its parameters and `fixed` numbers; raises `Untranslatable`."""
-    leaves, tree = jax.tree.flatten(_known(params, fixed, directions))
-    shapes = tuple(np.shape(leaf) for leaf in leaves)
-    key = method, tree, shapes, exposed, dtype, directions
-    program, modules, values = once(_programs, key, Programs).get(
-        [np.asarray(leaf) for leaf in leaves],
-        lambda: _translated(method, params, fixed, exposed, dtype, directions),
+) -> CompiledProgram:
+    """The kernel of a smoother with its parameters and `fixed` numbers; raises `TranslationError`.
+
+    `layout`: whether exposures are known, kind of numbers, stride.
+    """
+    exposed, dtype, stride = layout
+    known = _known(params, fixed, directions)
+    leaves, tree = jax.tree.flatten(known)
+    key = method, tree, tuple(np.shape(leaf) for leaf in leaves), exposed, dtype, directions
+    return _kernels.get(
+        key, known, lambda: _translated(method, params, fixed, exposed, dtype, directions), stride
     )
-
-    def made() -> tuple[Numbers, ModuleType]:
-        text, numbers = _write(program, stride)
-        return numbers, module_of(text)
-
-    numbers, module = once(modules, stride, made)
-    functions = FrameFunctions(*(getattr(module, name) for name in FrameFunctions._fields))
-    return FrameKernel(functions, program, numbers.of(values, dtype))

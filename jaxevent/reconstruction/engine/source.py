@@ -2,14 +2,18 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.expressions import ELEMENTWISE, Level, Node, Untranslatable, needed, value_of
-from jaxevent.codegen.text import Numbers, Place, Writer, import_functions
+from jaxevent.codegen.graph import (
+    Level,
+    Node,
+    TranslationError,
+    dependencies,
+)
+from jaxevent.codegen.write import Address, ModuleText, Writer
 from jaxevent.reconstruction.engine.entering import Places
 from jaxevent.reconstruction.engine.pixel import ROWS, PixelProgram, pieces
 
@@ -28,6 +32,9 @@ class Fields:
     whole: dict[str, int]
     slots: dict[int, str]  # field of each slot that is stored
     vectors: dict[int, int]  # which of `Slopes.changes` lie in the record, and where
+    states: dict[int, int]  # places of vectors in the record, by the leaf of the state
+    outputs: tuple[str, ...]  # of "mean" and "variance", of which there are derivatives
+    lanes: int  # numbers of a vector
     record: int  # numbers
     factors: int  # of derivatives of images
     changes: int  # numbers that tables write into records
@@ -40,11 +47,6 @@ class Fields:
         """The numbers of all pixels of a band."""
         return (len(self.cells) + self.record) * self.stride
 
-    def text(self, name: str) -> str:
-        """Where a field of the pixel z lies."""
-        array, place = ("whole", self.whole) if name in self.whole else ("cells", self.cells)
-        return f"{array}[{place[name]} * STRIDE + z]"
-
     def of_bands(self, name: str, cells: NDArray, whole: NDArray) -> NDArray:
         """A field's numbers in `loop.Memory`, [bands, stride]."""
         array, place = (whole, self.whole) if name in self.whole else (cells, self.cells)
@@ -54,13 +56,22 @@ class Fields:
         """The pixels' records in `loop.Memory`, [bands, stride, record]."""
         return cells[:, len(self.cells) * self.stride :].reshape(len(cells), self.stride, -1)
 
-    def uniform(self, name: str) -> int | None:
-        """The place of a number that is equal for all pixels in `loop.Line.uniform`."""
-        offsets = {"gain": 0, "weight_rate": ROWS, "blend_rate": ROWS + pieces(self.exposed)}
-        for kind, offset in offsets.items():
-            if name.startswith(kind):
-                return offset + int(name.removeprefix(kind))
-        return None
+    def text(self, name: str) -> str:
+        """Return the text of a field of the pixel z."""
+        array, place = ("whole", self.whole) if name in self.whole else ("cells", self.cells)
+        return f"{array}[{place[name]} * STRIDE + z]"
+
+    def addresses(self) -> dict[Any, str | Address]:
+        """Return where the inputs of a pixel lie, or texts that read them, by name."""
+        uniform = [("gain", ROWS), ("weight_rate", pieces(self.exposed)), ("blend_rate", ROWS)]
+        names = [f"{name}{k}" for name, count in uniform for k in range(count)]
+        found: dict[Any, str | Address] = {n: ("uniform", "at", k) for k, n in enumerate(names)}
+        found |= {name: ("cells", "z", at * self.stride) for name, at in self.cells.items()}
+        found |= {name: ("whole", "z", at * self.stride) for name, at in self.whole.items()}
+        found |= {slot: found[name] for slot, name in self.slots.items()}
+        points = ("since", "near", "polarity", "weight", "blend", "share", "edge")
+        found |= {name: name for name in points}
+        return found | {"segment_on": "on", "segment_off": "off"}
 
     @functools.cached_property
     def places(self) -> Places:
@@ -111,22 +122,22 @@ class Fields:
         for name in ("on", "off"):
             cells[name] = len(cells)
         slots, known = {}, {}
-        for node in needed(results(program)):
+        for node in dependencies(results(program)):
             if node.op == "slot":
                 k = node.args[0]
                 what = tuple(table[k].number for table in program.tables)
                 if node.kind != "f":
-                    raise Untranslatable("a table that is not of real numbers")
+                    raise TranslationError("a table that is not of real numbers")
                 if what not in known:
                     known[what] = f"slot{k}"
                     cells[f"slot{k}"] = len(cells)
                 slots[k] = known[what]
-        vectors, directions = {}, program.traced.directions
-        lanes = directions.lanes
-        if program.slopes is not None:
-            kinds = [change.kind for change in program.slopes.changes]
-            for k in (k for k, kind in enumerate(kinds) if kind != "number"):
-                vectors[k] = len(vectors) * lanes
+        directions = program.traced.directions
+        lanes, slopes = directions.lanes, program.slopes
+        changes = [] if slopes is None else slopes.changes
+        moved = [k for k, change in enumerate(changes) if change.kind != "number"]
+        vectors = {k: i * lanes for i, k in enumerate(moved)}
+        states = {changes[k].state: at for k, at in vectors.items() if changes[k].kind == "state"}
         wanted = set().union(*(_inputs([*start.values()]) for start in program.start))
         for variant, table in enumerate(program.tables):
             wanted |= _inputs([table[k] for k in slots])
@@ -139,10 +150,11 @@ class Fields:
         sums = len(program.excess)
         names += [f"total{row}_{k}" for k in range(sums) for row in range(ROWS)]
         cells |= {name: len(cells) + k for k, name in enumerate(names)}
-        factors = [] if program.slopes is None else program.slopes.factors_of(*directions.of)
+        outputs = () if slopes is None else directions.of
+        factors = [] if slopes is None else slopes.factors_of(*outputs)
         return cls(
-            cells, whole, slots, vectors, len(vectors) * lanes, len(factors),
-            len(table_changes(program, 0)), sums, stride, program.traced.exposed,
+            cells, whole, slots, vectors, states, outputs, lanes, len(vectors) * lanes,
+            len(factors), len(table_changes(program, 0)), sums, stride, program.traced.exposed,
         )  # fmt: skip
 
 
@@ -169,78 +181,11 @@ def _any(names: set[str], beginning: str) -> bool:
 
 
 def _inputs(nodes: list[Node]) -> set[str]:
-    return {n.args[0] for n in needed(nodes) if n.op == "input"}
+    return {n.args[0] for n in dependencies(nodes) if n.op == "input"}
 
-
-class PixelWriter(Writer):
-    """Writes expressions of a pixel whose numbers lie in `loop.Memory`."""
-
-    def __init__(self, fields: Fields):
-        super().__init__()
-        self.fields = fields
-
-    def place(self, node: Node) -> Place | None:
-        fields = self.fields
-        if node.op not in ("input", "slot"):
-            return None
-        name = fields.slots[node.args[0]] if node.op == "slot" else node.args[0]
-        for pointer, known in (("cells", fields.cells), ("whole", fields.whole)):
-            if name in known:
-                return pointer, "z", known[name] * fields.stride
-        uniform = fields.uniform(name)
-        return None if uniform is None else ("uniform", "at", uniform)
-
-    def input(self, node: Node) -> str:
-        name = node.args[0]
-        points = ("since", "near", "polarity", "weight", "blend", "share", "edge")
-        if name in (*points, "segment_on", "segment_off"):
-            return name.removeprefix("segment_")
-        raise Untranslatable(f"the use of {name!r}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Source:
-    """A kernel's text, and what its numbers are."""
-
-    text: str
-    fields: Fields
-    numbers: Numbers
-    vectors: dict[int, list[tuple[int, int, int]]]  # value, place in it, lane; by where they begin
-    lanes: int
-    outputs: tuple[str, ...]  # of "mean" and "variance", of which there are derivatives
-    states: dict[int, int]  # places of vectors in the record, by the leaf of the state
-
-    def values(self, values: list[NDArray], dtype: np.dtype) -> NDArray:
-        """The numbers that the text's functions take, from the values of a host program."""
-        out = np.zeros(self.numbers.size + len(self.vectors) * self.lanes, dtype)
-        out[: self.numbers.size] = self.numbers.of(values, dtype)
-        for at, parts in self.vectors.items():
-            for number, place, lane in parts:
-                out[at + lane] += np.ravel(values[number])[place]
-        return out
-
-
-HEAD = '''"""The functions of a kernel (`jaxevent.reconstruction.engine`)."""
-
-import numpy as np
-from numba import types
-
-from jaxevent.codegen.blocks import block
-from jaxevent.codegen.kept import callback
-{imports}
-from jaxevent.codegen.linear import vector_sums
-
-REAL, STRIDE = np.{real}, {stride}
-I, D, F = types.int64, types.float64, types.{real}
-CELLS, WHOLE, TIMES = types.CPointer(F), types.CPointer(I), types.CPointer(D)
-MARKS = types.CPointer(types.uint8)
-HOW = {{"error_model": "numpy", "fastmath": {{"contract"}}}}
-{constants}
-
-'''
 
 EVENTS = """
-@callback(I(CELLS, WHOLE, TIMES, WHOLE, CELLS, I, I, I, I, I, I, I, D, D, D, D, CELLS), **HOW)
+@cfunc(I(CELLS, WHOLE, NUMBERS, WHOLE, CELLS, I, I, I, I, I, I, I, D, D, D, D, CELLS), **OPTIONS)
 def events(
     cells, whole, last, stream, weights, weighted, i, end, till, first_own, last_own, padded,
     begin, rate, mid, blend_rate, numbers,
@@ -278,11 +223,11 @@ def events(
 """
 
 IMAGES = """
-@callback(
+@cfunc(
     types.void(
-        CELLS, WHOLE, TIMES, I, I, I, D, D, D, CELLS, CELLS, CELLS, MARKS, CELLS, CELLS, I, I
+        CELLS, WHOLE, NUMBERS, I, I, I, D, D, D, CELLS, CELLS, CELLS, MARKS, CELLS, CELLS, I, I
     ),
-    **HOW
+    **OPTIONS
 )
 def images(
     cells, whole, last, rows, width, padded, now, weight64, blend64, numbers, mean, variance, valid,
@@ -305,115 +250,86 @@ def images(
 """
 
 TABLES = """
-@callback(types.void(I, CELLS, I, I, CELLS, CELLS, I, CELLS), **HOW)
+@cfunc(types.void(I, CELLS, I, I, CELLS, CELLS, I, CELLS), **OPTIONS)
 def tables(variant, cells, begin, end, numbers, uniform, at, room):
+    for first in range(begin, end, 256):
+        pixels = min(end - first, 256)
 """
 BLOCK = 256  # pixels whose derivatives are computed side by side before they go into records
 
 EXCESS = """
-@callback(types.void(D, D, F, F, CELLS, CELLS), **HOW)
+@cfunc(types.void(D, D, F, F, CELLS, CELLS), **OPTIONS)
 def excess(share64, edge64, on, off, numbers, out):
     share, edge = REAL(share64), REAL(edge64)
 {lines}
 """
 
 
-def write(program: PixelProgram, stride: int) -> Source:
-    """The kernel of a program, in which bands have room for `stride` pixels."""
-    if any(n.level == Level.PIECE for n in needed(results(program))):
-        raise Untranslatable("a number of the piece that is not looked up at a point")
+def write(program: PixelProgram, stride: int) -> ModuleText:
+    """Write the module of a program, in which bands have room for `stride` pixels."""
+    if any(n.level == Level.PIECE for n in dependencies(results(program))):
+        raise TranslationError("a number of the piece that is not looked up at a point")
     fields = Fields.of(program, stride)
-    writer = PixelWriter(fields)
-    sums = _Sums(program, writer)
-    parts = [_events(program, writer, sums), _images(program, writer, sums)]
-    parts += [_tables(program, writer), _excess(program, writer)]
-    numbers, constants = writer.finish(program.host.values)
-    constants += sums.lines(numbers.size)
-    head = HEAD.format(
-        imports=import_functions(program.traced.dtype),
-        real=program.traced.dtype.name,
-        stride=stride,
-        constants=_text(constants),
-    )
-    text = "\n".join([head.rstrip(), "", *parts])
-    states = {int(name[5:]): fields.vectors[k] for name, k in sums.states.items()}
-    vectors = sums.vectors(numbers.size)
-    return Source(text, fields, numbers, vectors, sums.lanes, sums.outputs, states)
+    writer = Writer(program, fields.addresses())
+    size = len(fields.cells) * stride
+    writer.constants = [f"STRIDE, RECORDS, RECORD = {stride}, {size}, {fields.record}"]
+    _define_sums(program, writer, fields)
+    parts = [
+        write_part(program, writer, fields)
+        for write_part in (_write_events, _write_images, _write_tables)
+    ]
+    parts.append(_write_excess(program, writer))
+    about = "The functions of a filter (`jaxevent.reconstruction.engine`)."
+    return writer.module(about, parts, fields, program.dtype)
 
 
-def _text(lines: list[str]) -> str:
-    return "\n".join(lines)
+def _define_sums(program: PixelProgram, writer: Writer, fields: Fields) -> None:
+    """Define the sums of vectors by which derivatives follow events and make images."""
+    slopes, lanes = program.slopes, fields.lanes
+    if slopes is None:
+        return
+    numbers = {
+        k: writer.add_vector(lanes, change.nodes)
+        for k, change in enumerate(slopes.changes)
+        if change.kind == "number"
+    }
+    out = {
+        "follow": {f"state{leaf}": place for leaf, place in fields.states.items()},
+        "show": {name: k * lanes for k, name in enumerate(fields.outputs)},
+    }
+    for function, places in out.items():
+        order = {node: k for k, node in enumerate(slopes.factors_of(*places))}
+        sums = []
+        for name, place in places.items():
+            terms = tuple(
+                (order[node], k in numbers, numbers[k] if k in numbers else fields.vectors[k])
+                for node, k in slopes.factors[name]
+            )
+            sums.append((place, terms))
+        writer.constants.append(f"{function} = vector_sums({lanes}, {tuple(sums)})")
 
 
-class _Sums:
-    """The sums of vectors by which derivatives follow events, and of which images are made."""
-
-    def __init__(self, program: PixelProgram, writer: PixelWriter):
-        self.slopes, self.writer, self.vectors_at = program.slopes, writer, writer.fields.vectors
-        self.lanes = program.traced.directions.lanes
-        changes = [] if self.slopes is None else self.slopes.changes
-        self.states = {f"state{c.state}": k for k, c in enumerate(changes) if c.kind == "state"}
-        self.numbers = [k for k, change in enumerate(changes) if change.kind == "number"]
-        self.outputs = () if self.slopes is None else program.traced.directions.of
-
-    def factors(self, names: Iterable[str]) -> list[Node]:
-        """The factors of some results, each once."""
-        return [] if self.slopes is None else self.slopes.factors_of(*names)
-
-    def lines(self, numbers: int) -> list[str]:
-        """What the text says of them; vectors of numbers lie behind the `numbers`."""
-        if self.slopes is None:
-            return []
-        fields, slopes, out = self.writer.fields, self.slopes, []
-        beside = {k: numbers + i * self.lanes for i, k in enumerate(self.numbers)}
-        out.append(f"RECORDS, RECORD = {len(fields.cells)} * STRIDE, {fields.record}")
-        stores = {
-            "follow": {name: fields.vectors[k] for name, k in self.states.items()},
-            "show": {name: k * self.lanes for k, name in enumerate(self.outputs)},
-        }
-        for function, places in stores.items():
-            order = {node: k for k, node in enumerate(self.factors(places))}
-            sums = []
-            for name, place in places.items():
-                terms = tuple(
-                    (order[node], k in beside, beside.get(k, fields.vectors.get(k)))
-                    for node, k in slopes.factors[name]
-                )
-                sums.append((place, terms))
-            out.append(f"{function} = vector_sums({self.lanes}, {tuple(sums)})")
-        return out
-
-    def vectors(self, numbers: int) -> dict[int, list[tuple[int, int, int]]]:
-        """What the vectors of numbers hold, by where they begin."""
-        found = {}
-        for i, k in enumerate(self.numbers):
-            assert self.slopes is not None
-            found[numbers + i * self.lanes] = [
-                (*node.args, lane)
-                for lane, nodes in self.slopes.changes[k].nodes.items()
-                for node in nodes
-            ]
-        return found
-
-
-def _events(program: PixelProgram, writer: PixelWriter, sums: _Sums) -> str:
-    fields, factors = writer.fields, sums.factors(sums.states)
+def _write_events(program: PixelProgram, writer: Writer, fields: Fields) -> str:
+    states = [f"state{leaf}" for leaf in fields.states]
+    factors = [] if program.slopes is None else program.slopes.factors_of(*states)
     out = writer.lines([*program.after, *factors], 12)
     for k, node in enumerate(program.after):
         if node.op != "input" or node.args != (f"state{k}",):
             out.append(f"            {fields.text(f'state{k}')} = {writer.name(node)}")
-    if sums.states:
+    if states:
         given = "".join(f"{writer.name(node)}, " for node in factors)
         out.append("            record = RECORDS + z * RECORD")
         out.append(f"            follow(cells, record, cells, record, numbers, ({given}))")
-    return EVENTS.format(step=_text(out), on=fields.cells["on"], off=fields.cells["off"])
+    return EVENTS.format(step="\n".join(out), on=fields.cells["on"], off=fields.cells["off"])
 
 
-def _images(program: PixelProgram, writer: PixelWriter, sums: _Sums) -> str:
-    """Images, and row by row, after the factors of their derivatives, these."""
-    factors, slopes = sums.factors(sums.outputs), []
+def _write_images(program: PixelProgram, writer: Writer, fields: Fields) -> str:
+    """Write images, and row by row, after the factors of their derivatives, these."""
+    factors, slopes = [], []
+    if program.slopes is not None:
+        factors = program.slopes.factors_of(*fields.outputs)
     lines = writer.lines([program.image, program.variance, *factors], 12)
-    if sums.outputs:
+    if fields.outputs:
         lines += [
             f"            room[{k} * width + column] = {writer.name(node)}"
             for k, node in enumerate(factors)
@@ -427,25 +343,23 @@ def _images(program: PixelProgram, writer: PixelWriter, sums: _Sums) -> str:
         ]
     return IMAGES.format(
         since=len(factors),
-        show=_text(lines),
+        show="\n".join(lines),
         image=writer.name(program.image),
         variance=writer.name(program.variance),
-        slopes=_text(slopes),
+        slopes="\n".join(slopes),
     )
 
 
-def _tables(program: PixelProgram, writer: PixelWriter) -> str:
-    """What a piece says, for the pixels from begin to end."""
-    fields = writer.fields
-    kept = [k for k, name in fields.slots.items() if name == f"slot{k}"]
-    out = [TABLES.rstrip(), f"    for first in range(begin, end, {BLOCK}):"]
-    out.append(f"        pixels = min(end - first, {BLOCK})")
+def _write_tables(program: PixelProgram, writer: Writer, fields: Fields) -> str:
+    """Write what a piece says, for the pixels from begin to end."""
+    stored = [k for k, name in fields.slots.items() if name == f"slot{k}"]
+    out, changes = list[str](), []
     for variant, table in enumerate(program.tables):
         changes = table_changes(program, variant)
         out.append(f"        if variant == {variant}:")
         out += ["            for i in range(pixels):", "                z = first + i"]
-        out += writer.lines([*(table[k] for k in kept), *(node for *_, node in changes)], 16)
-        for k in kept:
+        out += writer.lines([*(table[k] for k in stored), *(node for *_, node in changes)], 16)
+        for k in stored:
             out.append(f"                {fields.text(f'slot{k}')} = {writer.name(table[k])}")
         for j, (*_, node) in enumerate(changes):
             out.append(f"                room[{j * BLOCK} + i] = {writer.name(node)}")
@@ -455,43 +369,10 @@ def _tables(program: PixelProgram, writer: PixelWriter) -> str:
     for j, (k, lane, _) in enumerate(changes):
         place = f"record + {fields.vectors[k] + lane}"
         out.append(f"            cells[{place}] = room[{j * BLOCK} + i]")
-    return _text([*out, ""])
+    return TABLES + "\n".join([*out, ""])
 
 
-def _excess(program: PixelProgram, writer: PixelWriter) -> str:
+def _write_excess(program: PixelProgram, writer: Writer) -> str:
     lines = writer.lines(program.excess, 4)
     lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(program.excess)]
-    return EXCESS.format(lines=_text(lines))
-
-
-# The state at the start is found once, for all pixels, by the same operations of NumPy.
-ARRAYS: dict[str, Callable[..., Any]] = {
-    **ELEMENTWISE,
-    "div": np.divide,
-    "select_n": lambda c, a, b: np.where(c, b, a),
-    "to_f": lambda x: np.asarray(x, float),
-    "to_i": lambda x: np.asarray(x).astype(int),
-    "to_b": lambda x: np.asarray(x) != 0,
-}
-
-
-def evaluate_arrays(
-    nodes: list[Node], known: Callable[[str], Any], values: list[Any], dtype: np.dtype
-) -> list[Any]:
-    """Expressions for arrays in place of numbers; `known(name)` gives inputs."""
-    found: dict[Node, Any] = {}
-    with np.errstate(all="ignore"):
-        for node in needed(nodes):
-            if node.op == "constant":
-                value = value_of(node)
-            elif node.op == "input":
-                value = known(node.args[0])
-            elif node.op == "number":
-                value = np.ravel(values[node.args[0]])[node.args[1]]
-            elif node.op == "entry":
-                array = values[node.args[0]]
-                value = array[np.clip(found[node.args[1]], 0, len(array) - 1)]
-            else:
-                value = ARRAYS[node.op](*(found[a] for a in node.args))
-            found[node] = np.asarray(value, dtype) if node.kind == "f" else np.asarray(value)
-    return [found[node] for node in nodes]
+    return EXCESS.format(lines="\n".join(lines))

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.expressions import Untranslatable
-from jaxevent.errors import InputError
+from jaxevent.codegen.module import make_kernel
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.engine.passes import DividedRecording, Held, Passes, Window
 from jaxevent.reconstruction.engine.room import ImageRoom
@@ -37,7 +36,7 @@ class Begin(NamedTuple):
 class FusedVideo(ImageSequence[P]):
     """Images of a reconstruction, made by a kernel (`fused`); as `Video` in all else.
 
-    Raises `Untranslatable` where there is no kernel for the method.
+    Raises `TranslationError` where there is no kernel for the method.
     """
 
     def __init__(
@@ -120,12 +119,9 @@ class FusedVideo(ImageSequence[P]):
         return window
 
 
-def wants_kernel(compiler: str | None, devices: Sequence[Any]) -> bool:
-    """Whether numba is asked for, or is what serves on these devices; raises `InputError`."""
-    if compiler not in (None, "numba", "xla"):
-        raise InputError(f"there is no compiler {compiler!r}; give numba or xla, or none")
-    single = jnp.result_type(float) == np.float32
-    return compiler == "numba" or (compiler is None and single and len(devices) < 2)
+def serves_images(devices: Sequence[Any]) -> bool:
+    """Return whether kernels are the faster way to images: in single precision, on one device."""
+    return jnp.result_type(float) == np.float32 and len(devices) < 2
 
 
 def video_by_kernel(
@@ -136,23 +132,24 @@ def video_by_kernel(
     compiler: str | None,
     options: dict[str, Any],
 ) -> ImageSequence[P] | None:
-    """A method's images by a kernel; None where it does not serve.
+    """Make the images of a method by a kernel.
 
-    Raises `InputError` where numba is asked for what it cannot do.
+    Args:
+        kind: Class of the images.
+        method: The method.
+        recording: Events and frames.
+        params: Parameters of the method.
+        compiler: "numba" or "xla" if the user names one.
+        options: Further options of the method's `estimate`.
+
+    Returns:
+        The images, or None where XLA compiles the method.
+
+    Raises:
+        InputError: The user names numba, and there is no kernel.
     """
-    if not wants_kernel(compiler, options.get("devices", ())):
-        return None
-    mine = {name: value for name, value in options.items() if name != "devices"}
-    try:
-        return kind(method, recording, params, **mine)
-    except Untranslatable as reason:
-        if compiler == "numba":
-            raise without_kernel(method.name, reason) from reason
-        return None
-
-
-def without_kernel(name: str, reason: Untranslatable) -> InputError:
-    """What to raise where numba is asked for and there is no kernel of a method."""
-    return InputError(
-        f"numba has no kernel for the method {name!r} ({reason}); leave out the compiler"
+    own = {name: value for name, value in options.items() if name != "devices"}
+    serves = serves_images(options.get("devices", ()))
+    return make_kernel(
+        method.name, compiler, serves, lambda: kind(method, recording, params, **own)
     )

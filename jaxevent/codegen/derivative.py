@@ -1,0 +1,242 @@
+"""Derivatives along several directions at once: linear programs transposed, and sums of vectors.
+
+JAX's forward mode makes a function of a function that is linear in the changes of the arguments.
+The factor of each change in a result is found by going through the expressions backwards, once for
+all directions. What is left for each direction is a sum of products, for all of them side by side.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+from jaxevent.codegen.functions import make_intrinsic
+from jaxevent.codegen.graph import Graph, Node, TranslationError, constant_value, dependencies
+from jaxevent.codegen.support import ir, types
+
+
+def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node, Node]:
+    """Return the factor of each change in a sum of products.
+
+    Raises:
+        TranslationError: The result is no such sum.
+    """
+    nodes = dependencies([result], changes)
+    moving = set(changes)
+    for node in nodes:
+        if any(a in moving for a in node.args if isinstance(a, Node)):
+            moving.add(node)
+    found: dict[Node, Node] = {}
+    at: dict[Node, Node] = {result: graph.constant(1.0)} if result in moving else {}
+    for node in reversed(nodes):
+        if node not in at:
+            continue
+        if node in changes:
+            found[node] = at[node]
+            continue
+        for argument, factor in _passed(node, at[node], moving, graph):
+            before = at.get(argument)
+            both = factor if before is None else graph.apply("add", (before, factor), "f")
+            at[argument] = both
+    return found
+
+
+def _passed(node: Node, at: Node, moving: set[Node], graph: Graph) -> list[tuple[Node, Node]]:
+    """The factors of a node's arguments, of its own."""
+    apply, args = graph.apply, node.args
+    minus = apply("neg", (at,), "f")
+    if node.op in ("add", "sub"):
+        parts = [(args[0], at), (args[1], at if node.op == "add" else minus)]
+    elif node.op == "neg":
+        parts = [(args[0], minus)]
+    elif node.op == "mul":
+        change, other = args if args[0] in moving else args[::-1]
+        if other in moving:
+            raise TranslationError("a product of derivatives")
+        parts = [(change, apply("mul", (at, other), "f"))]
+    elif node.op == "div" and args[1] not in moving:
+        inverse = apply("div", (graph.constant(1.0), args[1]), "f")
+        parts = [(args[0], apply("mul", (at, inverse), "f"))]
+    elif node.op == "select_n" and args[0] not in moving:
+        zero = graph.constant(0.0)
+        parts = [
+            (args[1], apply("select_n", (args[0], at, zero), "f")),
+            (args[2], apply("select_n", (args[0], zero, at), "f")),
+        ]
+    else:
+        raise TranslationError(f"the derivative of {node.op!r}")
+    return [(argument, factor) for argument, factor in parts if argument in moving]
+
+
+Term = tuple[int, bool, int]  # which factor; whether of numbers; where the vector begins
+Sum = tuple[int, tuple[Term, ...]]  # where it is written to, and what is added up
+
+
+def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
+    """A function for kernels: sums of products of numbers and vectors of `lanes` numbers.
+
+    `function(out, to, cells, at, numbers, factors)` writes the sums behind the place `to` of `out`.
+    Vectors lie in `cells` behind the place `at`, or in `numbers`. All are read before any is
+    written.
+    """
+
+    @make_intrinsic
+    def function(context: Any, out: Any, to: Any, cells: Any, at: Any, numbers: Any, factors: Any):
+        def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            lines = _Vectors(builder, context.get_value_type(signature.args[0].dtype), lanes)
+            out, to, cells, at, numbers, factors = arguments
+            totals = []
+            for _, terms in sums:
+                total = None
+                for factor, of_numbers, offset in terms:
+                    begin = None if of_numbers else at
+                    vector = lines.load(numbers if of_numbers else cells, begin, offset)
+                    product = lines.times(builder.extract_value(factors, factor), vector)
+                    total = product if total is None else lines.plus(total, product)
+                totals.append(total)
+            for (place, _), total in zip(sums, totals, strict=True):
+                lines.store(total, out, to, place)
+            return context.get_dummy_value()
+
+        return types.void(out, to, cells, at, numbers, factors), make
+
+    return function
+
+
+class _Vectors:
+    """Operations on vectors, in the compiler's language."""
+
+    def __init__(self, builder: Any, real: Any, lanes: int):
+        self.builder, self.lanes = builder, lanes
+        self.kind = ir.VectorType(real, lanes)
+        self.align = 4 if isinstance(real, ir.FloatType) else 8
+
+    def _pointer(self, array: Any, begin: Any, offset: int) -> Any:
+        place = ir.Constant(ir.IntType(64), offset)
+        if begin is not None:
+            place = self.builder.add(begin, place)
+        return self.builder.bitcast(self.builder.gep(array, [place]), self.kind.as_pointer())
+
+    def load(self, array: Any, begin: Any, offset: int) -> Any:
+        return self.builder.load(self._pointer(array, begin, offset), align=self.align)
+
+    def store(self, vector: Any, array: Any, begin: Any, offset: int) -> None:
+        vector = ir.Constant(self.kind, [0.0] * self.lanes) if vector is None else vector
+        self.builder.store(vector, self._pointer(array, begin, offset), align=self.align)
+
+    def times(self, number: Any, vector: Any) -> Any:
+        nothing, whole = ir.Constant(self.kind, ir.Undefined), ir.IntType(32)
+        one = self.builder.insert_element(nothing, number, ir.Constant(whole, 0))
+        order = ir.Constant(ir.VectorType(whole, self.lanes), [0] * self.lanes)
+        spread = self.builder.shuffle_vector(one, nothing, order)
+        return self.builder.fmul(spread, vector, flags=("contract",))
+
+    def plus(self, one: Any, other: Any) -> Any:
+        return self.builder.fadd(one, other, flags=("contract",))
+
+
+Table = list[Node]
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """A vector of changes, nothing along directions that are not named."""
+
+    kind: str  # of a "state", of a "table" (what frames say), or of a "number"
+    state: int  # which
+    nodes: dict[int, list[Node]]  # numbers to add up; or what the table holds in each variant
+
+
+@dataclasses.dataclass(frozen=True)
+class Slopes:
+    """How changes of results are made of others."""
+
+    changes: list[Change]
+    factors: dict[str, list[tuple[Node, int]]]  # by the result's name: factor, place in `changes`
+
+    def factors_of(self, *names: str) -> list[Node]:
+        """The factors of some results, each once."""
+        return list(dict.fromkeys(node for name in names for node, _ in self.factors[name]))
+
+
+def slopes_of(
+    outs: dict[str, list[Node]],
+    tables: list[Table],
+    excess: list[Node],
+    moving: set[Node],
+    graph: Graph,
+) -> Slopes:
+    """The derivatives of results, by direction; raises `TranslationError`.
+
+    `moving` are the changes of numbers of the parameters.
+    """
+    sums = {f"_{k}" for k, node in enumerate(excess) if moving & set(dependencies([node]))}
+
+    def changes(node: Node) -> bool:
+        name = str(node.args[0]) if node.op == "input" else ""
+        if node.op == "slot":
+            below = dependencies([table[node.args[0]] for table in tables])
+            return any(changes(n) for n in below)
+        ours = name.startswith("slope") or (name.startswith("total") and name[6:] in sums)
+        return ours or node in moving
+
+    every = dependencies([node for nodes in outs.values() for node in nodes])
+    known = {node for node in every if changes(node)}
+    # The factors of a change in all results: what has the same ones is one vector.
+    found: dict[tuple[int, Node], dict[str, Node]] = {}
+    for name, nodes in outs.items():
+        for direction, node in enumerate(nodes):
+            for change, factor in linear_factors(node, known, graph).items():
+                found.setdefault((direction, change), {})[name] = factor
+    vectors: dict[tuple[Any, ...], dict[int, list[Node]]] = {}
+    alike: dict[tuple[Any, ...], dict[str, Node]] = {}
+    for (direction, change), by_name in found.items():
+        key = _kind(change)
+        if key[0] == "state":
+            alike.setdefault(key, {})
+            if any(alike[key].setdefault(n, f) is not f for n, f in by_name.items()):
+                raise TranslationError("derivatives whose factors differ between directions")
+        else:
+            key += tuple((n, f.number) for n, f in sorted(by_name.items()))
+            alike[key] = by_name
+        vectors.setdefault(key, {}).setdefault(direction, []).append(change)
+    order = sorted(vectors, key=lambda key: ("state", "table", "number").index(key[0]))
+    made: list[Change] = []
+    terms: dict[str, dict[int, Node]] = {name: {} for name in outs}
+    for key in order:
+        kind, state = key[:2]
+        change = Change(kind, state, _contents(kind, vectors[key], tables, graph))
+        if change not in made:
+            made.append(change)
+        place = made.index(change)
+        for name, factor in alike[key].items():
+            before = terms[name].get(place, graph.constant(0.0))
+            terms[name][place] = graph.apply("add", (before, factor), "f")
+    sums = {
+        name: [(factor, place) for place, factor in by_place.items() if constant_value(factor) != 0]
+        for name, by_place in terms.items()
+    }
+    return Slopes(made, sums)
+
+
+def _contents(
+    kind: str, changes: dict[int, list[Node]], tables: list[Table], graph: Graph
+) -> dict[int, list[Node]]:
+    def total(nodes: list[Node]) -> Node:
+        return functools.reduce(lambda a, b: graph.apply("add", (a, b), "f"), nodes)
+
+    if kind == "state":
+        return {}
+    if kind == "number":
+        return changes
+    return {
+        lane: [total([table[slot.args[0]] for slot in slots]) for table in tables]
+        for lane, slots in changes.items()
+    }
+
+
+def _kind(change: Node) -> tuple[Any, ...]:
+    if change.op == "input" and str(change.args[0]).startswith("slope"):
+        return "state", int(change.args[0].removeprefix("slope").partition("_")[0])
+    if change.op not in ("number", "slot"):
+        raise TranslationError(f"the derivative of {change.op!r} at a point")
+    return "number" if change.op == "number" else "table", -1

@@ -1,0 +1,362 @@
+"""Choices of a caller and checks of what a file holds, which all readers share.
+
+The readers turn raw numbers of a file into fields of a recording by these functions, so that all
+accept the same values and word their errors alike.
+"""
+
+import contextlib
+import dataclasses
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent import arrays
+from jaxevent.camera import PinholeCamera
+from jaxevent.errors import InputError
+from jaxevent.lenses import LENSES, find_model
+from jaxevent.recording import Events, ImageSource
+
+GRAVITY = 9.80665  # m/s^2, standard gravity
+_UNFOLDED_BYTES = 1 << 27  # of arrays that every file may unfold to
+_MAX_COMPRESSION = 100  # times its own bytes that a larger file may unfold to
+_COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadOptions:
+    """Choices of `jaxevent.io.load`, which describes each of them, for a reader.
+
+    Attributes:
+        size: (width, height) in pixels; None takes the size that the file states.
+        in_memory: False leaves events and images in the file.
+        progress: Whether to show a progress bar; None shows one on a terminal.
+        stream: Name of the camera whose events are read; None where the file holds one.
+        frames: Name of the images that become the frames; None lets the reader choose.
+        without_frames: Whether frames are left out.
+        without_events: Whether events are left out; frames are then those of a camera of its own.
+        time_unit: Unit of the event times, "s", "ms", "us" or "ns"; None infers it.
+        repair: Repairs of event times that go back; None refuses them.
+        notes: Remarks that readers add, for `Recording.notes`.
+    """
+
+    size: tuple[int, int] | None = None
+    in_memory: bool = True
+    progress: bool | None = None
+    stream: str | None = None
+    frames: str | None = None
+    time_unit: str | None = None
+    repair: str | None = None
+    without_frames: bool = False
+    without_events: bool = False
+    notes: list[str] = dataclasses.field(default_factory=list, compare=False)
+
+    def refuse_stream(self, path: Path) -> None:
+        """Raise `InputError` if a camera is named, for a file that holds only one."""
+        if self.stream is not None:
+            raise InputError(f"{path}: holds one camera only; leave out stream= or --stream")
+
+    def refuse_time_unit(self, path: Path) -> None:
+        """Raise `InputError` if a unit of time is given, for a format that states its unit."""
+        if self.time_unit is not None:
+            raise InputError(
+                f"{path}: this format states the unit of its times; leave out time_unit= or "
+                "--time-unit"
+            )
+
+    def choose_stream(
+        self, path: Path, what: str, names: Sequence[str], described: Sequence[str] = ()
+    ) -> str | None:
+        """Choose the camera of a file that may hold several.
+
+        Args:
+            path: The file.
+            what: Words of the format for a camera, as "topic of events", for messages.
+            names: Names of the cameras in the file.
+            described: Longer names for the message, (n,) as `names`.
+
+        Returns:
+            One of `names`; None where there is none.
+
+        Raises:
+            InputError: There are several cameras and none is named, or none of that name.
+        """
+        if self.stream is not None and self.stream not in names:
+            noun, _, rest = what.partition(" ")
+            raise InputError(
+                f"{path}: has no {what} {self.stream!r}; its {f'{noun}s {rest}'.strip()} are "
+                f"{', '.join(names) or 'none'}"
+            )
+        if self.stream is None and len(names) > 1 and not self.without_events:
+            raise InputError(
+                f"{path}: holds the events of {len(names)} cameras, "
+                f"{', '.join(described or names)}; choose one with stream=, or with jaxevent "
+                "convert --stream"
+            )
+        return self.stream or next(iter(names), None)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the path before the message of an `InputError` that does not name it."""
+    try:
+        yield
+    except InputError as error:
+        if type(error) is not InputError or str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error
+
+
+@contextlib.contextmanager
+def reading(source: object) -> Iterator[None]:
+    """Turn any exception of a parser of bad files into an `InputError` naming `source`.
+
+    The parsers behind this (zipfile, zlib, Pillow, scipy, h5py) document no common exception.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason if len(reason) < 200 else reason[:200] + "..."
+        raise InputError(
+            f"{source}: cannot be read ({reason}); the file is damaged, incomplete or not "
+            "permitted, so fetch it again or check its permissions"
+        ) from error
+
+
+def damaged(what: str) -> InputError:
+    """Return the error to raise for a fault of a file, which `what` describes with its place."""
+    return InputError(f"{what}; the file was cut off or is damaged, so fetch it again")
+
+
+def max_unfolded(stored: int) -> int:
+    """Return the number of bytes of arrays that `stored` bytes of a file may unfold to."""
+    return max(_UNFOLDED_BYTES, _MAX_COMPRESSION * stored)
+
+
+def check_unfolded(size: int, stored: int, source: object) -> None:
+    """Raise `InputError` if a file claims to hold far more bytes of arrays than it can.
+
+    Memory stays bounded by what a file holds: real events and images compress less than 20 times.
+
+    Args:
+        size: Number of bytes that the arrays take in memory.
+        stored: Number of bytes of the file.
+        source: Name of the file for messages.
+    """
+    if size > max_unfolded(stored):
+        raise InputError(
+            f"{source}: {stored:,} bytes of the file claim to hold {size:,}, over "
+            f"{_MAX_COMPRESSION} times as many; it is damaged or not a recording, else store it "
+            "with less compression"
+        )
+
+
+def check_whole_records(path: Path, n_bytes: int, width: int, what: str = "a record") -> None:
+    """Check that the bytes of a file are whole records.
+
+    Args:
+        path: The file.
+        n_bytes: Number of its bytes that hold records.
+        width: Number of bytes of a record.
+        what: Words for a record, for the message.
+
+    Raises:
+        InputError: The last record is cut off.
+    """
+    if rest := n_bytes % width:
+        raise InputError(
+            f"{path}: ends inside {what}, {rest} bytes after the last whole one of {width} bytes; "
+            "the recording was cut off, so fetch it again or drop these bytes: truncate -s "
+            f"-{rest} FILE"
+        )
+
+
+def open_archive(file: Path) -> zipfile.ZipFile:
+    """Open a zip archive, or raise `InputError` if it claims to hold far more than it can."""
+    archive = zipfile.ZipFile(file)
+    unfolded = sum(member.file_size for member in archive.infolist())
+    check_unfolded(unfolded, file.stat().st_size, file)
+    return archive
+
+
+def check_events(
+    t: NDArray,
+    x: NDArray,
+    y: NDArray,
+    p: NDArray,
+    size: tuple[int, int],
+    source: str,
+    *,
+    first_row: int = 0,
+    origin: int = 0,
+) -> Events:
+    """Check the columns of a file and make events of them.
+
+    Args:
+        t: (events,) times in us, int64.
+        x: (events,) columns in px.
+        y: (events,) rows in px.
+        p: (events,) polarities, bool, 0/1 or -1/1.
+        size: (width, height) of the sensor in px.
+        source: Name of the file for messages.
+        first_row: Row of the first event in the file.
+        origin: Number of the first column and row of the sensor, 0 or 1.
+
+    Returns:
+        The events.
+
+    Raises:
+        InputError: An event is not valid; the message names the first.
+    """
+    arrays.as_size(*size, source)
+    arrays.check_lengths(t, x, y, p, source)
+    events = Events.of_checked(
+        arrays.as_plain(t, np.int64),
+        arrays.coordinates("x", x, size, source, first_row=first_row, origin=origin),
+        arrays.coordinates("y", y, size, source, first_row=first_row, origin=origin),
+        arrays.polarities(p, source, first_row),
+    )
+    events.check_order(source, first_row)
+    return events
+
+
+def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeCamera:
+    """Make the camera of a list of numbers.
+
+    Args:
+        values: fx fy cx cy in px, and the coefficients of the lens, as k1 k2 p1 p2 k3.
+        source: Name of the file for messages.
+        model: Name of the lens model, see `jaxevent.lenses`.
+
+    Returns:
+        The camera.
+
+    Raises:
+        InputError: The number of values is another, one is not finite, or the model is unknown.
+    """
+    found = find_model(model)
+    if found is None:
+        raise InputError(f"{source}: {_unsupported_lens(model)}")
+    values, names = np.ravel(values), LENSES[found].coefficients
+    count = 4 + len(names)
+    if values.shape != (count,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise InputError(
+            f"{source}: the calibration must be {_COUNTS[count]} finite numbers, fx fy cx cy "
+            f"{' '.join(names)}"
+        )
+    fx, fy, cx, cy, *distortion = (float(value) for value in values)
+    return PinholeCamera(fx, fy, cx, cy, tuple(distortion), found)
+
+
+def _unsupported_lens(model: str) -> str:
+    return (
+        f"the calibration has the lens model {model[:40]!r}, which is not supported; supported are "
+        f"{', '.join(LENSES)}"
+    )
+
+
+def make_supported_camera(
+    intrinsics: NDArray, model: str, coefficients: NDArray, source: str
+) -> tuple[PinholeCamera | None, dict[str, str]]:
+    """Make the camera of a calibration, or explain that its lens is not supported.
+
+    Args:
+        intrinsics: fx, fy, cx and cy in px.
+        model: Name of the lens model; "plumb_bob" of eight coefficients is rational.
+        coefficients: Coefficients of the lens; missing ones are 0.
+        source: Name of the file for messages.
+
+    Returns:
+        The camera or None, and the entry of `Recording.left_out`.
+
+    Raises:
+        InputError: The numbers are not valid.
+    """
+    found, k = find_model(model), np.ravel(coefficients)
+    if found == "radtan" and len(k) == len(LENSES["rational"].coefficients):
+        found = "rational"
+    if found is None:
+        return None, {"camera": f"{source}: {_unsupported_lens(model)}"}
+    count = len(LENSES[found].coefficients)
+    if np.any(k[count:]):
+        return None, {
+            "camera": f"{source}: the calibration has {len(k)} coefficients of the lens model "
+            f"{model[:40]!r}, of which {count} are supported"
+        }
+    k = np.concatenate([k[:count], np.zeros(max(0, count - len(k)))])
+    return make_camera(np.concatenate([np.ravel(intrinsics), k]), source, found), {}
+
+
+def whole_number(value: Any, source: object, what: str) -> int:
+    """Return one number of a file as an int.
+
+    Args:
+        value: The number, or an array of one.
+        source: Name of the file for messages.
+        what: Name of the number for messages.
+
+    Returns:
+        The number.
+
+    Raises:
+        InputError: The value is not one whole number below 2^62.
+    """
+    value = np.asarray(value)
+    number = value.item() if value.size == 1 and value.dtype.kind in "iuf" else None
+    if (
+        number is None
+        or not -arrays.MAX_TIME_US < number < arrays.MAX_TIME_US
+        or number != int(number)
+    ):
+        raise InputError(
+            f"{source}: {what} must be one whole number, not {np.ravel(value)[:3]}; correct it"
+        )
+    return int(number)
+
+
+def whole_size(width: Any, height: Any, source: object) -> tuple[int, int]:
+    """Return the sensor's size of a file as whole numbers.
+
+    Args:
+        width: Width in px, a number or an array of one.
+        height: Height in px.
+        source: Name of the file for messages.
+
+    Returns:
+        (width, height).
+
+    Raises:
+        InputError: A side is no whole number.
+    """
+    with reading(source):
+        return whole_number(width, source, "width"), whole_number(height, source, "height")
+
+
+def image_size(images: ImageSource | NDArray | None) -> tuple[int, int] | None:
+    """Return (width, height) of images (n, height, width); None of none."""
+    return None if images is None else (images.shape[2], images.shape[1])
+
+
+def sensor_size(otherwise: str, *sizes: tuple[int, int] | None) -> tuple[int, int]:
+    """Return the first size that is known.
+
+    Args:
+        otherwise: First part of the error, as "FILE: no image shows the sensor's size".
+        *sizes: (width, height) in px each, or None.
+
+    Returns:
+        (width, height) in px.
+
+    Raises:
+        InputError: No size is known.
+    """
+    for size in sizes:
+        if size is not None:
+            return size
+    raise InputError(f"{otherwise}; give size=(width, height) or --size")
