@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.tail import Tail
@@ -23,8 +24,10 @@ from jaxevent.reconstruction.video import PixelMethod, Video
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
 WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
+MAX_HELD_FRAMES = 32  # before what is settled is dropped
 
 
+@renamed_methods(dropping="drop_before", grown="append")
 class TailImages:
     """An `ImageSource` that holds the last images only."""
 
@@ -42,11 +45,11 @@ class TailImages:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         raise IndexError("frames that are gone cannot be read")
 
-    def grown(self, image: NDArray) -> "TailImages":
+    def append(self, image: NDArray) -> "TailImages":
         """Return the images with one more at the end."""
         return TailImages(np.concatenate([self.images, image[None]]), self.dropped)
 
-    def dropping(self, row: int) -> "TailImages":
+    def drop_before(self, row: int) -> "TailImages":
         """Return the images without those before a row."""
         return TailImages(self.images[max(row - self.dropped, 0) :].copy(), row)
 
@@ -82,7 +85,7 @@ class LiveVideo:
         self._turns = TurnLock("live images")
         self._recording = Recording("live", *size, Tail(*size), extra=extra or {})
         self._video: Video | None = None
-        self._grown = False
+        self._changed = False
 
     @property
     def _events(self) -> Tail:
@@ -115,7 +118,7 @@ class LiveVideo:
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
         self._events.add(events)
-        self._grown = True
+        self._changed = True
         self._settle()
 
     @synchronized
@@ -149,11 +152,11 @@ class LiveVideo:
             assert isinstance(known.images, TailImages)
             frames = Frames(
                 np.append(known.t, t),
-                known.images.grown(np.asarray(image)),
+                known.images.append(np.asarray(image)),
                 np.append(known.exposure, one.exposure),
             )
         self._recording = dataclasses.replace(r, frames=frames)
-        self._grown = True
+        self._changed = True
         self._settle()
 
     @synchronized
@@ -166,43 +169,43 @@ class LiveVideo:
                 f"images from {us.min()} to {us.max()} us were asked for; those from {start} to "
                 f"{stop} us can be had, earlier ones are forgotten and later ones not known"
             )
-        return self._following()(us)
+        return self._updated_video()(us)
 
     def _check(self) -> None:
         if not len(self._events) and self._recording.frames is None:
             raise InputError("nothing has been added yet; add events or a frame first")
 
-    def _following(self) -> Video:
+    def _updated_video(self) -> Video:
         """Return the video of all that has been added."""
         if self._video is None:
             self._video = Video(
                 self.estimator, self._recording, self.params,
                 window_events=self.window_events, progress=False,
             )  # fmt: skip
-        elif self._grown:
-            self._video.grow(self._recording)
-        self._grown = False
+        elif self._changed:
+            self._video.extend(self._recording)
+        self._changed = False
         return self._video
 
     def _settle(self) -> None:
         """Filter events that no addition changes, once they are a window's worth, and drop them."""
         tail, frames = self._events, self._recording.frames
         waiting = tail.count - tail.dropped
-        pictures = 0
+        held_frames = 0
         if frames is not None and isinstance(frames.images, TailImages):
-            pictures = len(frames.images.images)
-        if waiting < 2 * self.window_events and pictures < 32:
+            held_frames = len(frames.images.images)
+        if waiting < 2 * self.window_events and held_frames < MAX_HELD_FRAMES:
             return
         if self._expects_frames and (frames is None or len(frames) < 3):
             return
-        video = self._following()
+        video = self._updated_video()
         row, first_frame = video.settle(self._expects_frames)
         if row > tail.dropped:
             tail.drop(row)
         if frames is not None and isinstance(frames.images, TailImages):
             if first_frame > frames.images.dropped:
-                images = frames.images.dropping(first_frame)
+                images = frames.images.drop_before(first_frame)
                 self._recording = dataclasses.replace(
                     self._recording, frames=dataclasses.replace(frames, images=images)
                 )
-                self._grown = True
+                self._changed = True

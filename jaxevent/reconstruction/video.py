@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
+from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.devices import has_accelerator
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
@@ -35,7 +36,7 @@ from jaxevent.recording import Recording, Times, microseconds
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
 
-BEGINS = 32  # windows from which filtering can be taken up again
+MAX_STARTS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
 DEVICE_BATCH = 32  # on a GPU, where each call costs as much as several images
 
@@ -140,7 +141,7 @@ def _read(estimator: PixelMethod, params, trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
 
 
-class Begin(NamedTuple):
+class WindowStart(NamedTuple):
     """Start of a window with the state there, from which filtering can be taken up again."""
 
     start: int | None
@@ -332,6 +333,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
                 shown.update(len(batch))
 
 
+@renamed_methods(grow="extend")
 class Video(ImageSequence[P]):
     """Images of a reconstruction: `image, variance, valid = video(times)`.
 
@@ -348,8 +350,7 @@ class Video(ImageSequence[P]):
         progress: Show a progress bar; None: if it takes long.
         devices: Devices of this process over which pixels are sharded.
         factors: (2, pixels) factors on the ON and OFF thresholds of single pixels, for methods that
-            do
-            not pass over single events.
+            do not pass over single events.
     """
 
     estimator: PixelMethod
@@ -376,9 +377,12 @@ class Video(ImageSequence[P]):
             events=window_events,
             reuse=True,
         )
-        self._begins = [Begin(None, self._windows.initial(), None)]
-        self._open: FilteredWindow | None = None
-        self._coming: tuple[object, Any] = (None, None)  # the last images, and who asked for them
+        self._starts = [WindowStart(None, self._windows.initial(), None)]
+        self._current: FilteredWindow | None = None
+        self._pending: tuple[object, Any] = (
+            None,
+            None,
+        )  # the last reading and its images
         self._future: dict[int | None, Any] | None = None  # by the start of the window
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -408,50 +412,50 @@ class Video(ImageSequence[P]):
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, self._batch):
                 batch = times[first : min(first + self._batch, end)]
-                asker, coming = self._coming
-                if asker is not mine:  # two readings of this one fit into the reader
-                    jax.block_until_ready(coming)
-                out = self._place(reader(batch))
+                reading, images_before = self._pending
+                if reading is not mine:  # two readings of this one fit into the reader
+                    jax.block_until_ready(images_before)
+                out = self._put(reader(batch))
                 images = _read(self.estimator, self.params, trajectory, out)
-                self._coming = mine, images
+                self._pending = mine, images
                 for leaf in images:
                     leaf.copy_to_host_async()
                 yield batch, images
             done = end
 
-    def _place(self, part: Any) -> Any:
+    def _put(self, part: Any) -> Any:
         """Scale the counts of features or a read-out, and put them on the devices."""
         part = part if self._factors is None else part.scale_counts(self._factors)
         return part if self._mesh is None else part.over(self._devices)
 
-    def _share_out(self, state: Any) -> Any:
+    def _put_state(self, state: Any) -> Any:
         """Put a state or message on the devices; else every change of place is compiled."""
         return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
     def _window_of(self, time: int) -> FilteredWindow:
         """Return the filtered window that contains `time`; those before it are filtered first."""
         if self.estimator.needs_future and self._future is None:
-            self._look_ahead()
-        if self._open is not None and self._open.contains(time):
-            return self._open
-        begin = [b for b in self._begins if b.time <= time][-1]
+            self._run_backward_pass()
+        if self._current is not None and self._current.contains(time):
+            return self._current
+        begin = [b for b in self._starts if b.time <= time][-1]
         while True:
-            self._open = None  # so that two windows are never held at once
-            self._open, begin = self._filter(begin)
-            stop = self._open.window.stop
+            self._current = None  # so that two windows are never held at once
+            self._current, begin = self._filter(begin)
+            stop = self._current.window.stop
             if stop is None or time < stop:
-                return self._open
+                return self._current
 
     @property
     def settled(self) -> int | None:
         """Time (us) before which images can no longer be read; None: all can."""
-        return self._begins[0].start
+        return self._starts[0].start
 
-    def grow(self, recording: Recording) -> None:
+    def extend(self, recording: Recording) -> None:
         """Go on with the same recording after events or frames were added to its end."""
         self.recording = recording
         self._windows.extend(recording)
-        self._open, self._begins = None, self._begins[:1]
+        self._current, self._starts = None, self._starts[:1]
 
     def settle(self, frames: bool) -> tuple[int, int]:
         """Filter up to the time before which additions change nothing, and keep that state only.
@@ -462,19 +466,19 @@ class Video(ImageSequence[P]):
         Returns:
             The first row of the events and the first frame that are needed from then on.
         """
-        begin, final = self._begins[0], self._windows.final_time(frames)
+        begin, final = self._starts[0], self._windows.final_time(frames)
         while True:
-            self._open = None
+            self._current = None
             _, following = self._filter(begin)
             if following.start is None or following.start > final:
                 break
             begin = following
-        self._begins = [begin]
+        self._starts = [begin]
         return self._windows.first_needed(begin.start, begin.before)
 
-    def _look_ahead(self) -> None:
+    def _run_backward_pass(self) -> None:
         """Pass over all windows once, for the message of later windows at each."""
-        begin, starts, links = self._begins[0], [], []
+        begin, starts, links = self._starts[0], [], []
         total = len(self.recording.events)
         with bar(
             total=total, desc="look ahead", unit="event", unit_scale=True, progress=self.progress
@@ -491,23 +495,26 @@ class Video(ImageSequence[P]):
             message = links[place][0].apply(message)
             future[starts[place - 1]] = message
         self._future = future
-        self._open = filtered  # the last window has nothing later to know of
+        self._current = filtered  # no window is later than the last
 
-    def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
+    def _filter(self, begin: WindowStart) -> tuple[FilteredWindow, WindowStart]:
         """Prepare and filter the window that begins there; return it and the start of the next."""
         dispatch.check_threads()
         window, features = self._windows.prepare(begin.start, begin.before)
-        features = self._place(features)
+        features = self._put(features)
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
         future = None if self._future is None else self._future[begin.start]
-        state, future = self._share_out((state, future))
+        state, future = self._put_state((state, future))
         trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
-        following = Begin(window.stop, window.after, end)
-        if window.stop is not None and all(b.start != window.stop for b in self._begins):
-            self._begins = sorted([*self._begins, following], key=lambda b: b.time)
-            if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
-                self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
+        following = WindowStart(window.stop, window.after, end)
+        if window.stop is not None and all(b.start != window.stop for b in self._starts):
+            self._starts = sorted([*self._starts, following], key=lambda b: b.time)
+            if len(self._starts) > MAX_STARTS:  # first, last, half of the others
+                self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
         return FilteredWindow(window, window.reader(self._batch), trajectory), following
+
+
+__getattr__ = renamed_names(__name__)

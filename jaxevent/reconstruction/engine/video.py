@@ -15,7 +15,7 @@ from jaxevent.reconstruction.engine.room import ImageRoom
 from jaxevent.reconstruction.engine.timeline import NEVER
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.video import BEGINS, ImageSequence, P
+from jaxevent.reconstruction.video import MAX_STARTS, ImageSequence, P
 from jaxevent.recording import Recording
 
 WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
@@ -103,7 +103,9 @@ class FusedVideo(ImageSequence[P]):
         begin = Begin(window.stop, window.context, self._passes.state())
         if all(b.start != window.stop for b in self._begins):
             self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
-            if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
+            if (
+                len(self._begins) > MAX_STARTS
+            ):  # the first one, the last one, and half of the others
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
         return begin
 
