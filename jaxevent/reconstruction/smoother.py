@@ -45,10 +45,12 @@ from jaxevent.reconstruction.augment import (
     segment_excess,
     unclipped_weight,
 )
-from jaxevent.reconstruction.engine.images import prepared_by_kernel
-from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
-from jaxevent.reconstruction.engine.smoothed_images import DividedFrames
-from jaxevent.reconstruction.engine.video import video_by_kernel
+from jaxevent.reconstruction.engine.images import (
+    SmootherImages,
+    SmootherVideo,
+    images_from_kernel,
+    video_from_kernel,
+)
 from jaxevent.reconstruction.estimator import PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
     Features,
@@ -687,7 +689,7 @@ class Smoother(PixelEstimator[Params]):
         return np.stack([message.h, message.J])
 
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
-        """Return the steps of `run` and `read` at one pixel, for kernels (`engine.smoothing`).
+        """Return the steps of `run` and `read` at one pixel, for kernels (`engine.smoother_program`).
 
         They are functions of parameters, of what depends on these alone, and of numbers by name.
         """
@@ -791,7 +793,7 @@ class Smoother(PixelEstimator[Params]):
         """
         self.check_options(**options)
         params = self.Params() if params is None else params
-        fused = video_by_kernel(SmoothedVideo, self, recording, params, compiler, options)
+        fused = video_from_kernel(SmootherVideo, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused
 
     def prepare_images(
@@ -816,8 +818,14 @@ class Smoother(PixelEstimator[Params]):
             The images as a function of parameters.
         """
         params = self.Params() if params is None else params
-        fused = prepared_by_kernel(
-            DividedFrames, self, recording, times, params, extrapolate, compiler
+        fused = images_from_kernel(
+            SmootherImages,
+            self,
+            recording,
+            times,
+            params,
+            extrapolate=extrapolate,
+            compiler=compiler,
         )
         if fused is not None:
             return fused
