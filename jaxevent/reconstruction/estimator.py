@@ -12,6 +12,7 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
+from jaxevent.reconstruction.engine.images import images_from_kernel, video_from_kernel
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.frames import Timing, time_span
 from jaxevent.reconstruction.live import LiveVideo
@@ -299,3 +300,89 @@ class PixelEstimator(ImageEstimator[P]):
         self.check_options(**options)
         params = self.Params() if params is None else params
         return LiveVideo(self, size, params, frames=frames, **options)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class KernelEstimator(PixelEstimator[P]):
+    """A per-pixel method of which numba makes kernels for the CPU, from its own functions."""
+
+    kernel_video: ClassVar[Any]  # class of its images, see `engine.images`
+    kernel_images: ClassVar[Any]  # class of its kernels for prepared images
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
+    )
+
+    def estimate(
+        self,
+        recording: Recording,
+        params: P | None = None,
+        *,
+        compiler: str | None = None,
+        **options: Any,
+    ) -> ImageSequence[P]:
+        """Make images of a recording: `mean, variance, valid = estimate(recording, params)(times)`.
+
+        In single precision they come from a kernel that numba compiles from the method's own
+        functions (`engine`) for the CPU. `run` and `read`, compiled by XLA, serve where a function
+        has no translation, in double precision and on several devices.
+
+        Args:
+            recording: Events and frames.
+            params: Parameters; the defaults if None.
+            compiler: "numba" or "xla", to demand one of the two.
+            **options: Options of `Video`; those of `aks` include `factors`.
+
+        Returns:
+            Images as a function of time.
+
+        Raises:
+            InputError: The recording lacks what the method needs, or no kernel can do what is
+                demanded.
+        """
+        self.check_options(**options)
+        params = self.Params() if params is None else params
+        fused = video_from_kernel(self.kernel_video, self, recording, params, compiler, options)
+        return Video(self, recording, params, **options) if fused is None else fused
+
+    def prepare_images(
+        self,
+        recording: Recording,
+        times: Times,
+        params: P | None = None,
+        *,
+        extrapolate: bool = False,
+        compiler: str | None = None,
+    ) -> PreparedImages:
+        """Prepare the images at sorted times as a function of parameters, for losses.
+
+        On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
+        in one pass over the events. `run` and `read` serve where a function has no translation, in
+        double precision, on other devices and on several, for derivatives by the dead time
+        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.dispatch`).
+
+        Args:
+            recording: Events and frames.
+            times: Sorted times, integers in us or floats in s.
+            params: Parameters that act in preparation; the defaults if None.
+            extrapolate: Allow times outside the recording.
+            compiler: "numba" or "xla", to demand the kernel or to do without it.
+
+        Returns:
+            The images as a function of parameters.
+
+        Raises:
+            InputError: As `estimate`, and for times that are not sorted or outside the recording.
+        """
+        params = self.Params() if params is None else params
+        fused = images_from_kernel(
+            self.kernel_images,
+            self,
+            recording,
+            times,
+            params,
+            extrapolate=extrapolate,
+            compiler=compiler,
+        )
+        if fused is not None:
+            return fused
+        return super().prepare_images(recording, times, params, extrapolate=extrapolate)

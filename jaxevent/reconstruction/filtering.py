@@ -9,7 +9,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,13 +22,8 @@ from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.devices import loop_unroll
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.engine.images import (
-    FilterImages,
-    FilterVideo,
-    images_from_kernel,
-    video_from_kernel,
-)
-from jaxevent.reconstruction.estimator import P, PixelEstimator, PreparedImages
+from jaxevent.reconstruction.engine.images import FilterImages, FilterVideo
+from jaxevent.reconstruction.estimator import KernelEstimator, P
 from jaxevent.reconstruction.features import (
     SHAPES,
     SLOTS,
@@ -39,8 +34,6 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.recording import Recording, Times
 
 UNROLLED_RANKS = 8  # of a tile, that a GPU passes over at once
 
@@ -145,7 +138,7 @@ def readout_log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array
     observe="frame_model", initial="init", advance="predict", jump="event_update", tell="readout"
 )
 @dataclasses.dataclass(frozen=True, repr=False)
-class Filter(PixelEstimator[P]):
+class Filter(KernelEstimator[P]):
     """A causal method, made of pure functions of one pixel.
 
     Attributes:
@@ -164,82 +157,12 @@ class Filter(PixelEstimator[P]):
     predict: Callable[[P, Any, Array, Observation], Any]
     event_update: Callable[[P, Any, Event], Any] | None = None
     readout: Callable[[P, Any], tuple[Array, Array]] = readout_log_intensity
-    options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
-    )
+    kernel_video: ClassVar[Any] = FilterVideo
+    kernel_images: ClassVar[Any] = FilterImages
 
     @property
     def is_event_driven(self) -> bool:
         return self.event_update is not None
-
-    def estimate(
-        self,
-        recording: Recording,
-        params: P | None = None,
-        *,
-        compiler: str | None = None,
-        **options: Any,
-    ) -> ImageSequence[P]:
-        """Make images of a recording: `mean, variance, valid = estimate(recording, params)(times)`.
-
-        In single precision they come from a kernel that numba compiles from the method's own
-        functions (`engine`) for the CPU. `run` and `read`, compiled by XLA, serve where a function
-        has no translation, in double precision and on several devices.
-
-        Args:
-            recording: Events and frames.
-            params: Parameters; the defaults if None.
-            compiler: "numba" or "xla", to demand one of the two.
-            **options: Options of `Video`.
-
-        Returns:
-            Images as a function of time.
-
-        Raises:
-            InputError: The recording lacks what the method needs, or no kernel can do what is
-                demanded.
-        """
-        self.check_options(**options)
-        params = self.Params() if params is None else params
-        fused = video_from_kernel(FilterVideo, self, recording, params, compiler, options)
-        return Video(self, recording, params, **options) if fused is None else fused
-
-    def prepare_images(
-        self,
-        recording: Recording,
-        times: Times,
-        params: P | None = None,
-        *,
-        extrapolate: bool = False,
-        compiler: str | None = None,
-    ) -> PreparedImages:
-        """Prepare the images at sorted times as a function of parameters, for losses.
-
-        On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
-        in one pass over the events. `run` and `read` serve where a function has no translation, in
-        double precision, on other devices and on several, for derivatives by the dead time
-        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.dispatch`).
-
-        Args:
-            recording: Events and frames.
-            times: Sorted times, integers in us or floats in s.
-            params: Parameters that act in preparation; the defaults if None.
-            extrapolate: Allow times outside the recording.
-            compiler: "numba" or "xla", to demand the kernel or to do without it.
-
-        Returns:
-            The images as a function of parameters.
-
-        Raises:
-            InputError: As `estimate`, and for times that are not sorted or outside the recording.
-        """
-        params = self.Params() if params is None else params
-        fused = images_from_kernel(
-            FilterImages, self, recording, times, params, extrapolate=extrapolate, compiler=compiler
-        )
-        if fused is not None:
-            return fused
-        return super().prepare_images(recording, times, params, extrapolate=extrapolate)
 
     def step(self, params: P, state: Any, event: Event) -> Any:
         """Return the state of a pixel after an event: predict to it, then add it.

@@ -45,13 +45,8 @@ from jaxevent.reconstruction.augment import (
     segment_excess,
     unclipped_weight,
 )
-from jaxevent.reconstruction.engine.images import (
-    SmootherImages,
-    SmootherVideo,
-    images_from_kernel,
-    video_from_kernel,
-)
-from jaxevent.reconstruction.estimator import PixelEstimator, PreparedImages
+from jaxevent.reconstruction.engine.images import SmootherImages, SmootherVideo
+from jaxevent.reconstruction.estimator import KernelEstimator
 from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
@@ -59,8 +54,6 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
-from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.recording import Recording, Times
 
 
 class Params(CertaintyParams):
@@ -566,10 +559,12 @@ def adjacent_counts(
 
 @renamed_methods(keep="frame_info", tell="readout")
 @dataclasses.dataclass(frozen=True, repr=False)
-class Smoother(PixelEstimator[Params]):
+class Smoother(KernelEstimator[Params]):
     """The asynchronous Kalman smoother."""
 
     has_likelihood: ClassVar[bool] = True
+    kernel_video: ClassVar[Any] = SmootherVideo
+    kernel_images: ClassVar[Any] = SmootherImages
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "devices", "compiler", "factors"}), kw_only=True
     )
@@ -689,9 +684,9 @@ class Smoother(PixelEstimator[Params]):
         return np.stack([message.h, message.J])
 
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
-        """Return the steps of `run` and `read` at one pixel, for kernels (`engine.smoother_program`).
+        """Return the steps of `run` and `read` at one pixel, for kernels.
 
-        They are functions of parameters, of what depends on these alone, and of numbers by name.
+        See `engine.smoother_program`. They are functions of parameters, of what depends on these alone, and of numbers by name.
         """
 
         def lag(known):
@@ -762,74 +757,6 @@ class Smoother(PixelEstimator[Params]):
             "before": before,
             "excess": excess,
         }
-
-    def estimate(
-        self,
-        recording: Recording,
-        params: Params | None = None,
-        *,
-        compiler: str | None = None,
-        **options: Any,
-    ) -> ImageSequence[Params]:
-        """Make images of a recording: `mean, variance, valid = estimate(recording, params)(times)`.
-
-        On a CPU, in single precision, a kernel makes them. `run` and `read` serve in double
-        precision, on other devices and on several.
-
-        Args:
-            recording: Events and frames.
-            params: Parameters; the defaults if None.
-            compiler: "numba" or "xla", to demand the kernel or to do without it.
-            **options: Options of `Video`; `factors` (2, pixels) multiply the ON and OFF thresholds
-                of
-                single pixels.
-
-        Returns:
-            Images as a function of time.
-
-        Raises:
-            InputError: The recording lacks what the method needs, or no kernel can do what is
-                demanded.
-        """
-        self.check_options(**options)
-        params = self.Params() if params is None else params
-        fused = video_from_kernel(SmootherVideo, self, recording, params, compiler, options)
-        return Video(self, recording, params, **options) if fused is None else fused
-
-    def prepare_images(
-        self,
-        recording: Recording,
-        times: Times,
-        params: Params | None = None,
-        *,
-        extrapolate: bool = False,
-        compiler: str | None = None,
-    ) -> PreparedImages:
-        """Prepare images as a function of parameters; see `Filter.prepare_images`.
-
-        Args:
-            recording: Events and frames.
-            times: Sorted times, integers in us or floats in s.
-            params: Parameters that act in preparation; the defaults if None.
-            extrapolate: Allow times outside the recording.
-            compiler: "numba" or "xla", to demand the kernel or to do without it.
-
-        Returns:
-            The images as a function of parameters.
-        """
-        params = self.Params() if params is None else params
-        fused = images_from_kernel(
-            SmootherImages,
-            self,
-            recording,
-            times,
-            params,
-            extrapolate=extrapolate,
-            compiler=compiler,
-        )
-        if fused is not None:
-            return fused
-        return super().prepare_images(recording, times, params, extrapolate=extrapolate)
 
     def log_likelihood(self, params: Params, features: Features) -> Float[Array, ""]:
         """Return the log likelihood of all frames of a prepared recording, given its events.
