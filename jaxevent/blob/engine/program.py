@@ -251,7 +251,7 @@ def trace_track(
         "decide": (steps.decide_track, decide, True),
     }
     traced = {
-        name: translate_function(function, params, values, graph, host, alone)
+        name: translate_function(function, params, values, graph, host, single=alone)
         for name, (function, values, alone) in functions.items()
     }
     layout = _make_layout({"track": track, "prediction": prediction, "evidence": evidence})
