@@ -686,7 +686,8 @@ class Smoother(KernelEstimator[Params]):
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
         """Return the steps of `run` and `read` at one pixel, for kernels.
 
-        See `engine.smoother_program`. They are functions of parameters, of what depends on these alone, and of numbers by name.
+        See `engine.smoother_program`. They are functions of parameters, of quantities that depend on
+        parameters alone, and of numbers by name.
         """
 
         def lag(known):
