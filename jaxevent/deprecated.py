@@ -245,6 +245,11 @@ MOVED_MODULES: dict[str, str] = {
     "jaxevent.reconstruction.fused.video": "jaxevent.reconstruction.engine.images",
     "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
     "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.show.motion_pictures": "jaxevent.show.motion_figures",
+    "jaxevent.show.notebook": "jaxevent.show.figures",
+    "jaxevent.show.report": "jaxevent.show.tables",
+    "jaxevent.show.track_pictures": "jaxevent.show.track_figures",
+    "jaxevent.show.track_plots": "jaxevent.show.track_figures",
     "jaxevent.shown": "jaxevent.display",
 }
 
