@@ -247,13 +247,13 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 
 
 def evaluate_nodes(
-    nodes: list[Node], known: Callable[[str], Any], values: list[Any], dtype: np.dtype
+    nodes: list[Node], known: Callable[[Any], Any], values: list[Any], dtype: np.dtype
 ) -> list[Any]:
     """Evaluate expressions for arrays in place of numbers.
 
     Args:
         nodes: The expressions.
-        known: Returns the array of an input by its name.
+        known: Returns the array of an input by its name, or of a slot by its number.
         values: Values of the `ParameterProgram`.
         dtype: Kind of real numbers.
 
@@ -265,7 +265,7 @@ def evaluate_nodes(
         for node in dependencies(nodes):
             if node.op == "constant":
                 value = constant_value(node)
-            elif node.op == "input":
+            elif node.op in ("input", "slot"):
                 value = known(node.args[0])
             elif node.op == "number":
                 value = np.ravel(values[node.args[0]])[node.args[1]]

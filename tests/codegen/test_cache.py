@@ -101,25 +101,13 @@ def spoil(path: Path, how: str) -> None:
     changed = {
         "empty": b"",
         "cut in the hash": content[:20],
-        "cut": content[: len(content) // 2],
-        "one byte less": content[:-1],
         "one bit": content[:-1] + bytes([content[-1] ^ 1]),
-        "foreign": b"something else\n" * 100,
         "a pickle": b"cos\nsystem\n(S'exit 1'\ntR.",
     }
     path.write_bytes(changed[how])
 
 
-HOW = (
-    "empty",
-    "cut in the hash",
-    "cut",
-    "one byte less",
-    "one bit",
-    "foreign",
-    "a pickle",
-    "a folder",
-)
+HOW = ("empty", "cut in the hash", "one bit", "a pickle", "a folder")
 
 
 @pytest.mark.parametrize("how", HOW)

@@ -13,7 +13,7 @@ import math
 import queue
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -371,6 +371,8 @@ class ImageKernel(abc.ABC):
         TranslationError: There are no kernels for the images and their derivatives.
     """
 
+    passes_class: ClassVar[type]
+
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
         self.recording = PartitionedRecording(recording, Timing.of(params), method.is_event_driven)
         self.method, self.dtype = method, self.recording.dtype
@@ -379,6 +381,7 @@ class ImageKernel(abc.ABC):
         self._times = times - self.recording.origin
         self._arguments = method, recording, times, params
         self._turns = TurnLock(f"images of {recording.name}")
+        self._passes: dict[Directions, Any] = {}
         dead = params.without_gradient()
         numbers = [
             (leaf, k)
@@ -401,6 +404,23 @@ class ImageKernel(abc.ABC):
 
     def _key(self) -> tuple:
         return self.method, self.pixels, self.dtype.name
+
+    def passes_of(self, params: Any, directions: Directions = Directions()) -> Any:  # noqa: B008
+        """Return the passes for some derivatives, which go on with these parameters.
+
+        Args:
+            params: Parameters of the method.
+            directions: Numbers by which derivatives are taken.
+
+        Returns:
+            An object of `passes_class`.
+        """
+        if directions not in self._passes:
+            self._passes[directions] = self.passes_class(
+                self.recording, self.method, params, self.clock_offset, directions
+            )
+        self._passes[directions].use(params)
+        return self._passes[directions]
 
     @abc.abstractmethod
     def check(self, params: Any, directions: Directions) -> None:
@@ -450,28 +470,19 @@ class ImageKernel(abc.ABC):
 class FilterImages(ImageKernel):
     """Image kernel of a filter, which passes over the events."""
 
+    passes_class = FilterPasses
+
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self._passes: dict[Directions, FilterPasses] = {}
         super().__init__(method, recording, times, params)
         self._window = cut_window(self.recording, None, self.recording.windows.initial())
 
     def check(self, params: Any, directions: Directions) -> None:
-        passes = self._passes_of(params, Directions())
-        kind = passes.kind._replace(directions=directions)
+        kind = self.passes_of(params).kind._replace(directions=directions)
         fixed = self.recording.fixed_inputs(self.clock_offset)
         check_filter_kernel(self.method, params, fixed, kind)
 
-    def _passes_of(self, params: Any, directions: Directions) -> FilterPasses:
-        if directions not in self._passes:
-            self._passes[directions] = FilterPasses(
-                self.recording, self.method, params, self.clock_offset, directions
-            )
-        passes = self._passes[directions]
-        passes.use(params)
-        return passes
-
     def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
-        passes = self._passes_of(params, directions)
+        passes = self.passes_of(params, directions)
         passes.init(self._window)
         images = passes.image_buffers(len(times), self.pixels)
         passes.run(self._window, int(times[-1]) + 1 if len(times) else 0, times, images)
@@ -481,27 +492,19 @@ class FilterImages(ImageKernel):
 class SmootherImages(ImageKernel):
     """Image kernel of a smoother, which passes over all frames of a recording, band by band."""
 
+    passes_class = SmootherPasses
+
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self._passes: dict[Directions, SmootherPasses] = {}
         super().__init__(method, recording, times, params)
-        passes = self._passes_of(params, Directions())
+        passes = self.passes_of(params)
         self._whole = Segment(0, len(passes.clock))
         self._bands, _ = passes.partition(self._whole, self.recording.windows.initial())
 
     def check(self, params: Any, directions: Directions) -> None:
         SmootherPasses(self.recording, self.method, params, self.clock_offset, directions)
 
-    def _passes_of(self, params: Any, directions: Directions) -> SmootherPasses:
-        if directions not in self._passes:
-            self._passes[directions] = SmootherPasses(
-                self.recording, self.method, params, self.clock_offset, directions
-            )
-        passes = self._passes[directions]
-        passes.use(params)
-        return passes
-
     def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
-        passes = self._passes_of(params, directions)
+        passes = self.passes_of(params, directions)
         images, image_times = passes.image_buffers(len(times)), passes.image_times(times, 0)
         given = passes.inputs(self._whole, self._bands, np.zeros(passes.layout.bands, np.int64))
         run_over_rows(_smooth_bands, passes.layout.bands, passes, given, image_times, images)
