@@ -25,7 +25,7 @@ import jaxevent
 from jaxevent.blob import Tracker, Tracks, chi2, chi2_split, constant_velocity, moment
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Recording
-from jaxevent.show.track_pictures import track_colour, track_frames
+from jaxevent.show.track_figures import track_colour, track_frames
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
 DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}

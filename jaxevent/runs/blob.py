@@ -57,7 +57,7 @@ from jaxevent.runs.blob_positions import (
 from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
-from jaxevent.show.report import aligned, legend
+from jaxevent.show.tables import legend, results_table
 from jaxevent.splits import SPLITS, windows
 from jaxevent.tuning import Batches
 
@@ -185,7 +185,7 @@ class TrackGoal(Goal):
         if any("rmse" in row for row in rows):
             columns[1:1] = [("RMSE px", "rmse", 1, 3), ("median px", "median", 1, 3)]
             columns[3:3] = [("covered", "covered", 1, 3)]
-        return aligned(rows, columns) + legend(columns)
+        return results_table(rows, columns) + legend(columns)
 
     def _windows(
         self, sources: Sources, split: Shares, window: float | int | None

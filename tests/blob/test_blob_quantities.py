@@ -11,10 +11,10 @@ from PIL import Image
 from jaxevent import blob, simulate
 from jaxevent.blob import quantities
 from jaxevent.errors import InputError
-from jaxevent.show import track_pictures as pictures
-from jaxevent.show import track_plots
-from jaxevent.show.track_plots import write_track_plot
-from jaxevent.show.track_tables import COLUMNS, write_tracks
+from jaxevent.show import track_figures as pictures
+from jaxevent.show.images import video_writer
+from jaxevent.show.track_figures import write_track_plot
+from jaxevent.show.track_tables import COLUMNS, track_writer
 from jaxevent.simulate.blobs import CARS, blob_scene
 
 RNG = np.random.default_rng
@@ -377,6 +377,11 @@ def still(size=(120, 80)):
     return simulate.simulate_blobs([target], size, 1.0, seed=1)[0]
 
 
+def write_tracks(path, *arrays):
+    with track_writer(path) as write:
+        write(*arrays)
+
+
 @pytest.mark.parametrize("flat", [False, True])
 def test_csv_holds_every_living_row(tmp_path, flat):
     times, ids, mean, P, valid = tracks()
@@ -421,11 +426,13 @@ def test_tracks_that_cannot_be_written_are_named(tmp_path):
     with pytest.raises(InputError, match="do not fit"):
         write_tracks(tmp_path / "tracks.csv", times, ids * 1.0, mean, P, valid)
     with pytest.raises(InputError, match="not two of the tracks"):
-        write_track_plot(tmp_path / "a.png", still(), times, ids, mean, P, valid, pairs=[(3, 4)])
+        write_track_plot(
+            tmp_path / "a.png", still(), times, ids, mean, P, valid=valid, pairs=[(3, 4)]
+        )
     with pytest.raises(InputError, match="both the extent"):
-        write_track_plot(tmp_path / "a.png", still(), times, ids, mean, P, valid, extent=1.0)
+        write_track_plot(tmp_path / "a.png", still(), times, ids, mean, P, valid=valid, extent=1.0)
     with pytest.raises(InputError, match="file without suffix"):
-        write_track_plot(tmp_path / "a", still(), times, ids, mean, P, valid)
+        write_track_plot(tmp_path / "a", still(), times, ids, mean, P, valid=valid)
     with pytest.raises(InputError, match="not sorted"):
         list(pictures.track_frames(still(), times[::-1], ids, mean, valid))
     with pytest.raises(InputError, match="image 0 of 12 .* shape"):
@@ -511,7 +518,9 @@ def test_small_sensors_are_enlarged_in_a_video(tmp_path):
     imageio = pytest.importorskip("imageio_ffmpeg")
     times, ids, mean, _, valid = tracks()
     path = tmp_path / "tracks.mp4"
-    pictures.write_track_video(path, still(), times, ids, mean, valid)
+    with video_writer(path, 20) as write:
+        for picture in pictures.track_frames(still(), times, ids, mean, valid):
+            write(picture)
     # Not by the reader of imageio, which forks; JAX warns that this may deadlock.
     decode = [imageio.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
     decoded = subprocess.run(decode, capture_output=True, check=True)
@@ -525,9 +534,11 @@ def test_plots_are_written(tmp_path):
     pytest.importorskip("matplotlib")
     times, ids, mean, P, valid = tracks(T=12)
     given = still(), times, ids, mean, P
-    write_track_plot(tmp_path / "both.png", *given, valid, pairs=[(3, 17)], extent=0.2, focal=500.0)
+    write_track_plot(
+        tmp_path / "both.png", *given, valid=valid, pairs=[(3, 17)], extent=0.2, focal=500.0
+    )
     # None is valid: there is nothing to be shown over time.
-    write_track_plot(tmp_path / "none.png", *given, np.zeros_like(valid))
+    write_track_plot(tmp_path / "none.png", *given, valid=np.zeros_like(valid))
     sizes = []
     for name in ("both.png", "none.png"):
         with Image.open(tmp_path / name) as image:
@@ -550,21 +561,23 @@ def test_what_comes_nearer_grows_along_both_axes():
     valid[:, 5] = False
     sizes = np.concatenate([sizes, np.ones((50, 1, 2))], 1)
     few = np.zeros_like(sizes)
-    told = track_plots._scales(sizes, few, valid)
+    told = pictures._changes_scale(sizes, few, valid)
     assert told.tolist() == [True, True, False, False, False, False]
     flickers = np.exp(0.3 * np.sin(20 * t))[:, None, None] * 5 * np.ones((1, 1, 2))
     swells = np.exp(np.clip(4 - 20 * abs(t - 0.5), 0, 1))[:, None, None] * 5 * np.ones((1, 1, 2))
     tiny = sizes[:, :2] / 3
     for one in (flickers, swells, tiny):
-        assert not track_plots._scales(one, few[:, : one.shape[1]], valid[:, : one.shape[1]]).any()
+        assert not pictures._changes_scale(
+            one, few[:, : one.shape[1]], valid[:, : one.shape[1]]
+        ).any()
     # From the first to the last eighth both sizes grow by exp(0.44): of errors of 10 % of each at
     # both ends this is 4.4 standard deviations, of 30 % it is 1.5.
     for error, clear in ((0.1, True), (0.3, False)):
         variances = (error * sizes[:, :1]) ** 2
-        assert track_plots._scales(sizes[:, :1], variances, valid[:, :1]) == [clear]
+        assert pictures._changes_scale(sizes[:, :1], variances, valid[:, :1]) == [clear]
 
 
 def test_panels_hold_the_tracks_that_are_seen_longest():
     valid = np.arange(10)[:, None] >= np.arange(8)
-    shown = track_plots._longest(valid, [7])
+    shown = pictures._choose_longest(valid, [7])
     assert shown.tolist() == [True] * 6 + [False, True]

@@ -10,12 +10,12 @@ from noise import HEIGHT, WIDTH, small
 import jaxevent
 from jaxevent import events, show
 from jaxevent.blob.states import TrackStates
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import MissingExtra
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events
-from jaxevent.show import notebook
+from jaxevent.show import figures
 from jaxevent.tuning import FitResult
 
 
@@ -47,11 +47,11 @@ class Video(ImageSequence):
         yield times, Estimate(image, image * 0 + 0.04, image > 1)
 
 
-def motion() -> Motion:
+def motion() -> MotionEstimate:
     n = 20
     mean = np.stack([np.linspace(-5, 5, n), np.full(n, 2.0)], 1)
     covariance = np.broadcast_to(np.eye(2) * 0.25, (n, 2, 2))
-    return Motion.of("planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3)
+    return MotionEstimate.of("planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3)
 
 
 def test_events_are_drawn_where_they_are():
@@ -124,10 +124,10 @@ def test_notebooks_show_a_table_and_a_picture(monkeypatch):
     for title, thing in titles.items():
         shown = thing._repr_html_()
         assert title in shown and "data:image/png;base64," in shown
-    assert notebook.as_html(3) == "<pre>3</pre>"
-    assert "&lt;b&gt;" in notebook.as_html(dataclasses.replace(small(), name="<b>"))
+    assert figures.as_html(3) == "<pre>3</pre>"
+    assert "&lt;b&gt;" in figures.as_html(dataclasses.replace(small(), name="<b>"))
     assert show.plot_events(small())._repr_png_().startswith(b"\x89PNG")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert "pip install" in notebook.as_html(small()) and "img" not in notebook.as_html(small())
+    assert "pip install" in figures.as_html(small()) and "img" not in figures.as_html(small())
     with pytest.raises(MissingExtra):
         show.plot_events(small())
