@@ -429,9 +429,9 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         )
     notes = list(found.unit.notes)
     events = StoredEvents(columns, size, source, found, offset=offset, ms_to_idx=table)
-    clock = Clock("us", 0, 0, False) if states_unit else events.clock()
 
     def stored_times(name: str, what: str) -> NDArray[np.int64]:
+        clock = Clock("us", 0, 0, False) if states_unit else events.clock()
         return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
 
     def arrays(group: str, *names: str) -> list[NDArray]:
