@@ -22,6 +22,7 @@ from jaxevent.egomotion.truth import (
     find_imu_axes,
     fit_gyro_bias,
     from_poses,
+    known_motion,
 )
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
@@ -425,7 +426,7 @@ class WrittenMotion:
                 if unknown.any():
                     lines.append(
                         f"translation is not observable {100 * unknown.mean():.0f} % of the time: "
-                        f"rotation alone explains the events, and the {part.name} is not told"
+                        f"rotation alone explains the events, and the {part.name} is unknown"
                     )
         if self.outliers is not None:
             lines.append(
