@@ -12,5 +12,7 @@ def refuses(message: str, function: Callable[..., Any], *arguments: Any, **optio
     """Check that a call raises an `InputError` of one line that matches; return its text."""
     with pytest.raises(InputError, match=message) as error:
         function(*arguments, **options)
-    assert "\n" not in str(error.value)
-    return str(error.value)
+    text = str(error.value)
+    del error  # its traceback would keep files open
+    assert "\n" not in text
+    return text

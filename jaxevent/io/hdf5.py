@@ -79,53 +79,34 @@ from jaxevent.recording import (
 
 VERSION = 1
 _LEVELS_UNIT = "levels: 0 black, {most} white"  # of images
-_UNITS = {
-    "t_offset": CLOCK_UNIT,
-    "events/t": "us since t_offset",
-    "events/x": "px",
-    "events/y": "px",
-    "events/p": "1 ON, 0 OFF",
-    "ms_to_idx": "rows of events",
-    "frames/t": CLOCK_UNIT,
-    "frames/exposure": "us",
-    "camera": "px (fx, fy, cx, cy), 1 (of the lens)",
-    "poses/t": CLOCK_UNIT,
-    "poses/position": "m",
-    "poses/quaternion": "1",
-    "imu/t": CLOCK_UNIT,
-    "imu/gyro": "rad/s",
-    "imu/acc": "m/s^2",
-    "triggers/t": CLOCK_UNIT,
-    "triggers/edge": "1 rising, 0 falling, -1 unknown",
-    "triggers/channel": "1",
-    # Of the simulators and of `register`. What further arrays mean is not known here.
-    "extra/hdr": "linear intensity: 0 is the frames' black, 1 their white",
-    "extra/hdr_t": CLOCK_UNIT,
-    "extra/response": "intensity of grey values from 0 to 1",
-    "extra/certainty": "1, of grey values from 0 to 1",
-    "extra/clip": "intensity",
-    "extra/gain": "1",
-    "extra/hot": "1",
-    "extra/covered": "1",
-    "extra/homography": "px to px",
-    "extra/register_offset": "s",
-    "extra/c_on": "ln I",
-    "extra/c_off": "ln I",
-    "extra/mismatch": "1",
-    "extra/dark_offset": "intensity",
-    "extra/refractory": "s",
-    "extra/background_rate": "Hz",
-    "extra/white": "linear light of the video, 1 its white",
-    "extra/cut": "levels: 0 black, 255 white",
-    "extra/read_noise": "levels: 0 black, 255 white",
-    "extra/clock_offset": "s",
-    "extra/depth": "m",
-    "extra/depth_t": CLOCK_UNIT,
-    "extra/mask": "1000 times the number of the object",
-    "extra/mask_t": CLOCK_UNIT,
-    "extra/flow": "px",
-    "extra/flow_t": CLOCK_UNIT,
+# Names of datasets by their unit. The units of further arrays are not known here.
+_NAMES_OF_UNITS: dict[str, str] = {
+    CLOCK_UNIT: "t_offset frames/t poses/t imu/t triggers/t extra/hdr_t extra/depth_t extra/mask_t "
+    "extra/flow_t",
+    "us since t_offset": "events/t",
+    "px": "events/x events/y extra/flow",
+    "1 ON, 0 OFF": "events/p",
+    "rows of events": "ms_to_idx",
+    "us": "frames/exposure",
+    "px (fx, fy, cx, cy), 1 (of the lens)": "camera",
+    "m": "poses/position extra/depth",
+    "1": "poses/quaternion triggers/channel extra/gain extra/hot extra/covered extra/mismatch",
+    "rad/s": "imu/gyro",
+    "m/s^2": "imu/acc",
+    "1 rising, 0 falling, -1 unknown": "triggers/edge",
+    "linear intensity: 0 is the frames' black, 1 their white": "extra/hdr",
+    "intensity of grey values from 0 to 1": "extra/response",
+    "1, of grey values from 0 to 1": "extra/certainty",
+    "intensity": "extra/clip extra/dark_offset",
+    "px to px": "extra/homography",
+    "s": "extra/register_offset extra/refractory extra/clock_offset",
+    "ln I": "extra/c_on extra/c_off",
+    "Hz": "extra/background_rate",
+    "linear light of the video, 1 its white": "extra/white",
+    "levels: 0 black, 255 white": "extra/cut extra/read_noise",
+    "1000 times the number of the object": "extra/mask",
 }
+_UNITS = {name: unit for unit, names in _NAMES_OF_UNITS.items() for name in names.split()}
 _BLOSC_FILTER = 32001
 _BLOCK = 1 << 20  # events copied at a time: 13 MB
 _CHUNK = 1 << 16  # values compressed together
@@ -448,9 +429,9 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         )
     notes = list(found.unit.notes)
     events = StoredEvents(columns, size, source, found, offset=offset, ms_to_idx=table)
-    clock = Clock("us", 0, 0, False) if states_unit else events.clock()
 
     def stored_times(name: str, what: str) -> NDArray[np.int64]:
+        clock = Clock("us", 0, 0, False) if states_unit else events.clock()
         return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
 
     def arrays(group: str, *names: str) -> list[NDArray]:

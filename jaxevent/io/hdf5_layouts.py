@@ -232,11 +232,11 @@ def _read_mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Reco
     size = sensor_size(otherwise, options.size, image_size(images))
     found = infer_column_format(columns, size, source, options, usual="s")
     events = StoredEvents(columns, size, source, found)
-    notes, clock = list(found.unit.notes), events.clock()
+    notes = list(found.unit.notes)
 
     def stored_times(name: str, what: str) -> NDArray[np.int64]:
         name = f"{group}/{name}"
-        return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
+        return events.clock().read(array(file, name, source), f"{source}: {name}", what, notes)
 
     frames = imu = None
     if images is not None:

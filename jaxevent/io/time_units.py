@@ -274,7 +274,7 @@ class _Numbers(NamedTuple):
         return self.is_float and (self.digits is None or self.digits > 0)
 
     def rate(self, unit: str) -> float:
-        """Events per pixel and second."""
+        """Return the number of events per pixel and second."""
         return self.count / (self.pixels * self.span * SCALES[unit] * 1e-6)
 
     def describe(self, unit: str) -> str:

@@ -223,7 +223,7 @@ def test_what_another_process_writes_is_refused(folder, capsys):
 def test_a_fit_has_its_folder_alone(folder, capsys):
     config = write_config(folder, ONE.replace("small.h5", "source.h5") + 'fit = ["I0"]\n')
     (folder / "fitted").mkdir()
-    with results.alone(folder / "fitted"):
+    with results.lock_folder(folder / "fitted"):
         for more in ([], ["--resume"], ["--force"]):
             argv = ["fit", config, "--out", "fitted", *more]
             fails(capsys, argv, "fitted: another process writes there")

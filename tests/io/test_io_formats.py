@@ -162,7 +162,7 @@ for path in sys.argv[1:]:
     print(peak)
 """
     names = ["evt2", "evt3", "dat", "es-atis", "aedat2", "aedat4", "npy", "csv"]
-    sizes = [(name, count) for name in names for count in (4_000, 16_000)]
+    sizes = [(name, count) for name in names for count in (3_000, 9_000)]
     paths = [
         write(tmp_path / f"{name}{n}", name, formats.events_of(0, n, SIZE, 20 * n))
         for name, n in sizes
@@ -172,7 +172,7 @@ for path in sys.argv[1:]:
     )
     peaks = dict(zip(sizes, map(int, done.stdout.split()), strict=True))
     for name in names:
-        growth = (peaks[name, 16_000] - peaks[name, 4_000]) / 12_000
+        growth = (peaks[name, 9_000] - peaks[name, 3_000]) / 6_000
         assert growth < 4, (name, growth)  # bytes an event, of 13
 
 
