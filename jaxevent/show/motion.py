@@ -72,6 +72,7 @@ def write_known(
 
 
 def _write_csv(path: str | Path, columns: Mapping[str, Any]) -> None:
+    """Write columns as CSV."""
     with complete(Path(path)) as partial:
         pd.DataFrame(dict(columns)).to_csv(partial, index=False)
 
@@ -137,6 +138,7 @@ def write_errors(folder: Path, errors: Comparison) -> None:
 
 
 def _plain(value: float) -> float | None:
+    """Return a number for JSON, None if it is not finite."""
     return value if math.isfinite(value) else None
 
 
@@ -381,6 +383,7 @@ class WrittenMotion:
         return f"{number:,} {plural('estimate', number)}"
 
     def _describe_motion(self) -> list[str]:
+        """Return lines about when the motion was found, its components and errors."""
         lost = ~self.estimated.valid
         first = np.flatnonzero(~lost)
         if not len(first):

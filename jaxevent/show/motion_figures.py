@@ -163,6 +163,7 @@ def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDAr
 
 
 def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
+    """Draw some of the particles of a component."""
     cloud = motion.cloud
     if cloud is None or not len(cloud):
         return
@@ -295,6 +296,7 @@ def warped_events(
 
 
 def _centre(recording: Recording) -> NDArray[np.float64]:
+    """Return the principal point, or the middle of the sensor, px."""
     camera = recording.camera
     if camera is None:
         return np.array([(recording.width - 1) / 2, (recording.height - 1) / 2])
@@ -371,6 +373,7 @@ def _padded(array: NDArray) -> NDArray:
 
 @functools.partial(jax.jit, static_argnums=2)
 def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Sum weights at places (n, 2) px in an image; return it and its contrast."""
     image = splat(xy, weight, shape)
     return image, contrast(blur(image, 1))
 
