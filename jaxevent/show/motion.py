@@ -14,11 +14,16 @@ from numpy.typing import NDArray
 
 from jaxevent.display import plural
 from jaxevent.egomotion import flow as event_flow
-from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.motion import Motion, decided, table_columns
-from jaxevent.egomotion.truth import Known, known
-from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
+from jaxevent.egomotion.motion import MotionEstimate, is_observable, table_columns
+from jaxevent.egomotion.scores import MotionScores, score_motion
+from jaxevent.egomotion.truth import (
+    KnownMotion,
+    find_imu_axes,
+    fit_gyro_bias,
+    from_poses,
+    known_motion,
+)
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
@@ -79,7 +84,7 @@ def _write_csv(path: str | Path, columns: Mapping[str, Any]) -> None:
 
 def write_motion(
     path: str | Path,
-    motion: Motion,
+    motion: MotionEstimate,
     about: Mapping[str, Any] | None = None,
     method: str | None = None,
     params: Parameters | None = None,
@@ -123,7 +128,7 @@ def write_motion(
                 file[name].attrs["units"] = motion.model.units
 
 
-def write_errors(folder: Path, errors: Comparison) -> None:
+def write_errors(folder: Path, errors: MotionScores) -> None:
     """Write errors.csv (figure, value, unit) and errors.json into a folder."""
     rows = errors.rows()
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
@@ -142,11 +147,13 @@ def _plain(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.02) -> Known:
+def fitted_velocity(
+    recording: Recording, motion: MotionEstimate, span: float | int = 0.02
+) -> KnownMotion:
     """Return the motion from poses at the one depth that fits an estimate.
 
     The depth is not observable from poses. So only directions of an image velocity, and changes of
-    its speed, are compared with a truth. See `Model.at_one_depth`.
+    its speed, are compared with a truth. See `Model.from_twists_at_fitted_depth`.
 
     Args:
         recording: Recording with poses and calibration.
@@ -168,18 +175,20 @@ def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.
     f = math.sqrt(recording.camera.fx * recording.camera.fy)
     mean, _, valid = motion(twists.t, extrapolate=True)
     mean = np.where(valid[:, None], mean, np.nan)
-    return Known(model, twists.t, model.at_one_depth(twists, f, mean))
+    return KnownMotion(model, twists.t, model.from_twists_at_fitted_depth(twists, f, mean))
 
 
 class Truth(NamedTuple):
     """A known motion, its source in words, and further lines about it."""
 
-    known: Known
+    known: KnownMotion
     words: str
     notes: tuple[str, ...] = ()
 
 
-def measured_rotation(truth: Known, motion: Motion, unbiased: bool, turned: bool) -> Truth:
+def measured_rotation(
+    truth: KnownMotion, motion: MotionEstimate, unbiased: bool, turned: bool
+) -> Truth:
     """Prepare the angular velocity of a gyro for the comparison with an estimate.
 
     Without a known bias the constant that fits the estimate is subtracted. Without a known rotation
@@ -197,14 +206,14 @@ def measured_rotation(truth: Known, motion: Motion, unbiased: bool, turned: bool
     if not rows.any():
         return Truth(truth, words)
     estimate, measured = estimated.mean[rows], truth.values[rows]
-    axes = None if turned else nearest_axes(estimate, measured)
+    axes = None if turned else find_imu_axes(estimate, measured)
     if axes is not None:
         notes.append(
             f"the gyro is like the estimate in other axes: give --imu-rotation {axes} if they are "
             "its own"
         )
     elif not unbiased:
-        bias = constant_between(estimate, measured)
+        bias = fit_gyro_bias(estimate, measured)
         words = "the gyro without its bias"
         notes.append(
             f"a constant of {', '.join(f'{v:+.3f}' for v in bias)} rad/s was taken off the gyro: "
@@ -224,7 +233,7 @@ class Output:
     - motion.h5: the estimates as they were made, see `write_motion`;
     - motion.png: the components over time, see `motion_figure`;
     - warped.png: the events of a short window before and after warping along the motion;
-    - errors.csv and errors.json, with a truth: see `Comparison`;
+    - errors.csv and errors.json, with a truth: see `MotionScores`;
     - flow.h5 and flow.png, if `flow` is set: t (us), u, v (px/s) and valid of each event, and the
       window's events in colours of their flow.
 
@@ -256,7 +265,7 @@ class Output:
         bias: NDArray[np.float64] | None = None,
         rotation: NDArray[np.float64] | None = None,
         depth: float | int | None = None,
-    ) -> Callable[[Motion], Truth] | None:
+    ) -> Callable[[MotionEstimate], Truth] | None:
         """Return a function from the estimated motion to its truth; None without a truth.
 
         A gyro is used if there are no poses, see `measured_rotation`.
@@ -275,16 +284,18 @@ class Output:
             return None
         model = find_model(model)
         if self.truth != "auto":
-            table = Truth(known(recording, model, self.truth), str(self.truth))
+            table = Truth(known_motion(recording, model, self.truth), str(self.truth))
             return lambda motion: table
         if depth is not None:
-            at = Truth(known(recording, model, depth=depth), f"poses at the depth {depth:g} m")
+            at = Truth(
+                known_motion(recording, model, depth=depth), f"poses at the depth {depth:g} m"
+            )
             return lambda motion: at
         if model.fits_depth and recording.poses is not None and recording.camera is not None:
             words = "poses at one fitted depth"
             return lambda motion: Truth(fitted_velocity(recording, motion), words)
         zero = np.zeros(3) if bias is None else bias
-        truth = known(recording, model, "auto", zero, rotation=rotation)
+        truth = known_motion(recording, model, "auto", zero, rotation=rotation)
         if recording.poses is not None:
             return lambda motion: Truth(truth, "poses")
         return lambda motion: measured_rotation(
@@ -294,9 +305,9 @@ class Output:
     def write(
         self,
         recording: Recording,
-        motion: Motion,
+        motion: MotionEstimate,
         about: Mapping[str, Any] = MappingProxyType({}),
-        truth: Callable[[Motion], Truth] | None = None,
+        truth: Callable[[MotionEstimate], Truth] | None = None,
         *,
         progress: bool | None = None,
         method: str | None = None,
@@ -322,8 +333,8 @@ class Output:
         true = None if truth is None else truth(motion)
         errors = None
         if true is not None:
-            errors = compare(
-                motion, true.known, times, start=start, centred=self.centred, named=true.words
+            errors = score_motion(
+                motion, true.known, times, start=start, centred=self.centred, description=true.words
             )
             errors = dataclasses.replace(errors, notes=true.notes)
         outliers = None
@@ -347,7 +358,7 @@ class Output:
             files = sorted(path.name for path in folder.iterdir())
         return WrittenMotion(files, times, estimated, motion, errors, outliers, left_out)
 
-    def _draw_window(self, folder: Path, recording: Recording, motion: Motion) -> None:
+    def _draw_window(self, folder: Path, recording: Recording, motion: MotionEstimate) -> None:
         """Draw the events of a short window before and after warping, and in colours of flow."""
         part = window_of(recording, motion)
         flows = None
@@ -365,8 +376,8 @@ class WrittenMotion:
     files: list[str]
     times: NDArray[np.int64]
     estimated: Estimate
-    motion: Motion
-    errors: Comparison | None
+    motion: MotionEstimate
+    errors: MotionScores | None
     outliers: float | None  # percentage of events, where flow was asked for
     left_out: str | None = None  # the reason why there are no figures
 
@@ -379,7 +390,7 @@ class WrittenMotion:
 
     def _count(self) -> str:
         """Count the estimates, without those that are held."""
-        number = len(self.motion) - self.motion.held
+        number = len(self.motion) - self.motion.n_extended
         return f"{number:,} {plural('estimate', number)}"
 
     def _describe_motion(self) -> list[str]:
@@ -401,7 +412,7 @@ class WrittenMotion:
         sigma = np.sqrt(np.diagonal(self.estimated.covariance[first], axis1=1, axis2=2).clip(0))
         cells = [["", "mean", "least", "most", "sigma", ""]]
         model = self.motion.model
-        observable = decided(model, self.estimated.covariance[first])
+        observable = is_observable(model, self.estimated.covariance[first])
         for i, (name, unit) in enumerate(zip(model.components, model.units, strict=True)):
             column = mean[observable[:, i], i]
             numbers = (column.mean(), column.min(), column.max()) if len(column) else ()
@@ -429,7 +440,9 @@ class WrittenMotion:
         return lines
 
 
-def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool | None) -> float:
+def _write_flow(
+    path: Path, recording: Recording, motion: MotionEstimate, progress: bool | None
+) -> float:
     """Write the flow of all events, and return the percentage of outliers."""
     over = known_count = row = 0
     total = len(recording.events)

@@ -15,13 +15,13 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import flow as event_flow
-from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.flow import Flow
+from jaxevent.egomotion.geometry import blur, image_variance, splat
 from jaxevent.egomotion.models import Model, Numeric
-from jaxevent.egomotion.motion import Motion, decided
+from jaxevent.egomotion.motion import MotionEstimate, is_observable
 from jaxevent.egomotion.scores import axis_error, endpoint_error
-from jaxevent.egomotion.truth import Known
-from jaxevent.egomotion.warped import blur, contrast, splat
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Events, Recording
 from jaxevent.show.images import new_figure, save_figure
@@ -35,7 +35,11 @@ _TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
 
 
 def motion_figure(
-    motion: Motion, times: NDArray[np.int64], truth: Known | None = None, *, centred: bool = False
+    motion: MotionEstimate,
+    times: NDArray[np.int64],
+    truth: KnownMotion | None = None,
+    *,
+    centred: bool = False,
 ) -> Any:
     """Draw the components over times, against the truth and with errors where it is known.
 
@@ -58,7 +62,9 @@ def motion_figure(
     estimated = motion(times, centred=centred)
     model, seconds = motion.model, times * 1e-6
     errors = _errors(model, times, estimated, truth)
-    trust = np.where(estimated.valid[:, None] & decided(model, estimated.covariance), 1.0, np.nan)
+    trust = np.where(
+        estimated.valid[:, None] & is_observable(model, estimated.covariance), 1.0, np.nan
+    )
     extra = errors or _contrasts(motion, times)
     sizes = [len(model.components[part.rows]) for part in model.parts]
     rows, columns = max(sizes), len(sizes)  # a column for each part
@@ -81,7 +87,7 @@ def motion_figure(
         seen = [band[np.isfinite(band)] for band in (low, value, high)]
         seen = [np.percentile(band, [2, 98]) for band in seen if len(band)]
         if truth is not None:
-            inside = truth.within(times)
+            inside = truth.covers(times)
             true = truth(times[inside])[:, i]
             axis.plot(seconds[inside], true, color=_TRUE, lw=1.0, ls="--", label="truth")
             seen.append(true)
@@ -125,12 +131,12 @@ def motion_figure(
 
 
 def _errors(
-    model: type[Model], times: NDArray[np.int64], estimated: Estimate, truth: Known | None
+    model: type[Model], times: NDArray[np.int64], estimated: Estimate, truth: KnownMotion | None
 ) -> list[tuple[str, NDArray[np.float64]]]:
     """Compute errors over time, with the labels of their axes."""
     if truth is None:
         return []
-    inside = truth.within(times) & estimated.valid
+    inside = truth.covers(times) & estimated.valid
     if not inside.any():
         return []
     true, mean = truth(times[inside]), estimated.mean[inside]
@@ -154,7 +160,9 @@ def _errors(
     return errors
 
 
-def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDArray[np.float64]]]:
+def _contrasts(
+    motion: MotionEstimate, times: NDArray[np.int64]
+) -> list[tuple[str, NDArray[np.float64]]]:
     """Return the contrast of the events or the share explained, where there is no truth."""
     for label, values in (("contrast", motion.contrast), ("events explained", motion.agreement)):
         if values is not None and np.isfinite(values).any():
@@ -162,7 +170,7 @@ def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDAr
     return []
 
 
-def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
+def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> None:
     """Draw some of the particles of a component."""
     cloud = motion.cloud
     if cloud is None or not len(cloud):
@@ -211,7 +219,7 @@ def span_of(recording: Recording) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def window_of(recording: Recording, motion: Motion) -> Window:
+def window_of(recording: Recording, motion: MotionEstimate) -> Window:
     """Choose a window of 20 to 500 ms in the middle of the recording, or where motion is found.
 
     The image moves by 8 px in it, at the median speed over the sensor. Events beyond the first half
@@ -225,7 +233,7 @@ def window_of(recording: Recording, motion: Motion) -> Window:
     estimated = motion(middle, extrapolate=True)
     span = _DEFAULT_WINDOW_S
     if estimated.valid[0] and np.isfinite(estimated.mean).all():
-        xi, f = coordinates(recording.width, recording.height, recording.camera)
+        xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
         xi = xi[::8, ::8].reshape(-1, 2)
         U = _linear_flow(
             motion.model(f), xi, np.broadcast_to(estimated.mean, (len(xi), estimated.mean.shape[1]))
@@ -239,7 +247,7 @@ def window_of(recording: Recording, motion: Motion) -> Window:
     return Window(begin, end, middle)
 
 
-def flow_of(recording: Recording, motion: Motion, part: Window) -> Flow:
+def flow_of(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
     """Estimate the flow of a window's events, with those of 100 ms before as candidates."""
     if part.start == part.stop:
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
@@ -254,7 +262,7 @@ def flow_of(recording: Recording, motion: Motion, part: Window) -> Flow:
 
 def warped_events(
     recording: Recording,
-    motion: Motion,
+    motion: MotionEstimate,
     events: Events,
     reference: int,
     moved: NDArray[np.floating] | None = None,
@@ -272,7 +280,7 @@ def warped_events(
         (n, 2) px, columns and rows: pixels, or with a calibration undistorted coordinates about the
         principal point.
     """
-    xi, f = coordinates(recording.width, recording.height, recording.camera)
+    xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     xy = xi[events.y, events.x]
     since = (events.t - reference) * 1e-6
     # The motion is smooth: its integral on a grid of 1 ms or less.
@@ -306,7 +314,7 @@ def _centre(recording: Recording) -> NDArray[np.float64]:
 def plot_warped(
     path: str | Path,
     recording: Recording,
-    motion: Motion,
+    motion: MotionEstimate,
     part: Window | None = None,
     flows: Flow | None = None,
 ) -> None:
@@ -330,10 +338,10 @@ def plot_warped(
         flows = flows or flow_of(recording, motion, part)
         keep = flows.valid
         events = Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep])
-        xi, f = coordinates(recording.width, recording.height, recording.camera)
+        xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
         mean = motion(events.t, centred=True, extrapolate=True).mean
         moved = flows.flow[keep] - _linear_flow(motion.model(f), xi[events.y, events.x], mean)
-    xi, _ = coordinates(recording.width, recording.height, recording.camera)
+    xi, _ = pixel_coordinates(recording.width, recording.height, recording.camera)
     shape = recording.height, recording.width
     sign = np.where(events.p, 1.0, -1.0)
     places = (
@@ -375,7 +383,7 @@ def _padded(array: NDArray) -> NDArray:
 def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Sum weights at places (n, 2) px in an image; return it and its contrast."""
     image = splat(xy, weight, shape)
-    return image, contrast(blur(image, 1))
+    return image, image_variance(blur(image, 1))
 
 
 def _linear_flow(
