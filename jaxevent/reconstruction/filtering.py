@@ -22,8 +22,12 @@ from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.devices import loop_unroll
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.engine.images import DividedEvents, prepared_by_kernel
-from jaxevent.reconstruction.engine.video import FusedVideo, video_by_kernel
+from jaxevent.reconstruction.engine.images import (
+    FilterImages,
+    FilterVideo,
+    images_from_kernel,
+    video_from_kernel,
+)
 from jaxevent.reconstruction.estimator import P, PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
     SHAPES,
@@ -168,7 +172,7 @@ class Filter(PixelEstimator[P]):
         """
         self.check_options(**options)
         params = self.Params() if params is None else params
-        fused = video_by_kernel(FusedVideo, self, recording, params, compiler, options)
+        fused = video_from_kernel(FilterVideo, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused
 
     def prepare_images(
@@ -189,8 +193,8 @@ class Filter(PixelEstimator[P]):
         `compiler` is as in `estimate`.
         """
         params = self.Params() if params is None else params
-        fused = prepared_by_kernel(
-            DividedEvents, self, recording, times, params, extrapolate, compiler
+        fused = images_from_kernel(
+            FilterImages, self, recording, times, params, extrapolate=extrapolate, compiler=compiler
         )
         if fused is not None:
             return fused

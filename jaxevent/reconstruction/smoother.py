@@ -46,10 +46,12 @@ from jaxevent.reconstruction.augment import (
     segment_excess,
     unclipped_weight,
 )
-from jaxevent.reconstruction.engine.images import prepared_by_kernel
-from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
-from jaxevent.reconstruction.engine.smoothed_images import DividedFrames
-from jaxevent.reconstruction.engine.video import video_by_kernel
+from jaxevent.reconstruction.engine.images import (
+    SmootherImages,
+    SmootherVideo,
+    images_from_kernel,
+    video_from_kernel,
+)
 from jaxevent.reconstruction.estimator import PixelEstimator, PreparedImages
 from jaxevent.reconstruction.features import (
     Features,
@@ -519,7 +521,7 @@ class Smoother(PixelEstimator[Params]):
         return np.stack([message.h, message.J])
 
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
-        """What `run` and `read` do at one pixel, for kernels (`engine.smoothing`).
+        """What `run` and `read` do at one pixel, for kernels (`engine.smoother_program`).
 
         Functions of parameters, what is known with them, and numbers that kernels keep by name.
         """
@@ -608,7 +610,7 @@ class Smoother(PixelEstimator[Params]):
         """
         self.check_options(**options)
         params = self.Params() if params is None else params
-        fused = video_by_kernel(SmoothedVideo, self, recording, params, compiler, options)
+        fused = video_from_kernel(SmootherVideo, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused
 
     def prepare_images(
@@ -622,8 +624,14 @@ class Smoother(PixelEstimator[Params]):
     ) -> PreparedImages:
         """As `Filter.prepare_images`."""
         params = self.Params() if params is None else params
-        fused = prepared_by_kernel(
-            DividedFrames, self, recording, times, params, extrapolate, compiler
+        fused = images_from_kernel(
+            SmootherImages,
+            self,
+            recording,
+            times,
+            params,
+            extrapolate=extrapolate,
+            compiler=compiler,
         )
         if fused is not None:
             return fused

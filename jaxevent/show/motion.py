@@ -429,7 +429,7 @@ class WrittenMotion:
                 if unknown.any():
                     lines.append(
                         f"translation is not observable {100 * unknown.mean():.0f} % of the time: "
-                        f"rotation alone explains the events, and the {part.name} is not told"
+                        f"rotation alone explains the events, and the {part.name} is unknown"
                     )
         if self.outliers is not None:
             lines.append(

@@ -190,7 +190,7 @@ def program_of(
         ),
     }  # fmt: skip
     made = {
-        name: translate_function(function, params, values, graph, host, alone)
+        name: translate_function(function, params, values, graph, host, single=alone)
         for name, (function, values, alone) in functions.items()
     }
     layout = _layout({"slot": slot, "ahead": looked, "now": now})
