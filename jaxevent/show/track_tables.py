@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.blob.tables import COLUMNS, TABLE_UNITS, UNITS, table_columns
+from jaxevent.blob.tracks import COLUMNS, TABLE_UNITS, UNITS, table_columns
 from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.parameters import Parameters

@@ -15,9 +15,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
-from jaxevent.blob.states import TrackStates
-from jaxevent.blob.tables import TABLE_RATE, evenly
-from jaxevent.blob.tracks import Tracks
+from jaxevent.blob.track import TrackStates
+from jaxevent.blob.tracks import TABLE_RATE, Tracks, evenly_spaced_times
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.io.output import check_writable, complete
 from jaxevent.progress import bar
@@ -162,12 +161,16 @@ class Output:
         """Write files by kind; states are read once for all of them."""
         duration = (tracks.stop - tracks.start) * 1e-6
         rate = TABLE_RATE if self.rate is None else float(self.rate)
-        coarse = evenly(tracks.start, tracks.stop, min(rate, _MAX_TIMES / duration))
+        coarse = evenly_spaced_times(tracks.start, tracks.stop, min(rate, _MAX_TIMES / duration))
         often = min(max(_MAX_FPS, _MIN_PICTURES / duration), max(rate, _MAX_FPS))
-        pictures = evenly(tracks.start, tracks.stop, often) if ".mp4" in places else coarse[:0]
+        pictures = (
+            evenly_spaced_times(tracks.start, tracks.stop, often)
+            if ".mp4" in places
+            else coarse[:0]
+        )
         tables = [path for kind, path in places.items() if kind in (".csv", ".h5", ".hdf5")]
         times = (
-            evenly(tracks.start, tracks.stop, rate)
+            evenly_spaced_times(tracks.start, tracks.stop, rate)
             if tables and self.rate is not None
             else coarse[:0]
         )

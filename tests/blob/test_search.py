@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 from jaxevent import blob
+from jaxevent.blob.filter import EventBatch
 from jaxevent.blob.search.background import (
     clutter_evidence,
     find_hot_lines,
@@ -35,8 +36,7 @@ from jaxevent.blob.search.search import (
     max_events_per_step,
 )
 from jaxevent.blob.search.stream import Stream
-from jaxevent.blob.steps import Batch
-from jaxevent.blob.targets import Slots, look_ahead
+from jaxevent.blob.track import StepEvents, TrackBuffer, predict_and_gate
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.recording import Events, Recording
@@ -475,16 +475,16 @@ def test_events_near_two_paths_are_taken_by_no_third_target():
     params, filter = blob.moment.Params(), blob.moment.filter
     xi = jnp.array([[20.0, 20], [20, 21], [21, 20], [90, 90], [90, 90]])
     owner = jnp.array([[0, 1], [1, 2], [2, NO_OWNER], [0, NO_OWNER], [0, 1]])
-    batch = Batch(xi, jnp.zeros(5), jnp.ones(5))
-    state = filter.start(params, jnp.array([20.0, 20]), jnp.array(5.0))
+    batch = EventBatch(xi, jnp.zeros(5), jnp.ones(5))
+    state = filter.init(params, jnp.array([20.0, 20]), jnp.array(5.0))
     zero = jnp.zeros((), jnp.int32)
     inside = []
     for k in range(3):
-        slot = Slots(
+        slot = TrackBuffer(
             state, jnp.array(20.0), jnp.array(0.0), zero, zero, zero, zero, zero + k, zero == 0, {}
         )
-        ahead = look_ahead(filter, params, slot, zero + 1, zero, batch, jnp.ones(5, bool), owner)
-        inside.append(ahead.inside)
+        events = StepEvents(zero, batch, jnp.ones(5, bool), owner)
+        inside.append(predict_and_gate(filter, params, slot, zero + 1, events).inside)
     # Of one path alone even what its filter does not expect there; of two only what it does.
     assert np.array_equal(inside, [[1, 0, 0, 1, 0], [1, 1, 0, 0, 0], [0, 1, 1, 0, 0]])
 

@@ -9,7 +9,7 @@ from noise import HEIGHT, WIDTH, small
 
 import jaxevent
 from jaxevent import events, show
-from jaxevent.blob.states import TrackStates
+from jaxevent.blob.track import TrackStates
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import MissingExtra
 from jaxevent.estimator import Estimate

@@ -58,7 +58,7 @@ from jaxevent.reconstruction.engine.smoother_program import LATER, LINK, STATE, 
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.video import BEGINS, ImageSequence, P
+from jaxevent.reconstruction.video import MAX_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 
@@ -158,7 +158,9 @@ class FilterVideo(ImageSequence[P]):
         begin = WindowStart(window.stop, window.context, self._passes.copy_states())
         if all(b.start != window.stop for b in self._begins):
             self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
-            if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
+            if (
+                len(self._begins) > MAX_STARTS
+            ):  # the first one, the last one, and half of the others
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
         return begin
 
