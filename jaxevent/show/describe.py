@@ -81,6 +81,7 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
 
 
 def _value(values: Any) -> str:
+    """Describe an extra array by its values or shape."""
     if isinstance(values, ImageSource) and len(values.shape) > 1:  # it may stay in its file
         return f"{values.dtype} of shape {values.shape}"
     values = np.asarray(values)
@@ -90,16 +91,19 @@ def _value(values: Any) -> str:
 
 
 def _truth(recording: Recording, extra: Mapping[str, NDArray]) -> str:
+    """List the ground truth that a recording holds."""
     known = ["poses"] if recording.poses is not None and len(recording.poses) else []
     known += [name for name in extra if name.startswith(_TRUTH_NAMES)]
     return ", ".join(known) or "none"
 
 
 def _rate_of(t: NDArray[np.int64]) -> str:
+    """Describe the mean rate of times (us)."""
     return f", {(len(t) - 1) / ((t[-1] - t[0]) / 1e6):.1f} per s" if t[-1] > t[0] else ""
 
 
 def _about_triggers(triggers: Triggers) -> str:
+    """Describe triggers by channel and edge."""
     channels, counts = np.unique(triggers.channel, return_counts=True)
     shown = [
         f"{count:,} on channel {channel}" for channel, count in zip(channels, counts, strict=True)
@@ -144,6 +148,7 @@ def _about_clocks(recording: Recording) -> list[str]:
 def _about_events(
     events: EventSource, width: int, height: int, progress: bool | None
 ) -> list[tuple[str, str]]:
+    """Describe rate, polarity, gaps and hot pixels of events."""
     count = len(events)
     if not count:
         return [("events", "none")]
@@ -218,6 +223,7 @@ def _short(rate: float) -> str:
 
 
 def _about_frames(recording: Recording) -> list[tuple[str, str]]:
+    """Describe number, exposure and grey levels of frames."""
     frames = recording.frames
     if frames is None:
         return [("frames", f"none{recording.describe_left_out('frames')}")]

@@ -107,6 +107,7 @@ def writer(out: Path) -> Writer:
 def write_hdf5(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
+    """Write exact images as HDF5, see `writer`."""
     shape = (len(times), video.recording.height, video.recording.width)
     what = "linear intensity" if colours is None else "linear Rec. 709 red, green, blue"
     units = {"image": f"{what}: 0 is the frames' black, 1 their white"}
@@ -160,6 +161,7 @@ def _store(compressed: list[tuple[h5py.Dataset, int, Future[bytes]]]) -> None:
 def _write_video(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
+    """Write images for the display as MP4, see `writer`."""
     rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
     fps = min(rate, 60.0)
     range_used = RangeCounter(tone)
@@ -173,6 +175,7 @@ def _write_video(
 def _write_images(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
+    """Write images for the display as PNG files, see `writer`."""
     range_used = RangeCounter(tone)
     with complete(out, directory=True) as partial:
         lines = []

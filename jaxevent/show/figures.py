@@ -306,6 +306,7 @@ def _(motion: MotionEstimate) -> str:
 
 
 def _block(title: str, rows: Sequence[tuple[str, str]], picture: Callable[[], Any] | None) -> str:
+    """Format a title, a table and a picture as HTML."""
     cells = "".join(
         f"<tr><th>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
         for name, text in rows
@@ -321,6 +322,7 @@ def _block(title: str, rows: Sequence[tuple[str, str]], picture: Callable[[], An
 
 
 def _image_figure(width: int, height: int) -> tuple[Any, Any]:
+    """Make a figure with axes for an image of the sensor."""
     figure = new_figure(
         WIDTH_INCHES, min(max(WIDTH_INCHES * height / width, 2), 2 * WIDTH_INCHES) + 0.3
     )
@@ -330,6 +332,7 @@ def _image_figure(width: int, height: int) -> tuple[Any, Any]:
 
 
 def _sensor(part: Events | Recording, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Return width and height of the sensor, px."""
     if isinstance(part, Recording):
         return part.width, part.height
     if size is None:
@@ -342,6 +345,7 @@ def _sensor(part: Events | Recording, size: tuple[int, int] | None) -> tuple[int
 def _middle(
     part: Events | Recording, count: int | None, size: tuple[int, int] | None = None
 ) -> Events:
+    """Return so many events from the middle."""
     width, height = _sensor(part, size)
     source: EventSource = part.events if isinstance(part, Recording) else part
     count = width * height // 4 if count is None else count
@@ -359,6 +363,7 @@ def _frame_at(part: Events | Recording, events: Events) -> NDArray[np.float32] |
 
 
 def _title(part: Events | Recording, events: Events) -> str:
+    """Describe events by name, number and time."""
     name = f"{part.name}: " if isinstance(part, Recording) else ""
     span = ""
     if len(events):
@@ -367,9 +372,11 @@ def _title(part: Events | Recording, events: Events) -> str:
 
 
 def _bright(values: NDArray, least: float) -> float:
+    """Return the 99.5 % quantile of finite values, at least `least`."""
     known = values[np.isfinite(values)]
     return max(least, float(np.percentile(known, 99.5))) if len(known) else least
 
 
 def _rgb(colour: str) -> tuple[float, ...]:
+    """Convert a colour #rrggbb to red, green and blue from 0 to 1."""
     return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))

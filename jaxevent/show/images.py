@@ -119,12 +119,14 @@ def _to_tone_scale(intensity: NDArray[np.floating], how: str) -> NDArray[np.floa
 
 
 def _is_logarithmic(how: str) -> bool:
+    """Return whether a tone scales logarithms; raise `InputError` if it is unknown."""
     if how not in get_args(Tone):
         raise InputError(f"there is no tone {how!r}; choose one of {', '.join(get_args(Tone))}")
     return how in ("log", "clahe")
 
 
 def _equalise(images: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Equalise the histograms of images in tiles, with limited contrast."""
     from skimage.exposure import equalize_adapthist
 
     # A constant image has no contrast to equalise, and scikit-image turns it white.
@@ -237,6 +239,7 @@ def video_writer(
 
 
 def _check_displayable(path: str | Path, image: NDArray) -> None:
+    """Raise `InputError` for an array that is no grey or colour image of uint8."""
     grey_or_colour = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     if image.dtype != np.uint8 or not grey_or_colour or not image.size:
         raise InputError(

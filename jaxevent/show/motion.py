@@ -77,6 +77,7 @@ def write_known(
 
 
 def _write_csv(path: str | Path, columns: Mapping[str, Any]) -> None:
+    """Write columns as CSV."""
     with complete(Path(path)) as partial:
         pd.DataFrame(dict(columns)).to_csv(partial, index=False)
 
@@ -142,6 +143,7 @@ def write_errors(folder: Path, errors: MotionScores) -> None:
 
 
 def _plain(value: float) -> float | None:
+    """Return a number for JSON, None if it is not finite."""
     return value if math.isfinite(value) else None
 
 
@@ -392,6 +394,7 @@ class WrittenMotion:
         return f"{number:,} {plural('estimate', number)}"
 
     def _describe_motion(self) -> list[str]:
+        """Return lines about when the motion was found, its components and errors."""
         lost = ~self.estimated.valid
         first = np.flatnonzero(~lost)
         if not len(first):
@@ -448,7 +451,7 @@ def _write_flow(
     with complete_hdf5(path, "flow", params) as (file, check):
         file.attrs["format"] = "jaxevent event flow"
         stored = {name: file.create_dataset(name, (total,), kind) for name, kind in kinds.items()}
-        for part in event_flow.iterate(recording, motion, params, progress=progress):
+        for part in event_flow.iterate_flow(recording, motion, params, progress=progress):
             stop = row + len(part.valid)
             columns = {
                 "t": recording.events[row:stop].t, "u": part.flow[:, 0], "v": part.flow[:, 1],

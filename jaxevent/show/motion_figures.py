@@ -171,6 +171,7 @@ def _contrasts(
 
 
 def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> None:
+    """Draw some of the particles of a component."""
     cloud = motion.cloud
     if cloud is None or not len(cloud):
         return
@@ -303,6 +304,7 @@ def warped_events(
 
 
 def _centre(recording: Recording) -> NDArray[np.float64]:
+    """Return the principal point, or the middle of the sensor, px."""
     camera = recording.camera
     if camera is None:
         return np.array([(recording.width - 1) / 2, (recording.height - 1) / 2])
@@ -379,6 +381,7 @@ def _padded(array: NDArray) -> NDArray:
 
 @functools.partial(jax.jit, static_argnums=2)
 def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Sum weights at places (n, 2) px in an image; return it and its contrast."""
     image = splat(xy, weight, shape)
     return image, image_variance(blur(image, 1))
 

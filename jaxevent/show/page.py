@@ -159,12 +159,14 @@ def picture(sample: Any) -> dict[str, Any]:
 
 
 def _size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return width and height of a picture of an image, px."""
     height, width = shape
     scale = min(1.0, PICTURE_PX / max(height, width))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _grey(image: NDArray[np.uint8]) -> str:
+    """Encode a grey image."""
     from PIL import Image
 
     small = Image.fromarray(image).resize(_size(image.shape), Image.Resampling.BOX)
@@ -189,6 +191,7 @@ def _diverging(error: NDArray[np.float64]) -> str:
 
 
 def _png(image: Any) -> str:
+    """Encode a Pillow image as base64 of PNG."""
     held = io.BytesIO()
     image.save(held, format="PNG", optimize=True)
     return base64.b64encode(held.getvalue()).decode()
@@ -197,6 +200,7 @@ def _png(image: Any) -> str:
 def _failures(
     rows: Sequence[Mapping[str, Any]], names: Mapping[str, str]
 ) -> list[tuple[str, list[str]]]:
+    """List what failed and what was skipped, with titles."""
     parts = []
     for how in ("failed", "skipped"):
         lines = [
@@ -238,6 +242,7 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Tabl
 def _table(
     rows: Sequence[Mapping[str, Any]], columns: Sequence[Column], names: Mapping[str, str]
 ) -> Table:
+    """Tabulate all rows."""
     lines = []
     for row in rows:
         path = row["recording"]
@@ -252,6 +257,7 @@ def _table(
 
 
 def _parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Table:
+    """Tabulate the parameters of each method."""
     lines = []
     for method in methods:
         row = next(row for row in rows if row["method"] == method)
@@ -261,6 +267,7 @@ def _parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Ta
 
 
 def _computed(hosts: Sequence[str]) -> Table:
+    """Tabulate versions and machines."""
     import jax
 
     facts = {
@@ -480,6 +487,7 @@ def _colour(place: int) -> str:
 
 
 def _plot(figure: Any) -> str:
+    """Encode a figure as base64 of SVG."""
     import matplotlib
 
     held = io.BytesIO()

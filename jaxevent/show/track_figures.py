@@ -358,6 +358,7 @@ class _Bands:
             self.bounds += [float(np.nanmin(low[clear])), float(np.nanmax(high[clear]))]
 
     def finish(self, shown: int, total: int) -> None:
+        """Label the panels of tracks."""
         legend = 0 < shown <= _MAX_LEGEND
         some = "" if shown == total else f" of the {shown} tracks seen longest"
         if not self.axes:

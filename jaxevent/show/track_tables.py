@@ -78,6 +78,7 @@ def track_writer(
 
 @contextlib.contextmanager
 def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
+    """Open a CSV file for a function that appends rows."""
     with complete(path) as partial, partial.open("w", newline="") as file:
         file.write(",".join(TABLE_UNITS) + "\n")
 
@@ -92,6 +93,7 @@ def _csv_writer(path: Path) -> Iterator[Callable[..., None]]:
 def _hdf5_writer(
     path: Path, method: str | None, params: Parameters | None
 ) -> Iterator[Callable[..., None]]:
+    """Open an HDF5 file for a function that appends rows."""
     with complete_hdf5(path, method, params) as (file, check):
         file.attrs["format"] = "jaxevent tracks"
 

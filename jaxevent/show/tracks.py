@@ -158,6 +158,7 @@ class Output:
         progress: bool | None,
         method: str | None,
     ) -> "WrittenTracks":
+        """Write files by kind; states are read once for all of them."""
         duration = (tracks.stop - tracks.start) * 1e-6
         rate = TABLE_RATE if self.rate is None else float(self.rate)
         coarse = evenly_spaced_times(tracks.start, tracks.stop, min(rate, _MAX_TIMES / duration))
@@ -262,6 +263,7 @@ class Output:
             yield columns(k, pair[0], pair[1], value, deviation, nothing, nothing)
 
     def _write_quantities(self, path: Path, rows: "_TrackRows", tracks: Tracks) -> None:
+        """Write time to contact and range at coarse times as CSV."""
         tables = []
         since = jnp.asarray((rows.t - rows.t[0]) * 1e-6, jnp.result_type(float))
         Q_lambda = float(tracks.params.Q_lambda)

@@ -213,6 +213,7 @@ def _layer(result: Any, recording: Recording) -> _Layer:
 
 
 def _layer_of_table(path: Path) -> _Layer:
+    """Return the name of a CSV table and the function that sends it."""
     try:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
@@ -228,6 +229,7 @@ def _layer_of_table(path: Path) -> _Layer:
 
 
 def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name: str) -> None:
+    """Send a reconstruction at the frames' times."""
     if recording.frames is None:
         raise InputError(
             f"{recording.name}: has no frames, at whose times images are shown"
@@ -238,6 +240,7 @@ def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name:
 
 
 def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
+    """Tabulate tracks at even times."""
     times = np.arange(tracks.start, tracks.stop, STEP_US)
     states = tracks(times)
     row, column = np.nonzero(states.valid)
@@ -247,6 +250,7 @@ def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
 
 
 def _table_of_motion(motion: MotionEstimate) -> pd.DataFrame:
+    """Tabulate a motion at even times."""
     times = np.arange(motion.t[0], motion.t[-1] + 1, STEP_US) if len(motion) else motion.t
     estimated = motion(times)
     values = np.where(estimated.valid[:, None], estimated.mean, np.nan)

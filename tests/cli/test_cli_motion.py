@@ -85,7 +85,7 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsy
     monkeypatch.setattr(
         VotingEstimator, "estimate", lambda self, *_, model, **__: MotionEstimate.empty(model)
     )
-    monkeypatch.setattr(Planar, "otherwise", "planes")
+    monkeypatch.setattr(Planar, "fallback_method", "planes")
     found, asked = ImageSpeed(9.0, 8.0, 10.0, ()), []
 
     def suit(self, _, params, speed=None, **__):
@@ -126,7 +126,7 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
         )
 
     monkeypatch.setattr(command, "_told", told)
-    monkeypatch.setattr(Planar, "otherwise", "planes")
+    monkeypatch.setattr(Planar, "fallback_method", "planes")
     suited = AdaptedParams(voting.Params(), None, "", "")
     monkeypatch.setattr(MotionEstimator, "suit", lambda *_, **__: suited)
     used, seen, _ = command.estimated(voting, recording, None, {"model": Planar}, None, True)
@@ -387,7 +387,7 @@ def test_velocity_of_poses_at_the_depth_that_fits():
     told = pictures.fitted_velocity(recording, motion)
     np.testing.assert_allclose(told.values, 1.02 * source.velocity(told.t), rtol=0.02)
     for missing in ("poses", "camera"):
-        with pytest.raises(InputError, match="which tell an image velocity"):
+        with pytest.raises(InputError, match="which determine an image velocity"):
             pictures.fitted_velocity(dataclasses.replace(recording, **{missing: None}), motion)
 
 

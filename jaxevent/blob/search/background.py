@@ -151,6 +151,7 @@ class Background:
         return CellField(values, cell, 1.0, self._map_at(t))
 
     def _mean_rates(self, over: int) -> NDArray[np.float64]:
+        """Return rates averaged over squares of so many px, if the scene moves."""
         if self.scene is None:
             return self.rate
         cells = max(1, round(over / FINE_CELL_PX))
@@ -160,6 +161,7 @@ class Background:
         return self._means[cells]
 
     def _map_at(self, t: float | int) -> NDArray[np.float64]:
+        """Return the map (2, 3) from pixels at a time (s) to px from `corner`."""
         return AT_REST if self.scene is None else _map_to_scene(self.scene, self.corner, t)
 
     @functools.cached_property

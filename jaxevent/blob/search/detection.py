@@ -171,6 +171,7 @@ def _weights(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
 
 @njit_noalloc
 def _find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
+    """Call `find_blobs` from Python."""
     return find_blobs(x, y, n, clutter, cells, scratch)
 
 
@@ -227,6 +228,7 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
 
 @njit_noalloc_inlined
 def _sum_around(cells: Any, cell: int, wide: int) -> Any:
+    """Sum the counts of a cell and its eight neighbours."""
     total = 0
     for row in (cell - wide, cell, cell + wide):
         total += cells[row - 1] + cells[row] + cells[row + 1]
@@ -280,6 +282,7 @@ def measure_blobs(
 
 @njit_noalloc
 def _measure_blobs(x: Any, y: Any, weights: Any, labels: Any, blobs: Any) -> None:
+    """Call `sum_blobs` from Python."""
     sum_blobs(x, y, weights, labels, len(blobs.n), blobs)
 
 

@@ -90,6 +90,7 @@ class _PredictionScratch(NamedTuple):
 
     @classmethod
     def empty(cls, pixels: int, scored: int, shape: tuple[int, int]) -> "_PredictionScratch":
+        """Allocate scratch memory for so many pixels of windows and of scored events."""
         bins = tuple(
             _bins(*(n // g + table.shape[-1] for n in shape))
             for table, g in zip(_TABLES, BINS_PX, strict=True)

@@ -333,6 +333,7 @@ def _split_recording(stream: Stream, progress: bool | None) -> list[_Section]:
 
 
 def _prepare_section(stream: Stream, background: Background, progress: bool | None) -> _Section:
+    """Select the scale of a section, and take its scene as background if it moves."""
     with stage("find: scale", progress):
         selection = select_scale(stream, background)
     if selection is not None:

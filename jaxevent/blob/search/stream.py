@@ -225,6 +225,7 @@ class Stream:
         return (np.array(us) - self.start) * 1e-6
 
     def _span(self, begin: float | int, end: float | int) -> tuple[int, int]:
+        """Return the rows of a span (s), first and end."""
         us = [self.start + round(1e6 * t) for t in (begin, end)]
         first, last = (self._index(min(max(t, self.start), self.stop)) for t in us)
         return first, last
@@ -236,6 +237,7 @@ class Stream:
         return int(np.searchsorted(self._held.t, us))
 
     def _rows(self, first: int, last: int) -> _Rows:
+        """Return rows of the events with the masks of those left out."""
         if self._held is not None:
             events, hot, kept = self._held[first:last], COLD, ALL
         else:
@@ -349,6 +351,7 @@ def cell_at(A: Any, x: Any, y: Any, cell: int, shape: Any) -> tuple[int, int]:
 
 @njit_noalloc_inlined
 def _log2(cell: int) -> int:
+    """Return the exponent of a power of two."""
     bits = 0
     while 1 << bits < cell:
         bits += 1

@@ -175,6 +175,7 @@ class WindowTracker:
         return [paths[one] for one in sorted(self.confirmed - set(self.parts))]
 
     def _step(self, begin: float | int) -> None:
+        """Track through the window that begins at a time (s)."""
         w, shape = self.scale.window, self.stream.shape
         t = begin + w / 2
         events = self.stream.window(begin, begin + w)
@@ -280,6 +281,7 @@ class WindowTracker:
         self.contacts = now
 
     def _merge_pair(self, one: int, other: int) -> None:
+        """Merge the lighter of two tracks into the other one."""
         tracks = self.tracks
 
         def weight(i: int) -> tuple[bool, float]:
@@ -310,6 +312,7 @@ class WindowTracker:
         return tracks.merged | outside | (tracks.misses > coast)
 
     def _remove(self, ended: NDArray) -> None:
+        """Remove tracks that ended, and remember those that were confirmed."""
         if not ended.any():
             return
         over, self.tracks = self.tracks.take(ended), self.tracks.take(~ended)
@@ -318,6 +321,7 @@ class WindowTracker:
             self.min_sizes.pop(one, None)
 
     def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
+        """Start a track at each blob, at a time (s)."""
         n, p, C = blobs
         ids = np.arange(self.next_id, self.next_id + len(n))
         self.next_id += len(n)
@@ -365,6 +369,7 @@ def predict_gates(tracks: TrackTable, t: float | int, window: float | int) -> Tr
 
 @njit_noalloc
 def _predict_gates(tracks: Any, gates: Any) -> None:
+    """Fill in the predictions and gates of all tracks."""
     turn = CONFIG.max_turn_sizes
     for k in range(len(tracks.n)):
         C, known = tracks.C[k], tracks.confirmed[k]
@@ -551,6 +556,7 @@ def _gate_clutter(gates: Any, clutter: Any, x: float, y: float, determinant: flo
 def _update_tracks(
     tracks: Any, gates: Any, clutter: Any, in_blobs: Any, gated: Any, out: Any
 ) -> None:
+    """Fill in the measurements, and update each track as detected or missed."""
     for k in range(len(tracks.n)):
         (n, z, D), in_blob = (in_blobs.n[k], in_blobs.p[k], in_blobs.C[k]), True
         C, variance = tracks.C[k], gates.P[k, 0]
