@@ -31,8 +31,8 @@ from jaxevent.egomotion.bundle.windows import Params as BatchParams
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.engine.running import FusedRun
-from jaxevent.egomotion.particle_filter.parameters import Params
+from jaxevent.egomotion.particle_filter.engine import CompiledFilter
+from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.simulate import motion_scene
 
 PUBLISHED = 0.1  # M events/s, N = 100
@@ -115,23 +115,23 @@ def voting_bench() -> tuple[dict[str, float], dict[str, float]]:
     for model, scene, N in CASES:
         recording, truth = motion_scene(scene, "constant", 200, size=SIZE, duration=0.3)
         params = Params(radius=RADIUS, baseline=BASELINE, particles=N)
-        kind, gatherer = voting.gatherer(recording, params, model)
+        kind, sampler = voting.sampler(recording, params, model)
         rng = np.random.default_rng(0)
         at = np.array([0.2])
-        middle = kind.of_scene(truth, at)[0]
+        middle = kind.from_scene(truth, at)[0]
         particles = middle + 0.02 * np.abs(middle).max() * rng.normal(size=(N, len(middle)))
         particles = particles.astype(np.float32)
-        oldest = float(kind.oldest(params))
-        made = jax.device_put(gatherer.whole(0.2 * oldest, oldest).candidates)
+        oldest = float(kind.max_age(params))
+        made = jax.device_put(sampler.sample_all(0.2 * oldest, oldest).candidates)
         events = int(np.asarray(made.valid).sum())
         noise = filtering.draw(jax.random.key(0), len(made.elapsed), params, kind)
-        start = filtering.begin(params, kind, noise)
+        start = filtering.init(params, kind, noise)
         start = eqx.tree_at(
             lambda c: (c.particles, c.searching),
             start,
             (jnp.asarray(particles), jnp.asarray(False)),
         )
-        scan, kernel = eqx.filter_jit(filtering.run), FusedRun(params, kind)
+        scan, kernel = eqx.filter_jit(filtering.run), CompiledFilter(params, kind)
         seconds = cpu_timed(lambda a=(kernel, made, noise, start): a[0](*a[1:])[1].mean)
         by_xla = cpu_timed(lambda a=(scan, params, kind, made, noise, start): a[0](*a[1:])[1].mean)
         # The loop's ages: those that the filter has for planar motion; there one tau is all.

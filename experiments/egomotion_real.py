@@ -41,9 +41,9 @@ import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, geometry, voting
-from jaxevent.egomotion.baselines.tracked_points import Params, followed, undistorted
+from jaxevent.egomotion.baselines.points import Params, interpolate_positions, track_points
 from jaxevent.egomotion.bundle.windows import stamp_offset
-from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.errors import require
 
 Rows = list[dict[str, Any]]
@@ -98,7 +98,7 @@ def tubrip(data: Path, name: str) -> Rows:
     omega = np.asarray(recording.extra["omega"])
     length = (recording.stop - recording.start) * 1e-6
     rows: Rows = []
-    found: list[tuple[str, egomotion.Motion]] = []
+    found: list[tuple[str, egomotion.MotionEstimate]] = []
     for share in (1.0, 0.5):
         values = {"duration": float(share * length), "events": 30000}
         found.append(
@@ -144,7 +144,7 @@ def nearest_rotation(
     """
     camera, e = recording.camera, recording.events[:]
     assert camera is not None
-    positions, f = coordinates(recording.width, recording.height, camera)
+    positions, f = pixel_coordinates(recording.width, recording.height, camera)
     xi = positions[e.y, e.x]
     flow = np.asarray(geometry.flow(xi[:, 0], xi[:, 1], f, twist[:3], twist[3:], 1 / depth))
     basis = np.asarray(geometry.rotation_basis(xi, f)).reshape(-1, 3)
@@ -154,10 +154,10 @@ def nearest_rotation(
     return Omega, rms[0], rms[1]
 
 
-def fitted(recording: jaxevent.Recording, frames: bool) -> egomotion.Motion:
+def fitted(recording: jaxevent.Recording, frames: bool) -> egomotion.MotionEstimate:
     """General motion without settings, to events alone if told so."""
     params = batch.Params.of({"frames": frames})
-    suited = batch.suit(recording, params, camera=recording.camera).params
+    suited = batch.adapt_params(recording, params, camera=recording.camera).params
     return batch.estimate(recording, suited)
 
 
@@ -273,12 +273,14 @@ def axis(data: Path) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
     frames, camera, params = recording.frames, recording.camera, Params.of({})
     assert frames is not None and camera is not None
-    positions, f = coordinates(recording.width, recording.height, camera)
+    positions, f = pixel_coordinates(recording.width, recording.height, camera)
     found = []
     for first in range(2, len(frames) - 10, 8):
         grey = frames[first : first + 11].intensity
         images = [np.rint(255 * image).astype(np.uint8) for image in grey]
-        ends = (undistorted(at, positions) / f for at in followed(cv2, params, images))
+        ends = (
+            interpolate_positions(at, positions) / f for at in track_points(cv2, params, images)
+        )
         begin, end = (np.concatenate([at, np.ones((len(at), 1))], 1) for at in ends)
         far = np.linalg.norm(end - begin, axis=1) > 6 / f
         lines = np.cross(begin[far], end[far])

@@ -33,10 +33,10 @@ from bench import machine
 
 import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
-from jaxevent.egomotion.comparison import FIGURES, compare
 from jaxevent.egomotion.estimator import MotionEstimator
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.scores import UNITS, score_motion
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
@@ -70,7 +70,7 @@ class Sequence(NamedTuple):
     name: str
     model: str
     seed: str
-    make: Callable[[], tuple[Recording, Known | None]]
+    make: Callable[[], tuple[Recording, KnownMotion | None]]
 
 
 def simulated(seed: int) -> Iterator[Sequence]:
@@ -89,33 +89,33 @@ def simulated(seed: int) -> Iterator[Sequence]:
         yield Sequence(f"{scene}, {change}", model, str(seed), make)
 
 
-def fast(speed: float, seed: int) -> tuple[Recording, Known]:
+def fast(speed: float, seed: int) -> tuple[Recording, KnownMotion]:
     size: dict[str, Any] = {"size": (160, 120), "duration": 0.06, "speed": speed}
     recording, source = motion_scene("rotation", "constant", seed, **size)
     t = np.arange(0, 60_001, 1000)
-    return recording, Known(find_model("rotation"), t, source.twist(t)[1])
+    return recording, KnownMotion(find_model("rotation"), t, source.twist(t)[1])
 
 
-def simulate(model: str, scene: str, change: str, seed: int) -> tuple[Recording, Known]:
+def simulate(model: str, scene: str, change: str, seed: int) -> tuple[Recording, KnownMotion]:
     recording, source = motion_scene(scene, change, seed, duration=DURATION)
     t = np.arange(0, round(1e6 * DURATION) + 1, 1000)
     kind = find_model(model)
-    return recording, Known(kind, t, kind.of_scene(source, t))
+    return recording, KnownMotion(kind, t, kind.from_scene(source, t))
 
 
 def real(data: Path) -> Iterator[Sequence]:
-    def slider(model: str) -> tuple[Recording, Known | None]:
+    def slider(model: str) -> tuple[Recording, KnownMotion | None]:
         whole = jaxevent.load(data / "slider_depth.zip")
         cut = dataclasses.replace(whole[SLIDER[0] : SLIDER[1]], poses=whole.poses)
         if model == "planar":
             return cut, None
         along = np.tile([1.0, 0, 0, 0, 0, 0], (2, 1))
-        return cut, Known(find_model(model), np.array([cut.start, cut.stop]), along)
+        return cut, KnownMotion(find_model(model), np.array([cut.start, cut.stop]), along)
 
-    def tubrip(name: str) -> tuple[Recording, Known]:
+    def tubrip(name: str) -> tuple[Recording, KnownMotion]:
         cut = jaxevent.load(data / f"tubrip_{name}_rotation.npz")
         t, omega = np.array([cut.start, cut.stop]), np.asarray(cut.extra["omega"])
-        return cut, Known(find_model("rotation"), t, np.tile(omega, (2, 1)))
+        return cut, KnownMotion(find_model("rotation"), t, np.tile(omega, (2, 1)))
 
     for model in ("planar", "general"):
         yield Sequence("slider_depth", model, "real", functools.partial(slider, model))
@@ -133,7 +133,7 @@ METHODS: dict[str, tuple[MotionEstimator[Any], dict[str, Any] | None]] = {
 }
 
 
-def estimated(label: str, model: str, recording: Recording) -> Motion:
+def estimated(label: str, model: str, recording: Recording) -> MotionEstimate:
     method, given = METHODS[label]
     params = None if given is None else method.Params.of(given[model])
     return method.estimate(recording, params, model=model)
@@ -149,7 +149,7 @@ def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict
     """A row of one method on one sequence."""
     recording, known = made(sequence)
     model, length = sequence.model, (recording.stop - recording.start) * 1e-6
-    METHODS[label][0].place(recording, model, None)
+    METHODS[label][0].find_model_and_camera(recording, model, None)
     if (label, model) not in warm and label != "frames":
         estimated(label, model, recording[: recording.start + round(1e6 * min(WARM, length))])
         warm.add((label, model))
@@ -161,7 +161,7 @@ def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict
     settle, end = (SETTLE, END) if length > 2 * (SETTLE + END) - 0.01 else (0.0, 0.0)
     first, last = recording.start + round(1e6 * settle), recording.stop - round(1e6 * end)
     times = np.arange(first, last + 1, STEP if settle else 1000)
-    found = compare(motion, known, times, start=first, centred=True)
+    found = score_motion(motion, known, times, start=first, centred=True)
     failed = not found.figures
     # To no rotation there is no axis and no share.
     figures = {name: value for name, value in found.figures.items() if np.isfinite(value)}
@@ -176,7 +176,7 @@ def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict
 
 
 @functools.lru_cache(maxsize=1)
-def made(sequence: Sequence) -> tuple[Recording, Known | None]:
+def made(sequence: Sequence) -> tuple[Recording, KnownMotion | None]:
     return sequence.make()
 
 
@@ -186,7 +186,7 @@ def shown(value: float) -> str:
 
 def markdown(model: str, rows: list[dict[str, Any]]) -> str:
     columns = [*SHOWN[model], "lost", "failed", "CPU"]
-    units = {**FIGURES, "lost": "%", "failed": "", "CPU": "s/s"}
+    units = {**UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
     heads = [f"{name} {units[name]}".strip() for name in columns]
     lines = [
         "| sequence | method | " + " | ".join(heads) + " |",
@@ -221,7 +221,7 @@ def main() -> None:
     for sequence in sequences:
         for label in arguments.methods:
             key = (sequence.name, sequence.model, sequence.seed, label)
-            if key in done or not METHODS[label][0].knows(find_model(sequence.model)):
+            if key in done or not METHODS[label][0].supports(find_model(sequence.model)):
                 continue
             try:
                 row = measured(sequence, label, warm)

@@ -27,8 +27,8 @@ from bench import machine
 from jaxevent.confidence import confidence_intervals
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.models import Planar, Rotation
-from jaxevent.egomotion.particle_filter.parameters import Params
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.particle_filter.params import Params
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.recording import Events, Recording
 from jaxevent.runs.egomotion import MotionGoal, MotionLoss
 from jaxevent.simulate import motion_scene
@@ -42,9 +42,9 @@ RUNS, SETTLE, ITERATIONS = 2, 0.05, 20
 class Simulated(MotionGoal):
     """The goal of recordings whose truth is here instead of in a file."""
 
-    truths: tuple[Known, ...] = ()
+    truths: tuple[KnownMotion, ...] = ()
 
-    def known(self, recording: Recording) -> Known:
+    def known(self, recording: Recording) -> KnownMotion:
         return self.truths[int(recording.name)]
 
 
@@ -57,7 +57,7 @@ def velocity(t: np.ndarray, angle: float) -> np.ndarray:
 DT = 2e-4  # s, steps of points
 
 
-def points(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Recording, Known]:
+def points(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Recording, KnownMotion]:
     """Points, an event at every pixel that one enters."""
     angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     return entering(seed, size, velocity(np.arange(0, seconds, DT), angle))
@@ -65,7 +65,7 @@ def points(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Reco
 
 def drifting(
     seed: int, size: tuple[int, int], noise: float, seconds: float = 0.4
-) -> tuple[Recording, Known]:
+) -> tuple[Recording, KnownMotion]:
     """Points whose velocity wanders by `noise` of its speed per square root of a second."""
     rng = np.random.default_rng([seed, 5])
     angle = rng.uniform(0, 2 * np.pi)
@@ -77,7 +77,7 @@ def drifting(
 
 def entering(
     seed: int, size: tuple[int, int], path: np.ndarray, number: int = 60
-) -> tuple[Recording, Known]:
+) -> tuple[Recording, KnownMotion]:
     """Points that move by a path of velocities (times, 2), `DT` apart, px/s."""
     rng = np.random.default_rng([seed, 1])
     at, sign = rng.uniform([0, 0], size, (number, 2)), rng.random(number) < 0.5
@@ -94,24 +94,26 @@ def entering(
     t, x, y, p = table[np.argsort(table[:, 0], kind="stable")].T
     events = Events(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p > 0)
     grid = np.rint(1e6 * times).astype(np.int64)
-    return Recording("points", *size, events), Known(Planar, grid, path)
+    return Recording("points", *size, events), KnownMotion(Planar, grid, path)
 
 
-def wall(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Recording, Known]:
+def wall(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Recording, KnownMotion]:
     """An ideal camera before a textured wall."""
     texture = ("noise", "shapes")[seed % 2]
     recording, source = motion_scene(
         "planar", "varying", seed, size=size, duration=seconds, texture=texture
     )
     t = np.arange(0, round(seconds * 1e6) + 1, 1000)
-    return recording, Known(Planar, t, source.velocity(t))
+    return recording, KnownMotion(Planar, t, source.velocity(t))
 
 
-def turning(seed: int, size: tuple[int, int], seconds: float = 0.4) -> tuple[Recording, Known]:
+def turning(
+    seed: int, size: tuple[int, int], seconds: float = 0.4
+) -> tuple[Recording, KnownMotion]:
     """An ideal camera that turns."""
     recording, source = motion_scene("rotation", "varying", seed, size=size, duration=seconds)
     t = np.arange(0, round(seconds * 1e6) + 1, 1000)
-    return recording, Known(Rotation, t, source.twist(t)[1])
+    return recording, KnownMotion(Rotation, t, source.twist(t)[1])
 
 
 class Problem:

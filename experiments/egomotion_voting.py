@@ -26,9 +26,9 @@ from bench import machine
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.particle_filter.parameters import Params
-from jaxevent.egomotion.particle_filter.smoothing import smoothed
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.particle_filter.filtering import smooth
+from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.scores import axis_error, relative_error, relative_magnitude_error
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
@@ -72,18 +72,18 @@ def planar(motion: str, seed: int, texture: str, speed: float = 200.0) -> tuple[
 
 
 def errors(
-    motion: Motion,
+    motion: MotionEstimate,
     params: Params,
     truth: Callable[[NDArray], NDArray],
     times: NDArray[np.floating],
 ) -> dict[str, float]:
     """Mean relative errors, %, in three readings, and whether the run is lost."""
     true = truth(times)
-    smooth = smoothed(motion, params)
+    smoothed = smooth(motion, params)
     told = {
         "at once": motion(times, extrapolate=True),
         "fixed lag": motion(times, centred=True, extrapolate=True),
-        "smoothed": smooth(times, extrapolate=True),
+        "smoothed": smoothed(times, extrapolate=True),
     }
     scores = {name: 100 * float(relative_error(s.mean, true).mean()) for name, s in told.items()}
     mean = told["smoothed"].mean

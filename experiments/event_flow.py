@@ -40,10 +40,15 @@ from tqdm import tqdm
 
 import jaxevent
 from jaxevent.egomotion import contrast
-from jaxevent.egomotion.baselines.local_planes import normal_flow
-from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.field import RigidFlow
-from jaxevent.egomotion.patches import LENGTHS, REACH, SHARP, look
+from jaxevent.egomotion.baselines.planes import normal_flow
+from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.flow import RigidFlow
+from jaxevent.egomotion.patches import (
+    DURATIONS_S,
+    MAX_DISPLACEMENT_PX,
+    MIN_SHARPNESS,
+    measure_sharpness,
+)
 from jaxevent.recording import Recording
 
 LONGEST = 0.4  # s
@@ -58,24 +63,24 @@ class Contrast:
 
     def __init__(self, recording: Recording):
         self.recording = recording
-        self.xi, _ = coordinates(recording.width, recording.height, None)
+        self.xi, _ = pixel_coordinates(recording.width, recording.height, None)
 
     def flow(self, times: NDArray[np.int64], extrapolate: bool = False) -> NDArray[np.float64]:
         return np.stack([self._one(int(t)) for t in times])
 
     def _one(self, t: int) -> NDArray[np.float64]:
         best: dict[tuple[float, ...], tuple[float, NDArray]] = {}
-        for length in LENGTHS[LENGTHS <= LONGEST]:
-            seen = look(self.recording, t, float(length), REACH, self.xi)
+        for length in DURATIONS_S[DURATIONS_S <= LONGEST]:
+            seen = measure_sharpness(self.recording, t, float(length), MAX_DISPLACEMENT_PX, self.xi)
             if seen is None:
                 continue
             energy = seen.energy.mean(0).reshape(len(seen.xi), -1)
-            at, n = energy.argmax(1), len(seen.ways)
-            way = np.stack([seen.ways[at % n], seen.ways[at // n]], -1)
+            at, n = energy.argmax(1), len(seen.displacements)
+            way = np.stack([seen.displacements[at % n], seen.displacements[at // n]], -1)
             sharp = energy.max(1) / np.maximum(np.median(energy, 1), 1e-9)
             for k, place in enumerate(map(tuple, seen.xi.tolist())):
-                inside = np.abs(way[k]).max() < REACH - 0.5
-                if inside and sharp[k] > best.get(place, (SHARP, way[k]))[0]:
+                inside = np.abs(way[k]).max() < MAX_DISPLACEMENT_PX - 0.5
+                if inside and sharp[k] > best.get(place, (MIN_SHARPNESS, way[k]))[0]:
                     best[place] = float(sharp[k]), way[k] / float(length)
         if not best:
             return np.zeros_like(self.xi)

@@ -34,9 +34,9 @@ HOMES = {
     "egomotion": {
         "voting": "jaxevent.egomotion.particle_filter.estimator:voting",
         "batch": "jaxevent.egomotion.bundle.sequence:batch",
-        "contrast": "jaxevent.egomotion.baselines.contrast_maximisation:contrast",
-        "planes": "jaxevent.egomotion.baselines.local_planes:planes",
-        "frames": "jaxevent.egomotion.baselines.tracked_points:frames",
+        "contrast": "jaxevent.egomotion.baselines.contrast:contrast",
+        "planes": "jaxevent.egomotion.baselines.planes:planes",
+        "frames": "jaxevent.egomotion.baselines.points:frames",
     },
 }
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxevent.egomotion import Model, Motion, MotionEstimator
+from jaxevent.egomotion import Model, MotionEstimate, MotionEstimator
 from jaxevent.egomotion.models import Part
 from jaxevent.estimator import Estimate
 from jaxevent.parameters import Number, Parameters
@@ -25,7 +25,7 @@ class ZoomRoll(Model):
         x, y = xi[..., 0], xi[..., 1]
         return jnp.stack([jnp.stack([x, -y], -1), jnp.stack([y, x], -1)], -2)
 
-    def extent(self, params):
+    def search_bound(self, params):
         return params.omega_max
 
     def diffusion(self, params, mean):
@@ -47,7 +47,7 @@ class Guess(MotionEstimator[Params]):
     """The same motion at all times, whatever the events."""
 
     def prepare(self, recording, times, params=None, *, model=ZoomRoll, camera=None, seed=0):
-        self.place(recording, model, camera)
+        self.find_model_and_camera(recording, model, camera)
         return (), np.asarray(times)
 
     def run(self, params, features, state=None):
@@ -62,7 +62,9 @@ class Guess(MotionEstimator[Params]):
         params = Params() if params is None else params
         t = np.array([recording.start, recording.stop])
         mean, covariance, _ = self.read(params, self.run(params, ())[0], t)
-        return Motion.of(model, t, np.asarray(mean), np.asarray(covariance)).within(recording)
+        return MotionEstimate.from_arrays(
+            model, t, np.asarray(mean), np.asarray(covariance)
+        ).with_recording(recording)
 
 
 guess = Guess("guess", Params, models=("zoom-roll",))

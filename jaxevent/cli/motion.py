@@ -141,15 +141,15 @@ def run(
     out: Path,
 ) -> None:
     from jaxevent.egomotion import find_model
-    from jaxevent.egomotion.choice import choose
-    from jaxevent.egomotion.twists import gyro_bias
-    from jaxevent.egomotion.twists import imu_rotation as rotation_of
+    from jaxevent.egomotion.model_selection import select_model
+    from jaxevent.egomotion.truth import gyro_bias
+    from jaxevent.egomotion.truth import imu_rotation as rotation_of
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
     kind = None if model == "auto" else find_model(model)
     if kind is not None:
-        _check(find_estimator(method or kind.method), kind, imu, smooth)
+        _check(find_estimator(method or kind.best_method), kind, imu, smooth)
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
     turned = None if imu_rotation is None else rotation_of(imu_rotation)
@@ -168,10 +168,10 @@ def run(
         bias = gyro_bias(recording.imu, *still)
     whole, recording = recording, _stretch(recording, start, stop)
     if kind is None:
-        choice = choose(recording)
+        choice = select_model(recording)
         print("\n".join(choice.lines))
         kind = choice.model
-    estimator = find_estimator(method or kind.method)
+    estimator = find_estimator(method or kind.best_method)
     _check(estimator, kind, imu, smooth)
     _need_camera(recording, kind)
     true = output.known(whole, kind, bias, turned, depth)
@@ -181,7 +181,7 @@ def run(
         settings["smooth"] = True
     gyro, other = (imu, bias, turned), not (method or params or smooth)
     estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
-    told, warning = told.with_layers(recording)
+    told, warning = told.with_flow_consistency(recording)
     if warning:
         print(warning)
     seconds = time.perf_counter() - clock
@@ -241,7 +241,7 @@ def _with_camera(recording: Any, focal: float | int | None) -> Any:
 def _truth_there(recording: Any, kind: Any) -> list[str]:
     """A line that says that the recording itself tells its motion, if it does."""
     has = {"poses": recording.poses, "gyro": recording.imu}
-    sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.known_from
+    sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.truth_sources
     known = [name for name in sources if has[name] is not None and len(has[name])]
     return [f"the recording's {known[0]} can tell errors: add --truth"] if known else []
 
@@ -263,7 +263,7 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
     from jaxevent.parameters import read_toml
 
     if path is None:
-        return estimator.start(kind), set()
+        return estimator.initial_params(kind), set()
     values = estimator.Params.load(path, estimator.name)
     table = read_toml(path)
     return values, {*table, *table.get(estimator.name, {})}
@@ -286,20 +286,20 @@ def estimated(
 
     kind = settings["model"]
     values, given = _parameters(estimator, kind, params)
-    suited = estimator.suit(recording, values, given=given)
-    if suited.line:
-        print(suited.line)
+    suited = estimator.adapt_params(recording, values, given=given)
+    if suited.message:
+        print(suited.message)
     told = _told(estimator, recording, suited.params, settings, gyro)
     first, usual = told.t[told.valid][:1], (estimator, told, suited.params)
     soon = len(first) and first[0] - recording.start <= (recording.stop - recording.start) / 2
-    if soon or not other or not kind.otherwise:
+    if soon or not other or not kind.fallback_method:
         return usual
     late = " before the recording's middle" if len(first) else ""
-    print(f"{estimator.name} found no motion{late}, so {kind.otherwise} is tried")
-    estimator = find_estimator(kind.otherwise)
-    suited = estimator.suit(recording, estimator.start(kind), speed=suited.speed)
-    if suited.lengths:
-        print(f"{estimator.name}: {suited.lengths}")
+    print(f"{estimator.name} found no motion{late}, so {kind.fallback_method} is tried")
+    estimator = find_estimator(kind.fallback_method)
+    suited = estimator.adapt_params(recording, estimator.initial_params(kind), speed=suited.speed)
+    if suited.params_message:
+        print(f"{estimator.name}: {suited.params_message}")
     told = _told(estimator, recording, suited.params, settings, gyro)
     if len(first) and not told.valid.any():
         return usual
@@ -322,7 +322,7 @@ def _gyro(
     import numpy as np
 
     from jaxevent.egomotion import from_gyro
-    from jaxevent.egomotion.twists import constant_between
+    from jaxevent.egomotion.truth import fit_gyro_bias
 
     zero = np.zeros(3) if bias is None else bias
     measured = from_gyro(recording.imu, zero, turned)
@@ -333,6 +333,6 @@ def _gyro(
     if not len(at):
         return measured
     rows = next(part.rows for part in told.model.parts if part.figure == "Omega")
-    off = constant_between(told(at).mean[:, rows], measured(at)[1])
+    off = fit_gyro_bias(told(at).mean[:, rows], measured(at)[1])
     print(f"the gyro's bias, from a first estimate: {', '.join(f'{v:+.3f}' for v in off)} rad/s")
     return dataclasses.replace(measured, Omega=measured.Omega - off)

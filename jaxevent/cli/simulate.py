@@ -302,5 +302,5 @@ def _simulate_motion(
             times = np.arange(0, round(1e6 * duration) + 1, 1000)
             # Scenes of a name that is no model's move in general.
             model = MODELS.get(name, General)
-            write_known(table, model, times, model.of_scene(source, times))
+            write_known(table, model, times, model.from_scene(source, times))
     print_stored(recording, out)

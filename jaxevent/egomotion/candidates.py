@@ -1,12 +1,12 @@
-"""Earlier neighbours of events, from which hypotheses of a motion are scored: on the host.
+"""Candidates: earlier neighbours of events, against which motions are scored. On the host.
 
 A point of the scene that crosses the pixels fires at one after another. So the earlier events of
-the same polarity near an event are candidates for its predecessor: each is a displacement d [px]
-and an age dt [s], and a motion with image velocity U explains it if d = U dt. Candidates depend on
-the data only. They are gathered once, in batches of fixed shape; filters then run many times.
+the same polarity near an event are candidates for its predecessor. Each has a displacement d (px)
+and an age dt (s), and a motion with image velocity U explains it if d = U dt. Candidates depend on
+the data only. They are sampled once, in batches of fixed shape, for any number of runs.
 
-Several events per pixel are kept, not only the latest: an edge fires bursts, and the last event of
-a burst is late, so a surface of latest events makes every motion too fast.
+Several events per pixel are candidates, not only the latest. An edge fires bursts, and the last
+event of a burst is late, so with the latest events alone every motion would be too fast.
 """
 
 import dataclasses
@@ -20,82 +20,102 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
-from jaxevent.egomotion.geometry import undistorted
+from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Recording
 
-READ_ROWS = 65536  # events read from a file at a time
-NEVER = np.iinfo(np.int64).min // 2
+READ_EVENTS = 65536  # events read from a file at a time
+NEVER = np.iinfo(np.int64).min // 2  # us, before all events
 
 Numeric = Array | np.ndarray
 Ages = float | int | NDArray[np.floating]
 
 
-class Expected(NamedTuple):
-    """Where candidates are looked for: at most margin + slack dt [px] from the flow's d = U dt.
+class ExpectedFlow(NamedTuple):
+    """A range of flows: candidates are at most margin + slack dt (px) from d = U dt.
 
-    Arrays (rows, columns) are by as many equal parts of the sensor.
+    Arrays (rows, columns) are for as many equal parts of the sensor.
     """
 
-    U: NDArray[np.floating]  # (2, rows, columns), px/s
-    slack: NDArray[np.floating]  # (rows, columns), px/s
+    U: NDArray[np.floating]  # (2, rows, columns) px/s
+    slack: NDArray[np.floating]  # (rows, columns) px/s
     margin: float  # px
 
 
+@renamed_methods(room="bounds", reach="radius")
 class Candidates(eqx.Module):
     """Batches of K events with up to C candidates each; an axis of batches leads where stacked.
 
-    Where there is no candidate the age is 0, as no real one is; see `mask`. Where an event had more
-    than C, these are C of them in even steps, and `scale` says how many each stands for.
+    Unused entries have the age 0, as no candidate has; see `mask`. If an event has more than C
+    candidates, C of them are sampled in even steps.
     """
 
-    d: Float[Numeric, "*batches K C 2"]  # px, x and y: the event's position less the candidate's
+    d: Float[Numeric, "*batches K C 2"]  # px, (x, y) of the event less those of the candidate
     age: Float[Numeric, "*batches K C"]  # s
-    xi: Float[Numeric, "*batches K 2"]  # px, of the event; see `coordinates`
-    room: Float[Numeric, "*batches K 2 2"]  # px, least and largest d in the sensor, x and y
-    valid: Bool[Numeric, "*batches K"]  # an event; others only fill up
-    scale: Float[Numeric, "*batches K"]
-    rate: Float[Numeric, "*batches K"]  # 1/s of age, candidates wherever in the window
-    elapsed: Float[Numeric, "*batches"]  # s from the last event of the batch before to this one's
-    history: Float[Numeric, "*batches"]  # s, age up to which there are all candidates; see `gather`
-    reach: int = eqx.field(static=True)  # candidates are at most so many pixels away, in x and y
+    xi: Float[Numeric, "*batches K 2"]  # px, of the event; see `pixel_coordinates`
+    bounds: Float[Numeric, "*batches K 2 2"]  # px, least and largest d within the sensor, (x, y)
+    valid: Bool[Numeric, "*batches K"]  # whether an event is real rather than padding
+    scale: Float[Numeric, "*batches K"]  # number of candidates that each stands for
+    rate: Float[Numeric, "*batches K"]  # 1/s, candidates per time of age
+    elapsed: Float[Numeric, "*batches"]  # s, from the last event of the batch before to this one's
+    history: Float[Numeric, "*batches"]  # s, age up to which all candidates are known
+    radius: int = eqx.field(static=True)  # px, largest distance of a candidate in x and y
 
     @property
     def mask(self) -> Bool[Numeric, "*batches K C"]:
-        """Which candidates are there."""
+        """Return which entries hold a candidate."""
         return self.age > 0
 
 
-class Batches(NamedTuple):
-    """Some batches, the times (us) of each one's last event, and which rows the events are."""
+class CandidateBatches(NamedTuple):
+    """Some batches of candidates, with the events that they belong to."""
 
     candidates: Candidates
-    t: NDArray[np.int64]  # (batches,); batches without any event have the time of the one before
-    row: NDArray[np.int64]  # (batches, K), -1 where not valid
+    t: NDArray[np.int64]  # (batches,) us, of the last event; empty batches repeat the one before
+    row: NDArray[np.int64]  # (batches, K) rows of the events in the recording, -1 for padding
 
 
-def coordinates(
+def pixel_coordinates(
     width: int, height: int, camera: PinholeCamera | None
 ) -> tuple[NDArray[np.float64], float]:
-    """Positions (height, width, 2) of pixels in px, and the focal length (px) they belong to.
+    """Return undistorted positions of all pixels.
 
-    With a camera as `geometry.undistorted` gives them, which says what is raised. Without one they
-    are the pixels' own columns and rows, counted from the middle of the sensor, and f is 1.
+    Args:
+        width: Width of the sensor, px.
+        height: Height of the sensor, px.
+        camera: The camera; without one positions are relative to the middle of the sensor.
+
+    Returns:
+        Positions (height, width, 2), px, and their focal length, px; 1 without a camera.
+
+    Raises:
+        InputError: The distortion has no inverse; see `geometry.undistort`.
     """
     y, x = np.mgrid[:height, :width].astype(np.float64)
     if camera is None:
         return np.stack([x - (width - 1) / 2, y - (height - 1) / 2], -1), 1.0
-    xi, f = undistorted(camera, x.ravel(), y.ravel())
+    xi, f = undistort(camera, x.ravel(), y.ravel())
     return xi.reshape(height, width, 2), f
 
 
-class Gatherer:
-    """Candidates of a recording, some batches after another.
+@renamed_methods(gather="sample", whole="sample_all", done="is_exhausted")
+class CandidateSampler:
+    """Sampler of the candidates of a recording, some batches after another.
 
-    One event in `every` is scored (the first, then every `every`-th), all are candidates. A batch
-    holds `batch` scored events, fewer where they would take longer than `longest` seconds; a gap
-    of `silence` seconds between events makes history begin anew. For each
-    the `per_pixel` most recent earlier events of the same polarity at every pixel at most `radius`
-    away in x and y are looked at; those of the same timestamp never count.
+    One event in `every` is scored, all are candidates. The candidates of an event are the
+    `per_pixel` latest earlier events of the same polarity at each pixel up to `radius` away in x
+    and y. Those of the same timestamp are left out.
+
+    Args:
+        recording: The recording.
+        camera: The camera that undistorts displacements, or None.
+        radius: Largest distance of a candidate in x and y, px.
+        per_pixel: Number of latest events of a pixel that may be candidates.
+        most: Largest number of candidates of an event; of more these many in even steps.
+        every: One event in so many is scored.
+        batch: Number of scored events of a batch.
+        longest: Largest duration of a batch, s; it may hold fewer events.
+        silence: Gap between events after which the history starts anew, s.
     """
 
     def __init__(
@@ -115,101 +135,117 @@ class Gatherer:
         self.most, self.every, self.batch = most, every, batch
         self.longest, self.silence = round(1e6 * longest), round(1e6 * silence)
         shape = recording.height, recording.width
-        self.xi, self.f = coordinates(recording.width, recording.height, camera)
-        self._ring = np.full((2, *shape, per_pixel), NEVER)
-        self._head = np.zeros((2, *shape), np.int16)
-        window = (2 * radius + 1) ** 2 * per_pixel
-        self._scratch = np.zeros((3, window))
+        self.xi, self.f = pixel_coordinates(recording.width, recording.height, camera)
+        self._recent = RecentEvents(
+            self.xi,
+            np.full((2, *shape, per_pixel), NEVER),
+            np.zeros((2, *shape), np.int16),
+            np.zeros((3, (2 * radius + 1) ** 2 * per_pixel)),
+        )
         self._row, self._end = 0, len(recording.events)
         self._last = int(recording.events[:1].t[0]) if self._end else 0
-        self._clock = np.array([self._last, self._last])  # activity's begin, the last event
+        self._clock = np.array([self._last, self._last])  # start of the history, last event
 
     @property
-    def done(self) -> bool:
-        """Whether all events have been taken."""
+    def is_exhausted(self) -> bool:
+        """Return whether all events have been sampled."""
         return self._row >= self._end
 
-    def gather(
+    def sample(
         self,
         batches: int,
         youngest: Ages,
         oldest: Ages,
         span: float | int = np.inf,
-        expected: Expected | None = None,
-    ) -> Batches:
-        """The next `batches` batches, with candidates from `youngest` to `oldest` seconds of age.
+        expected: ExpectedFlow | None = None,
+    ) -> CandidateBatches:
+        """Sample the next batches.
 
-        Ages may be arrays (rows, columns) for as many equal parts of the sensor, and where the flow
-        is about known it may be told where they are `expected`. The shape of what
-        is given is always the same; batches for which no event is left, or only events more than
-        `span` seconds after the first one, hold none. `history` is since when events have come
-        without a long silence, but never longer than `oldest`.
+        Args:
+            batches: Number of batches. The last ones are empty if no event is left.
+            youngest: Least age of candidates, s; an array (rows, columns) is for as many equal
+                parts of the sensor.
+            oldest: Largest age of candidates, s; likewise.
+            span: Largest time from the first event to the last, s; later ones are left for the next
+                call.
+            expected: The flow near which candidates are sampled; by default all are.
+
+        Returns:
+            The batches, always of the same shape.
         """
         real = np.dtype(jnp.result_type(float))
-        size, most = self.batch, self.most
-        d, age = np.zeros((batches, size, most, 2), real), np.zeros((batches, size, most), real)
-        xi, scale = np.zeros((batches, size, 2), real), np.ones((batches, size), real)
-        rate = np.zeros((batches, size), real)
-        room = np.zeros((batches, size, 2, 2), real)
-        row, t = np.full((batches, size), -1), np.zeros(batches, np.int64)
-        history = np.zeros(batches, real)
+        shape = batches, self.batch
+        out = CandidateArrays(
+            d=np.zeros((*shape, self.most, 2), real),
+            age=np.zeros((*shape, self.most), real),
+            xi=np.zeros((*shape, 2), real),
+            bounds=np.zeros((*shape, 2, 2), real),
+            scale=np.ones(shape, real),
+            rate=np.zeros(shape, real),
+            row=np.full(shape, -1),
+            t=np.zeros(batches, np.int64),
+            history=np.zeros(batches, real),
+        )
         young, old = np.broadcast_arrays(np.atleast_2d(youngest), np.atleast_2d(oldest))
         # Single precision may fall short of a whole number of microseconds.
         young, old = 1e6 * (1 - 1e-6) * young, 1e6 * (1 + 1e-6) * old
         limits = np.stack([np.maximum(1, np.ceil(young)), np.floor(old)])
         limits = np.minimum(limits, -NEVER / 2).astype(np.int64)
         if expected is None:
-            gate = np.zeros((3, 1, 1))
-            gate[2] = np.inf
+            gate, margin = np.array([0, 0, np.inf])[:, None, None], 0.0
         else:
             gate = np.concatenate([expected.U, expected.slack[None]]).astype(np.float64)
-        margin = 0.0 if expected is None else expected.margin
-        # Batch, events in it, time of its first, and after which no event is taken.
-        state = np.array([0, 0, 0, -NEVER])
+            margin = expected.margin
         span = -NEVER if span == np.inf else round(1e6 * span)
+        rules = BatchRules(
+            limits, gate, margin, self.every, self.longest, span, self.radius, self.silence
+        )
+        # Batch, events in it, time of its first, and after which no event is used.
+        cursor = np.array([0, 0, 0, -NEVER])
         full = False
-        while not full and not self.done:
-            events = self.recording.events[self._row : self._row + READ_ROWS]
-            used, full = _gather(
-                Stream(events.t, events.x, events.y, events.p, self._row),
-                Rules(self.every, self.longest, span, self.radius, margin, self.silence),
-                Latest(self.xi, self._ring, self._head),
-                limits,
-                gate,
-                Filled(d, age, xi, room, scale, rate, row, t, history),
-                state,
-                self._clock,
-                self._scratch,
-            )
+        while not full and not self.is_exhausted:
+            events = self.recording.events[self._row : self._row + READ_EVENTS]
+            stream = EventStream(events.t, events.x, events.y, events.p, self._row)
+            used, full = _fill_batches(stream, rules, self._recent, out, cursor, self._clock)
             self._row += used
-        begun = state[0] + (state[1] > 0)
-        history[begun:] = history[begun - 1] if begun else 0
-        t[begun:] = t[begun - 1] if begun else self._last
+        t, history = out.t, out.history
+        filled = cursor[0] + (cursor[1] > 0)
+        history[filled:] = history[filled - 1] if filled else 0
+        t[filled:] = t[filled - 1] if filled else self._last
         history = np.minimum(history, 1e-6 * limits[1].min())
         elapsed = np.diff(t, prepend=self._last) * 1e-6
         self._last = int(t[-1])
-        made = Candidates(
-            d, age, xi, room, row >= 0, scale, rate, elapsed.astype(real), history.astype(real),
-            self.radius,
+        candidates = Candidates(
+            out.d, out.age, out.xi, out.bounds, out.row >= 0, out.scale, out.rate,
+            elapsed.astype(real), history.astype(real), self.radius,
         )  # fmt: skip
-        return Batches(made, t, row)
+        return CandidateBatches(candidates, t, out.row)
 
-    def whole(self, youngest: Ages, oldest: Ages) -> Batches:
-        """All batches that are left, at least one, for recordings that fit into memory."""
-        parts: list[Batches] = []
-        while not parts or not self.done:
-            parts.append(self.gather(64, youngest, oldest))
-        fields = {}
+    def sample_all(self, youngest: Ages, oldest: Ages) -> CandidateBatches:
+        """Sample all batches that are left, at least one, of a recording that fits into memory.
+
+        Args:
+            youngest: Least age of candidates, s.
+            oldest: Largest age of candidates, s.
+
+        Returns:
+            The batches.
+        """
+        parts: list[CandidateBatches] = []
+        while not parts or not self.is_exhausted:
+            parts.append(self.sample(64, youngest, oldest))
         used = max(1, sum(int(part.candidates.valid.any(-1).sum()) for part in parts))
-        names = {field.name for field in dataclasses.fields(Candidates)} - {"reach"}
-        for name in names:
-            fields[name] = np.concatenate([getattr(part.candidates, name) for part in parts])[:used]
+        names = {field.name for field in dataclasses.fields(Candidates)} - {"radius"}
+        fields = {
+            name: np.concatenate([getattr(part.candidates, name) for part in parts])[:used]
+            for name in names
+        }
         t, row = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "row"))
-        return Batches(Candidates(**fields, reach=self.radius), t[:used], row[:used])
+        return CandidateBatches(Candidates(**fields, radius=self.radius), t[:used], row[:used])
 
 
-class Stream(NamedTuple):
-    """Events (n,), and the row of the first of them."""
+class EventStream(NamedTuple):
+    """Events (n,), and the row of the first one in the recording."""
 
     t: NDArray
     x: NDArray
@@ -218,32 +254,35 @@ class Stream(NamedTuple):
     row: int
 
 
-class Rules(NamedTuple):
-    """How batches are filled: see `Gatherer`; times in us."""
+class BatchRules(NamedTuple):
+    """Rules by which batches are filled, see `CandidateSampler.sample`; times in us."""
 
+    limits: NDArray[np.int64]  # (2, rows, columns) least and largest age
+    gate: NDArray[np.float64]  # (3, rows, columns) px/s, U and slack of the expected flow
+    margin: float
     every: int
     longest: int
     span: int
     radius: int
-    margin: float
     silence: int
 
 
-class Latest(NamedTuple):
-    """Where pixels look, and their latest events."""
+class RecentEvents(NamedTuple):
+    """The latest events of each pixel, in rings, and scratch for the candidates of one event."""
 
     position: NDArray  # (height, width, 2) px
-    ring: NDArray  # (2, height, width, kept) us
-    head: NDArray  # (2, height, width), the newest's place in the ring
+    ring: NDArray  # (2, height, width, per_pixel) us
+    head: NDArray  # (2, height, width) index of the newest in the ring
+    scratch: NDArray  # (3, candidates)
 
 
-class Filled(NamedTuple):
-    """The arrays of `Candidates` and `Batches`, to be filled."""
+class CandidateArrays(NamedTuple):
+    """The arrays of `Candidates` and `CandidateBatches`, to be filled."""
 
     d: NDArray
     age: NDArray
     xi: NDArray
-    room: NDArray
+    bounds: NDArray
     scale: NDArray
     rate: NDArray
     row: NDArray
@@ -252,14 +291,14 @@ class Filled(NamedTuple):
 
 
 @njit_noalloc
-def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
-    """Fill batches from events: how many events were used, and whether all batches are full."""
+def _fill_batches(stream, rules, recent, out, cursor, clock):
+    """Fill batches from events; return the number of events used, and whether all are full."""
     # Names of their own: numba reads arrays out of tuples anew in every loop.
     t_in, x, y, p, row_in = stream
-    every, longest, span, radius, margin, silence = rules
-    position, ring, head = latest
-    d, age, xi, room, scale, rate, row, t, history = out
-    batch, fill, first, until = state
+    limits, gate, margin, every, longest, span, radius, silence = rules
+    position, ring, head, scratch = recent
+    d, age, xi, bounds, scale, rate, row, t, history = out
+    batch, fill, first, until = cursor
     parts_y, parts_x = limits.shape[1:]
     gates_y, gates_x = gate.shape[1:]
     batches, size, most = age.shape
@@ -273,7 +312,7 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
             if fill == size or (fill > 0 and now - first > longest):
                 batch, fill = batch + 1, 0
             if batch == batches or now > until:
-                state[0], state[1], state[2], state[3] = batch, fill, first, until
+                cursor[0], cursor[1], cursor[2], cursor[3] = batch, fill, first, until
                 return i, True
             if fill == 0:
                 if batch == 0:
@@ -302,7 +341,7 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
                             scratch[0, found], scratch[1, found], scratch[2, found] = dx, dy, dt
                             found += 1
             # Steps of found / C from an offset that changes from event to event (multiples of the
-            # golden ratio, evenly spread): every candidate is as likely to be taken.
+            # golden ratio, evenly spread): every candidate is equally probable.
             taken = min(found, most)
             offset = ((row_in + i) * 0.6180339887498949) % 1.0
             for c in range(taken):
@@ -315,11 +354,11 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
             rate[batch, fill] = number / (ages * 1e-6) if ages > 0 else 0.0
             xi[batch, fill, 0] = here_x
             xi[batch, fill, 1] = here_y
-            # d is the event's position less the candidate's: the least at the far side.
-            room[batch, fill, 0, 0] = here_x - position[line, width - 1, 0]
-            room[batch, fill, 1, 0] = here_x - position[line, 0, 0]
-            room[batch, fill, 0, 1] = here_y - position[height - 1, column, 1]
-            room[batch, fill, 1, 1] = here_y - position[0, column, 1]
+            # d is the event's position less the candidate's: least for a candidate at the far side.
+            bounds[batch, fill, 0, 0] = here_x - position[line, width - 1, 0]
+            bounds[batch, fill, 1, 0] = here_x - position[line, 0, 0]
+            bounds[batch, fill, 0, 1] = here_y - position[height - 1, column, 1]
+            bounds[batch, fill, 1, 1] = here_y - position[0, column, 1]
             row[batch, fill] = row_in + i
             t[batch] = now
             history[batch] = (now - clock[0]) * 1e-6
@@ -327,5 +366,8 @@ def _gather(stream, rules, latest, limits, gate, out, state, clock, scratch):
         at = (head[sign, line, column] + 1) % kept
         head[sign, line, column] = at
         ring[sign, line, column, at] = now
-    state[0], state[1], state[2], state[3] = batch, fill, first, until
+    cursor[0], cursor[1], cursor[2], cursor[3] = batch, fill, first, until
     return len(t_in), False
+
+
+__getattr__ = renamed_names(__name__)

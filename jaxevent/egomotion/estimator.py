@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.deprecated import renamed_methods
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.patches import Speed, tried, usual_speed
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.patches import ImageSpeed, describe_windows, measure_image_speed
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.parameters import Parameters
@@ -23,110 +24,162 @@ from jaxevent.recording import Recording, Times, check_times, microseconds
 
 P = TypeVar("P", bound=Parameters)
 
-COMMON = frozenset({"model", "camera", "seed"})  # options of every method
-RATE = 200.0  # Hz at which estimates are compared with what is known
+COMMON_OPTIONS = frozenset({"model", "camera", "seed"})  # of every method
+SCORE_RATE_HZ = 200.0  # of the times at which estimates are compared with known motion
+TRUTH_POINTS = 256  # of the known motion of a training segment
 
 
-class Stretch(NamedTuple):
-    """A stretch of a recording, of times in us, whose motion is known: to be fitted to."""
+def score_times(start: int, stop: int) -> NDArray[np.int64]:
+    """Return times (us) at `SCORE_RATE_HZ` from `start` on, before `stop`."""
+    return np.arange(start, stop, round(1e6 / SCORE_RATE_HZ))
+
+
+class TrainingSegment(NamedTuple):
+    """A part of a recording with known motion, from `start` to `stop` (us)."""
 
     recording: Recording
     start: int
     stop: int
-    known: Known
-    split: int  # the place in `splits.SPLITS`
+    known: KnownMotion
+    split: int  # index in `splits.SPLITS`
 
-    def cut(self) -> Recording:
-        """Its events."""
+    def crop(self) -> Recording:
+        """Return the part of the recording."""
         return self.recording[self.start : self.stop]
+
+    def truth(
+        self, times: NDArray[np.int64], settle: float | int
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Return the first five fields of `TrainingRuns`.
+
+        Args:
+            times: (T,) times of the estimates, us.
+            settle: Time after the start from which errors count, s.
+
+        Returns:
+            Times (T,) in s, times of the truth (G,) in s, the truth (G, d), 1 or 0 for each of the
+            times (T,), and their sum, above 0.
+        """
+        grid = np.linspace(self.start, self.stop, TRUTH_POINTS)
+        inside = np.clip(grid, self.known.t[0], self.known.t[-1])
+        truth = self.known(np.rint(inside).astype(np.int64))
+        time = (times - self.start) * 1e-6
+        counted = ((time >= settle) & self.known.covers(times)).astype(float)
+        weight = np.asarray(max(counted.sum(), 1e-9))
+        return time, (grid - self.start) * 1e-6, truth, counted, weight
 
 
 @dataclasses.dataclass(frozen=True)
-class Suited(Generic[P]):
-    """Parameters that suit a recording, how fast its image moves, and what is said of both.
+class AdaptedParams(Generic[P]):
+    """Parameters adapted to a recording.
 
-    `moves` says the speed, `lengths` the windows.
+    Attributes:
+        params: The parameters.
+        speed: The speed of the image, or None if it is unknown.
+        speed_message: A clause about the speed.
+        params_message: A clause about the parameters that were adapted.
     """
 
     params: P
-    speed: Speed | None
-    moves: str
-    lengths: str
+    speed: ImageSpeed | None
+    speed_message: str
+    params_message: str
 
     @property
-    def line(self) -> str:
-        return ": ".join(filter(None, (self.moves, self.lengths)))
+    def message(self) -> str:
+        """A line to print; "" if nothing was to adapt."""
+        return ": ".join(filter(None, (self.speed_message, self.params_message)))
 
 
-class Batch(eqx.Module):
-    """A prepared stretch to be fitted to: what is true of it, and the estimates of some runs."""
+class TrainingRuns(eqx.Module):
+    """A segment prepared for a fit of parameters: its known motion, and the estimates of runs."""
 
-    time: Float[Array | np.ndarray, " T"]  # s since the stretch's start
-    grid: Float[Array | np.ndarray, " G"]  # s, of the truth
+    time: Float[Array | np.ndarray, " T"]  # s since the segment's start
+    grid: Float[Array | np.ndarray, " G"]  # s, times of the truth
     truth: Float[Array | np.ndarray, "G d"]
-    counted: Float[Array | np.ndarray, " T"]  # 1: the error counts
+    counted: Float[Array | np.ndarray, " T"]  # 1 where the error counts
     weight: Float[Array | np.ndarray, ""]
     model: Model
 
     def estimates(self, params: Any) -> tuple[Float[Array, "runs T d"], Float[Array, "runs T"]]:
-        """Means of every run, and by how much (s) what was seen is older; differentiable."""
+        """Return the means of every run, and their lags (s); differentiable."""
         raise NotImplementedError
 
-    def over(self, devices: Sequence[Any]) -> "Batch":
-        """The batch on several devices; on the first of them, where it is not shared out."""
+    def over(self, devices: Sequence[Any]) -> "TrainingRuns":
+        """Put the runs on devices; on the first one, where they cannot be distributed."""
         return jax.device_put(self, devices[0])
 
 
+@renamed_methods(
+    knows="supports",
+    place="find_model_and_camera",
+    start="initial_params",
+    suit="adapt_params",
+    follow="training_runs",
+)
 @dataclasses.dataclass(frozen=True, repr=False)
 class MotionEstimator(Estimator[P]):
-    """A method that tells the camera's motion.
+    """A method that estimates the camera's motion.
 
-    `estimate` returns a `Motion`. Options that all methods take are the `model`, a name of
-    `models.MODELS`, "package.module:Class" or the class; the `camera`, by default the recording's;
-    and the `seed`: the same one gives the same motion. Some take `smooth`: whether later events
-    tell of a time too; `cloud`: how many particles of an estimate to keep; and `gyro`, what a gyro
-    measured (`twists.from_gyro`).
+    `estimate` returns a `MotionEstimate`. All methods have the options `model`, a name of
+    `models.MODELS`, "package.module:Class" or the class; `camera`, by default the recording's; and
+    `seed`, of the random numbers. Some have `smooth`, whether to use later events too; `cloud`, the
+    number of particles of an estimate to return; and `gyro`, measured twists (`truth.from_gyro`).
 
     Attributes:
         linear: Whether it needs a flow that is linear in the motion.
-        lengths: Parameters that suit the speed of the image, of `lengths(params, speed)`.
+        lengths: Function (params, speed) that returns values of parameters adapted to the speed of
+            the image, as lengths of windows.
     """
 
     family: ClassVar[str] = "egomotion"
     linear: bool = dataclasses.field(default=False, kw_only=True)
-    lengths: Callable[[Any, Speed], dict[str, float]] | None = dataclasses.field(
+    lengths: Callable[[Any, ImageSpeed], dict[str, float]] | None = dataclasses.field(
         default=None, kw_only=True
     )
-    options: frozenset[str] = dataclasses.field(default=COMMON, kw_only=True)
+    options: frozenset[str] = dataclasses.field(default=COMMON_OPTIONS, kw_only=True)
 
-    def knows(self, model: type[Model]) -> bool:
-        """Whether it can tell the motion of a model."""
+    def supports(self, model: type[Model]) -> bool:
+        """Return whether it can estimate the motion of a model."""
         return (model.name in self.models or not self.models) and not (
             self.linear and model.half_line
         )
 
     def find_model(self, model: str | type[Model]) -> type[Model]:
-        """The model; raises `InputError` for an unknown one, and one that the method cannot tell"""
+        """Return the model of a name, of "package.module:Class", or the class itself.
+
+        Raises:
+            InputError: The model is unknown, or the method does not support it.
+        """
         found = find_model(model)
-        if not self.knows(found):
-            known = [name for name, one in MODELS.items() if self.knows(one)]
+        if not self.supports(found):
+            known = [name for name, one in MODELS.items() if self.supports(one)]
             raise InputError(
                 f"the method {self.name!r} does not know {found.title} but {in_words(known)}; "
                 "choose another model or method"
             )
         return found
 
-    def place(
+    def find_model_and_camera(
         self, recording: Recording, model: str | type[Model] | None, camera: PinholeCamera | None
     ) -> tuple[type[Model], PinholeCamera | None]:
-        """The model, by default the first that it knows, and the camera, if none the recording's.
+        """Return the model and the camera that `estimate` uses.
 
-        Raises `InputError` as `find_model` does, and where the model needs a camera and there is
-        none.
+        Args:
+            recording: The recording.
+            model: Model or its name; by default the first one that the method supports.
+            camera: The camera; by default the recording's.
+
+        Returns:
+            The model, and the camera or None.
+
+        Raises:
+            InputError: The model is unknown or not supported, it needs a camera and there is none,
+                or the recording lacks what the method needs.
         """
         self.check_options(model=model, camera=camera)
         if model is None:
-            model = next(one for one in MODELS.values() if self.knows(one))
+            model = next(one for one in MODELS.values() if self.supports(one))
         found, camera = self.find_model(model), camera or recording.camera
         if found.needs_camera and camera is None:
             raise InputError(
@@ -136,90 +189,97 @@ class MotionEstimator(Estimator[P]):
         self.check(recording)
         return found, camera
 
-    def start(self, model: type[Model]) -> P:
-        """The parameters that it starts with."""
+    def initial_params(self, model: type[Model]) -> P:
+        """Return the parameters for a model, before they are adapted to a recording."""
         return self.Params()
 
-    def suit(
+    def adapt_params(
         self,
         recording: Recording,
         params: P,
         *,
         camera: PinholeCamera | None = None,
         given: Collection[str] = (),
-        speed: Speed | None = None,
-    ) -> Suited[P]:
-        """Parameters with windows as long as the recording needs, and lines that say so.
+        speed: ImageSpeed | None = None,
+    ) -> AdaptedParams[P]:
+        """Adapt lengths of windows to the speed of the image, where the defaults are far off.
 
-        Lengths of time are chosen by how fast the image moves, where the defaults are far from
-        right: by `speed`, or `patches.usual_speed`. Those named in `given` stay as they are.
+        Args:
+            recording: The recording.
+            params: The parameters.
+            camera: The camera; by default the recording's.
+            given: Names of parameters that stay as they are.
+            speed: The speed; by default `patches.measure_image_speed`.
+
+        Returns:
+            The parameters, with messages about them.
         """
         if self.lengths is None:
-            return Suited(params, speed, "", "")
-        speed = speed or usual_speed(recording, camera)
+            return AdaptedParams(params, speed, "", "")
+        speed = speed or measure_image_speed(recording, camera)
         if speed is None:
-            still = f"nothing was seen to move {tried(recording)}; windows are as by default"
-            return Suited(params, None, still, "")
+            still = (
+                f"nothing was seen to move {describe_windows(recording)}; windows are as by default"
+            )
+            return AdaptedParams(params, None, still, "")
         chosen = self.lengths(params, speed)
         chosen = {name: value for name, value in chosen.items() if name not in given}
-        said = ", ".join(
-            f"{name} = {value:.2g} {self.Params.settings()[name].unit}"
-            for name, value in chosen.items()
-        )
-        moves = f"the image moves at about {speed.usual:.3g} px/s"
-        said = said or "windows are as given or by default"
-        return Suited(params.replace(**chosen), speed, moves, said)
+        settings = self.Params.settings()
+        values = ", ".join(f"{name} = {v:.2g} {settings[name].unit}" for name, v in chosen.items())
+        moves = f"the image moves at about {speed.median:.3g} px/s"
+        values = values or "windows are as given or by default"
+        return AdaptedParams(params.replace(**chosen), speed, moves, values)
 
-    def follow(
+    def training_runs(
         self,
-        stretches: Sequence[Stretch],
+        segments: Sequence[TrainingSegment],
         params: P,
         model: type[Model],
         runs: int,
         settle: float | int,
-    ) -> list[Batch]:
-        """Stretches prepared to be fitted to, each with so many runs of different random numbers.
+    ) -> list[TrainingRuns]:
+        """Prepare segments for a fit of parameters.
 
-        Errors count from `settle` seconds after a stretch's start on.
+        Args:
+            segments: Segments with known motion.
+            params: The parameters at the start of the fit.
+            model: Motion model.
+            runs: Number of runs of each segment, with different random numbers.
+            settle: Time after a segment's start from which errors count, s.
+
+        Returns:
+            The runs of each segment.
         """
-        return [Stacked.of(self, stretch, params, model, runs, settle, k) for k, stretch in
-                enumerate(stretches)]  # fmt: skip
+        prepared = []
+        for number, segment in enumerate(segments):
+            recording = segment.crop()
+            times = score_times(recording.start, recording.stop + 1)
+            common = *segment.truth(times, settle), model()
+            seeds = range(number * runs, (number + 1) * runs)
+            prepared.append(self._runs_of_segment(common, recording, times, params, seeds))
+        return prepared
 
-
-def truth_of(stretch: Stretch) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times (s) since a stretch's start, and what is true at them."""
-    grid = np.linspace(stretch.start, stretch.stop, 256)
-    inside = np.clip(grid, stretch.known.t[0], stretch.known.t[-1])
-    return (grid - stretch.start) * 1e-6, stretch.known(np.rint(inside).astype(np.int64))
-
-
-class Stacked(Batch):
-    """Of any differentiable estimator: what it prepares for every run, one after another."""
-
-    prepared: tuple[tuple[Any, Any], ...]  # features and out of every run
-    method: Any = eqx.field(static=True)
-
-    @classmethod
-    def of(
-        cls,
-        method: MotionEstimator[P],
-        stretch: Stretch,
+    def _runs_of_segment(
+        self,
+        common: tuple[Any, ...],
+        recording: Recording,
+        times: NDArray[np.int64],
         params: P,
-        model: type[Model],
-        runs: int,
-        settle: float | int,
-        seed: int,
-    ) -> "Stacked":
-        recording = stretch.cut()
-        times = np.arange(recording.start, recording.stop + 1, round(1e6 / RATE))
+        seeds: Sequence[int],
+    ) -> TrainingRuns:
+        """Prepare the runs of a segment with these seeds; `common` are the fields of all kinds."""
+        model = type(common[-1])
         prepared = tuple(
-            method.prepare(recording, times, params, model=model, seed=seed * runs + k)
-            for k in range(runs)
+            self.prepare(recording, times, params, model=model, seed=seed) for seed in seeds
         )
-        time = (times - stretch.start) * 1e-6
-        counted = ((time >= settle) & stretch.known.within(times)).astype(float)
-        weight = np.asarray(max(counted.sum(), 1e-9))
-        return cls(time, *truth_of(stretch), counted, weight, model(), prepared, method)
+        return StackedRuns(*common, prepared, self)
+
+
+class StackedRuns(TrainingRuns):
+    """Runs of any differentiable estimator, each from the start of the segment."""
+
+    prepared: tuple[tuple[Any, Any], ...]  # features and read-out of every run
+    method: Any = eqx.field(static=True)
 
     def estimates(self, params: Any) -> tuple[Array, Array]:
         means = []
@@ -230,8 +290,8 @@ class Stacked(Batch):
         return means, jnp.zeros(means.shape[:2], means.dtype)
 
 
-class Told(Batch):
-    """A stretch whose motion was told when it was prepared, by a method on the host."""
+class FixedEstimates(TrainingRuns):
+    """Runs of an estimator on the host, computed when the segment was prepared."""
 
     mean: Float[Array | np.ndarray, "runs T d"]
 
@@ -239,26 +299,23 @@ class Told(Batch):
         mean = jnp.asarray(self.mean)
         return mean, jnp.zeros(mean.shape[:2], mean.dtype)
 
-    def over(self, devices: Sequence[Any]) -> "Told":
-        return jax.device_put(self, devices[0])
 
-
-class Given(NamedTuple):
-    """What a method that computes on the host is given."""
+class HostInputs(NamedTuple):
+    """Inputs of a method that computes on the host."""
 
     recording: Recording
     model: type[Model]
     camera: PinholeCamera | None
     seed: int
     progress: bool | None
-    more: Mapping[str, Any]  # its own options
+    options: Mapping[str, Any]  # of this method alone
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class OnHost(MotionEstimator[P]):
-    """A method of which `solve(params, given)` tells the motion of a whole recording."""
+class HostEstimator(MotionEstimator[P]):
+    """A method on the host: `solve(params, inputs)` estimates the motion of a whole recording."""
 
-    solve: Callable[[P, Given], Motion]
+    solve: Callable[[P, HostInputs], MotionEstimate]
     differentiable: bool = dataclasses.field(default=False, kw_only=True)
 
     def prepare(
@@ -272,60 +329,58 @@ class OnHost(MotionEstimator[P]):
         seed: int = 0,
         progress: bool | None = None,
         extrapolate: bool = False,
-        **more: Any,
-    ) -> tuple[Given, NDArray[np.int64]]:
-        """What `run` needs; raises `InputError` as `estimate` does and for times outside."""
-        self.refuse_unknown(more)
-        self.check_options(seed=seed, progress=progress, **more)
-        found, camera = self.place(recording, model, camera)
+        **options: Any,
+    ) -> tuple[HostInputs, NDArray[np.int64]]:
+        self.refuse_unknown(options)
+        self.check_options(seed=seed, progress=progress, **options)
+        found, camera = self.find_model_and_camera(recording, model, camera)
         if not extrapolate and len(recording.events):
             check_times(times, recording.start, recording.stop, recording.name)
-        given = Given(recording, found, camera, seed, progress, more)
-        return given, np.atleast_1d(microseconds(times))
+        inputs = HostInputs(recording, found, camera, seed, progress, options)
+        return inputs, np.atleast_1d(microseconds(times))
 
-    def follow(
+    def _runs_of_segment(
         self,
-        stretches: Sequence[Stretch],
+        common: tuple[Any, ...],
+        recording: Recording,
+        times: NDArray[np.int64],
         params: P,
-        model: type[Model],
-        runs: int,
-        settle: float | int,
-    ) -> list[Batch]:
-        """Stretches with the motion that these parameters tell; rest where they tell none."""
-        batches: list[Batch] = []
-        for number, stretch in enumerate(stretches):
-            recording = stretch.cut()
-            times = np.arange(recording.start, recording.stop + 1, round(1e6 / RATE))
-            means = []
-            for k in range(runs):
-                seed = number * runs + k
-                told = self.estimate(recording, params, model=model, seed=seed, progress=False)
-                mean, _, valid = told(times, extrapolate=True)
-                means.append(np.where(valid[:, None], mean, 0.0))
-            time = (times - stretch.start) * 1e-6
-            counted = ((time >= settle) & stretch.known.within(times)).astype(float)
-            weight = np.asarray(max(counted.sum(), 1e-9))
-            batches.append(
-                Told(time, *truth_of(stretch), counted, weight, model(), np.stack(means))
-            )
-        return batches
+        seeds: Sequence[int],
+    ) -> TrainingRuns:
+        model, means = type(common[-1]), []
+        for seed in seeds:
+            motion = self.estimate(recording, params, model=model, seed=seed, progress=False)
+            mean, _, valid = motion(times, extrapolate=True)
+            means.append(np.where(valid[:, None], mean, 0.0))  # at rest where the motion is lost
+        return FixedEstimates(*common, np.stack(means))
 
-    def run(self, params: P, features: Given, state: None = None) -> tuple[Motion, None]:
-        """The motion, computed on the host."""
-        return self.solve(params, features).within(features.recording), None
+    def run(
+        self, params: P, features: HostInputs, state: None = None
+    ) -> tuple[MotionEstimate, None]:
+        return self.solve(params, features).with_recording(features.recording), None
 
-    def read(self, params: P, trajectory: Motion, out: NDArray[np.int64]) -> Estimate:
-        """The motion at the times that were prepared."""
+    def read(self, params: P, trajectory: MotionEstimate, out: NDArray[np.int64]) -> Estimate:
         return trajectory(out, extrapolate=True)
 
-    def estimate(self, recording: Recording, params: P | None = None, **options: Any) -> Motion:
-        """The `Motion` of a recording; see the module of the method for what it is.
+    def estimate(
+        self, recording: Recording, params: P | None = None, **options: Any
+    ) -> MotionEstimate:
+        """Estimate the motion of a recording; see the module of the method.
 
-        Raises `InputError` for a model that is unknown or that the method does not know, where the
-        model needs a camera and there is none, and for what the method needs and is not there.
-        Without parameters they are the defaults, with windows that `suit` the recording.
+        Args:
+            recording: The recording.
+            params: The parameters; by default with windows adapted to the recording.
+            options: Options of the method, see `MotionEstimator`.
+
+        Returns:
+            The motion.
+
+        Raises:
+            InputError: The model is unknown or not supported, it needs a camera and there is none,
+                or the recording lacks what the method needs.
         """
-        given, _ = self.prepare(recording, np.zeros(0, np.int64), params, **options)
+        inputs, _ = self.prepare(recording, np.zeros(0, np.int64), params, **options)
         if params is None:
-            params = self.suit(recording, self.start(given.model), camera=given.camera).params
-        return self.run(params, given)[0]
+            start = self.initial_params(inputs.model)
+            params = self.adapt_params(recording, start, camera=inputs.camera).params
+        return self.run(params, inputs)[0]

@@ -1,19 +1,21 @@
-"""Optical flow of each event, once the camera's motion is known; and how many events contradict it.
+"""Optical flow of events and of pixels, once the camera's motion is known.
 
     U, valid, residual = flow(recording, voting.estimate(recording, model="rotation"))
+    field = RigidFlow(recording, motion).flow(times)  # (T, height, width, 2) px/s
 
 Planar motion is the flow, a rotation makes B Omega. General motion leaves the speed rho along the
-half-line B Omega + rho a, a = A T / |A T|, to the depth. It is told by the event's candidates: with
+half-line B Omega + rho a, a = A T / |A T|, to the depth. The event's candidates determine it. With
 q = d - dt B Omega, what the rotation leaves of the displacement d from an earlier event of age dt,
 
     S(rho) = |U|^g sum_c exp(-|q_c - rho dt_c a|^2 / (2 sigma_x^2)),  U = B Omega + rho a,
 
-over those that U moves by b/2 to b, is looked at on a grid of speeds; the largest one is refined by
-least squares over the candidates that voted for it. The candidate nearest to the half-line alone
-(thesis, chapter 6) tells less: an edge's burst of events offers many.
+over the candidates that U moves by b/2 to b, is evaluated on a grid of speeds. The largest one is
+refined by least squares over the candidates that voted for it. The candidate nearest to the
+half-line alone (thesis, chapter 6) is less certain, since an edge's burst of events offers many.
 """
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,19 +25,27 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.candidates import Candidates, Gatherer
+from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.egomotion.candidates import Candidates, CandidateSampler, pixel_coordinates
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
 from jaxevent.parameters import Count, Number, Parameters, Positive
 from jaxevent.progress import bar
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, Times, microseconds
 
-BATCH, BATCHES = 256, 32  # events that are looked at together, and how often before the host acts
+BATCH_EVENTS = 256
+CHUNK_BATCHES = 32  # batches per call of the compiled function
 REFINEMENTS = 2
+DEPTH_WINDOW_US = 30_000  # on either side of a time, whose events determine depths
+CANDIDATE_WINDOW_US = 100_000  # before that, whose events are candidates
+DEPTH_SIGMAS_PX = (1.5, 3.0, 6.0, 15.0, 50.0)  # of Gaussians; the narrowest with events counts
+MIN_DENSITY = 0.3  # events per pixel at which a Gaussian counts in full
+DEPTH_SPREAD = 0.3  # relative deviation of the inverse depths of one position
 
 
 class Params(Parameters):
@@ -55,23 +65,29 @@ class Params(Parameters):
     limit = Positive(1.0, "px", "an event none of whose candidates is so near is an outlier")
 
 
+@renamed_methods(outliers="outlier_percentage")
 class Flow(NamedTuple):
-    """Flow of n events: `flow` (n, 2) in px/s, `valid` (n,), `residual` (n,) in px.
+    """Flow of n events.
 
-    The flow is that of undistorted coordinates of one focal length, where there is a calibration
-    (see `geometry.undistorted`). `valid` is False, and the flow NaN, where the motion is lost and,
-    in general motion, where no candidate is within `limit`. The residual is the distance of the
-    candidate that fits the flow best, infinite where there is none.
+    It is the flow of undistorted coordinates of one focal length, if there is a calibration (see
+    `geometry.undistort`). Events are invalid where the motion is lost and, in general motion, where
+    no candidate is within `Params.limit`.
+
+    Attributes:
+        flow: (n, 2) flow, px/s; NaN where invalid.
+        valid: (n,) whether the flow is known.
+        residual: (n,) distance of the candidate that fits the flow best, px; infinite without
+            candidates, NaN where the motion is lost.
     """
 
     flow: NDArray[np.float32]
     valid: NDArray[np.bool_]
     residual: NDArray[np.float32]
 
-    def outliers(self, limit: float | int = 1.0) -> float:
-        """The percentage of events whose residual is above `limit` px.
+    def outlier_percentage(self, limit: float | int = 1.0) -> float:
+        """Return the percentage of events with a residual above `limit` px.
 
-        Among those for which the motion is known; 0 where there is none.
+        It counts events for which the motion is known, and is 0 without any.
         """
         known = ~np.isnan(self.residual)
         return 100 * float((self.residual[known] > limit).mean()) if known.any() else 0.0
@@ -79,77 +95,86 @@ class Flow(NamedTuple):
 
 def flow(
     recording: Recording,
-    motion: Motion,
+    motion: MotionEstimate,
     params: Params | None = None,
     *,
     camera: PinholeCamera | None = None,
     progress: bool | None = None,
 ) -> Flow:
-    """The flow of every event of a recording; see `Flow`, and `iterate`, which says what it takes.
+    """Estimate the flow of every event of a recording.
 
-    Raises `InputError` for a rotation or general motion without a calibration.
+    Args:
+        recording: The recording.
+        motion: The camera's motion; its fixed-lag estimates are used.
+        params: The parameters.
+        camera: The calibration; by default the recording's.
+        progress: Whether to show a progress bar; by default in a terminal.
+
+    Returns:
+        The flow.
+
+    Raises:
+        InputError: The motion needs a calibration and there is none.
     """
-    parts = list(iterate(recording, motion, params, camera=camera, progress=progress))
+    parts = list(iterate_flow(recording, motion, params, camera=camera, progress=progress))
     if not parts:
-        none = np.zeros(0, np.float32)
-        return Flow(none.reshape(0, 2), none.astype(bool), none)
-    return Flow(
-        np.concatenate([part.flow for part in parts]),
-        np.concatenate([part.valid for part in parts]),
-        np.concatenate([part.residual for part in parts]),
-    )
+        return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
+    return Flow(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def iterate(
+def iterate_flow(
     recording: Recording,
-    motion: Motion,
+    motion: MotionEstimate,
     params: Params | None = None,
     *,
     camera: PinholeCamera | None = None,
     progress: bool | None = None,
 ) -> Iterator[Flow]:
-    """The same in stretches of up to 8192 events, one after another, in constant memory.
+    """Estimate the flow of events in chunks of up to 8192 events, in constant memory.
 
-    `camera` is by default the recording's. The motion is that which `motion` tells of the events'
-    times, centred: a fixed-lag estimate. Residuals are NaN where it is lost.
+    Args:
+        recording: The recording.
+        motion: The camera's motion; its fixed-lag estimates are used.
+        params: The parameters.
+        camera: The calibration; by default the recording's.
+        progress: Whether to show a progress bar; by default in a terminal.
+
+    Yields:
+        The flow of consecutive events.
+
+    Raises:
+        InputError: The motion needs a calibration and there is none.
     """
     params = params or Params.of({})
-    camera = camera or recording.camera
-    if motion.model.needs_camera and camera is None:
-        raise InputError(
-            f"{recording.name}: has no calibration, which the flow of {motion.model.title} needs"
-            f"{recording.describe_left_out('camera')}; give a camera"
-        )
-    gatherer = Gatherer(
+    sampler = CandidateSampler(
         recording,
-        camera,
+        _required_camera(recording, motion, camera),
         radius=params.radius,
         per_pixel=params.per_pixel,
         most=params.candidates,
         every=1,
-        batch=BATCH,
+        batch=BATCH_EVENTS,
         longest=1e6,
         silence=float(params.tau_max),
     )
     real = np.dtype(jnp.result_type(float))
-    ages = _ages(params, motion, gatherer)
-    model = motion.model(gatherer.f)
-    with bar(
-        total=len(recording.events), unit="event", unit_scale=True, desc="flow", progress=progress
-    ) as shown:
-        while not gatherer.done:
-            made = gatherer.gather(BATCHES, *ages)
-            seen = made.row >= 0
-            rows = made.row[seen]
+    ages = _age_range(params, motion, sampler)
+    model = motion.model(sampler.f)
+    total = len(recording.events)
+    with bar(total=total, unit="event", unit_scale=True, desc="flow", progress=progress) as shown:
+        while not sampler.is_exhausted:
+            batches = sampler.sample(CHUNK_BATCHES, *ages)
+            used = batches.row >= 0
+            rows = batches.row[used]
             if not len(rows):
                 break
             t = recording.events[int(rows[0]) : int(rows[-1]) + 1].t
-            told = motion(t, centred=True, extrapolate=True)
-            known = told.valid & np.isfinite(told.mean).all(1)
-            mean = np.zeros((*seen.shape, told.mean.shape[1]), real)
-            mean[seen] = np.where(known[:, None], told.mean, 0)
-            U, residual = _flows(params, model, made.candidates, mean)
-            U, residual = np.asarray(U)[seen], np.asarray(residual)[seen]
+            estimate = motion(t, centred=True, extrapolate=True)
+            known = estimate.valid & np.isfinite(estimate.mean).all(1)
+            mean = np.zeros((*used.shape, estimate.mean.shape[1]), real)
+            mean[used] = np.where(known[:, None], estimate.mean, 0)
+            U, residual = _estimate_flow(params, model, batches.candidates, mean)
+            U, residual = np.asarray(U)[used], np.asarray(residual)[used]
             valid = known & (residual <= float(params.limit)) if model.half_line else known
             yield Flow(
                 np.where(valid[:, None], U, np.nan).astype(np.float32),
@@ -159,16 +184,30 @@ def iterate(
             shown.update(len(rows))
 
 
-def _ages(params: Params, motion: Motion, gatherer: Gatherer) -> tuple[float, float]:
-    """Youngest and oldest candidates (s) that any event can need, from the flow at the border."""
+def _required_camera(
+    recording: Recording, motion: MotionEstimate, camera: PinholeCamera | None
+) -> PinholeCamera | None:
+    """Return the camera, by default the recording's; `InputError` if it is needed and missing."""
+    camera = camera or recording.camera
+    if motion.model.needs_camera and camera is None:
+        raise InputError(
+            f"{recording.name}: has no calibration, which the flow of {motion.model.title} needs"
+            f"{recording.describe_left_out('camera')}; give a camera"
+        )
+    return camera
+
+
+def _age_range(
+    params: Params, motion: MotionEstimate, sampler: CandidateSampler
+) -> tuple[float, float]:
+    """Bound the ages (s) of candidates that any event can need, by the flow at the border."""
     tau_max, b = float(params.tau_max), float(params.baseline)
     mean = np.asarray(motion.mean[motion.valid], float)
     if not len(mean):
         return tau_max / 2, tau_max
-    border = np.concatenate(
-        [gatherer.xi[0], gatherer.xi[-1], gatherer.xi[:, 0], gatherer.xi[:, -1]]
-    )
-    model = motion.model(gatherer.f)
+    xi = sampler.xi
+    border = np.concatenate([xi[0], xi[-1], xi[:, 0], xi[:, -1]])
+    model = motion.model(sampler.f)
     basis = np.asarray(model.basis(border))
     if model.uniform:
         speed = float(np.linalg.norm(mean @ basis[0].T, axis=1).max())
@@ -179,63 +218,182 @@ def _ages(params: Params, motion: Motion, gatherer: Gatherer) -> tuple[float, fl
     return min(b / 2 / max(speed, 1e-9), tau_max / 2), tau_max
 
 
+class _Displacements(NamedTuple):
+    """Candidates (C, K) of K events, relative to the flow that does not depend on depth."""
+
+    age: Array  # s
+    along: Array  # px, component along the half-line of what the rotation leaves
+    across2: Array  # px^2, square of the other component
+    base: Array  # (K, 2) px/s, start of the half-line
+    a: Array  # (K, 2) its direction
+
+    def in_baseline(self, params: Params, speed: Array) -> Array:
+        """Return which candidates a flow of this speed (px/s) has moved by b/2 to b."""
+        distance = self.age * speed
+        return (self.age > 0) & (distance >= params.baseline / 2) & (distance <= params.baseline)
+
+
 @eqx.filter_jit
-def _flows(
+def _estimate_flow(
     params: Params,
     model: Model,
     candidates: Candidates,
     mean: Float[Array | NDArray, "batches K dimension"],
 ) -> tuple[Float[Array, "batches K 2"], Float[Array, "batches K"]]:
-    """Flow and residual of batches of events."""
+    """Estimate flow and residual of batches of events."""
     grid = jnp.geomspace(params.slowest, params.fastest, params.speeds)
     grid = jnp.concatenate([jnp.zeros(1, grid.dtype), grid])
 
-    def one(batch: tuple[Array, Array, Array, Array]):
+    def estimate(batch: tuple[Array, Array, Array, Array]):
         d, age, xi, mean = batch
         base = jax.vmap(model.flow)(xi, mean)
-        a = jax.vmap(model.line)(xi, mean) if model.half_line else jnp.zeros_like(base)
+        a = jnp.zeros_like(base)
+        if model.half_line:
+            a = jax.vmap(model.half_line_direction)(xi, mean)
         q = d - age[..., None] * base  # C K 2
         along = (q * a).sum(-1)
-        off = ((q - along[..., None] * a) ** 2).sum(-1)
+        found = _Displacements(age, along, ((q - along[..., None] * a) ** 2).sum(-1), base, a)
         rho = jnp.zeros_like(along[0])
         if model.half_line:
-            rho = _voted(params, grid, age, along, off, base, a)
+            rho = _vote_speed(params, grid, found)
         U = base + rho[:, None] * a
-        moved = _moved(params, age, length(U))
-        nearest = jnp.sqrt(off + (along - rho * age) ** 2)
+        moved = found.in_baseline(params, length(U))
+        nearest = jnp.sqrt(found.across2 + (along - rho * age) ** 2)
         return U, jnp.where(moved, nearest, jnp.inf).min(0)
 
     d, age = (jnp.swapaxes(jnp.asarray(part), 1, 2) for part in (candidates.d, candidates.age))
     xi = jnp.asarray(candidates.xi)
-    return lax.map(one, (d, age, xi, jnp.asarray(mean)))
+    return lax.map(estimate, (d, age, xi, jnp.asarray(mean)))
 
 
-def _moved(params: Params, age: Array, speed: Array) -> Array:
-    """Which candidates a flow of this speed has moved by b/2 to b; none where there is none."""
-    way = age * speed
-    return (age > 0) & (way >= params.baseline / 2) & (way <= params.baseline)
-
-
-def _voted(
-    params: Params, grid: Array, age: Array, along: Array, off: Array, base: Array, a: Array
-) -> Float[Array, " K"]:
-    """The speed (px/s) along the half-line for which most candidates (C, K) vote."""
+def _vote_speed(params: Params, grid: Array, found: _Displacements) -> Float[Array, " K"]:
+    """Return the speed (px/s) along the half-line for which most candidates vote."""
     exponent = -0.5 / params.sigma_x**2
-    share = jnp.where(age > 0, jnp.exp(off * exponent), 0)
-    speed = length(base[:, None] + grid[:, None] * a[:, None])  # K speeds
+    weight = jnp.where(found.age > 0, jnp.exp(found.across2 * exponent), 0)
+    speed = length(found.base[:, None] + grid[:, None] * found.a[:, None])  # K speeds
 
-    def add(S: Array, one: tuple[Array, Array, Array]):
-        age, along, share = (part[:, None] for part in one)
-        votes = share * jnp.exp((along - grid * age) ** 2 * exponent)
-        return S + jnp.where(_moved(params, age, speed), votes, 0), None
+    def add(S: Array, candidate: tuple[Array, Array, Array]):
+        age, along, weight = (part[:, None] for part in candidate)
+        votes = weight * jnp.exp((along - grid * age) ** 2 * exponent)
+        one = found._replace(age=age)
+        return S + jnp.where(one.in_baseline(params, speed), votes, 0), None
 
-    S = lax.scan(add, jnp.zeros_like(speed), (age, along, share))[0]
-    # A fast flow looks at younger, fewer candidates.
+    S = lax.scan(add, jnp.zeros_like(speed), (found.age, found.along, weight))[0]
+    # A fast flow has younger, fewer candidates.
     rho = grid[(S * speed**params.gain).argmax(1)]
     for _ in range(REFINEMENTS):
-        votes = share * jnp.exp((along - rho * age) ** 2 * exponent)
-        votes = jnp.where(_moved(params, age, length(base + rho[:, None] * a)), votes, 0)
-        moment = (votes * age**2).sum(0)
-        fitted = (votes * along * age).sum(0) / jnp.where(moment > 0, moment, 1)
+        votes = weight * jnp.exp((found.along - rho * found.age) ** 2 * exponent)
+        U = found.base + rho[:, None] * found.a
+        votes = jnp.where(found.in_baseline(params, length(U)), votes, 0)
+        moment = (votes * found.age**2).sum(0)
+        fitted = (votes * found.along * found.age).sum(0) / jnp.where(moment > 0, moment, 1)
         rho = jnp.where(moment > 0, jnp.clip(fitted, 0, params.fastest), rho)
     return rho
+
+
+@dataclasses.dataclass(frozen=True)
+class RigidFlow:
+    """Optical flow of all pixels of a rigid scene, a function of time: `flow(times)`.
+
+        motion = egomotion.voting.estimate(recording, model="rotation")
+        moving = RigidFlow(recording, motion)
+        video = jaxevent.mc.estimate(recording, params, motion=moving)
+
+    For general motion the events around a time determine the depths. The inverse depth of a pixel,
+    in units of the camera's speed, is the mean of those of the events. They are weighted by a
+    Gaussian, and by the image motion that translation makes there. Gaussians get narrower step by
+    step, and events far from the mean of the step before count less.
+
+    Attributes:
+        recording: Recording whose events determine depths.
+        motion: The camera's motion.
+        camera: The calibration; by default the recording's.
+    """
+
+    recording: Recording
+    motion: MotionEstimate
+    camera: PinholeCamera | None = None
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
+        """Return the optical flow at some times.
+
+        Args:
+            times: (T,) integers (us) or floats (s).
+            extrapolate: Whether times outside the recording are allowed.
+
+        Returns:
+            (T, height, width, 2) flow in x and y, px/s; NaN where the motion is lost.
+
+        Raises:
+            InputError: A time is outside the recording without `extrapolate`, or the motion needs a
+                calibration and there is none.
+        """
+        camera = _required_camera(self.recording, self.motion, self.camera)
+        size = self.recording.height, self.recording.width
+        xi, f = pixel_coordinates(size[1], size[0], camera)
+        times = np.atleast_1d(microseconds(times))
+        estimate = self.motion(times, centred=True, extrapolate=extrapolate)
+        out = np.full((len(times), *size, 2), np.nan, np.float32)
+        model = self.motion.model(f)
+        # Displacements of pixels are those of undistorted coordinates, distorted again.
+        undistortion = np.stack([np.gradient(xi, axis=1), np.gradient(xi, axis=0)], -1)
+        distortion = np.linalg.inv(undistortion)
+        for row, t in enumerate(times.tolist()):
+            if estimate.valid[row]:
+                mean = np.asarray(estimate.mean[row], float)
+                U = _map_pixels(model.flow, xi, mean)
+                if model.half_line:
+                    U = U + self._parallax(t, xi, model, mean)
+                out[row] = (distortion @ U[..., None])[..., 0]
+        return out
+
+    def _parallax(
+        self, t: int, xi: NDArray[np.float64], model: Model, mean: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the flow (height, width, 2) that is due to translation."""
+        f = model.f
+        first = max(t - DEPTH_WINDOW_US - CANDIDATE_WINDOW_US, self.recording.start)
+        part = self.recording[first : t + DEPTH_WINDOW_US]
+        found = flow(part, self.motion, camera=self.camera, progress=False)
+        e = part.events[: len(part.events)]
+        use = found.valid & (e.t >= t - DEPTH_WINDOW_US)
+        # A T of a heading: its direction is the half-line's, its length px/s at inverse depth 1.
+        size = np.hypot(xi[..., 0] * mean[2] - f * mean[0], xi[..., 1] * mean[2] - f * mean[1])
+        a = _map_pixels(model.half_line_direction, xi, mean)
+        x, y = e.x[use], e.y[use]
+        base = _map_pixels(model.flow, xi, mean)
+        speed = ((found.flow[use] - base[y, x]) * a[y, x]).sum(-1)
+        if not len(x):
+            return np.zeros((*size.shape, 2))
+        rho = speed / np.maximum(size[y, x], 1e-9)  # inverse depth
+        smooth = np.full(size.shape, np.median(rho))
+        for sigma in reversed(DEPTH_SIGMAS_PX):
+            # Events of a wrong speed deviate from the wider surroundings.
+            off = (rho - smooth[y, x]) / np.maximum(DEPTH_SPREAD * smooth[y, x], 1e-9)
+            weight = size[y, x] / (1 + off**2)
+            total, mass, count = (
+                gaussian_filter(_sum_by_pixel(size.shape, y, x, values), sigma)
+                for values in (weight * rho, weight, np.ones(len(x)))
+            )
+            trust = np.clip(count / MIN_DENSITY, 0, 1)
+            smooth = smooth + trust * (total / np.maximum(mass, 1e-12) - smooth)
+        return (smooth * size)[..., None] * a
+
+
+def _sum_by_pixel(
+    shape: tuple[int, ...], y: NDArray, x: NDArray, values: NDArray
+) -> NDArray[np.float64]:
+    """Sum the values of the events of each pixel."""
+    sums = np.bincount(y.astype(int) * shape[1] + x, values, shape[0] * shape[1])
+    return np.asarray(sums, float).reshape(shape)
+
+
+def _map_pixels(
+    function: Callable, xi: NDArray[np.float64], mean: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Evaluate a function of a position and a motion at every pixel, (height, width, 2)."""
+    flat = jax.vmap(function, (0, None))(jnp.asarray(xi.reshape(-1, 2)), jnp.asarray(mean))
+    return np.asarray(flat, float).reshape(xi.shape)
+
+
+__getattr__ = renamed_names(__name__)

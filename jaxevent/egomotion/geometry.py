@@ -1,16 +1,23 @@
-"""Image motion of a rigid scene: flow, residuals of matched events, rotations and twists.
+"""Geometry of the moving image: flow of a rigid scene, rotations, twists, warped events.
 
-Everything speaks of the camera's own motion, the camera twist: the camera moves with the velocity T
-(m/s) and turns with Omega (rad/s), both in its own axes, x to the right, y down, z forward. A point
-at P in these axes moves by dP/dt = -T - Omega x P. Image coordinates x, y (px) are undistorted,
-relative to the principal point and of one focal length f (px): x = f X / Z. With inverse depth
-1 / Z (1/m) the image moves with
+Motion is the camera's own, its twist: the velocity T (m/s) and the angular velocity Omega (rad/s)
+in its axes, x to the right, y down, z forward. A point at P in these axes moves by
+dP/dt = -T - Omega x P. Image coordinates x, y (px) are undistorted, relative to the principal point
+and of one focal length f (px): x = f X / Z. With inverse depth 1 / Z (1/m) the image moves with
 
     U = A T / Z + B Omega,  A = [-f 0 x; 0 -f y],  B = [xy/f -(f+x^2/f) y; f+y^2/f -xy/f -x]
 
 (egomotion thesis, 6.1, whose B is misprinted; its equations 3.2, 6.3, 6.4, 6.11 and 6.18 have the
-scene's twist, that is both signs turned.) Scale is not observable: T and 1 / Z only occur as their
+scene's twist, with both signs changed). Scale is not observable: T and 1 / Z only occur as their
 product. All functions broadcast over leading axes and are differentiable.
+
+Images of warped events show how well a motion fits. If it is the right one, the events that one
+point of the scene made fall together, and the image of their polarities has a high variance
+(Gallego, Rebecq & Scaramuzza, "A Unifying Contrast Maximization Framework for Event Cameras",
+CVPR 2018).
+
+    image = blur(splat(warped, polarity, (height, width)), 1)
+    sharpness = image_variance(image)
 """
 
 from collections.abc import Sequence
@@ -18,10 +25,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.errors import InputError
 
@@ -29,28 +38,54 @@ Scalars = Float[Array | np.ndarray, "..."] | float | int
 
 
 def A(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
-    """The matrix of translation (px): A T / Z is the flow in px/s of a camera that moves with T."""
+    """Return the translation matrix: A T / Z is the flow of a camera with velocity T.
+
+    Args:
+        x: Horizontal coordinate, px.
+        y: Vertical coordinate, px.
+        f: Focal length, px.
+
+    Returns:
+        (..., 2, 3) matrices, px.
+    """
     x, y, f = jnp.broadcast_arrays(*map(_real, (x, y, f)))
     return _rows([-f, 0 * f, x], [0 * f, -f, y])
 
 
 def B(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
-    """The matrix of rotation (px): B Omega is the flow in px/s of a camera that turns by Omega."""
+    """Return the rotation matrix: B Omega is the flow of a camera with angular velocity Omega.
+
+    Args:
+        x: Horizontal coordinate, px.
+        y: Vertical coordinate, px.
+        f: Focal length, px.
+
+    Returns:
+        (..., 2, 3) matrices, px.
+    """
     x, y, f = jnp.broadcast_arrays(*map(_real, (x, y, f)))
-    return jnp.stack([jnp.stack(row, -1) for row in _turning_rows(x, y, f)], -2)
+    return jnp.stack([jnp.stack(row, -1) for row in _rotation_rows(x, y, f)], -2)
 
 
 def rotation_basis(
-    xi: Float[Array | np.ndarray, "*places 2"], f: float | Float[Array, ""]
-) -> Float[Array | np.ndarray, "*places 2 3"]:
-    """`B` at places xi (px): of NumPy arrays in NumPy, in their precision, else in JAX."""
+    xi: Float[Array | np.ndarray, "*points 2"], f: float | Float[Array, ""]
+) -> Float[Array | np.ndarray, "*points 2 3"]:
+    """Return `B` at positions, computed by NumPy for NumPy arrays.
+
+    Args:
+        xi: (*points, 2) positions, px.
+        f: Focal length, px.
+
+    Returns:
+        (*points, 2, 3) matrices, px, in the precision of the positions.
+    """
     if not isinstance(xi, np.ndarray):
         return B(xi[..., 0], xi[..., 1], jnp.asarray(f, xi.dtype))
     x, y = xi[..., 0], xi[..., 1]
-    return np.stack([np.stack(row, -1) for row in _turning_rows(x, y, f)], -2)
+    return np.stack([np.stack(row, -1) for row in _rotation_rows(x, y, f)], -2)
 
 
-def _turning_rows(x: Any, y: Any, f: Any) -> tuple[list, list]:
+def _rotation_rows(x: Any, y: Any, f: Any) -> tuple[list, list]:
     return [x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]
 
 
@@ -62,7 +97,19 @@ def flow(
     Omega: Float[Array | np.ndarray, "*#o 3"],
     inverse_depth: Scalars,
 ) -> Float[Array, "... 2"]:
-    """U = A T / Z + B Omega in px/s, at inverse depths 1 / Z (1/m), 0 for points at infinity."""
+    """Return the flow U = A T / Z + B Omega of points of a rigid scene.
+
+    Args:
+        x: Horizontal coordinate, px.
+        y: Vertical coordinate, px.
+        f: Focal length, px.
+        T: (..., 3) velocity of the camera, m/s.
+        Omega: (..., 3) angular velocity of the camera, rad/s.
+        inverse_depth: 1 / Z, 1/m; 0 for points at infinity.
+
+    Returns:
+        (..., 2) flow, px/s.
+    """
     rho = _real(inverse_depth)[..., None]
     return _apply(A(x, y, f), T) * rho + _apply(B(x, y, f), Omega)
 
@@ -75,11 +122,22 @@ def bilinear(
     T: Float[Array | np.ndarray, "*#t 3"],
     Omega: Float[Array | np.ndarray, "*#o 3"],
 ) -> Float[Array, "..."]:
-    """The depth-free constraint T' (I + M Omega), 0 for the flow U (px/s) of the camera twist.
+    """Return the depth-free constraint T' (I + M Omega), which is 0 for the flow of the twist.
 
-    I = U x X and M = X X' - |X|^2 1, X = (x, y, f); 6.4 of the thesis has I - M Omega, for the
-    scene's twist. It is the determinant of (U - B Omega, A T), has the unit of px^2/s times that of
-    T and changes its sign with T: which way the camera moves it does not tell.
+    I = U x X and M = X X' - |X|^2 1 with X = (x, y, f); 6.4 of the thesis has I - M Omega, for the
+    scene's twist. The value is the determinant of (U - B Omega, A T). T and -T satisfy it
+    alike.
+
+    Args:
+        x: Horizontal coordinate, px.
+        y: Vertical coordinate, px.
+        f: Focal length, px.
+        U: (..., 2) flow, px/s.
+        T: (..., 3) velocity of the camera.
+        Omega: (..., 3) angular velocity of the camera, rad/s.
+
+    Returns:
+        (...) values, px^2/s times the unit of T.
     """
     x, y, f = map(_real, (x, y, f))
     U, T, Omega = map(_real, (U, T, Omega))
@@ -98,14 +156,25 @@ def rotation_residual(
     f: Scalars,
     Omega: Float[Array | np.ndarray, "*#o 3"],
 ) -> Float[Array, "... 2"]:
-    """d - dt B Omega (px): what a pure rotation leaves of the displacement d (px) within dt (s).
+    """Return d - dt B Omega, the displacement that a rotation leaves unexplained.
 
-    `d` and `dt` are those of an event at (x, y) from its earlier candidate. The residual r_c is
-    its `length` (thesis 6.12, in px).
+    Its `length` is the residual r_c of the thesis, 6.12, in px.
+
+    Args:
+        d: (..., 2) displacement of an event from its earlier candidate, px.
+        dt: Time between the two, s.
+        x: Horizontal coordinate, px.
+        y: Vertical coordinate, px.
+        f: Focal length, px.
+        Omega: (..., 3) angular velocity of the camera, rad/s.
+
+    Returns:
+        (..., 2) residual, px.
     """
     return _real(d) - _real(dt)[..., None] * _apply(B(x, y, f), Omega)
 
 
+# Eight letters of one equation, public since the first release.
 def half_line_residual(
     d: Float[Array | np.ndarray, "*#d 2"],
     dt: Scalars,
@@ -116,13 +185,25 @@ def half_line_residual(
     Omega: Float[Array | np.ndarray, "*#o 3"],
     rho_max: Scalars = jnp.inf,
 ) -> Float[Array, "... 2"]:
-    """q - s a (px): a displacement d (px) within dt > 0 (s), less its best flow of positive depth.
+    """Return the displacement that no flow of positive depth explains.
 
-    q = d - dt B Omega, a = A T / |A T|, s = clip(q . a, 0, rho_max dt); the residual r_c is its
-    `length`. `rho_max` (px/s) bounds the flow due to translation, |A T| / Z. Only the direction of
-    T matters; that it is a half-line tells T from -T. Where A T is 0, in the focus of expansion or
-    without translation, and with rho_max = 0, it is `rotation_residual`. Replaces 6.9 of the
-    thesis, whose |F| is |q x a| times |A T| / dt.
+    The residual is q - s a with q = d - dt B Omega, a = A T / |A T| and
+    s = clip(q . a, 0, rho_max dt). It distinguishes T from -T, since the flow lies on a half-line.
+    It equals `rotation_residual` where A T is 0, in the focus of expansion or without translation,
+    and with rho_max = 0. It replaces 6.9 of the thesis, whose |F| is |q x a| times |A T| / dt.
+
+    Args:
+        d: (..., 2) displacement of an event from its earlier candidate, px.
+        dt: Time between the two, s, above 0.
+        x: Horizontal coordinate, px.
+        y: Vertical coordinate, px.
+        f: Focal length, px.
+        T: (..., 3) velocity of the camera; only its direction counts.
+        Omega: (..., 3) angular velocity of the camera, rad/s.
+        rho_max: Largest flow due to translation, |A T| / Z, px/s.
+
+    Returns:
+        (..., 2) residual, px.
     """
     q = rotation_residual(d, dt, x, y, f, Omega)
     a = _apply(A(x, y, f), T)
@@ -133,20 +214,20 @@ def half_line_residual(
 
 
 def length(v: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-    """The Euclidean length along the last axis; its gradient at 0 is 0."""
+    """Return the Euclidean length along the last axis, whose gradient at 0 is 0."""
     square = jnp.sum(_real(v) ** 2, -1)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def unit(v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-    """The vector of length 1 along the last axis; that of 0 is 0."""
+    """Scale vectors along the last axis to length 1; zero vectors stay."""
     square = (v**2).sum(-1, keepdims=True)
     return jnp.where(square > 0, v / jnp.sqrt(jnp.where(square > 0, square, 1)), v)
 
 
 @full_precision
 def rotation_exp(phi: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """The rotation matrix of a rotation vector (rad), by Rodrigues' formula."""
+    """Return the rotation matrix of a rotation vector (rad), by Rodrigues' formula."""
     phi = _real(phi)
     first, second, _ = _coefficients(_dot(phi, phi))
     K = _cross_matrix(phi)
@@ -154,9 +235,9 @@ def rotation_exp(phi: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array, "*b
 
 
 def rotation_log(R: Float[Array | np.ndarray, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
-    """The rotation vector (rad) of a rotation matrix, of an angle up to pi.
+    """Return the rotation vector (rad) of a rotation matrix, of an angle up to pi.
 
-    Half turns have two; there it jumps, and has no gradient.
+    At half turns, which have two rotation vectors, it jumps and has no gradient.
     """
     R = _real(R)
     # 4 q q' of the unit quaternion q = (w, v) is linear in R. Its column with the largest diagonal
@@ -183,7 +264,7 @@ def rotation_log(R: Float[Array | np.ndarray, "*batch 3 3"]) -> Float[Array, "*b
 
 @full_precision
 def twist_exp(xi: Float[Array | np.ndarray, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
-    """The camera's pose after 1 s of the constant twist (T, Omega): camera to first camera."""
+    """Return the camera's pose after 1 s of a constant twist (T, Omega), relative to the first."""
     xi = _real(xi)
     phi = xi[..., 3:]
     _, second, third = _coefficients(_dot(phi, phi))
@@ -196,7 +277,7 @@ def twist_exp(xi: Float[Array | np.ndarray, "*batch 6"]) -> Float[Array, "*batch
 
 @full_precision
 def twist_log(P: Float[Array | np.ndarray, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
-    """The twist (T, Omega) that leads to the pose P in 1 s: the inverse of `twist_exp`."""
+    """Return the constant twist (T, Omega) that leads to the pose P in 1 s, as `twist_exp` does."""
     P = _real(P)
     phi = rotation_log(P[..., :3, :3])
     square = _dot(phi, phi)
@@ -210,15 +291,24 @@ def twist_log(P: Float[Array | np.ndarray, "*batch 4 4"]) -> Float[Array, "*batc
     return jnp.concatenate([(inverse @ P[..., :3, 3:])[..., 0], phi], -1)
 
 
-def undistorted(
+def undistort(
     camera: PinholeCamera, x: ArrayLike, y: ArrayLike
 ) -> tuple[NDArray[np.float64], float]:
-    """Coordinates (events, 2) in px of events' pixels as all functions here take them, and f (px).
+    """Undo the distortion of pixels, on the host in float64.
 
-    Distortion is undone, the principal point is (0, 0), and both axes have the focal length
-    f = sqrt(fx fy). On the host, in float64. Raises `InputError` for a camera without positive
-    focal lengths and for pixels at which its distortion has no inverse, or that look more than 87
-    degrees from the axis.
+    The principal point becomes (0, 0), and both axes get the focal length f = sqrt(fx fy).
+
+    Args:
+        camera: The camera.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+
+    Returns:
+        Coordinates (n, 2) in px, as the functions of this module take them, and f (px).
+
+    Raises:
+        InputError: A focal length is not positive, or the distortion has no inverse at a pixel
+            within 87 degrees of the axis.
     """
     straight = camera.normalise(x, y)
     if np.isnan(straight).any():
@@ -230,6 +320,83 @@ def undistorted(
         )
     f = float(np.sqrt(camera.fx * camera.fy))
     return f * straight, f
+
+
+def splat(
+    xy: Float[Array | NDArray, "E 2"],
+    weight: Float[Array | NDArray, "*channels E"],
+    shape: tuple[int, int],
+    offset: tuple[Scalars, Scalars] = (0.0, 0.0),
+) -> Float[Array, "*channels height width"]:
+    """Sum weighted events into images, each into its four nearest pixels bilinearly.
+
+    Events outside the image, or not finite, are left out. At the border weights fade, so the image
+    is continuous in `xy`. It is differentiable in `xy` and `weight`, forward and in reverse.
+
+    Args:
+        xy: (E, 2) positions of events, x first, px.
+        weight: (*channels, E) weights.
+        shape: Height and width of the image, px.
+        offset: Position (x, y) of the pixel [0, 0], px: minus the principal point for coordinates
+            that are relative to it.
+
+    Returns:
+        (*channels, height, width) images.
+    """
+    xy, weight = jnp.asarray(xy), jnp.asarray(weight)
+    height, width = shape
+    # A frame of one pixel around the image takes what leaves it.
+    x = jnp.clip(_replace_nonfinite(xy[:, 0] - offset[0]) + 1, 0, width + 1)
+    y = jnp.clip(_replace_nonfinite(xy[:, 1] - offset[1]) + 1, 0, height + 1)
+    i, j = jnp.floor(x), jnp.floor(y)
+    u, v = x - i, y - j
+    pixel = j.astype(jnp.int32) * (width + 2) + i.astype(jnp.int32)
+    bilinear = jnp.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], -1)
+    # One row of four per event, then four shifted sums: faster than four scatters. At the last row
+    # and column u and v are 0.
+    rows = jnp.zeros((*weight.shape[:-1], (height + 2) * (width + 2), 4), xy.dtype)
+    rows = rows.at[..., pixel, :].add(weight[..., None] * bilinear, mode="promise_in_bounds")
+    four = rows.reshape(*weight.shape[:-1], height + 2, width + 2, 4)
+    return (
+        four[..., 1:-1, 1:-1, 0]
+        + four[..., 1:-1, :-2, 1]
+        + four[..., :-2, 1:-1, 2]
+        + four[..., :-2, :-2, 3]
+    )
+
+
+def blur(image: Float[Array, "*channels height width"], times: int = 1) -> Array:
+    """Smooth an image by [1 2 1] / 4 in x and in y; it is 0 beyond the border.
+
+    Args:
+        image: (*channels, height, width) image.
+        times: Number of repetitions.
+
+    Returns:
+        (*channels, height, width) image.
+    """
+    for _ in range(times):
+        for axis in (image.ndim - 2, image.ndim - 1):
+            n = image.shape[axis]
+            pad = [(1, 1) if k == axis else (0, 0) for k in range(image.ndim)]
+            wide = jnp.pad(image, pad)
+            before, here, after = (lax.slice_in_dim(wide, k, k + n, axis=axis) for k in range(3))
+            image = (before + 2 * here + after) / 4
+    return image
+
+
+def sum_of_squares(image: Float[Array, "*channels height width"]) -> Float[Array, ""]:
+    """Return the sum of squares of an image: of polarities, the net number of like pairs."""
+    return jnp.sum(image**2)
+
+
+def image_variance(image: Float[Array, "height width"]) -> Float[Array, ""]:
+    """Return the variance of an image, its contrast (Gallego et al., 2018)."""
+    return jnp.var(image)
+
+
+def _replace_nonfinite(value: Array) -> Array:
+    return jnp.where(jnp.isfinite(value), value, -1e6)
 
 
 def _real(value: ArrayLike | float | int) -> Array:
@@ -263,9 +430,9 @@ def _polynomial(t: Array, coefficients: Sequence[float | int]) -> Array:
 
 
 def _coefficients(square: Array) -> tuple[Array, Array, Array]:
-    """sin a / a, (1 - cos a) / a^2 and (a - sin a) / a^3 of a^2, with two axes appended.
+    """Return sin a / a, (1 - cos a) / a^2 and (a - sin a) / a^3 of a^2, with two axes appended.
 
-    Below a^2 = 0.1 by series that end with an error of 1e-15 or less.
+    Below a^2 = 0.1 series are used, with an error of at most 1e-15.
     """
     small = square < 0.1
     a = jnp.sqrt(jnp.where(small, 1, square))
@@ -280,3 +447,6 @@ def _coefficients(square: Array) -> tuple[Array, Array, Array]:
         for s, c in zip(series, closed, strict=True)
     )
     return one, two, three
+
+
+__getattr__ = renamed_names(__name__)

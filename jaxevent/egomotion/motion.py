@@ -1,4 +1,4 @@
-"""What every estimator of the camera's motion gives: a `Motion`, which answers at any time."""
+"""The result of every estimator of the camera's motion: a `MotionEstimate`, a function of time."""
 
 import dataclasses
 from typing import TYPE_CHECKING, NamedTuple
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.display import HtmlRepr
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
@@ -15,91 +16,122 @@ from jaxevent.recording import Recording, Times, check_times, microseconds
 if TYPE_CHECKING:
     import pandas
 
-ACROSS = 0.1  # of the spread of speeds at several depths, that of the velocity across them
-# Of a motion, what a lens that was calibrated leaves: of a rotation, that f is off by 0.5 %, the
-# centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_egomotion_patches.py).
-LENS = 0.01
-UNDECIDED = 1.0  # rad, standard deviation of a direction that is not told
+# Standard deviation across the velocity, as a fraction of that along it, where parts of the image
+# move at several speeds.
+TANGENTIAL_FRACTION = 0.1
+# Relative error of a motion that a calibrated lens leaves: of a rotation, if f is off by 0.5 %, the
+# centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_model_selection.py).
+LENS_ERROR = 0.01
+MAX_DIRECTION_SIGMA = 1.0  # rad, standard deviation of a direction that the data determine
 
 
-def decided(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether components are told, (times, d): those of a direction are not where it is any."""
-    told = np.ones(covariance.shape[:2], bool)
+def is_observable(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return which components of the motion the data determine.
+
+    A component is not observable if it belongs to a direction whose standard deviation exceeds
+    1 rad. All other components are observable.
+
+    Args:
+        model: Motion model, or its name.
+        covariance: (times, d, d) covariance of the estimates.
+
+    Returns:
+        (times, d) booleans.
+    """
+    observable = np.ones(covariance.shape[:2], bool)
     for part in find_model(model).parts:
         if part.direction:
-            spread = np.trace(covariance[:, part.rows, part.rows], axis1=1, axis2=2)
-            told[:, part.rows] = ~(spread > UNDECIDED**2)[:, None]
-    return told
+            variance = np.trace(covariance[:, part.rows, part.rows], axis1=1, axis2=2)
+            observable[:, part.rows] = ~(variance > MAX_DIRECTION_SIGMA**2)[:, None]
+    return observable
 
 
-def left_by_lens(camera: PinholeCamera | None) -> float:
-    """The share of a motion that a camera's calibration leaves: `LENS` if its lens distorts."""
-    return LENS if camera is not None and camera.is_distorted else 0.0
+def lens_error(camera: PinholeCamera | None) -> float:
+    """Return the relative error of a motion that the calibration of a camera's lens leaves."""
+    return LENS_ERROR if camera is not None and camera.is_distorted else 0.0
 
 
 def table_columns(
-    model: str | type[Model], times: NDArray[np.int64], told: Estimate
+    model: str | type[Model], times: NDArray[np.int64], estimate: Estimate
 ) -> dict[str, NDArray]:
     """Arrange a motion as the columns of a table.
 
     Args:
-        model: Its model, of d components.
-        times: (T,), us.
-        told: The motion at these times: mean (T, d), covariance (T, d, d), valid (T,).
+        model: Motion model of d components, or its name.
+        times: (T,) times, us.
+        estimate: The motion at these times: mean (T, d), covariance (T, d, d), valid (T,).
 
     Returns:
         Arrays (T,) by name: t (s), each component, its standard deviation sigma_<component>, and
-        lost, 0 or 1. Where it is lost the components and their sigmas are NaN.
+        lost, 0 or 1. Where the motion is lost the components and their sigmas are NaN.
     """
     names = find_model(model).components
-    lost = ~told.valid[:, None]
-    variance = np.diagonal(told.covariance, axis1=1, axis2=2)
+    lost = ~estimate.valid[:, None]
+    variance = np.diagonal(estimate.covariance, axis1=1, axis2=2)
     columns: dict[str, NDArray] = {"t": times / 1e6}
-    columns |= dict(zip(names, np.where(lost, np.nan, told.mean).T, strict=True))
+    columns |= dict(zip(names, np.where(lost, np.nan, estimate.mean).T, strict=True))
     sigma = np.where(lost, np.nan, np.sqrt(np.maximum(variance, 0)))
     columns |= {f"sigma_{name}": s for name, s in zip(names, sigma.T, strict=True)}
-    return columns | {"lost": (~told.valid).astype(int)}
+    return columns | {"lost": (~estimate.valid).astype(int)}
 
 
-class Calibration(NamedTuple):
-    """What errors are made of beside the covariance C of a fit of a motion m:
+class CovarianceCalibration(NamedTuple):
+    """Coefficients that turn the covariance C of a fit into that of the errors of a motion m.
 
-    factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b'),
+    The calibrated covariance is factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b').
+    Here d is the change of the motion within the time span of an estimate, and b the deviation of
+    its middle from a straight line. `experiments/studies/predicted_errors.md` has their choice.
 
-    d the change of the motion within what an estimate sees and b by how much it bends there.
-    See `experiments/studies/predicted_errors.md` for their choice. `behind` adds what a real
-    lens makes.
+    Attributes:
+        factor: Factor of the covariance of the fit.
+        share: Relative error, the same in all directions.
+        speed: Relative error of the size of the motion.
+        change: Error as a fraction of the change of the motion.
     """
 
     factor: float = 1.0
     share: float = 0.0
-    speed: float = 0.0  # likewise, of motions that are told too slow or too fast
+    speed: float = 0.0
     change: float = 0.0
 
-    def behind(self, camera: PinholeCamera | None) -> "Calibration":
-        """The same, with what a camera's calibration leaves."""
-        return self._replace(share=float(np.hypot(self.share, left_by_lens(camera))))
+    def with_lens(self, camera: PinholeCamera | None) -> "CovarianceCalibration":
+        """Return the coefficients with the error that the camera's calibration leaves."""
+        return self._replace(share=float(np.hypot(self.share, lens_error(camera))))
 
 
+@renamed_fields(held="n_extended")
+@renamed_methods(
+    of="from_arrays",
+    nothing="empty",
+    calibrated="with_calibrated_covariance",
+    with_layers="with_flow_consistency",
+    within="with_recording",
+    reaching="extended_to",
+)
 @dataclasses.dataclass(frozen=True)
-class Motion(HtmlRepr):
-    """An estimated motion: `mean, covariance, valid = motion(times)`.
+class MotionEstimate(HtmlRepr):
+    """An estimated motion, a function of time: `mean, covariance, valid = motion(times)`.
 
-    The components are those of its `model`: of planar motion the image velocity (px/s), of a
-    rotation the camera's angular velocity (rad/s), of general motion its heading, a unit vector,
-    and then its angular velocity, in the camera's axes, x to the right, y down, z forward. The
+    The components are those of its `model`. Planar motion has the image velocity (px/s), and a
+    rotation the camera's angular velocity (rad/s). General motion has the heading, a unit vector,
+    then the angular velocity. Axes are the camera's: x to the right, y down, z forward. The
     covariance of a heading is that of small steps across it.
 
-    Arrays by estimate, n of them: `t` (us), at which it was made, of rising order; `mean`
-    (n, d); `covariance` (n, d, d); `valid`, false while the motion is being searched for or no
-    event tells it; `lag` (s) by which what was seen is older than `t`; `contrast`, how much better
-    the motion explains the events than chance would, about 1 where it does not; `evidence`, the
-    log-likelihood of the events since the estimate before. The last two are NaN where an estimator
-    has none. `agreement` (n,), where an estimator tells it, is the share of the events that the
-    motion explains. `cloud` (n, particles, d), where it was asked for, is some of a filter's
-    particles: the likelier a motion, the more of them are near it. `recording` is the recording's
-    name and `span` (us) from when to when it lasts; without a span, all times may be asked for.
-    Of the estimates `held`, at the ends, repeat the one beside (`reaching`).
+    Attributes:
+        model: The motion model, of d components.
+        t: (n,) times of the estimates, us, rising.
+        mean: (n, d) motions.
+        covariance: (n, d, d) covariances of their errors.
+        valid: (n,) false during a search and where no event determines the motion.
+        lag: (n,) time by which the motion that was observed precedes `t`, s.
+        contrast: (n,) agreement of events with the motion, relative to chance; about 1 where the
+            motion explains nothing, NaN where the method has no such measure.
+        evidence: (n,) log-likelihood of the events since the estimate before; NaN likewise.
+        cloud: (n, particles, d) particles drawn by weight, or None.
+        agreement: (n,) fraction of the events that the motion explains, or None.
+        recording: Name of the recording.
+        span: First and last time of the recording, us; None allows all times.
+        n_extended: Number of estimates that `extended_to` has added at the ends.
     """
 
     model: type[Model]
@@ -114,10 +146,10 @@ class Motion(HtmlRepr):
     agreement: NDArray[np.floating] | None = None
     recording: str = "the recording"
     span: tuple[int, int] | None = None
-    held: int = 0
+    n_extended: int = 0
 
     @classmethod
-    def of(
+    def from_arrays(
         cls,
         model: str | type[Model],
         t: NDArray[np.int64],
@@ -125,28 +157,47 @@ class Motion(HtmlRepr):
         covariance: NDArray[np.floating],
         valid: NDArray[np.bool_] | None = None,
         contrast: NDArray[np.floating] | None = None,
-    ) -> "Motion":
-        """Of an estimator that has no lag and no likelihood, and by default is never lost."""
-        n, none = len(t), np.full(len(t), np.nan)
+    ) -> "MotionEstimate":
+        """Make the result of a method without lag and likelihood.
+
+        Args:
+            model: Motion model of d components, or its name.
+            t: (n,) times, us, rising.
+            mean: (n, d) motions.
+            covariance: (n, d, d) covariances.
+            valid: (n,) whether the motion was found; by default everywhere.
+            contrast: (n,) agreement of events with the motion, relative to chance.
+
+        Returns:
+            The estimate.
+        """
+        n, missing = len(t), np.full(len(t), np.nan)
         valid = np.ones(n, bool) if valid is None else valid
-        contrast = none if contrast is None else contrast
-        return cls(find_model(model), t, mean, covariance, valid, np.zeros(n), contrast, none)
+        contrast = missing if contrast is None else contrast
+        return cls(find_model(model), t, mean, covariance, valid, np.zeros(n), contrast, missing)
 
     @classmethod
-    def nothing(cls, model: str | type[Model]) -> "Motion":
-        """Of a recording that tells nothing."""
+    def empty(cls, model: str | type[Model]) -> "MotionEstimate":
+        """Make the result for a recording without data, with no estimates."""
         n = len(find_model(model).components)
-        return cls.of(model, np.zeros(0, np.int64), np.zeros((0, n)), np.zeros((0, n, n)))
+        return cls.from_arrays(model, np.zeros(0, np.int64), np.zeros((0, n)), np.zeros((0, n, n)))
 
-    def calibrated(
+    def with_calibrated_covariance(
         self,
-        by: Calibration,
+        calibration: CovarianceCalibration,
         length: float | int | NDArray[np.floating] = 0.0,
-        alone: NDArray[np.floating] | None = None,
-    ) -> "Motion":
-        """The same with the covariance that its errors have; an estimate sees `length` seconds.
+        lone_change: NDArray[np.floating] | None = None,
+    ) -> "MotionEstimate":
+        """Replace the covariance of the fits by that of the errors.
 
-        Estimates beside each other tell how the motion changes; of one `alone` (d,) may tell it.
+        Args:
+            calibration: The coefficients.
+            length: Time span of the data of an estimate, s; one number or (n,).
+            lone_change: (d,) change of the motion within the time span, if there is one estimate;
+                of several it is measured between neighbours.
+
+        Returns:
+            The estimate with the calibrated covariance.
         """
         if not len(self):
             return self
@@ -161,87 +212,104 @@ class Motion(HtmlRepr):
                 early, now, late = (
                     np.interp(self.t + k * half, t, column[found]) for k in (-1, 0, 1)
                 )
-                # Beyond one end it goes on as it comes, and bends as it did nearby.
+                # Beyond one end the motion is extrapolated, and bends as it did nearby.
                 early = np.where(begins & ~ends, 2 * now - late, early)
                 late = np.where(ends & ~begins, 2 * now - early, late)
                 change[:, i], bend[:, i] = late - early, late + early - 2 * now
                 if inner.any():
                     bend[:, i] = np.interp(self.t, self.t[inner], bend[inner, i])
-        elif alone is not None:
-            change[:] = alone
-        covariance = by.factor * self.covariance
+        elif lone_change is not None:
+            change[:] = lone_change
+        covariance = calibration.factor * self.covariance
         for d in (change, bend):
-            covariance = covariance + by.change**2 * d[:, :, None] * d[:, None, :]
+            covariance = covariance + calibration.change**2 * d[:, :, None] * d[:, None, :]
         eye = np.eye(mean.shape[1])
-        covariance = covariance + by.share**2 * (mean**2).sum(1)[:, None, None] * eye
-        covariance = covariance + by.speed**2 * mean[:, :, None] * mean[:, None, :]
+        covariance = covariance + calibration.share**2 * (mean**2).sum(1)[:, None, None] * eye
+        covariance = covariance + calibration.speed**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, covariance=covariance)
 
-    def with_layers(self, recording: Recording) -> tuple["Motion", str]:
-        """The same, with the spread of the image's parts in its covariance, and a line of warning.
+    def with_flow_consistency(self, recording: Recording) -> tuple["MotionEstimate", str]:
+        """Add the spread of the motions of parts of the image to the covariance.
 
-        One velocity of the whole image is no better than by how much its parts differ, as those at
-        several depths do; and where they differ from a rotation translation may have made all of
-        it. See `layers`. Where the camera stands still and things move (`still`), nothing tells its
-        motion but theirs.
+        One velocity of the whole image is at most as certain as its parts are alike. Where they
+        differ from a rotation, translation may have caused all of the motion. Where the camera is
+        static and objects move, the objects alone determine the estimate.
+
+        Args:
+            recording: The recording of the estimate.
+
+        Returns:
+            The estimate with the larger covariance, and a warning; "" if nothing was added.
         """
-        from jaxevent.egomotion.layers import layers
-        from jaxevent.egomotion.patches import usual_speed
-        from jaxevent.egomotion.still import stands_still
+        from jaxevent.egomotion.patches import (
+            flow_consistency,
+            is_camera_static,
+            measure_image_speed,
+        )
 
-        speed = usual_speed(recording) if recording.frames else None
-        if self.valid.any() and stands_still(recording, speed):
-            return self._of_things(), (
-                "the camera seems to stand still while things move: edges that the frames show "
-                "make no events; sigmas count that, and jaxevent track follows things"
+        speed = measure_image_speed(recording) if recording.frames else None
+        if self.valid.any() and is_camera_static(recording, speed):
+            return self._with_full_uncertainty(), (
+                "the camera seems to stand still while objects move: edges in the frames make no "
+                "events; sigmas include that, and jaxevent track follows objects"
             )
-        found = layers(recording, self.model, speed=speed)
-        if found is None or not found.several:
+        found = flow_consistency(recording, self.model, speed=speed)
+        if found is None or not found.is_inconsistent:
             return self, ""
         mean = np.nan_to_num(self.mean)
         size2 = (mean**2).sum(1)[:, None, None]
         spread = found.spread if self.model.uniform else 1.0
         along = spread**2 * mean[:, :, None] * mean[:, None, :]
-        across = (spread * ACROSS) ** 2 * size2 * np.eye(mean.shape[1])
-        how = "as one" if self.model.uniform else "as a rotation makes it"
+        across = (spread * TANGENTIAL_FRACTION) ** 2 * size2 * np.eye(mean.shape[1])
+        expected = "as one" if self.model.uniform else "as a rotation makes it"
         cause, other = "at several depths", "general"
-        if self.model.uniform and found.both:
+        if self.model.uniform and found.both_directions:
             cause, other = "both ways if the camera rolls", "rotation"
         needs = "" if recording.camera else " --focal PX"
         line = (
-            f"the image does not move {how}: parts of it at {found.slow:.0f} to {found.fast:.0f} "
-            f"px/s, as {cause}; sigmas count that, and --model {other}{needs} "
+            f"the image does not move {expected}: parts of it move at {found.slow:.0f} to "
+            f"{found.fast:.0f} px/s, as {cause}; sigmas include that, and --model {other}{needs} "
             "may explain it"
         )
         return dataclasses.replace(self, covariance=self.covariance + along + across), line
 
-    def _of_things(self) -> "Motion":
-        """The same, whose covariance counts that it may be no motion of the camera at all."""
+    def _with_full_uncertainty(self) -> "MotionEstimate":
+        """Add the whole motion to the covariance: it may not be the camera's at all."""
         covariance, mean = self.covariance.copy(), np.nan_to_num(self.mean)
         for part in self.model.parts:
             m = mean[:, part.rows]
             own = m[:, :, None] * m[:, None, :]
-            own = own + (ACROSS**2 * (m**2).sum(1))[:, None, None] * np.eye(m.shape[1])
+            across = TANGENTIAL_FRACTION**2 * (m**2).sum(1)
+            own = own + across[:, None, None] * np.eye(m.shape[1])
             covariance[:, part.rows, part.rows] += np.eye(3) if part.direction else own
         return dataclasses.replace(self, covariance=covariance)
 
-    def within(self, recording: Recording) -> "Motion":
-        """The same, of that recording."""
+    def with_recording(self, recording: Recording) -> "MotionEstimate":
+        """Set the name and the time span from a recording."""
         span = None
         if len(recording.events) or recording.frames:
             span = recording.start, recording.stop
         return dataclasses.replace(self, recording=recording.name, span=span)
 
-    def reaching(self, first: int, last: int, rate: NDArray[np.floating] | None = None) -> "Motion":
-        """The same, with estimates at `first` and `last` (us), before and after all others.
+    def extended_to(
+        self, first: int, last: int, rate: NDArray[np.floating] | None = None
+    ) -> "MotionEstimate":
+        """Add estimates before and after all others, with the motion of the nearest one.
 
-        They are what is told at these times: the motion held, with a covariance that grows by how
-        much it usually changes, `rate` (d, d) per us^2 or as the estimates tell. None is added next
-        to one that is lost.
+        Their covariance grows with the time in between. None is added next to a lost estimate.
+
+        Args:
+            first: Time of the added first estimate, us.
+            last: Time of the added last estimate, us.
+            rate: (d, d) growth of the covariance per us^2; by default the mean square change
+                between the estimates.
+
+        Returns:
+            The longer estimate.
         """
         if not len(self):
             return self
-        rate = self._change() if rate is None else rate
+        rate = self._change_rate() if rate is None else rate
         early = bool(self.valid[0] and first < self.t[0])
         late = bool(self.valid[-1] and last > self.t[-1])
         rows = np.r_[[0] * early, : len(self), [len(self) - 1] * late].astype(int)
@@ -254,10 +322,10 @@ class Motion(HtmlRepr):
             if added:
                 arrays["covariance"][row] += float(at - arrays["t"][row]) ** 2 * rate
                 arrays["t"][row] = at
-        return dataclasses.replace(self, **arrays, held=self.held + early + late)
+        return dataclasses.replace(self, **arrays, n_extended=self.n_extended + early + late)
 
-    def _change(self) -> NDArray[np.float64]:
-        """The mean square (d, d) of changes from an estimate to the next, per us^2."""
+    def _change_rate(self) -> NDArray[np.float64]:
+        """Return the mean square (d, d) of changes between successive estimates, per us^2."""
         found = np.flatnonzero(self.valid & np.isfinite(self.mean).all(1))
         dt = np.diff(self.t[found]).astype(float)
         rates = np.diff(self.mean[found], axis=0)[dt > 0] / dt[dt > 0, None]
@@ -270,11 +338,11 @@ class Motion(HtmlRepr):
 
         Args:
             times: Integers (us) or floats (s); by default the table holds the estimates themselves.
-            centred: Whether an estimate counts for the time that what it saw shows, see the call.
+            centred: Whether to use fixed-lag estimates, see the call.
 
         Returns:
             A row for each time. The columns are t (s), the model's components, their standard
-            deviations sigma_<component>, and lost (0 or 1): where it is 1 the numbers are NaN.
+            deviations sigma_<component>, and lost (0 or 1). The numbers are NaN where it is 1.
             `attrs["units"]` has the unit of each column.
 
         Raises:
@@ -283,10 +351,10 @@ class Motion(HtmlRepr):
         import pandas
 
         if times is None:
-            us, told = self.t, Estimate(self.mean, self.covariance, self.valid)
+            us, estimate = self.t, Estimate(self.mean, self.covariance, self.valid)
         else:
-            us, told = np.atleast_1d(microseconds(times)), self(times, centred=centred)
-        table = pandas.DataFrame(table_columns(self.model, us, told))
+            us, estimate = np.atleast_1d(microseconds(times)), self(times, centred=centred)
+        table = pandas.DataFrame(table_columns(self.model, us, estimate))
         units = dict(zip(self.model.components, self.model.units, strict=True))
         sigmas = {f"sigma_{name}": unit for name, unit in units.items()}
         table.attrs["units"] = {"t": "s", **units, **sigmas, "lost": "1"}
@@ -297,21 +365,29 @@ class Motion(HtmlRepr):
 
     def __repr__(self) -> str:
         lost = int((~self.valid).sum())
-        return f"Motion({self.model.name}, {len(self)} estimates, {lost} lost)"
+        return f"MotionEstimate({self.model.name}, {len(self)} estimates, {lost} lost)"
 
     def __call__(
         self, times: Times, *, centred: bool = False, extrapolate: bool = False
     ) -> Estimate:
-        """The motion at `times`: integers (us) or floats (s).
+        """Return the motion at some times.
 
-        Means and covariances are interpolated linearly between the estimates before and after the
-        time; directions are made unit vectors. Before the first and after the last estimate the
-        mean is held, and the covariance grows by how much the motion usually changes in that time.
-        With `centred` an estimate counts for the time that what it saw shows, `lag` before its own:
-        a fixed-lag estimate, which needs the events up to that much later. `valid` is false where
-        either estimate is not valid, before the first, and outside the recording. Raises
-        `InputError` for times that are not finite and, unless told to `extrapolate`, outside the
-        recording.
+        Means and covariances are interpolated linearly between the estimates before and after, and
+        directions scaled to unit vectors. Before the first and after the last estimate the mean is
+        constant, and the covariance grows by the mean square change of the motion in that time.
+
+        Args:
+            times: Integers (us) or floats (s).
+            centred: Whether an estimate holds for the time `lag` before its own, when the motion
+                was observed. This is a fixed-lag estimate, of events up to `lag` later.
+            extrapolate: Whether times outside the recording are allowed.
+
+        Returns:
+            An `Estimate` of mean (times, d), covariance (times, d, d) and valid (times,). Invalid
+            are times next to a lost estimate, before the first one, and outside the recording.
+
+        Raises:
+            InputError: A time is not finite, or outside the recording without `extrapolate`.
         """
         times = np.atleast_1d(microseconds(times))
         inside = np.ones(len(times), bool)
@@ -321,21 +397,24 @@ class Motion(HtmlRepr):
             inside = (times >= self.span[0]) & (times <= self.span[1])
         n, d = self.mean.shape
         if n == 0:
-            none = np.full((len(times), d), np.nan), np.full((len(times), d, d), np.nan)
-            return Estimate(*none, np.zeros(len(times), bool))
+            missing = np.full((len(times), d), np.nan), np.full((len(times), d, d), np.nan)
+            return Estimate(*missing, np.zeros(len(times), bool))
         at = self.t - (1e6 * self.lag if centred else 0)
         at = np.maximum.accumulate(at)
-        place = np.searchsorted(at, times, "right")
-        after, before = np.minimum(place, n - 1), np.maximum(place - 1, 0)
+        row = np.searchsorted(at, times, "right")
+        after, before = np.minimum(row, n - 1), np.maximum(row - 1, 0)
         gap = at[after] - at[before]
-        share = np.where(gap > 0, (times - at[before]) / np.where(gap > 0, gap, 1), 0)
-        share = np.clip(share, 0, 1)
-        mean = self.model.between(self.mean[before], self.mean[after], share)
-        share = share[:, None, None]
-        covariance = (1 - share) * self.covariance[before] + share * self.covariance[after]
+        fraction = np.where(gap > 0, (times - at[before]) / np.where(gap > 0, gap, 1), 0)
+        fraction = np.clip(fraction, 0, 1)
+        mean = self.model.interpolate(self.mean[before], self.mean[after], fraction)
+        fraction = fraction[:, None, None]
+        covariance = (1 - fraction) * self.covariance[before] + fraction * self.covariance[after]
         beyond = np.maximum(at[0] - times, 0) + np.maximum(times - at[-1], 0)
         if beyond.any():
-            covariance = covariance + beyond[:, None, None] ** 2 * self._change()
+            covariance = covariance + beyond[:, None, None] ** 2 * self._change_rate()
         valid = self.valid[before] & self.valid[after] & (times >= at[0]) & inside
         valid &= np.isfinite(mean).all(1) & np.isfinite(covariance).all((1, 2))
         return Estimate(mean, covariance, valid)
+
+
+__getattr__ = renamed_names(__name__)

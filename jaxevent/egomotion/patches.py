@@ -1,214 +1,294 @@
-"""How patches of the image move, from events alone, before anything else is known.
+"""Speed of the image from events alone, measured in patches, before any motion is known.
 
-    speed = usual_speed(recording)   # px/s, None where nothing is seen to move
+    speed = measure_image_speed(recording)  # None where nothing is seen to move
 
-Methods choose the lengths of their windows by that (`MotionEstimator.suit`), and models are
-compared by it (`choice`). Around some times, events of a window of length L are moved back by every
-way d (px in L) of a grid. The signed image of a patch of 24 px is sharpest at the way that it took
-(cf. contrast maximisation). Of windows of many lengths the sharpest in which that way is within
-reach tells a patch's speed |d| / L best.
+Methods adapt the lengths of their windows to it (`MotionEstimator.adapt_params`), and models are
+compared on patches (`model_selection`). Around some times, the events of a window of duration L are
+moved back by every displacement d (px in L) of a grid. The signed image of a patch of 24 px is
+sharpest for the true displacement (cf. contrast maximisation). Of windows of many durations, the
+sharpest one whose displacement is within the grid determines the speed |d| / L of a patch.
+
+Frames show whether the camera is static. Where it moves, all edges across its motion make events;
+where it is static, those of the background make none. So `is_camera_static` counts the strongest
+edges of frames that have an event beside them while the image moves by a few pixels.
+
+    flow_consistency(recording)  # whether all parts of the image move as one
+
+Motion models are fitted to patches (`fit_planar`, `fit_rotation`, `fit_general`), each to one half
+of the pixels. On the other half, D_p is the log of a patch's sharpness under one model less that
+under another. Errors of patches are independent, so z = sum D_p / sqrt(sum D_p^2) is standard
+normal where both explain the events alike.
 """
 
 import contextlib
+import dataclasses
 import weakref
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
-from jaxevent.egomotion.candidates import coordinates
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
+from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.geometry import A, rotation_basis
+from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Recording
 
-PATCH = 24  # px
-REACH = 7  # px, the longest way that is tried, in x and y
-LENGTHS = 0.0015625 * 2.0 ** np.arange(11)  # s, of windows that are tried
-TIMES = 6  # at which windows are tried
-MOST = 12_000  # events of a window, of whole patches
-FEWEST = 40  # events of a patch
-LEAST_WAY = 2.5  # px; a shorter way is not told from none
-SHARP = 1.15  # a patch's sharpest image by the median over all ways, at least
-ALIKE = 0.2  # of the patches whose halves tell one way, at least; of noise 0.1
-ENOUGH = 6  # patches that tell a speed, at least
-MARGIN = 6  # px of a patch's image around it
-GRAIN = 2  # px of its pixels
+PATCH_PX = 24
+MAX_DISPLACEMENT_PX = 7  # of the grid, in x and y
+DURATIONS_S = 0.0015625 * 2.0 ** np.arange(11)  # of the windows
+N_TIMES = 6  # at which windows, or frames, are evaluated
+MAX_WINDOW_EVENTS = 12_000  # of whole patches
+MIN_PATCH_EVENTS = 40
+MIN_DISPLACEMENT_PX = 2.5  # shorter ones cannot be distinguished from 0
+MIN_SHARPNESS = 1.15  # of a patch's sharpest image, relative to the median of all displacements
+MIN_AGREEMENT = 0.2  # fraction of patches whose halves agree; of noise it is 0.1
+MIN_PATCHES = 6  # with a speed
+MARGIN_PX = 6  # of a patch's image around the patch
+IMAGE_PIXEL_PX = 2
+FRAME_DISPLACEMENT_PX = 5.0  # of the image around a frame whose edges are counted
+EDGE_FRACTION = 0.1  # of the pixels, those of the steepest log intensity
+DARK_LEVEL = 0.05  # of full scale, added before the logarithm: darker greys are noise
+MAX_STATIC_EDGES = 0.3  # fraction of edges with events, below which the camera is static
 
-# Of `usual_speed`: events, sensor, answer.
-_latest: tuple[Any, Any, "Speed | None"] = (lambda: None, None, None)
+FIT_TIMES = 4  # at which patches are evaluated for fits
+FIT_DISPLACEMENT_PX = 10  # of their grid, in x and y
+WINDOW_DISPLACEMENT_PX = 5.0  # median displacement of the image in a window of a fit
+HALF_LINE_PX = np.linspace(0, 1.4 * FIT_DISPLACEMENT_PX, 29)  # positions along a half-line
+N_HEADINGS = 6  # from which a general motion is refined
+MIN_Z = 3.0  # from which parts of the image move apart
+# Of the model's displacement; a roll moves half of the patches backwards.
+SPEED_FACTORS = np.concatenate([-np.geomspace(3.0, 0.3, 25), np.geomspace(0.3, 3.0, 25)])
+
+# Of `measure_image_speed`: the latest events, sensor and camera, and result.
+_latest: tuple[Any, Any, "ImageSpeed | None"] = (lambda: None, None, None)
 
 
-class Speed(NamedTuple):
-    """Of patches of the image (px/s): the median, and the slowest and the fastest quarter's bound.
+@renamed_fields(usual="median", at="by_time")
+@dataclasses.dataclass(frozen=True)
+class ImageSpeed:
+    """Speeds of patches of the image.
 
-    `at` lists for each of some times (us) the usual speed then, NaN where nothing is seen to move.
+    Attributes:
+        median: Median, px/s.
+        slow: Lower quartile, px/s.
+        fast: Upper quartile, px/s.
+        by_time: Some times (us) with the median at each, px/s; NaN where nothing is seen to move.
     """
 
-    usual: float
+    median: float
     slow: float
     fast: float
-    at: tuple[tuple[int, float], ...]
+    by_time: tuple[tuple[int, float], ...]
 
 
-class Look(NamedTuple):
-    """How sharp patches of a window become by every way, for two halves of the pixels.
+@renamed_methods(length="duration", ways="displacements")
+class PatchSharpness(NamedTuple):
+    """Sharpness of the patches of a window by displacement, for two halves of the pixels.
 
-    Patches that hold too few events are left out; `energy` is the sum of squares of the signed
-    image, per event, of ways that are `ways` (2, n) px in the window's length (s), in x and y.
+    Patches with too few events are left out.
     """
 
-    middle: int  # us
-    length: float
-    xi: NDArray[np.float64]  # (patches, 2) px, of their middles, from the principal point
-    count: NDArray[np.int64]  # (patches,)
-    energy: NDArray[np.float64]  # (2, patches, n, n), rows by the way in y
-    ways: NDArray[np.float64]  # (n,) px
+    middle: int  # us, of the window
+    duration: float  # s, of the window
+    xi: NDArray[np.float64]  # (patches, 2) px, middles from the principal point
+    count: NDArray[np.int64]  # (patches,) events
+    # (2, patches, n, n) sum of squares of the signed image per event; rows by the displacement in y
+    energy: NDArray[np.float64]
+    displacements: NDArray[np.float64]  # (n,) px in the window's duration, in x and in y
 
 
-def middles(recording: Recording, number: int) -> list[int]:
-    """So many times (us), spread evenly over the events."""
+def spread_times(recording: Recording, number: int) -> list[int]:
+    """Choose times, spread evenly over the events.
+
+    Args:
+        recording: A recording with events.
+        number: Number of times.
+
+    Returns:
+        The times, us.
+    """
     events, n = recording.events, len(recording.events)
     rows = [int(n * (k + 0.5) / number) for k in range(number)]
     return [int(events[row : row + 1].t[0]) for row in rows]
 
 
-def usual_speed(recording: Recording, camera: PinholeCamera | None = None) -> Speed | None:
-    """How fast things move in the image (px/s, undistorted); None where that is not seen.
+def measure_image_speed(
+    recording: Recording, camera: PinholeCamera | None = None
+) -> ImageSpeed | None:
+    """Measure the speed at which the image moves, in undistorted px/s.
 
-    Windows of 1.6 ms to 1.6 s are tried at six times, spread evenly over the events. The latest
-    answer is kept: the windows of each method, the choice of the model and scores ask for it.
+    Windows of 1.6 ms to 1.6 s are evaluated at six times, spread evenly over the events. The latest
+    result is cached, because methods, model selection and scores need it one after another.
+
+    Args:
+        recording: The recording.
+        camera: The camera; by default the recording's.
+
+    Returns:
+        The speed, or None where nothing is seen to move.
     """
-    asked = recording.width, recording.height, camera or recording.camera
+    sensor = recording.width, recording.height, camera or recording.camera
     global _latest
-    events, known, speed = _latest
-    if events() is recording.events and known == asked:
+    events, known_sensor, speed = _latest
+    if events() is recording.events and known_sensor == sensor:
         return speed
-    speed = _measured(recording, asked[2])
-    with contextlib.suppress(TypeError):  # a source of the user's own may not take references
-        _latest = weakref.ref(recording.events), asked, speed
+    speed = _measure_speed(recording, sensor[2])
+    with contextlib.suppress(TypeError):  # a user's event source may not allow references
+        _latest = weakref.ref(recording.events), sensor, speed
     return speed
 
 
-def tried(recording: Recording) -> str:
-    """Of which lengths windows are tried, in words: those that fit in the recording."""
-    if len(recording.events) < FEWEST:
+def describe_windows(recording: Recording) -> str:
+    """Describe the durations of the windows that are evaluated, those that fit, in words."""
+    if len(recording.events) < MIN_PATCH_EVENTS:
         return "in so few events"
-    fit = [float(length) for length in LENGTHS if _fits(recording, length)]
-    if not fit:
+    fitting = [float(duration) for duration in DURATIONS_S if _fits(recording, duration)]
+    if not fitting:
         return "in so short a recording"
-    ends = sorted({fit[0], fit[-1]})
-    told = [f"{1e3 * one:.2g} ms" if one < 0.1 else f"{one:.2g} s" for one in ends]
-    return f"in windows of {' to '.join(told)}"
+    ends = sorted({fitting[0], fitting[-1]})
+    words = [f"{1e3 * one:.2g} ms" if one < 0.1 else f"{one:.2g} s" for one in ends]
+    return f"in windows of {' to '.join(words)}"
 
 
-def _fits(recording: Recording, length: float) -> bool:
-    """Whether the recording is as long as a window of this length (s)."""
-    return 2 * round(5e5 * length) <= recording.stop - recording.start + 1
+def _fits(recording: Recording, duration: float) -> bool:
+    """Return whether the recording is at least as long as a window (s)."""
+    return 2 * round(5e5 * duration) <= recording.stop - recording.start + 1
 
 
-def _measured(recording: Recording, camera: PinholeCamera | None) -> Speed | None:
-    if len(recording.events) < FEWEST:
+def _measure_speed(recording: Recording, camera: PinholeCamera | None) -> ImageSpeed | None:
+    if len(recording.events) < MIN_PATCH_EVENTS:
         return None
-    xi, _ = coordinates(recording.width, recording.height, camera)
-    speeds, at, patches = [], [], 0
-    for middle in middles(recording, TIMES):
-        found: dict[tuple[float, ...], tuple[float, float]] = {}
-        for length in LENGTHS:
-            seen = look(recording, middle, float(length), REACH, xi)
-            if seen is None:
+    xi, _ = pixel_coordinates(recording.width, recording.height, camera)
+    speeds, by_time, n_patches = [], [], 0
+    for middle in spread_times(recording, N_TIMES):
+        best: dict[tuple[float, ...], tuple[float, float]] = {}  # sharpness and speed by position
+        for duration in DURATIONS_S:
+            window = measure_sharpness(recording, middle, float(duration), MAX_DISPLACEMENT_PX, xi)
+            if window is None:
                 continue
-            sharp, way, alike = _sharpest(seen)
-            for k, place in enumerate(map(tuple, seen.xi.tolist())):
-                # At the border of what is tried the way may be longer still.
-                if way[k] < REACH - 0.5 and sharp[k] > found.get(place, (SHARP, 0.0))[0]:
-                    told = alike[k] and way[k] >= LEAST_WAY
-                    found[place] = sharp[k], way[k] / float(length) if told else 0.0
-        here = np.array([speed for _, speed in found.values() if speed > 0])
-        patches += len(found)
+            sharpness, size, agree = _best_displacements(window)
+            for k, position in enumerate(map(tuple, window.xi.tolist())):
+                # At the border of the grid the displacement may be longer still.
+                inside = size[k] < MAX_DISPLACEMENT_PX - 0.5
+                if inside and sharpness[k] > best.get(position, (MIN_SHARPNESS, 0.0))[0]:
+                    known = agree[k] and size[k] >= MIN_DISPLACEMENT_PX
+                    best[position] = sharpness[k], size[k] / float(duration) if known else 0.0
+        here = np.array([speed for _, speed in best.values() if speed > 0])
+        n_patches += len(best)
         speeds.append(here)
-        at.append((middle, float(np.median(here)) if len(here) >= ENOUGH else np.nan))
+        by_time.append((middle, float(np.median(here)) if len(here) >= MIN_PATCHES else np.nan))
     speed = np.concatenate(speeds)
-    if len(speed) < max(ENOUGH, ALIKE * patches):
+    if len(speed) < max(MIN_PATCHES, MIN_AGREEMENT * n_patches):
         return None
-    low, usual, high = np.percentile(speed, [25, 50, 75])
-    return Speed(float(usual), float(low), float(high), tuple(at))
+    slow, median, fast = np.percentile(speed, [25, 50, 75])
+    return ImageSpeed(float(median), float(slow), float(fast), tuple(by_time))
 
 
-def _sharpest(seen: Look) -> tuple[NDArray, NDArray, NDArray]:
-    """Of patches: how sharp they become, the way (px) that does it, whether both halves tell it."""
-    n, m = len(seen.xi), len(seen.ways)
-    halves = seen.energy.reshape(2, n, -1)
+def _best_displacements(window: PatchSharpness) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the best sharpness of patches, its displacement (px), and whether halves agree."""
+    n, m = len(window.xi), len(window.displacements)
+    halves = window.energy.reshape(2, n, -1)
     energy = halves.mean(0)
 
-    def way(best: NDArray) -> NDArray:
-        return np.stack([seen.ways[best % m], seen.ways[best // m]], -1)
+    def displacement(best: NDArray) -> NDArray:
+        return np.stack([window.displacements[best % m], window.displacements[best // m]], -1)
 
-    apart = np.hypot(*np.moveaxis(way(halves[0].argmax(1)) - way(halves[1].argmax(1)), -1, 0))
-    sharp = energy.max(1) / np.maximum(np.median(energy, 1), 1e-9)
-    return sharp, np.hypot(*way(energy.argmax(1)).T), apart <= 2
+    difference = displacement(halves[0].argmax(1)) - displacement(halves[1].argmax(1))
+    apart = np.hypot(*np.moveaxis(difference, -1, 0))
+    sharpness = energy.max(1) / np.maximum(np.median(energy, 1), 1e-9)
+    return sharpness, np.hypot(*displacement(energy.argmax(1)).T), apart <= 2
 
 
-def look(
+def measure_sharpness(
     recording: Recording,
     middle: int,
-    length: float,
-    reach: int,
+    duration: float,
+    max_displacement: int,
     xi: NDArray[np.float64],
-) -> Look | None:
-    """The patches of the window of a length (s) about a time (us); None where there are none.
+) -> PatchSharpness | None:
+    """Measure the sharpness of the patches of a window.
 
-    `xi` (height, width, 2) are the pixels' places; see `candidates.coordinates`.
+    Args:
+        recording: The recording.
+        middle: Middle of the window, us.
+        duration: Duration of the window, s.
+        max_displacement: Longest displacement in x and y, px.
+        xi: (height, width, 2) positions of pixels, see `candidates.pixel_coordinates`.
+
+    Returns:
+        The sharpness, or None if no patch has enough events.
     """
     corner = np.floor(xi.min((0, 1)))
-    columns = int((xi[..., 0].max() - corner[0]) // PATCH) + 1
-    half, index = round(5e5 * length), recording.events.index
+    columns = int((xi[..., 0].max() - corner[0]) // PATCH_PX) + 1
+    half, index = round(5e5 * duration), recording.events.index
     start, stop = index(middle - half), index(middle + half)
-    if stop - start < FEWEST or not _fits(recording, length):
+    if stop - start < MIN_PATCH_EVENTS or not _fits(recording, duration):
         return None
-    events = recording.events[start : min(stop, start + 40 * MOST)]
+    events = recording.events[start : min(stop, start + 40 * MAX_WINDOW_EVENTS)]
     at = xi[events.y, events.x] - corner
-    row, column = (at[:, 1] // PATCH).astype(int), (at[:, 0] // PATCH).astype(int)
+    row, column = (at[:, 1] // PATCH_PX).astype(int), (at[:, 0] // PATCH_PX).astype(int)
     patch = row * columns + column
     count = np.bincount(patch)
     order = np.random.default_rng(0).permutation(len(count))
-    order = order[count[order] >= FEWEST]
+    order = order[count[order] >= MIN_PATCH_EVENTS]
     if not len(order):
         return None
-    taken = np.sort(order[: max(1, int((np.cumsum(count[order]) <= MOST).sum()))])
+    n_used = max(1, int((np.cumsum(count[order]) <= MAX_WINDOW_EVENTS).sum()))
+    used = np.sort(order[:n_used])
     number = np.full(len(count), -1)
-    number[taken] = np.arange(len(taken))
+    number[used] = np.arange(len(used))
     keep = number[patch] >= 0
-    local = at[keep] - np.stack([column, row], 1)[keep] * PATCH
-    sign, which = np.where(events.p[keep], 1.0, -1.0), number[patch[keep]]
+    which = number[patch[keep]]
     halves = (events.x[keep].astype(int) + events.y[keep]) % 2
-    since = (events.t[keep] - middle) * 1e-6 / length
-    ways = np.arange(-reach, reach + 1.0)
-    energy = np.zeros((2, len(taken), len(ways), len(ways)))
-    side = (PATCH + 2 * MARGIN) // GRAIN
-    images = np.empty((2, len(taken), side, side))
-    _energies(local, since, sign, which, halves, ways, images, energy)
+    of_patches = PatchEvents(
+        at[keep] - np.stack([column, row], 1)[keep] * PATCH_PX,
+        (events.t[keep] - middle) * 1e-6 / duration,
+        np.where(events.p[keep], 1.0, -1.0),
+        which,
+        halves,
+    )
+    displacements = np.arange(-max_displacement, max_displacement + 1.0)
+    energy = np.zeros((2, len(used), len(displacements), len(displacements)))
+    side = (PATCH_PX + 2 * MARGIN_PX) // IMAGE_PIXEL_PX
+    _accumulate_energy(of_patches, displacements, np.empty((2, len(used), side, side)), energy)
     for k in range(2):
-        share = np.bincount(which[halves == k], minlength=len(taken))
-        energy[k] /= np.maximum(share, 1)[:, None, None]
-    centre = corner + (np.stack([taken % columns, taken // columns], 1) + 0.5) * PATCH
-    return Look(middle, length, centre, count[taken], energy, ways)
+        events_of_half = np.bincount(which[halves == k], minlength=len(used))
+        energy[k] /= np.maximum(events_of_half, 1)[:, None, None]
+    centre = corner + (np.stack([used % columns, used // columns], 1) + 0.5) * PATCH_PX
+    return PatchSharpness(middle, duration, centre, count[used], energy, displacements)
+
+
+class PatchEvents(NamedTuple):
+    """Events (n,) of patches."""
+
+    at: NDArray[np.float64]  # (n, 2) px, from the corner of the patch
+    since: NDArray[np.float64]  # time from the middle of the window, in durations
+    sign: NDArray[np.float64]
+    patch: NDArray[np.int64]
+    half: NDArray[np.int64]
 
 
 @njit_noalloc
-def _energies(at, since, sign, patch, half, ways, images, energy):
-    """Sums of squares of patches' signed images, of pixels of `GRAIN`, for every way."""
-    side = images.shape[3]
-    for row in range(len(ways)):
-        for column in range(len(ways)):
-            images[:] = 0
+def _accumulate_energy(events, displacements, scratch, energy):
+    """Sum the squares of patches' signed images for every displacement."""
+    at, since, sign, patch, half = events
+    side = scratch.shape[3]
+    for row in range(len(displacements)):
+        for column in range(len(displacements)):
+            scratch[:] = 0
             for e in range(len(at)):
-                x = (at[e, 0] - ways[column] * since[e] + MARGIN) / GRAIN
-                y = (at[e, 1] - ways[row] * since[e] + MARGIN) / GRAIN
+                x = (at[e, 0] - displacements[column] * since[e] + MARGIN_PX) / IMAGE_PIXEL_PX
+                y = (at[e, 1] - displacements[row] * since[e] + MARGIN_PX) / IMAGE_PIXEL_PX
                 i, j = int(np.floor(x)), int(np.floor(y))
                 if i < 0 or j < 0 or i >= side - 1 or j >= side - 1:
                     continue
                 u, v = x - i, y - j
-                image = images[half[e], patch[e]]
+                image = scratch[half[e], patch[e]]
                 image[j, i] += sign[e] * (1 - u) * (1 - v)
                 image[j, i + 1] += sign[e] * u * (1 - v)
                 image[j + 1, i] += sign[e] * (1 - u) * v
@@ -218,5 +298,305 @@ def _energies(at, since, sign, patch, half, ways, images, energy):
                     total = 0.0
                     for j in range(side):
                         for i in range(side):
-                            total += images[k, c, j, i] ** 2
+                            total += scratch[k, c, j, i] ** 2
                     energy[k, c, row, column] = total
+
+
+def is_camera_static(recording: Recording, speed: ImageSpeed | None) -> bool:
+    """Return whether the edges in the frames make no events.
+
+    Args:
+        recording: The recording.
+        speed: Speed of the image, or None if it is unknown.
+
+    Returns:
+        A boolean; false without frames or a speed.
+    """
+    fraction = None if speed is None else edge_event_fraction(recording, speed)
+    return fraction is not None and fraction < MAX_STATIC_EDGES
+
+
+def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -> float | None:
+    """Measure the fraction of the strongest edges in frames that have events beside them.
+
+    Args:
+        recording: The recording.
+        speed: Speed of the image; by default it is measured.
+
+    Returns:
+        The median over some frames, or None. It is None where nothing is seen to move, and where no
+        frame has events before and after it while the image moves by `FRAME_DISPLACEMENT_PX`.
+    """
+    frames, events, n = recording.frames, recording.events, len(recording.events)
+    if frames and speed is None:
+        speed = measure_image_speed(recording)
+    if frames is None or speed is None:
+        return None
+    half = round(5e5 * FRAME_DISPLACEMENT_PX / speed.median)
+    first, last = int(events[:1].t[0]), int(events[n - 1 :].t[0])
+    rows = np.flatnonzero((frames.t - half >= first) & (frames.t + half <= last))
+    if not len(rows):
+        return None
+    rows = np.unique(rows[((np.arange(N_TIMES) + 0.5) * len(rows) / N_TIMES).astype(int)])
+    fractions = []
+    for at, image in zip(frames.t[rows].tolist(), frames[rows].intensity, strict=True):
+        edges = _find_edges(image)
+        part = events[events.index(at - half) : events.index(at + half)]
+        active = np.zeros(edges.shape, bool)
+        active[part.y, part.x] = True
+        fractions.append(maximum_filter(active, 3)[edges].mean())
+    return float(np.median(fractions))
+
+
+def _find_edges(image: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Find the pixels of a frame (intensity) where log intensity is steepest."""
+    smooth = gaussian_filter(np.log(image + DARK_LEVEL), 1.0)
+    slope = np.hypot(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
+    return slope >= np.quantile(slope, 1 - EDGE_FRACTION)
+
+
+@renamed_fields(both="both_directions")
+@renamed_methods(several="is_inconsistent")
+@dataclasses.dataclass(frozen=True)
+class FlowConsistency:
+    """Differences between the motions of parts of the image, along the model's direction.
+
+    Attributes:
+        spread: Standard deviation of the speeds, relative to their median.
+        z: Test statistic of whether they differ.
+        slow: 10th percentile of the speeds, px/s.
+        fast: 90th percentile of the speeds, px/s.
+        both_directions: Whether some parts move backwards.
+    """
+
+    spread: float
+    z: float
+    slow: float
+    fast: float
+    both_directions: bool
+
+    @property
+    def is_inconsistent(self) -> bool:
+        """Return whether the image does not move as one."""
+        return self.z > MIN_Z
+
+
+def flow_consistency(
+    recording: Recording,
+    model: type[Model] = Planar,
+    camera: PinholeCamera | None = None,
+    speed: ImageSpeed | None = None,
+) -> FlowConsistency | None:
+    """Test whether the image moves as one, as planar motion or a rotation does.
+
+    Each patch may move by its own factor of the displacement that the model makes there.
+
+    Args:
+        recording: The recording.
+        model: `Planar` or `Rotation`.
+        camera: The camera; by default the recording's.
+        speed: The speed of the image; by default it is measured.
+
+    Returns:
+        The consistency, or None where nothing is seen to move, and for other models.
+    """
+    camera = camera or recording.camera
+    if model not in (Planar, Rotation):
+        return None
+    speed = speed or measure_image_speed(recording, camera)
+    if speed is None:
+        return None
+    _, f = pixel_coordinates(recording.width, recording.height, camera)
+    factors = np.append(SPEED_FACTORS, 1.0)
+    differences, best_factors, speeds = [], [], []
+    for window in measure_windows(recording, speed, camera):
+        d = fit_planar(window)
+        if float(np.hypot(*d)) < 1:
+            continue
+        displacements = np.tile(d, (len(window.xi), 1))
+        if model is Rotation:
+            turn = fit_rotation(window, f, d)
+            displacements = np.asarray(rotation_basis(window.xi, f)) @ turn
+        own = factors[:, None, None] * displacements
+        train = log_sharpness(window, 0, own)
+        best, rows = train.argmax(0), np.arange(len(window.xi))
+        differences.append(
+            log_sharpness(window, 1, own[best, rows]) - log_sharpness(window, 1, own[-1])
+        )
+        gain = train.max(0) - train[-1] + train.max(0) - np.median(train, 0)
+        is_sharp = gain > np.log(1.3)
+        factor = factors[best][is_sharp]
+        best_factors.append(factor)
+        speeds.append(np.abs(factor) * np.hypot(*displacements[is_sharp].T) / window.duration)
+    if not best_factors or not len(np.concatenate(best_factors)):
+        return None
+    factor = np.concatenate(best_factors)
+    low, high = np.percentile(factor, [16, 84])
+    slow, fast = np.percentile(np.concatenate(speeds), [10, 90])
+    median = float(np.median(np.abs(factor)))
+    spread = float((high - low) / 2 / max(median, 1e-9))
+    z = z_score(np.concatenate(differences))
+    return FlowConsistency(spread, z, float(slow), float(fast), bool(low < 0))
+
+
+def measure_windows(
+    recording: Recording, speed: ImageSpeed, camera: PinholeCamera | None = None
+) -> list[PatchSharpness]:
+    """Evaluate patches at some times, in windows in which the image moves by a few px.
+
+    Args:
+        recording: The recording.
+        speed: Speed of the image.
+        camera: The camera; by default the recording's.
+
+    Returns:
+        The windows that hold enough events.
+    """
+    windows = []
+    xi, _ = pixel_coordinates(recording.width, recording.height, camera or recording.camera)
+    for middle in spread_times(recording, FIT_TIMES):
+        near = [(abs(t - middle), v) for t, v in speed.by_time if np.isfinite(v)]
+        here = min(near)[1] if near else speed.median
+        duration = DURATIONS_S[np.abs(np.log(DURATIONS_S * here / WINDOW_DISPLACEMENT_PX)).argmin()]
+        window = measure_sharpness(recording, middle, float(duration), FIT_DISPLACEMENT_PX, xi)
+        if window is not None:
+            windows.append(window)
+    return windows
+
+
+def log_sharpness(
+    window: PatchSharpness, half: int, displacements: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Interpolate the log of the sharpness of patches.
+
+    Args:
+        window: The patches.
+        half: Half of the pixels, 0 or 1.
+        displacements: (..., patches, 2) displacements, px.
+
+    Returns:
+        (..., patches) values.
+    """
+    at = np.clip(displacements + FIT_DISPLACEMENT_PX, 0, 2 * FIT_DISPLACEMENT_PX)
+    patch = np.broadcast_to(np.arange(len(window.xi)), at.shape[:-1])
+    values = np.log(np.maximum(window.energy[half], 1e-6))
+    return map_coordinates(values, [patch, at[..., 1], at[..., 0]], order=1, mode="nearest")
+
+
+def _minimise(loss: Callable[[NDArray], float], starts: list[NDArray], size: float) -> NDArray:
+    """Minimise a loss from several starts by simplexes of a size."""
+    from scipy.optimize import minimize
+
+    options = {"maxiter": 250, "xatol": 1e-3 * size, "fatol": 1e-3}
+    found = []
+    for start in starts:
+        simplex = np.concatenate([start[None], start + size * np.eye(len(start))])
+        options["initial_simplex"] = simplex
+        found.append(minimize(loss, start, method="Nelder-Mead", options=options))
+    return min(found, key=lambda one: one.fun).x
+
+
+def fit_planar(window: PatchSharpness) -> NDArray[np.float64]:
+    """Fit one displacement (2,) in px to all patches."""
+    n = len(window.displacements)
+    sums = np.log(np.maximum(window.energy[0], 1e-6)).sum(0)
+    row, column = divmod(int(sums.argmax()), n)
+    start = window.displacements[[column, row]]
+
+    def loss(d: NDArray) -> float:
+        return -float(log_sharpness(window, 0, np.tile(d, (len(window.xi), 1))).sum())
+
+    return _minimise(loss, [start], 0.5)
+
+
+def fit_rotation(
+    window: PatchSharpness, f: float, planar: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Fit a rotation to the patches.
+
+    Args:
+        window: The patches.
+        f: Focal length, px.
+        planar: (2,) displacement of all patches, px, from which the fit starts.
+
+    Returns:
+        (3,) rotation vector over the window, rad.
+    """
+    basis = np.asarray(rotation_basis(window.xi, f))
+    first = np.array([planar[1] / f, -planar[0] / f, 0.0])
+    roll = 2.0 / max(float(np.hypot(*window.xi.T).mean()), 1.0)
+    starts = [first + np.array([0, 0, k * roll]) for k in (-2, 0, 2)]
+    starts.append(np.zeros(3))
+    unit = np.array([1 / f, 1 / f, roll / 2])
+
+    def loss(v: NDArray) -> float:
+        return -float(log_sharpness(window, 0, basis @ (v * unit)).sum())
+
+    return _minimise(loss, [one / unit for one in starts], 1.0) * unit
+
+
+def half_line_displacements(
+    window: PatchSharpness, f: float, T: NDArray, turn: NDArray
+) -> NDArray[np.float64]:
+    """Return displacements along the half-lines of a general motion.
+
+    Args:
+        window: The patches.
+        f: Focal length, px.
+        T: (3,) heading.
+        turn: (3,) rotation vector over the window, rad.
+
+    Returns:
+        (positions, patches, 2) displacements, px.
+    """
+    base = np.asarray(rotation_basis(window.xi, f)) @ turn
+    line = np.einsum("pij,j->pi", _translation_basis(window.xi, f), T)
+    line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+    return base + HALF_LINE_PX[:, None, None] * line
+
+
+def _translation_basis(xi: NDArray[np.float64], f: float) -> NDArray[np.float64]:
+    """Return `geometry.A` at positions (n, 2), (n, 2, 3)."""
+    return np.stack([np.asarray(A(x, y, f)) for x, y in xi])
+
+
+def fit_general(window: PatchSharpness, f: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fit a general motion, with the best position along its half-line for each patch.
+
+    Args:
+        window: The patches.
+        f: Focal length, px.
+        turn: (3,) rotation vector over the window from which the fit starts, rad.
+
+    Returns:
+        (6,) heading and rotation vector over the window, rad.
+    """
+    columns = _translation_basis(window.xi, f)
+    basis = np.asarray(rotation_basis(window.xi, f))
+
+    def displacements(v: NDArray) -> NDArray:
+        line = columns @ v[:3]
+        line = line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
+        return basis @ (v[3:] / f) + HALF_LINE_PX[:, None, None] * line
+
+    def loss(v: NDArray) -> float:
+        size = float(np.linalg.norm(v[:3]))
+        best = log_sharpness(window, 0, displacements(v)).max(0)
+        return -float(best.sum()) + 10 * (size - 1) ** 2
+
+    headings = np.random.default_rng(0).normal(size=(40, 3))
+    headings /= np.linalg.norm(headings, axis=1, keepdims=True)
+    headings = np.concatenate([headings, np.eye(3), -np.eye(3)])
+    starts = [np.append(T, factor * f * turn) for T in headings for factor in (0.0, 0.5, 1.0)]
+    starts = sorted(starts, key=loss)[:N_HEADINGS]
+    found = _minimise(loss, starts, 0.3)
+    return np.append(found[:3] / np.linalg.norm(found[:3]), found[3:] / f)
+
+
+def z_score(D: NDArray[np.float64]) -> float:
+    """Return the sum of independent differences, relative to its standard deviation."""
+    size = float(np.sqrt((D**2).sum()))
+    return float(D.sum()) / size if size > 0 else 0.0
+
+
+__getattr__ = renamed_names(__name__)

@@ -1,38 +1,70 @@
-"""How far an estimate of the motion is from the truth.
+"""Errors of an estimated motion.
 
-    scores = motion_errors(Omega=(estimate, truth), T=(heading, true_heading))
+    errors = motion_errors(Omega=(estimate, truth), T=(heading, true_heading))
+    scores = score_motion(motion, truth, times)
 
 Errors follow the egomotion thesis, 5.20 to 5.21 and 6.22 to 6.29.
 """
 
+import dataclasses
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxevent.egomotion.models import Model, unit_vectors
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
+from jaxevent.metrics import MEANINGS
 
-_OUTLIER = 0.05  # relative magnitude error from which the thesis counts an outlier
+OUTLIER_ERROR = 0.05  # relative magnitude error from which a vector is an outlier in the thesis
+UNITS = {  # of `motion_errors`
+    "AEE": "px/s", "AEE_rel": "%", "AAE_U": "deg", "AAE_T": "deg", "AAE_Omega": "deg",
+    "AME": "deg/s", "AME_rel": "%", "AME_N": "%", "vector_error": "%", "outliers": "%",
+}  # fmt: skip
 
 
 def endpoint_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """|U - U_g| (n,) of vectors (n, components), in their unit; the mean is AEE (5.20)."""
+    """Return |U - U_g|, whose mean is AEE (5.20).
+
+    Args:
+        estimate: (n, components) vectors.
+        truth: (n, components) vectors.
+
+    Returns:
+        (n,) errors, in the unit of the vectors.
+    """
     estimate, truth = _pair(estimate, truth)
     return np.linalg.norm(estimate - truth, axis=-1)
 
 
 def relative_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """|V - V_g| / |V_g| (n,); of flow the mean is AEE_rel (5.21), of Omega the vector error.
+    """Return |V - V_g| / |V_g|; of flow the mean is AEE_rel (5.21), of Omega the vector error.
 
-    Infinite where only the truth is the zero vector, 0 where both are.
+    Args:
+        estimate: (n, components) vectors.
+        truth: (n, components) vectors.
+
+    Returns:
+        (n,) errors; infinite where only the truth is the zero vector, 0 where both are.
     """
     return _ratio(endpoint_error(estimate, truth), np.linalg.norm(_pair(truth, truth)[1], axis=-1))
 
 
 def axis_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """Angles (n,) in degrees between vectors (n, 2 or 3) of any length; the mean is AAE (6.22-25).
+    """Return the angles between vectors of any length, whose mean is AAE (6.22-25).
 
-    arccos of the normalised product, computed by arctan2, which stays exact near 0 and 180 degrees.
-    90 degrees where one of them is the zero vector, the mean over all directions, and 0 where both
-    are.
+    They are the arccos of the normalised product, computed by arctan2, which is exact near 0 and
+    180 degrees too.
+
+    Args:
+        estimate: (n, 2 or 3) vectors.
+        truth: (n, 2 or 3) vectors.
+
+    Returns:
+        (n,) angles, degrees. They are 90, the mean over all directions, where one is the zero
+        vector, and 0 where both are.
     """
     estimate, truth = (unit_vectors(v) for v in _pair(estimate, truth))
     # tan(angle / 2) = |a - b| / |a + b| of unit vectors.
@@ -42,23 +74,41 @@ def axis_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
 
 
 def magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """| |V| - |V_g| | (n,), in their unit; of Omega the mean is AME (6.26-27)."""
+    """Return | |V| - |V_g| |; of Omega the mean is AME (6.26-27).
+
+    Args:
+        estimate: (n, components) vectors.
+        truth: (n, components) vectors.
+
+    Returns:
+        (n,) errors, in the unit of the vectors.
+    """
     estimate, truth = _pair(estimate, truth)
     return np.abs(np.linalg.norm(estimate, axis=-1) - np.linalg.norm(truth, axis=-1))
 
 
 def relative_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """| |V| - |V_g| | / |V_g| (n,); of Omega the mean is AME_rel (6.28).
+    """Return | |V| - |V_g| | / |V_g|; of Omega the mean is AME_rel (6.28).
 
-    Infinite where only the truth is the zero vector, 0 where both are.
+    Args:
+        estimate: (n, components) vectors.
+        truth: (n, components) vectors.
+
+    Returns:
+        (n,) errors; infinite where only the truth is the zero vector, 0 where both are.
     """
     return _ratio(magnitude_error(estimate, truth), np.linalg.norm(_pair(truth, truth)[1], axis=-1))
 
 
 def normalised_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
-    """| |V| - |V_g| | / max |V_g| (n,), over the whole truth; of Omega the mean is AME_N (6.29).
+    """Return | |V| - |V_g| | / max |V_g|, over all times; of Omega the mean is AME_N (6.29).
 
-    Infinite where the whole truth is 0 and the estimate is not, 0 where both are.
+    Args:
+        estimate: (n, components) vectors.
+        truth: (n, components) vectors.
+
+    Returns:
+        (n,) errors; infinite where the whole truth is 0 and the estimate is not, 0 where both are.
     """
     error = magnitude_error(estimate, truth)
     largest = np.linalg.norm(_pair(truth, truth)[1], axis=-1).max(initial=0)
@@ -66,9 +116,18 @@ def normalised_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray
 
 
 def outlier_percentage(
-    estimate: ArrayLike, truth: ArrayLike, limit: float | int = _OUTLIER
+    estimate: ArrayLike, truth: ArrayLike, limit: float | int = OUTLIER_ERROR
 ) -> float:
-    """Percentage of vectors whose relative magnitude error is at least `limit` (thesis 6.5.3)."""
+    """Return the percentage of outliers (thesis 6.5.3).
+
+    Args:
+        estimate: (n, components) vectors.
+        truth: (n, components) vectors.
+        limit: Relative magnitude error from which a vector is an outlier.
+
+    Returns:
+        Percentage.
+    """
     return _percent(relative_magnitude_error(estimate, truth) >= limit)
 
 
@@ -79,17 +138,23 @@ def motion_errors(
     Omega: tuple[ArrayLike, ArrayLike] | None = None,
     V: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> dict[str, float]:
-    """The thesis' figures for pairs of (estimate, truth), each (n, components), n > 0.
+    """Return the errors of the thesis for pairs of estimate and truth.
 
-    - U, image velocity in px/s: AEE (px/s), AEE_rel (%), AAE_U (degrees);
-    - T, translation in any unit and of any length: AAE_T (degrees);
-    - Omega, in rad/s: AAE_Omega (degrees), AME (degrees/s), AME_rel (%), AME_N (%), vector_error
-      (%), outliers (%);
-    - V, any other vector: AME_rel (%), vector_error (%), outliers (%).
+    All but the outliers are means over the n times. Scaling T by a positive number changes nothing.
 
-    All are means over the n times except outliers. Scaling the estimate or the truth of T by a
-    positive number changes nothing. Raises `InputError` for pairs of other shapes, none at all,
-    and values that are not finite.
+    Args:
+        U: Pair of image velocities (n, 2), px/s.
+        T: Pair of translations (n, 3), in any unit and of any length.
+        Omega: Pair of angular velocities (n, 3), rad/s.
+        V: Pair of any other vectors (n, components).
+
+    Returns:
+        Errors by name. U has AEE (px/s), AEE_rel (%) and AAE_U (degrees), and T has AAE_T
+        (degrees). Omega has AAE_Omega (degrees), AME (degrees/s) and AME_N (%). Omega and V have
+        AME_rel (%), vector_error (%) and outliers (%).
+
+    Raises:
+        InputError: A pair has two shapes or no rows, or a value is not finite.
     """
     scores: dict[str, float] = {}
     if U is not None:
@@ -112,7 +177,112 @@ def motion_errors(
     return scores
 
 
+@dataclasses.dataclass(frozen=True)
+class MotionScores:
+    """Errors of a motion over the times at which it was found.
+
+    Attributes:
+        figures: Errors by name, see `motion_errors`.
+        startup: Time before the motion was first found, which is left out, s.
+        lost: Fraction of the later times at which it was lost, which are left out.
+        count: Number of times compared.
+        truth: The truth in words.
+        notes: Further lines to print.
+    """
+
+    figures: Mapping[str, float]
+    startup: float
+    lost: float
+    count: int
+    truth: str
+    notes: tuple[str, ...] = ()
+
+    def rows(self) -> list[tuple[str, float, str]]:
+        """Return the name, value and unit of each error."""
+        rows = [(name, value, UNITS[name]) for name, value in self.figures.items()]
+        return [*rows, ("lost", 100 * self.lost, "%"), ("startup", self.startup, "s")]
+
+    def table(self) -> list[str]:
+        """Return the lines of a table to print."""
+        rows = [(name, f"{value:.4g}", unit) for name, value, unit in self.rows()]
+        widths = [max(len(row[i]) for row in rows) for i in range(2)]
+        lines = [
+            f"{name:{widths[0]}}  {value:>{widths[1]}} {unit:4}  {MEANINGS[name]}"
+            for name, value, unit in rows[:-2]
+        ]
+        lines += self.notes if lines else ()
+        return [
+            *(lines or ["the motion was never found where the truth is known"]),
+            f"of {self.count:,} times against {self.truth}; the first {self.startup:.3f} s and "
+            f"{100 * self.lost:.2f} % lost later are left out",
+        ]
+
+
+def score_motion(
+    motion: MotionEstimate,
+    truth: KnownMotion,
+    times: NDArray[np.int64],
+    *,
+    start: int | None = None,
+    centred: bool = False,
+    description: str = "the truth",
+) -> MotionScores:
+    """Compare a motion with a known one.
+
+    Args:
+        motion: The estimate.
+        truth: The known motion.
+        times: (n,) times, us; those at which the truth is unknown are left out.
+        start: Time of the first event, us; by default the first of the times.
+        centred: Whether to use fixed-lag estimates.
+        description: The truth in words.
+
+    Returns:
+        The errors.
+    """
+    times = times[truth.covers(times)]
+    estimate = motion(times, centred=centred, extrapolate=True)
+    start = int(times[0]) if start is None and len(times) else start or 0
+    found = np.flatnonzero(estimate.valid)
+    if not len(found):
+        span = (int(times[-1]) - start) * 1e-6 if len(times) else 0.0
+        return MotionScores({}, max(span, 0.0), 1.0, 0, description)
+    lost, first = ~estimate.valid[found[0] :], int(times[found[0]])
+    mean, true = estimate.mean[found], truth(times[found])
+    pairs = {part.figure: (mean[:, part.rows], true[:, part.rows]) for part in motion.model.parts}
+    startup = max(first - start, 0) * 1e-6
+    return MotionScores(
+        motion_errors(**pairs), startup, float(lost.mean()), len(found), description
+    )
+
+
+def errors_by_part(
+    model: type[Model], mean: NDArray[np.floating], true: NDArray[np.floating]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the error of each direction, and of all other components together.
+
+    Args:
+        model: Motion model of d components.
+        mean: (n, d) estimates.
+        true: (n, d) known motions.
+
+    Returns:
+        Arrays (n,) by the name of a direction, degrees, and "error" of the rest, %.
+    """
+    errors = {
+        part.name: axis_error(mean[:, part.rows], true[:, part.rows])
+        for part in model.parts
+        if part.direction
+    }
+    rest = [np.arange(mean.shape[1])[part.rows] for part in model.parts if not part.direction]
+    if rest:
+        columns = np.concatenate(rest)
+        errors["error"] = 100 * relative_error(mean[:, columns], true[:, columns])
+    return errors
+
+
 def _pair(estimate: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], ...]:
+    """Return the estimate and the truth as arrays, or raise `InputError`."""
     pair = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     if pair[0].shape != pair[1].shape or pair[0].ndim != 2 or not len(pair[0]):
         raise InputError(
@@ -124,14 +294,6 @@ def _pair(estimate: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], .
             row = int(np.argmin(np.isfinite(values).all(-1)))
             raise InputError(f"the {name} motion is not finite in row {row}; leave that time out")
     return pair
-
-
-def unit_vectors(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    # The largest component first: the square of a tiny one would be lost.
-    largest = np.abs(v).max(-1, keepdims=True)
-    v = v / np.where(largest > 0, largest, 1)
-    size = np.linalg.norm(v, axis=-1, keepdims=True)
-    return v / np.where(size > 0, size, 1)
 
 
 def _ratio(error: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -152,9 +152,9 @@ def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[
     """Return positions (n, 2), px, without the distortion."""
     if camera is None or not camera.is_distorted:
         return at.astype(np.float64)
-    from jaxevent.egomotion.geometry import undistorted
+    from jaxevent.egomotion.geometry import undistort
 
-    straight, f = undistorted(camera, at[:, 0], at[:, 1])
+    straight, f = undistort(camera, at[:, 0], at[:, 1])
     return straight / f * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 

@@ -42,10 +42,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxevent.egomotion.comparison import by_part
-from jaxevent.egomotion.estimator import RATE, Batch, MotionEstimator, Stretch
+from jaxevent.egomotion.estimator import (
+    SCORE_RATE_HZ,
+    MotionEstimator,
+    TrainingRuns,
+    TrainingSegment,
+)
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.scores import errors_by_part
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
 from jaxevent.methods import find
@@ -65,12 +70,12 @@ class MotionLoss:
 
     centred: bool = False
 
-    def __call__(self, params: Any, batch: Batch) -> Float[Array, ""]:
+    def __call__(self, params: Any, batch: TrainingRuns) -> Float[Array, ""]:
         means, lags = batch.estimates(params)
         return jnp.mean(jax.vmap(lambda mean, lag: self.one(batch, mean, lag))(means, lags))
 
     def one(
-        self, batch: Batch, mean: Float[Array, "T d"], lag: Float[Array, " T"]
+        self, batch: TrainingRuns, mean: Float[Array, "T d"], lag: Float[Array, " T"]
     ) -> Float[Array, ""]:
         """Compute the loss of one run.
 
@@ -128,7 +133,7 @@ class MotionGoal(Goal):
             return {name: float(getattr(params, name)) for name in acts}
 
         def make(params: Any) -> Batches:
-            made = self.method.follow(found, params, self.kind, self.runs, self.settle)
+            made = self.method.training_runs(found, params, self.kind, self.runs, self.settle)
             return batches_by_split(found, made)
 
         return LastBatches(acting, make)
@@ -150,8 +155,8 @@ class MotionGoal(Goal):
                 continue
             known = mine[0].known
             motion = self.method.estimate(recording, params, model=self.kind, progress=progress)
-            t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / RATE))
-            t = t[known.within(t)]
+            t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / SCORE_RATE_HZ))
+            t = t[known.covers(t)]
             told = motion(t, centred=self.loss.centred) if self.loss.centred else motion(t)
             mean, _, valid = told
             truth = known(t)
@@ -165,7 +170,7 @@ class MotionGoal(Goal):
                 usable = inside & valid
                 row: dict[str, Any] = {"recording": given, "split": name, "error": None}
                 if usable.any():
-                    each = by_part(self.kind, mean[usable], truth[usable])
+                    each = errors_by_part(self.kind, mean[usable], truth[usable])
                     row |= {name: finite(float(values.mean())) for name, values in each.items()}
                 row["lost"] = float((~valid[inside]).mean())
                 row["windows"] = len(chosen)
@@ -178,14 +183,14 @@ class MotionGoal(Goal):
                 columns.insert(1, (f"{part.name} deg", part.name, 1, 2))
         return aligned(rows, columns) + legend(columns)
 
-    def known(self, recording: Recording) -> Known:
+    def known(self, recording: Recording) -> KnownMotion:
         """Return the true motion of a recording, whose name is its path."""
         settings = {"model": self.model, "truth": self.truth, **self.of_truth}
         return scores.true_motion(recording, settings)
 
     def _windows(
         self, sources: Sources, split: Shares, window: float | int | None
-    ) -> list[Stretch]:
+    ) -> list[TrainingSegment]:
         """Cut all recordings with known truth into windows that hold events."""
         found = []
         for place, (_, recording) in (
@@ -203,7 +208,7 @@ class MotionGoal(Goal):
                 )
             for begin, end, s in windows(first, stop, window, split, place):
                 if events.index(begin) < events.index(end):
-                    found.append(Stretch(recording, begin, end, truth, s))
+                    found.append(TrainingSegment(recording, begin, end, truth, s))
         return found
 
 

@@ -29,12 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.comparison import by_part, compare
-from jaxevent.egomotion.estimator import RATE, MotionEstimator
+from jaxevent.egomotion.estimator import SCORE_RATE_HZ, MotionEstimator
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known, known
-from jaxevent.egomotion.twists import from_gyro, imu_rotation
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.scores import errors_by_part, score_motion
+from jaxevent.egomotion.truth import KnownMotion, from_gyro, imu_rotation, known_motion
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.parameters import Parameters
@@ -118,12 +117,12 @@ def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
     return truth_files(truth, str(path))
 
 
-def true_motion(recording: Recording, options: Mapping[str, Any]) -> Known:
+def true_motion(recording: Recording, options: Mapping[str, Any]) -> KnownMotion:
     """Return the true motion of a recording, whose name is its path."""
     source = options["truth"]
     if not (isinstance(source, str) and source in RECORDED):
         source = truth_table(source, recording.name)
-    return known(
+    return known_motion(
         recording,
         model_of(options),
         source,
@@ -173,8 +172,8 @@ class MotionProtocol(Protocol):
         metrics = find_metrics(options.get("metrics", ()), MEASURES)
         first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
         begin = first + round(options.get("settle", 0.0) * 1e6)
-        times = np.arange(begin, last + 1, round(1e6 / RATE))
-        times = times[truth.within(times)]
+        times = np.arange(begin, last + 1, round(1e6 / SCORE_RATE_HZ))
+        times = times[truth.covers(times)]
         if not len(times):
             raise InputError(
                 f"{recording.name}: its events and the true motion are not of one time; times are "
@@ -194,7 +193,7 @@ class MotionProtocol(Protocol):
             )
         seconds = time.perf_counter() - clock
         centred = options.get("centred", False)
-        found = compare(motion, truth, times, start=first, centred=centred)
+        found = score_motion(motion, truth, times, start=first, centred=centred)
         mean, _, valid = motion(times, centred=centred)
 
         def listed(values: Any) -> list[float | None]:
@@ -203,7 +202,7 @@ class MotionProtocol(Protocol):
                 for value, ok in zip(values, valid, strict=True)
             ]
 
-        each = by_part(model, np.where(valid[:, None], mean, 0), truth(times))
+        each = errors_by_part(model, np.where(valid[:, None], mean, 0), truth(times))
         return {
             "model": options.get("model", "planar"),
             **{k: float(v) if np.isfinite(v) else None for k, v in found.figures.items()},
@@ -238,7 +237,7 @@ def _settings(
     return settings
 
 
-class SampledMotion(Motion):
+class SampledMotion(MotionEstimate):
     """A motion that is known at the times of its estimates alone, without interpolation."""
 
     def __call__(
@@ -250,13 +249,13 @@ class SampledMotion(Motion):
 
 def _of_function(
     recording: Recording, method: MethodFunction, times: NDArray[np.int64], model: type[Model]
-) -> Motion:
+) -> MotionEstimate:
     """Return the motion that a function estimates at `times` (us); lost where it is NaN."""
     d = len(model.components)
     mean, covariance, _ = method.estimate(recording, times, [(d,)])
     if covariance is None or covariance.shape != (len(times), d, d):
         covariance = np.full((len(times), d, d), np.nan)
-    return SampledMotion.of(model, times, mean, covariance, np.isfinite(mean).all(1))
+    return SampledMotion.from_arrays(model, times, mean, covariance, np.isfinite(mean).all(1))
 
 
 def _own(

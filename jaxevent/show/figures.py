@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.tracks import Tracks
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.events import event_image
 from jaxevent.reconstruction.video import ImageSequence
@@ -118,9 +118,9 @@ def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int =
 
 
 def plot_motion(
-    motion: Motion,
+    motion: MotionEstimate,
     times: Times | None = None,
-    truth: Known | None = None,
+    truth: KnownMotion | None = None,
     *,
     centred: bool = False,
 ) -> Any:

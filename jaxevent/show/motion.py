@@ -15,11 +15,16 @@ from numpy.typing import NDArray
 
 from jaxevent.display import plural
 from jaxevent.egomotion import flow as event_flow
-from jaxevent.egomotion.comparison import Comparison, compare
 from jaxevent.egomotion.models import Model, find_model
-from jaxevent.egomotion.motion import Motion, decided, table_columns
-from jaxevent.egomotion.truth import Known, known
-from jaxevent.egomotion.twists import constant_between, from_poses, nearest_axes
+from jaxevent.egomotion.motion import MotionEstimate, is_observable, table_columns
+from jaxevent.egomotion.scores import MotionScores, score_motion
+from jaxevent.egomotion.truth import (
+    KnownMotion,
+    find_imu_axes,
+    fit_gyro_bias,
+    from_poses,
+    known_motion,
+)
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
@@ -64,7 +69,7 @@ def _write_csv(path: str | Path, columns: Mapping[str, Any]) -> None:
 
 def write_motion(
     path: str | Path,
-    motion: Motion,
+    motion: MotionEstimate,
     about: Mapping[str, Any] | None = None,
     method: str | None = None,
     params: Parameters | None = None,
@@ -103,7 +108,7 @@ def write_motion(
                 file[name].attrs["units"] = motion.model.units
 
 
-def write_errors(folder: Path, found: Comparison) -> None:
+def write_errors(folder: Path, found: MotionScores) -> None:
     """Write errors.csv (figure, value, unit) and errors.json into a folder."""
     rows = found.rows()
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
@@ -121,8 +126,10 @@ def _plain(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.02) -> Known:
-    """The motion from poses at the one depth that fits `motion`; see `Model.at_one_depth`.
+def fitted_velocity(
+    recording: Recording, motion: MotionEstimate, span: float | int = 0.02
+) -> KnownMotion:
+    """Return the motion from poses at the one depth that fits `motion` best.
 
     Poses do not tell the depth, so that of an image velocity only directions, and changes of the
     speed, are compared with a truth. Raises `InputError` without poses or calibration.
@@ -139,18 +146,20 @@ def fitted_velocity(recording: Recording, motion: Motion, span: float | int = 0.
     f = math.sqrt(recording.camera.fx * recording.camera.fy)
     mean, _, valid = motion(twists.t, extrapolate=True)
     mean = np.where(valid[:, None], mean, np.nan)
-    return Known(model, twists.t, model.at_one_depth(twists, f, mean))
+    return KnownMotion(model, twists.t, model.from_twists_at_fitted_depth(twists, f, mean))
 
 
 class Truth(NamedTuple):
     """A known motion, what it is in words, and further lines about it."""
 
-    known: Known
+    known: KnownMotion
     words: str
     notes: tuple[str, ...] = ()
 
 
-def measured_rotation(truth: Known, motion: Motion, unbiased: bool, turned: bool) -> Truth:
+def measured_rotation(
+    truth: KnownMotion, motion: MotionEstimate, unbiased: bool, turned: bool
+) -> Truth:
     """The truth of a gyro, as it is compared with an estimate.
 
     Where nothing has told its bias (`unbiased`) the constant that fits the estimate is taken off.
@@ -162,14 +171,14 @@ def measured_rotation(truth: Known, motion: Motion, unbiased: bool, turned: bool
     if not rows.any():
         return Truth(truth, words)
     estimate, measured = told.mean[rows], truth.values[rows]
-    axes = None if turned else nearest_axes(estimate, measured)
+    axes = None if turned else find_imu_axes(estimate, measured)
     if axes is not None:
         notes.append(
             f"the gyro is like the estimate in other axes: give --imu-rotation {axes} if they are "
             "its own"
         )
     elif not unbiased:
-        bias = constant_between(estimate, measured)
+        bias = fit_gyro_bias(estimate, measured)
         words = "the gyro without its bias"
         notes.append(
             f"a constant of {', '.join(f'{v:+.3f}' for v in bias)} rad/s was taken off the gyro: "
@@ -224,7 +233,7 @@ class Output:
         bias: NDArray[np.float64] | None = None,
         rotation: NDArray[np.float64] | None = None,
         depth: float | int | None = None,
-    ) -> Callable[[Motion], Truth] | None:
+    ) -> Callable[[MotionEstimate], Truth] | None:
         """The truth, given the motion; None where none is asked for.
 
         Of a gyro, which is looked at where there are no poses, `bias` (rad/s) is taken off and
@@ -235,16 +244,18 @@ class Output:
             return None
         model = find_model(model)
         if self.truth != "auto":
-            table = Truth(known(recording, model, self.truth), str(self.truth))
+            table = Truth(known_motion(recording, model, self.truth), str(self.truth))
             return lambda motion: table
         if depth is not None:
-            at = Truth(known(recording, model, depth=depth), f"poses at the depth {depth:g} m")
+            at = Truth(
+                known_motion(recording, model, depth=depth), f"poses at the depth {depth:g} m"
+            )
             return lambda motion: at
         if model.fits_depth and recording.poses is not None and recording.camera is not None:
             words = "poses at one fitted depth"
             return lambda motion: Truth(fitted_velocity(recording, motion), words)
         zero = np.zeros(3) if bias is None else bias
-        truth = known(recording, model, "auto", zero, rotation=rotation)
+        truth = known_motion(recording, model, "auto", zero, rotation=rotation)
         if recording.poses is not None:
             return lambda motion: Truth(truth, "poses")
         return lambda motion: measured_rotation(
@@ -254,9 +265,9 @@ class Output:
     def write(
         self,
         recording: Recording,
-        motion: Motion,
+        motion: MotionEstimate,
         about: Mapping[str, Any] = MappingProxyType({}),
-        truth: Callable[[Motion], Truth] | None = None,
+        truth: Callable[[MotionEstimate], Truth] | None = None,
         progress: bool | None = None,
         method: str | None = None,
         params: Parameters | None = None,
@@ -271,8 +282,8 @@ class Output:
         true = None if truth is None else truth(motion)
         found = None
         if true is not None:
-            found = compare(
-                motion, true.known, times, start=start, centred=self.centred, named=true.words
+            found = score_motion(
+                motion, true.known, times, start=start, centred=self.centred, description=true.words
             )
             found = dataclasses.replace(found, notes=true.notes)
         outliers = None
@@ -295,7 +306,7 @@ class Output:
             files = sorted(path.name for path in folder.iterdir())
         return Written(files, times, told, motion, found, outliers, left_out)
 
-    def _draw_window(self, folder: Path, recording: Recording, motion: Motion) -> None:
+    def _draw_window(self, folder: Path, recording: Recording, motion: MotionEstimate) -> None:
         """The events of a short window as they fell, moved back, and in colours of their flow."""
         part = window_of(recording, motion)
         flows = None
@@ -313,8 +324,8 @@ class Written:
     files: list[str]
     times: NDArray[np.int64]
     told: Estimate
-    motion: Motion
-    errors: Comparison | None
+    motion: MotionEstimate
+    errors: MotionScores | None
     outliers: float | None  # percentage of events, where flow was asked for
     left_out: str | None = None  # why there are no pictures
 
@@ -327,7 +338,7 @@ class Written:
 
     def _count(self) -> str:
         """Of estimates, without those that are held."""
-        number = len(self.motion) - self.motion.held
+        number = len(self.motion) - self.motion.n_extended
         return f"{number:,} {plural('estimate', number)}"
 
     def _found(self) -> list[str]:
@@ -348,7 +359,7 @@ class Written:
         sigma = np.sqrt(np.diagonal(self.told.covariance[first], axis1=1, axis2=2).clip(0))
         cells = [["", "mean", "least", "most", "sigma", ""]]
         model = self.motion.model
-        told = decided(model, self.told.covariance[first])
+        told = is_observable(model, self.told.covariance[first])
         for i, (name, unit) in enumerate(zip(model.components, model.units, strict=True)):
             column = mean[told[:, i], i]
             numbers = (column.mean(), column.min(), column.max()) if len(column) else ()
@@ -384,7 +395,9 @@ class _Tried(Exception):
     """Only to leave a block without effect."""
 
 
-def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool | None) -> float:
+def _write_flow(
+    path: Path, recording: Recording, motion: MotionEstimate, progress: bool | None
+) -> float:
     """Write the flow of all events, in stretches; returns the percentage of outliers."""
     over = known_count = row = 0
     total = len(recording.events)
@@ -402,9 +415,9 @@ def _write_flow(path: Path, recording: Recording, motion: Motion, progress: bool
             for name, column in columns.items():
                 stored[name][row:stop] = column
             check()
-            known = ~np.isnan(part.residual)
-            known_count += int(known.sum())
-            over += int((part.residual[known] > float(params.limit)).sum())
+            known_motion = ~np.isnan(part.residual)
+            known_count += int(known_motion.sum())
+            over += int((part.residual[known_motion] > float(params.limit)).sum())
             row = stop
         units = {"t": CLOCK_UNIT, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
         for name, unit in units.items():

@@ -14,13 +14,13 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import flow as event_flow
-from jaxevent.egomotion.candidates import coordinates
+from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.flow import Flow
+from jaxevent.egomotion.geometry import blur, image_variance, splat
 from jaxevent.egomotion.models import Model, Numeric
-from jaxevent.egomotion.motion import Motion, decided
+from jaxevent.egomotion.motion import MotionEstimate, is_observable
 from jaxevent.egomotion.scores import axis_error, endpoint_error
-from jaxevent.egomotion.truth import Known
-from jaxevent.egomotion.warped import blur, contrast, splat
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Recording
@@ -35,9 +35,9 @@ _TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
 
 def plot_motion(
     path: str | Path,
-    motion: Motion,
+    motion: MotionEstimate,
     times: NDArray[np.int64],
-    truth: Known | None = None,
+    truth: KnownMotion | None = None,
     *,
     centred: bool = False,
 ) -> None:
@@ -46,7 +46,11 @@ def plot_motion(
 
 
 def motion_figure(
-    motion: Motion, times: NDArray[np.int64], truth: Known | None = None, *, centred: bool = False
+    motion: MotionEstimate,
+    times: NDArray[np.int64],
+    truth: KnownMotion | None = None,
+    *,
+    centred: bool = False,
 ) -> Any:
     """The components over times (us), against the truth and with errors where known.
 
@@ -60,7 +64,7 @@ def motion_figure(
     told = motion(times, centred=centred)
     model, seconds = motion.model, times * 1e-6
     judged = _judged(model, times, told, truth)
-    trust = np.where(told.valid[:, None] & decided(model, told.covariance), 1.0, np.nan)
+    trust = np.where(told.valid[:, None] & is_observable(model, told.covariance), 1.0, np.nan)
     extra = judged or _contrasts(motion, times)
     sizes = [len(model.components[part.rows]) for part in model.parts]
     rows, columns = max(sizes), len(sizes)  # a column for each part
@@ -83,7 +87,7 @@ def motion_figure(
         seen = [band[np.isfinite(band)] for band in (low, value, high)]
         seen = [np.percentile(band, [2, 98]) for band in seen if len(band)]
         if truth is not None:
-            inside = truth.within(times)
+            inside = truth.covers(times)
             true = truth(times[inside])[:, i]
             axis.plot(seconds[inside], true, color=_TRUE, lw=1.0, ls="--", label="truth")
             seen.append(true)
@@ -124,12 +128,12 @@ def motion_figure(
 
 
 def _judged(
-    model: type[Model], times: NDArray[np.int64], told: Estimate, truth: Known | None
+    model: type[Model], times: NDArray[np.int64], told: Estimate, truth: KnownMotion | None
 ) -> list[tuple[str, NDArray[np.float64]]]:
     """Errors over time, with the labels of their axes."""
     if truth is None:
         return []
-    inside = truth.within(times) & told.valid
+    inside = truth.covers(times) & told.valid
     if not inside.any():
         return []
     true, mean = truth(times[inside]), told.mean[inside]
@@ -153,7 +157,9 @@ def _judged(
     return judged
 
 
-def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDArray[np.float64]]]:
+def _contrasts(
+    motion: MotionEstimate, times: NDArray[np.int64]
+) -> list[tuple[str, NDArray[np.float64]]]:
     """Without a truth: how well the motion explains the events."""
     for label, values in (("contrast", motion.contrast), ("events explained", motion.agreement)):
         if values is not None and np.isfinite(values).any():
@@ -161,7 +167,7 @@ def _contrasts(motion: Motion, times: NDArray[np.int64]) -> list[tuple[str, NDAr
     return []
 
 
-def _cloud(axis: Any, motion: Motion, component: int, centred: bool) -> None:
+def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> None:
     cloud = motion.cloud
     if cloud is None or not len(cloud):
         return
@@ -211,7 +217,7 @@ def span_of(recording: Recording) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def window_of(recording: Recording, motion: Motion) -> Window:
+def window_of(recording: Recording, motion: MotionEstimate) -> Window:
     """In the middle of the recording, or of where the motion is found: 20 to 500 ms.
 
     So long that the image moves by 8 px, at the median speed over the sensor. Events beyond the
@@ -225,7 +231,7 @@ def window_of(recording: Recording, motion: Motion) -> Window:
     told = motion(middle, extrapolate=True)
     span = _USUAL
     if told.valid[0] and np.isfinite(told.mean).all():
-        xi, f = coordinates(recording.width, recording.height, recording.camera)
+        xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
         xi = xi[::8, ::8].reshape(-1, 2)
         U = _linear_flow(
             motion.model(f), xi, np.broadcast_to(told.mean, (len(xi), told.mean.shape[1]))
@@ -238,7 +244,7 @@ def window_of(recording: Recording, motion: Motion) -> Window:
     return Window(begin, end, middle)
 
 
-def flow_of(recording: Recording, motion: Motion, part: Window) -> Flow:
+def flow_of(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
     """The flow of a window's events, given those of the 100 ms before, which are candidates."""
     if part.start == part.stop:
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
@@ -253,7 +259,7 @@ def flow_of(recording: Recording, motion: Motion, part: Window) -> Flow:
 
 def warped_events(
     recording: Recording,
-    motion: Motion,
+    motion: MotionEstimate,
     events: Events,
     reference: int,
     moved: NDArray[np.floating] | None = None,
@@ -264,7 +270,7 @@ def warped_events(
     `moved` (n, 2) is the flow (px/s) due to translation at each event. Without a calibration
     coordinates are those of pixels, else undistorted ones about the principal point.
     """
-    xi, f = coordinates(recording.width, recording.height, recording.camera)
+    xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     xy = xi[events.y, events.x]
     since = (events.t - reference) * 1e-6
     # The motion is smooth: its integral on a grid of 1 ms or less.
@@ -297,7 +303,7 @@ def _centre(recording: Recording) -> NDArray[np.float64]:
 def plot_warped(
     path: str | Path,
     recording: Recording,
-    motion: Motion,
+    motion: MotionEstimate,
     part: Window | None = None,
     flows: Flow | None = None,
 ) -> None:
@@ -315,10 +321,10 @@ def plot_warped(
         flows = flows or flow_of(recording, motion, part)
         keep = flows.valid
         events = Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep])
-        xi, f = coordinates(recording.width, recording.height, recording.camera)
+        xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
         mean = motion(events.t, centred=True, extrapolate=True).mean
         moved = flows.flow[keep] - _linear_flow(motion.model(f), xi[events.y, events.x], mean)
-    xi, _ = coordinates(recording.width, recording.height, recording.camera)
+    xi, _ = pixel_coordinates(recording.width, recording.height, recording.camera)
     shape = recording.height, recording.width
     sign = np.where(events.p, 1.0, -1.0)
     places = (
@@ -359,7 +365,7 @@ def _padded(array: NDArray) -> NDArray:
 @functools.partial(jax.jit, static_argnums=2)
 def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
     image = splat(xy, weight, shape)
-    return image, contrast(blur(image, 1))
+    return image, image_variance(blur(image, 1))
 
 
 def _linear_flow(

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxevent.blob.tracks import Tracks
 from jaxevent.display import plural
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording
@@ -76,7 +76,7 @@ def _(tracks: Tracks) -> str:
 
 
 @as_html.register
-def _(motion: Motion) -> str:
+def _(motion: MotionEstimate) -> str:
     lost = int((~motion.valid).sum())
     rows = [
         ("motion", motion.model.title),

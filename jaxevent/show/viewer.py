@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.blob.tracks import Tracks
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError, require
 from jaxevent.io.images import is_series, read_series
 from jaxevent.io.output import complete
@@ -25,7 +25,7 @@ STEP = 5_000  # us between states of tracks and of motion
 TABLES = "tracks.csv", "motion.csv"  # of the folders that the commands write
 CIRCLE = np.linspace(0, 2 * np.pi, 25)
 
-Result = ImageSequence | Tracks | Motion | str | Path
+Result = ImageSequence | Tracks | MotionEstimate | str | Path
 
 
 def view(
@@ -185,7 +185,7 @@ def _layer(result: Any, recording: Recording) -> _Layer:
     if isinstance(result, Tracks):
         table = _table_of_tracks(result)
         return "tracks", lambda send, _: send.tracks(table)
-    if isinstance(result, Motion):
+    if isinstance(result, MotionEstimate):
         table = _table_of_motion(result)
         return "motion", lambda send, _: send.curves(table)
     if isinstance(result, ImageSequence):
@@ -239,7 +239,7 @@ def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
     return pd.DataFrame(known | dict(zip(COLUMNS, states.T, strict=True)))
 
 
-def _table_of_motion(motion: Motion) -> pd.DataFrame:
+def _table_of_motion(motion: MotionEstimate) -> pd.DataFrame:
     times = np.arange(motion.t[0], motion.t[-1] + 1, STEP) if len(motion) else motion.t
     told = motion(times)
     values = np.where(told.valid[:, None], told.mean, np.nan)

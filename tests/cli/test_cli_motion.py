@@ -20,13 +20,13 @@ from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
 from jaxevent.cli import motion as command
 from jaxevent.egomotion import choice, voting
-from jaxevent.egomotion.comparison import compare
-from jaxevent.egomotion.estimator import MotionEstimator, Suited
+from jaxevent.egomotion.estimator import AdaptedParams, MotionEstimator
 from jaxevent.egomotion.models import MODELS, General, Planar
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.particle_filter.estimator import Voting
-from jaxevent.egomotion.patches import Speed
-from jaxevent.egomotion.truth import Known
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.particle_filter.estimator import VotingEstimator
+from jaxevent.egomotion.patches import ImageSpeed
+from jaxevent.egomotion.scores import score_motion
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError, install_command
 from jaxevent.estimator import Estimate
 from jaxevent.parameters import read_toml
@@ -82,13 +82,15 @@ def test_columns_are_exact():
 
 
 def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(Voting, "estimate", lambda self, *_, model, **__: Motion.nothing(model))
+    monkeypatch.setattr(
+        VotingEstimator, "estimate", lambda self, *_, model, **__: MotionEstimate.empty(model)
+    )
     monkeypatch.setattr(Planar, "otherwise", "planes")
-    found, asked = Speed(9.0, 8.0, 10.0, ()), []
+    found, asked = ImageSpeed(9.0, 8.0, 10.0, ()), []
 
     def suit(self, _, params, speed=None, **__):
         asked.append(speed)
-        return Suited(params, found, "the image moves at 9: px/s", "window = 2 s")
+        return AdaptedParams(params, found, "the image moves at 9: px/s", "window = 2 s")
 
     monkeypatch.setattr(MotionEstimator, "suit", suit)
     words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
@@ -117,13 +119,15 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
     def told(estimator, *_):
         share = first if estimator.name == "voting" else other
         if share is None:
-            return Motion.nothing(Planar)
+            return MotionEstimate.empty(Planar)
         t = recording.start + np.array([round(share * long)])
-        return Motion.of(Planar, t, np.ones((1, 2)), np.eye(2)[None], np.array([True]))
+        return MotionEstimate.from_arrays(
+            Planar, t, np.ones((1, 2)), np.eye(2)[None], np.array([True])
+        )
 
     monkeypatch.setattr(command, "_told", told)
     monkeypatch.setattr(Planar, "otherwise", "planes")
-    suited = Suited(voting.Params(), None, "", "")
+    suited = AdaptedParams(voting.Params(), None, "", "")
     monkeypatch.setattr(MotionEstimator, "suit", lambda *_, **__: suited)
     used, seen, _ = command.estimated(voting, recording, None, {"model": Planar}, None, True)
     assert used.name == taken and seen.valid.any() == (first is not None)
@@ -135,7 +139,9 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
 def test_a_dataframe_has_the_columns_that_the_command_writes(tmp_path):
     t = np.array([1000, 3000, 6000])
     mean, covariance = np.arange(6.0).reshape(3, 2), np.tile(np.diag([4.0, 9.0]), (3, 1, 1))
-    motion = Motion.of("planar", t, mean, covariance, np.array([True, True, False]))
+    motion = MotionEstimate.from_arrays(
+        "planar", t, mean, covariance, np.array([True, True, False])
+    )
     motion = dataclasses.replace(motion, span=(0, 7000))
     table = motion.to_dataframe()
     times = np.arange(0, 7001, 500)
@@ -166,10 +172,12 @@ def test_a_folder_of_everything(folder, capsys):
 
     recording = jaxevent.load(path)[:0.2]
     given = read_toml(folder / "mine.toml")
-    suited = voting.suit(recording, voting.Params.of(given), given=given)
+    suited = voting.adapt_params(recording, voting.Params.of(given), given=given)
     params = suited.params
-    assert "px/s" in suited.line and suited.line in said
-    motion, _ = voting.estimate(recording, params, seed=3, cloud=64).with_layers(recording)
+    assert "px/s" in suited.message and suited.message in said
+    motion, _ = voting.estimate(recording, params, seed=3, cloud=64).with_flow_consistency(
+        recording
+    )
     header, table = read_table(out / "motion.csv")
     assert header == ["t", "vx", "vy", "sigma_vx", "sigma_vy", "lost"]
     events = recording.events
@@ -225,7 +233,7 @@ def test_a_folder_of_everything(folder, capsys):
         for i, name in enumerate("uv"):
             np.testing.assert_array_equal(file[name], flow.flow[:, i])
         assert np.array_equal(file["valid"], flow.valid) and np.array_equal(file["t"], events.t)
-        assert file.attrs["outliers"] == pytest.approx(flow.outliers())
+        assert file.attrs["outliers"] == pytest.approx(flow.outlier_percentage())
     for name in ("motion.png", "warped.png", "flow.png"):
         with Image.open(out / name) as figure:
             assert figure.width > 800 and figure.height > 500
@@ -274,10 +282,10 @@ def test_a_gyro_helps_a_method_that_takes_one(folder, monkeypatch):
     jaxevent.save(dataclasses.replace(recording, imu=imu), folder / "imu.h5")
     given = []
 
-    class WithGyro(Voting):
+    class WithGyro(VotingEstimator):
         def estimate(self, recording, params, *, model, seed, progress, gyro):
             given.append((len(recording.events), seed, gyro))
-            return Motion.nothing(model)
+            return MotionEstimate.empty(model)
 
     mine = WithGyro("voting", voting.Params, options=frozenset({"gyro"}))
     monkeypatch.setattr("jaxevent.egomotion.particle_filter.estimator.voting", mine)
@@ -293,13 +301,13 @@ def known_general(source, span=(0, 250_000)):
     t = np.arange(span[0], span[1] + 1, 5_000)
     T, Omega = source.twist(t)
     T = T / np.linalg.norm(T, axis=1, keepdims=True)
-    return Known(General, t, np.concatenate([T, Omega], 1))
+    return KnownMotion(General, t, np.concatenate([T, Omega], 1))
 
 
-def motion_of(known: Known, valid=None) -> Motion:
+def motion_of(known: KnownMotion, valid=None) -> MotionEstimate:
     n = known.values.shape[1]
     covariance = np.broadcast_to(0.01 * np.eye(n), (len(known.t), n, n))
-    return Motion.of(known.model, known.t, known.values, covariance, valid)
+    return MotionEstimate.from_arrays(known.model, known.t, known.values, covariance, valid)
 
 
 def test_general_motion_is_written_too(tmp_path):
@@ -344,7 +352,7 @@ def test_events_moved_back_fall_together():
     x, y = np.rint(at[inside]).astype(np.uint16).T
     events = Events(t[inside], x, y, np.ones(inside.sum(), bool))
     recording = Recording("points", WIDTH, HEIGHT, events, camera=camera)
-    known = Known(MODELS["rotation"], np.array([0, 60_000]), np.stack([Omega, Omega]))
+    known = KnownMotion(MODELS["rotation"], np.array([0, 60_000]), np.stack([Omega, Omega]))
     back = warped_events(recording, motion_of(known), events, 30_000)
     middle = (80 * P[:, :2] / P[:, 2:] + (47.5, 35.5))[inside]
     assert np.abs(back - middle).max() < 0.75  # half a pixel, and what the turn makes of it
@@ -352,7 +360,7 @@ def test_events_moved_back_fall_together():
 
     # Planar, of changing speed: U = (0, 1000 + 1e5 t) moves by 1000 t + 5e4 t^2.
     t = np.array([0, 10_000, 40_000])
-    flat = Known(Planar, np.array([0, 50_000]), np.array([[0.0, 1000.0], [0.0, 6000.0]]))
+    flat = KnownMotion(Planar, np.array([0, 50_000]), np.array([[0.0, 1000.0], [0.0, 6000.0]]))
     x = np.array([5, 6, 7], np.uint16)
     part = Events(t, x, x, np.ones(3, bool))
     back = warped_events(recording, motion_of(flat), part, 10_000)
@@ -363,19 +371,19 @@ def test_events_moved_back_fall_together():
 def test_errors_of_centred_estimates():
     """What was 20 ms ago, told 20 ms late, is right when centred."""
     t = np.arange(0, 300_001, 10_000)
-    truth = Known(Planar, t, np.c_[1e-3 * t, 300 - 1e-3 * t])
+    truth = KnownMotion(Planar, t, np.c_[1e-3 * t, 300 - 1e-3 * t])
     late = dataclasses.replace(motion_of(truth), t=t + 20_000, lag=np.full(len(t), 0.02))
     times = np.arange(40_000, 280_000, 1000)
-    told = compare(late, truth, times, centred=True)
+    told = score_motion(late, truth, times, centred=True)
     assert told.figures["AEE"] < 1e-9 and told.count == len(times) and told.startup == 0
-    told = compare(late, truth, times, start=30_000)
+    told = score_motion(late, truth, times, start=30_000)
     assert told.figures["AEE"] == pytest.approx(20 * np.sqrt(2)) and told.startup == 0.01
 
 
 def test_velocity_of_poses_at_the_depth_that_fits():
     recording, source = motion_scene("planar", "varying", size=(8, 6), focal=80.0, duration=0.3)
     t = np.arange(0, 300_001, 1000)
-    motion = motion_of(Known(Planar, t, 1.02 * source.velocity(t)))
+    motion = motion_of(KnownMotion(Planar, t, 1.02 * source.velocity(t)))
     told = pictures.fitted_velocity(recording, motion)
     np.testing.assert_allclose(told.values, 1.02 * source.velocity(told.t), rtol=0.02)
     for missing in ("poses", "camera"):

@@ -13,7 +13,7 @@ from noise import ONE, small, write_config
 
 import jaxevent
 from jaxevent import cli
-from jaxevent.egomotion.truth import known
+from jaxevent.egomotion.truth import known_motion
 from jaxevent.io import output
 from jaxevent.register.geometry import read_homography
 from jaxevent.runs import results
@@ -297,6 +297,6 @@ def test_a_byte_order_mark_is_no_reason_to_refuse(folder):
     recording = jaxevent.load(place, (10, 10))
     assert recording.events[:].t.tolist() == [100_000, 500_000]
     assert float(jaxevent.akf.Params.load(place / "params.toml").c_on) == pytest.approx(0.25)
-    assert known(recording, "planar", place / "motion.csv").t.tolist() == [0, 1_000_000]
+    assert known_motion(recording, "planar", place / "motion.csv").t.tolist() == [0, 1_000_000]
     assert len(read_positions(place / "positions.csv").t) == 2
     assert read_homography(place / "homography.csv").tolist() == np.eye(3).tolist()

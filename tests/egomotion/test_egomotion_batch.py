@@ -27,7 +27,7 @@ from jaxevent.egomotion.bundle.warp import (
     warp,
 )
 from jaxevent.egomotion.bundle.windows import DARK, Params, read_frame_pixels, stamp_offset
-from jaxevent.egomotion.twists import Twists
+from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 

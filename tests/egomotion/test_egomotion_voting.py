@@ -11,11 +11,12 @@ from points import HEIGHT, WIDTH, moved, recorded, turning
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import candidates, voting
+from jaxevent.egomotion.candidates import CandidateSampler
 from jaxevent.egomotion.models import MODELS, General, Planar
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.likelihood import along_edge, score
-from jaxevent.egomotion.particle_filter.smoothing import smoothed
+from jaxevent.egomotion.particle_filter.filtering import smooth
+from jaxevent.egomotion.particle_filter.likelihood import is_along_edge, score_batch
 from jaxevent.errors import InputError
 from jaxevent.recording import Events
 
@@ -32,7 +33,7 @@ def scattered(number=400, seed=0, width=9, height=7, span=4000):
     return recorded(t, x, y, p, width, height)
 
 
-def slow(recording, row, radius, per_pixel, youngest, oldest):
+def search_candidates(recording, row, radius, per_pixel, youngest, oldest):
     """(dx, dy, age in us) of an event's candidates, looked for among all earlier events."""
     e = recording.events
     found, at_pixel = [], {}
@@ -51,17 +52,17 @@ def slow(recording, row, radius, per_pixel, youngest, oldest):
 @pytest.mark.parametrize("every, batch, pieces, per_pixel", [(1, 7, 3, 3), (3, 16, 64, 8)])
 def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
     recording = scattered()
-    gatherer = candidates.Gatherer(
+    sampler = CandidateSampler(
         recording, radius=2, per_pixel=per_pixel, most=200, every=every, batch=batch, longest=1e9
     )
     rows, ends = [], []
-    while not gatherer.done:
-        made = gatherer.gather(pieces, 40e-6, 2000e-6)
+    while not sampler.is_exhausted:
+        made = sampler.sample(pieces, 40e-6, 2000e-6)
         c = made.candidates
         for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
             rows.append(made.row[b, k])
             np.testing.assert_array_equal(c.mask[b, k], c.age[b, k] > 0)
-            expected = slow(recording, rows[-1], 2, per_pixel, 40, 2000)
+            expected = search_candidates(recording, rows[-1], 2, per_pixel, 40, 2000)
             assert listed(c, b, k) == expected
             assert c.scale[b, k] == 1
             since = recording.events.t[rows[-1]] - recording.start
@@ -75,15 +76,18 @@ def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
         ends += made.t[filled].tolist()
         np.testing.assert_array_equal(made.t[filled], recording.events.t[made.row.max(1)[filled]])
     np.testing.assert_array_equal(rows, np.arange(0, len(recording.events), every))
-    assert sum(len(slow(recording, r, 2, per_pixel, 40, 2000)) for r in rows) > 500
+    assert sum(len(search_candidates(recording, r, 2, per_pixel, 40, 2000)) for r in rows) > 500
     assert len(ends) == -(-len(rows) // batch)
 
 
 def test_too_many_candidates_are_thinned_evenly():
     recording = scattered(number=3000)
-    some = candidates.Gatherer(recording, radius=2, per_pixel=4, most=10, every=1, batch=50)
-    every = candidates.Gatherer(recording, radius=2, per_pixel=4, most=200, every=1, batch=50)
-    few, all_ = (g.whole(1e-6, 1e-2).candidates for g in (some, every))
+    few, all_ = (
+        CandidateSampler(recording, radius=2, per_pixel=4, most=most, every=1, batch=50)
+        .sample_all(1e-6, 1e-2)
+        .candidates
+        for most in (10, 200)
+    )
     number = all_.mask.sum(-1)
     np.testing.assert_allclose(few.scale, np.maximum(number / 10, 1))
     np.testing.assert_array_equal(few.mask.sum(-1), np.minimum(number, 10))
@@ -98,16 +102,15 @@ def test_candidates_about_an_expected_flow():
     recording = scattered(number=1500)
     rng = np.random.default_rng(0)
     youngest, oldest = rng.uniform([[100]], 500, (7, 9)), rng.uniform(1000, 3000, (7, 9))
-    gate = candidates.Expected(
-        rng.uniform(-1000, 1000, (2, 7, 9)), rng.uniform(0, 300, (7, 9)), 1.5
-    )
-    gatherer = candidates.Gatherer(recording, radius=2, per_pixel=4, most=200, every=3, batch=50)
-    made = gatherer.gather(20, 1e-6 * youngest, 1e-6 * oldest, expected=gate)
+    U, slack = rng.uniform(-1000, 1000, (2, 7, 9)), rng.uniform(0, 300, (7, 9))
+    gate = candidates.ExpectedFlow(U, slack, 1.5)
+    sampler = CandidateSampler(recording, radius=2, per_pixel=4, most=200, every=3, batch=50)
+    made = sampler.sample(20, 1e-6 * youngest, 1e-6 * oldest, expected=gate)
     c, e, some = made.candidates, recording.events, 0
     for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
         x, y = int(e.x[made.row[b, k]]), int(e.y[made.row[b, k]])
         U, slack = gate.U[:, y, x], gate.slack[y, x]
-        every = slow(recording, made.row[b, k], 2, 4, youngest[y, x], oldest[y, x])
+        every = search_candidates(recording, made.row[b, k], 2, 4, youngest[y, x], oldest[y, x])
         near = [
             (dx, dy, age)
             for dx, dy, age in every
@@ -130,24 +133,23 @@ def listed(c, b, k):
 
 def test_chunks_end_in_time_and_lose_nothing():
     recording = scattered()
-    rows, gatherer = [], candidates.Gatherer(recording, radius=2, every=3, batch=7)
-    while not gatherer.done:
-        made = gatherer.gather(40, 0.0, 1.0, span=5e-4)
+    rows, sampler = [], CandidateSampler(recording, radius=2, every=3, batch=7)
+    while not sampler.is_exhausted:
+        made = sampler.sample(40, 0.0, 1.0, span=5e-4)
         t = recording.events.t[made.row[made.row >= 0]]
         assert t[-1] - t[0] <= 500
         rows.append(made.row[made.row >= 0])
     assert len(rows) == 8
     np.testing.assert_array_equal(np.concatenate(rows), np.arange(0, 400, 3))
     # A search needs candidates of all ages.
-    short = candidates.Gatherer(recording, radius=2, every=3).gather(9, 0.0, 1e-3).candidates
-    assert np.max(short.history) == 1e-3
+    short = CandidateSampler(recording, radius=2, every=3).sample(9, 0.0, 1e-3)
+    assert np.max(short.candidates.history) == 1e-3
 
 
 def test_a_batch_ends_in_time_and_times_add_up():
     recording = recorded([0, 100, 5000, 30000, 30001, 30001], [1] * 6, [1] * 6, [1] * 6)
-    made = candidates.Gatherer(recording, every=1, batch=4, longest=0.004, silence=0.02).whole(
-        0.0, 1.0
-    )
+    sampler = CandidateSampler(recording, every=1, batch=4, longest=0.004, silence=0.02)
+    made = sampler.sample_all(0.0, 1.0)
     assert made.t.tolist() == [100, 5000, 30001]
     np.testing.assert_allclose(made.candidates.elapsed, [1e-4, 4.9e-3, 25.001e-3])
     np.testing.assert_allclose(made.candidates.history, [1e-4, 5e-3, 1e-6])
@@ -156,19 +158,14 @@ def test_a_batch_ends_in_time_and_times_add_up():
 def test_displacements_are_undistorted():
     camera = PinholeCamera(80.0, 80.0, 60.0, 45.0, (-0.3, 0.1, 0.001, -0.002, 0.0))
     recording = recorded([0, 1000], [110, 113], [80, 78], [1, 1])
-    c = candidates.Gatherer(recording, camera, every=1).whole(0.0, 1.0).candidates
+    c = CandidateSampler(recording, camera, every=1).sample_all(0.0, 1.0).candidates
     xi: np.ndarray = np.asarray(c.xi)[0, :2]
     np.testing.assert_allclose(c.d[0, 1, 0], xi[1] - xi[0])
-    x, y = np.transpose(xi) / 80
-    r2 = x**2 + y**2
-    rooms = np.asarray(c.room)[0, 0]  # from the first column to the last, at its row
-    edge, _ = candidates.coordinates(WIDTH, HEIGHT, camera)
+    bounds = np.asarray(c.bounds)[0, 0]  # from the first column to the last, at its row
+    edge, _ = candidates.pixel_coordinates(WIDTH, HEIGHT, camera)
     here = np.asarray(c.xi)[0, 0]
-    np.testing.assert_allclose(rooms[:, 0], here[0] - edge[80, [WIDTH - 1, 0], 0])
-    np.testing.assert_allclose(rooms[:, 1], here[1] - edge[[HEIGHT - 1, 0], 110, 1])
-    radial = 1 - 0.3 * r2 + 0.1 * r2**2
-    back_x = x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x**2)
-    np.testing.assert_allclose(80 * back_x + 60, [110, 113], atol=1e-6)
+    np.testing.assert_allclose(bounds[:, 0], here[0] - edge[80, [WIDTH - 1, 0], 0])
+    np.testing.assert_allclose(bounds[:, 1], here[1] - edge[[HEIGHT - 1, 0], 110, 1])
     assert np.abs(np.asarray(c.d)[0, 1, 0] - [3, -2]).max() > 0.5
 
 
@@ -181,11 +178,11 @@ def prepared(likelihood="soft", model="planar", number=500, **settings):
     t = np.sort(rng.integers(0, 100_000, number))
     x, y, p = rng.integers(0, 14, number), rng.integers(0, 11, number), rng.random(number) < 0.5
     recording = recorded(t, x, y, p, 14, 11, PinholeCamera(20.0, 20.0, 6.0, 5.0))
-    kind, gatherer = voting.gatherer(recording, params, model)
-    return params, kind, gatherer.whole(1e-3, 0.1).candidates
+    kind, sampler = voting.sampler(recording, params, model)
+    return params, kind, sampler.sample_all(1e-3, 0.1).candidates
 
 
-def by_hand(params, model, batch, particles, weights, searching):
+def sum_over_events(params, model, batch, particles, weights, searching):
     """Sums over events, one term after another: each particle's log-likelihood; votes; chance; tau.
 
     `tau` is the mean over events of the age of a common range's oldest candidates.
@@ -197,7 +194,7 @@ def by_hand(params, model, batch, particles, weights, searching):
     sigma = float(params.sigma_x) * (2 if searching else 1)
     for k in np.flatnonzero(batch.valid):
         x, y = batch.xi[k]
-        least_d, most_d = batch.room[k]
+        least_d, most_d = batch.bounds[k]
         f, general = model.f, model.name == "general"
         rows = np.array([[x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]])
         flows = [q if model.name == "planar" else rows @ q[-3:] for q in particles]
@@ -258,9 +255,9 @@ def by_hand(params, model, batch, particles, weights, searching):
         # votes, a disc's and a strip's of the window's half width.
         area = 2 * np.pi * sigma**2
         if general:
-            area = area / 2 + np.sqrt(2 * np.pi) * sigma * batch.reach
+            area = area / 2 + np.sqrt(2 * np.pi) * sigma * batch.radius
         usual = batch.rate[k] * (1 - share) * tau
-        chance += max(usual * area / (2 * batch.reach + 1) ** 2, 0.2)
+        chance += max(usual * area / (2 * batch.radius + 1) ** 2, 0.2)
     return total, votes, chance, np.mean(taus)
 
 
@@ -274,51 +271,64 @@ def cloud_of(kind):
     return particles, rng.dirichlet(np.ones(30) * 20)
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("likelihood", ["soft", "band", "literal", "search"])
-def test_a_score_is_the_slow_one(likelihood, model):
+# Each branch of the likelihood once: of flows, ranges of ages and half-lines.
+@pytest.mark.parametrize(
+    "likelihood, model",
+    [
+        *(("soft", model) for model in MODELS),
+        ("band", "rotation"),
+        ("search", "planar"),
+        ("search", "general"),
+        ("literal", "planar"),
+        ("literal", "general"),
+    ],
+)
+def test_scores_equal_a_loop(likelihood, model):
     searching = likelihood == "search"
     params, kind, c = prepared("soft" if searching else likelihood, model, r_t=50.0)
     batch = jax.tree.map(lambda a: a[25], c)
     particles, weights = cloud_of(kind)
-    told = SCORE(params, kind, batch, *map(jnp.asarray, (particles, weights, searching)))
-    expected, votes, chance, tau = by_hand(params, kind, batch, particles, weights, searching)
+    found = SCORE(params, kind, batch, *map(jnp.asarray, (particles, weights, searching)))
+    expected, votes, chance, tau = sum_over_events(
+        params, kind, batch, particles, weights, searching
+    )
     assert expected.std() > 0.05
-    np.testing.assert_allclose(told.log_likelihood.sum(0), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.log_likelihood.sum(0), expected, rtol=1e-9, atol=1e-12)
     if likelihood != "literal":
-        np.testing.assert_allclose([told.votes, told.chance], [votes, chance], rtol=1e-9)
+        np.testing.assert_allclose([found.votes, found.chance], [votes, chance], rtol=1e-9)
         # Seen is the mean flow since candidates: that of half their ages ago.
-        np.testing.assert_allclose(told.lag, (0.7 * tau + tau) / 2 / 2)
+        np.testing.assert_allclose(found.lag, (0.7 * tau + tau) / 2 / 2)
 
 
 @pytest.mark.parametrize("searching", [False, True])
-def test_a_step_is_the_slow_one(searching):
+def test_step_equals_a_loop(searching):
     params, kind, c = prepared()
     batch = dataclasses.replace(
         jax.tree.map(lambda a: jnp.asarray(a[25]), c), history=jnp.array(1.0)
     )
     particles, weights = cloud_of(kind)
-    carry = filtering.State(
+    carry = filtering.ParticleState(
         *map(jnp.asarray, (particles, np.log(weights), searching, 0.0, 0.0, 0.0, 0.0))
     )
-    cloud, zero = jnp.zeros_like(carry.particles), jnp.zeros(())
-    after, told = STEP(params, kind, carry, jax.tree.map(jnp.asarray, batch), cloud, zero, cloud)
-    gain, *_ = by_hand(params, kind, batch, particles, weights, searching)
+    cloud = jnp.zeros_like(carry.particles)
+    noise = filtering.BatchNoise(cloud, jnp.zeros(()), cloud)
+    after, found = STEP(params, kind, carry, jax.tree.map(jnp.asarray, batch), noise)
+    gain, *_ = sum_over_events(params, kind, batch, particles, weights, searching)
     gain = gain * (min(1, 0.5 / gain.std()) if searching else 1)
     w = weights * np.exp(gain)
-    np.testing.assert_allclose(told.evidence, np.log(w.sum()), rtol=1e-9)
+    np.testing.assert_allclose(found.evidence, np.log(w.sum()), rtol=1e-9)
     w /= w.sum()
     mean = w @ particles
-    np.testing.assert_allclose(told.mean, mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(
-        told.covariance, (particles - mean).T @ np.diag(w) @ (particles - mean), rtol=1e-8
+        found.covariance, (particles - mean).T @ np.diag(w) @ (particles - mean), rtol=1e-8
     )
     few = 1 / (w**2).sum() <= 15
     np.testing.assert_allclose(jnp.exp(after.log_weights), 1 / 30 if few else w, rtol=1e-9)
 
 
 STEP = eqx.filter_jit(filtering.step)
-SCORE = eqx.filter_jit(score)
+SCORE = eqx.filter_jit(score_batch)
 
 
 def test_systematic_resampling_is_unbiased():
@@ -344,7 +354,7 @@ def test_resampling_carries_the_score():
 def test_gradient_without_resampling(likelihood, optimised):
     params, kind, c = prepared(likelihood, number=300, resample_below=0.0, r_t=50.0, memory=1e9)
     noise = filtering.draw(jax.random.key(3), len(c.elapsed), params, kind)
-    carry = filtering.begin(params, kind, noise)
+    carry = filtering.init(params, kind, noise)
     carry = dataclasses.replace(carry, particles=carry.particles / 6, searching=jnp.asarray(False))
     names = ["noise"] + (["r_t", "alpha_literal"] if likelihood == "literal" else
                          ["sigma_x", "s0", "alpha"])  # fmt: skip
@@ -353,8 +363,9 @@ def test_gradient_without_resampling(likelihood, optimised):
     def loss(values):
         raw = {**params.raw, **dict(zip(names, values, strict=True))}
         tuned = eqx.tree_at(lambda p: p.raw, params, raw)
-        _, told = filtering.run(tuned, kind, c, noise, carry)
-        return ((told.mean - jnp.array([50.0, 20.0])) ** 2).mean() / 1e3 - told.evidence.sum() / 100
+        _, found = filtering.run(tuned, kind, c, noise, carry)
+        error = ((found.mean - jnp.array([50.0, 20.0])) ** 2).mean()
+        return error / 1e3 - found.evidence.sum() / 100
 
     at = jnp.stack([params.raw[name] for name in names])
     h = 1e-6
@@ -376,33 +387,36 @@ FAST = voting.Params.of({"every": 2, "candidates": 48})
 
 def test_planar_motion_is_found():
     truth = np.array([130.0, -70.0])
-    recording = moved(lambda at: truth, 0.5, 120, seed=3)
-    motion = voting.estimate(recording, FAST, seed=1)
+    recording = moved(lambda at: truth, 0.45, 120, seed=3)
+    motion = voting.estimate(recording, FAST, seed=1, cloud=16)
     assert relative_error(motion, truth) < 0.03
+    # The particles that are asked for are drawn by weight, and change nothing else.
+    assert motion.cloud.shape == (len(motion), 16, 2)
+    apart = motion.cloud.mean(1) - motion.mean
+    spread = np.sqrt(np.trace(motion.covariance, axis1=1, axis2=2))
+    assert (np.linalg.norm(apart, axis=1) < 1.0 * spread)[motion.valid].all()
     again = voting.estimate(recording, FAST, seed=1)
+    assert again.cloud is None
     np.testing.assert_array_equal(motion.mean, again.mean)
-    truth = np.array([-40.0, -260.0])  # another speed
-    assert relative_error(voting.estimate(moved(lambda at: truth, 0.4, 120, 4), FAST), truth) < 0.03
 
 
 def test_rotation_is_found():
     truth = np.array([0.5, 1.5, -1.2])
-    recording = moved(turning(truth), 0.6, 150, seed=5, camera=CAMERA)
+    recording = moved(turning(truth), 0.45, 150, seed=5, camera=CAMERA)
     motion = voting.estimate(recording, FAST, model="rotation", seed=0)
     assert relative_error(motion, truth) < 0.05
 
 
 def test_single_precision(float32):
     truth = np.array([130.0, -70.0])
-    motion = voting.estimate(
-        moved(lambda at: truth, 0.5, 120, seed=3), voting.Params.of(FAST.values())
-    )
+    recording = moved(lambda at: truth, 0.45, 120, seed=3)
+    motion = voting.estimate(recording, voting.Params.of(FAST.values()))
     assert motion.mean.dtype == np.float32
     assert relative_error(motion, truth) < 0.03
 
 
-@pytest.mark.parametrize("before, truth", [((200, 0), (-40, -250)), ((300, 0), (60, 0))])
-def test_a_motion_that_changes_at_once_is_found_again(before, truth):
+def test_motion_is_found_again_after_a_sudden_change():
+    before, truth = (300, 0), (60, 0)
     first = moved(lambda at: np.array(before), 0.3, 120, seed=6).events
     second = moved(lambda at: np.array(truth), 0.4, 120, seed=7).events
     parts = [np.concatenate([getattr(first, n), getattr(second, n)]) for n in "xyp"]
@@ -417,7 +431,7 @@ def test_a_motion_that_changes_at_once_is_found_again(before, truth):
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
-def test_seeds_and_parameters_in_one_call():
+def test_vmap_over_seeds_and_parameters():
     params, kind, c = prepared()
     c = jax.tree.map(lambda a: a[:4], c)  # as many as elsewhere: one program
     keys = jax.random.split(jax.random.key(0), 3)
@@ -425,7 +439,7 @@ def test_seeds_and_parameters_in_one_call():
     def final(key, alpha):
         tuned = eqx.tree_at(lambda p: p.raw["alpha"], params, alpha)
         noise = filtering.draw(key, len(c.elapsed), params, kind)
-        return RUN(tuned, kind, c, noise, filtering.begin(params, kind, noise))[1].mean[-1]
+        return RUN(tuned, kind, c, noise, filtering.init(params, kind, noise))[1].mean[-1]
 
     alphas = jnp.log(jnp.array([1.0, 2.0, 3.0]))
     together = jax.jit(jax.vmap(final))(keys, alphas)
@@ -437,10 +451,10 @@ def test_seeds_and_parameters_in_one_call():
 RUN = eqx.filter_jit(filtering.run)
 
 
-# The literal one has a case for planar motion, and one for the others.
+# Rotations have no branch of their own.
 @pytest.mark.parametrize(
     "model, likelihood",
-    [*((model, "soft") for model in MODELS), ("planar", "literal"), ("general", "literal")],
+    [("planar", "soft"), ("general", "soft"), ("planar", "literal"), ("general", "literal")],
 )
 def test_odd_streams(model, likelihood):
     params = voting.Params.of({**FAST.values(), "likelihood": likelihood})
@@ -467,22 +481,22 @@ def test_odd_streams(model, likelihood):
     assert not states.valid.any() and np.isnan(states.mean).all()
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_particles_that_all_die_begin_anew(model):
+@pytest.mark.parametrize("model", ["planar", "general"])
+def test_filter_restarts_when_all_particles_die(model):
     params, kind, c = prepared(model=model)
     c = jax.tree.map(lambda a: a[:4], c)
     noise = filtering.draw(jax.random.key(0), len(c.elapsed), params, kind)
-    carry = filtering.begin(params, kind, noise)
+    carry = filtering.init(params, kind, noise)
     dead = dataclasses.replace(carry, log_weights=jnp.full_like(carry.log_weights, -jnp.inf))
-    after, told = RUN(params, kind, c, noise, dead)
-    assert told.searching[0] and after.searching
+    after, found = RUN(params, kind, c, noise, dead)
+    assert found.searching[0] and after.searching
     assert np.ptp(after.particles, axis=0).min() > 1  # everywhere
-    for value in (*jax.tree.leaves(told), after.particles, after.log_weights):
+    for value in (*jax.tree.leaves(found), after.particles, after.log_weights):
         assert np.isfinite(value).all()
 
 
 def test_states_between_batches():
-    motion = Motion(
+    motion = MotionEstimate(
         Planar, np.array([1000, 3000]), np.array([[1.0, 0], [3, 4]]),
         np.stack([np.eye(2), 3 * np.eye(2)]), np.array([False, True]),
         np.full(2, 5e-4), np.ones(2), np.zeros(2),
@@ -494,64 +508,60 @@ def test_states_between_batches():
     np.testing.assert_allclose(motion(np.array([1500]), centred=True).mean, [[2, 2]])
 
 
-def test_smoothed_is_the_dense_posterior():
+def test_smoothing_equals_the_dense_posterior():
     """Of a random walk seen with noise: a Kalman filter, then the joint Gaussian of all times."""
-    params, rng, n = voting.Params.of({"noise_rotation": 2.0}), np.random.default_rng(0), 40
+    params, rng, n = (
+        voting.Params.of({"noise_rotation": 2.0}),
+        np.random.default_rng(0),
+        40,
+    )
     dt = rng.uniform(1e-3, 1e-2, n)
     dt[0], R, P0 = 0.0, np.diag([0.1, 0.2, 0.4]), np.eye(3)
     z = np.cumsum(2 * np.sqrt(dt)[:, None] * rng.normal(size=(n, 3)), 0)
     z += rng.normal(size=(n, 3)) @ np.sqrt(R)
-    mean, P, told = np.zeros(3), P0, []
+    mean, P, found = np.zeros(3), P0, []
     for k in range(n):
         P = P + 4.0 * dt[k] * np.eye(3)
         K = P @ np.linalg.inv(P + R)
         mean, P = mean + K @ (z[k] - mean), (np.eye(3) - K) @ P
-        told.append((mean, P))
+        found.append((mean, P))
     t = np.rint(1e6 * np.cumsum(dt)).astype(np.int64)
     lag = np.linspace(0.02, 0.03, n)
-    means, covariances = (np.array(part) for part in zip(*told, strict=True))
-    motion = dataclasses.replace(Motion.of("rotation", t, means, covariances), lag=lag)
-    smooth = smoothed(motion, params)
+    means, covariances = (np.array(part) for part in zip(*found, strict=True))
+    motion = dataclasses.replace(
+        MotionEstimate.from_arrays("rotation", t, means, covariances), lag=lag
+    )
+    smoothed = smooth(motion, params)
     # cov(x_i, x_j) = P0 + 4 min(t_i, t_j), each component alone.
     joint = 1 + 4 * np.cumsum(dt)[np.minimum.outer(np.arange(n), np.arange(n))]
     for i in range(3):
         gain = joint @ np.linalg.inv(joint + R[i, i] * np.eye(n))
-        np.testing.assert_allclose(smooth.mean[:, i], gain @ z[:, i], rtol=1e-2, atol=2e-3)
+        np.testing.assert_allclose(smoothed.mean[:, i], gain @ z[:, i], rtol=1e-2, atol=2e-3)
         posterior = joint - gain @ joint
-        np.testing.assert_allclose(smooth.covariance[:, i, i], np.diag(posterior), rtol=1e-3)
-    np.testing.assert_allclose(smooth.t, t - 1e6 * lag, atol=1)
-    assert not smooth.lag.any()
+        np.testing.assert_allclose(smoothed.covariance[:, i, i], np.diag(posterior), rtol=1e-3)
+    np.testing.assert_allclose(smoothed.t, t - 1e6 * lag, atol=1)
+    assert not smoothed.lag.any()
     # Nothing passes a stretch in which the motion is lost.
     valid = np.arange(n) != 20
-    cut = smoothed(dataclasses.replace(motion, valid=valid), params)
-    first = smoothed(Motion.of("rotation", t[:20], means[:20], covariances[:20]), params)
+    cut = smooth(dataclasses.replace(motion, valid=valid), params)
+    first = smooth(
+        MotionEstimate.from_arrays("rotation", t[:20], means[:20], covariances[:20]), params
+    )
     np.testing.assert_allclose(cut.mean[:20], first.mean)
     np.testing.assert_allclose(cut.mean[20], means[20])
-
-
-def test_clouds_are_told_by_weight():
-    recording = moved(lambda at: np.array([130.0, -70.0]), 0.25, 120, seed=3)
-    motion = voting.estimate(recording, FAST, cloud=16)
-    assert motion.cloud.shape == (len(motion), 16, 2)
-    apart = motion.cloud.mean(1) - motion.mean
-    spread = np.sqrt(np.trace(motion.covariance, axis1=1, axis2=2))
-    assert (np.linalg.norm(apart, axis=1) < 1.0 * spread)[motion.valid].all()
-    plain = voting.estimate(recording, FAST)
-    assert plain.cloud is None
-    np.testing.assert_array_equal(plain.mean, motion.mean)
 
 
 def test_general_particles():
     params = voting.Params.of({"preset": "general"})
     kind = General(100.0)
     noise = filtering.draw(jax.random.key(0), 1, params, kind)
-    particles = jax.jit(filtering.begin, static_argnums=1)(params, kind, noise).particles
+    particles = jax.jit(filtering.init, static_argnums=1)(params, kind, noise).particles
     particles = np.asarray(particles)
     np.testing.assert_allclose(np.linalg.norm(particles[:, :3], axis=1), 1)
     # All over the sphere: second moments of directions are 1 / 3.
     T = particles[:, :3]
     np.testing.assert_allclose(T.T @ T / 500, np.eye(3) / 3, atol=0.06)
-    steps, moved = 0.01 * np.asarray(noise.normal[0]), jax.jit(jax.vmap(kind.moved))
+    steps, moved = 0.01 * np.asarray(noise.normal[0]), jax.jit(jax.vmap(kind.retract))
     after = np.asarray(moved(particles, steps))
     np.testing.assert_allclose(np.linalg.norm(after[:, :3], axis=1), 1)
     across = steps[:, :3] - particles[:, :3] * (steps[:, :3] * particles[:, :3]).sum(1)[:, None]
@@ -560,13 +570,13 @@ def test_general_particles():
     cloud = moved(around, 5 * steps)
     mean = np.asarray(jax.jit(kind.mean)(cloud, np.full(500, 1 / 500)))
     np.testing.assert_allclose(mean[:3], [0.6, 0, 0.8], atol=0.02)
-    apart = np.asarray(jax.jit(jax.vmap(kind.apart, (0, None)))(cloud, mean))
+    apart = np.asarray(jax.jit(jax.vmap(kind.deviation, (0, None)))(cloud, mean))
     np.testing.assert_allclose(apart[:, :3] @ mean[:3], 0, atol=1e-12)
     covariance = apart.T @ apart / 500
     np.testing.assert_allclose(np.linalg.eigvalsh(covariance[:3, :3])[1:], 0.05**2, rtol=0.2)
 
 
-def test_what_cannot_be_estimated_is_refused():
+def test_impossible_estimates_are_refused():
     recording = recorded([0, 1], [0, 1], [0, 1], [0, 1])
     for model in ("rotation", "general"):
         with pytest.raises(InputError, match="calibration"):
@@ -589,5 +599,5 @@ def test_candidates_along_an_edge_against_a_loop():
         near = bool(earlier) and abs(min(earlier) - last) <= edge
         expected.append(0 < age[c] <= edge and near)
     params = voting.Params(edge=edge)
-    found = along_edge(params, jnp.asarray(d), jnp.asarray(age), jnp.asarray(last))
+    found = is_along_edge(params, jnp.asarray(d), jnp.asarray(age), jnp.asarray(last))
     assert np.array_equal(found, expected) and 0 < sum(expected) < (age > 0).sum()

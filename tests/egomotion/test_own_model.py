@@ -77,7 +77,7 @@ def test_methods_find_the_true_motion():
     assert motion.valid.all() and off(motion.mean) < 0.05
     with pytest.raises(jaxevent.InputError, match="does not know zoom and roll but general"):
         jaxevent.METHODS["batch"].estimate(recording, model=ZoomRoll)
-    assert planes.knows(ZoomRoll)
+    assert planes.supports(ZoomRoll)
 
 
 def test_the_package_supplies_how_places_move():
@@ -86,7 +86,7 @@ def test_the_package_supplies_how_places_move():
     for one, (zoom, roll), place in zip(back, way, xi, strict=True):
         matrix = scipy.linalg.expm(-np.array([[zoom, -roll], [roll, zoom]]))
         np.testing.assert_allclose(one, matrix @ place, atol=2e-3)
-    np.testing.assert_allclose(ZoomRoll().arms(xi), [np.sqrt((xi**2).sum(1).mean())] * 2)
+    np.testing.assert_allclose(ZoomRoll().pixel_scale(xi), [np.sqrt((xi**2).sum(1).mean())] * 2)
 
 
 @pytest.mark.slow

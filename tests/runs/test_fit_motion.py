@@ -95,8 +95,8 @@ def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
         }
     )  # candidates are so young at every velocity: their ages are held fixed in derivatives
     recording = recorded(0)[0.05:0.13]
-    kind, gatherer = voting.gatherer(recording, params, "planar")
-    made = gatherer.whole(0.01, 0.02).candidates
+    kind, sampler = voting.sampler(recording, params, "planar")
+    made = sampler.sample_all(0.01, 0.02).candidates
     made = jax.tree.map(lambda leaf: jnp.asarray(leaf[-30:]), made)
     truth = jnp.asarray(VELOCITIES[0])
     names = ("alpha", "noise", "sigma_x")
@@ -106,7 +106,7 @@ def test_the_gradient_with_resampling_is_that_of_common_random_numbers():
         raw = {name: params.raw[name] + theta[k] for k, name in enumerate(names)}
         noise = filtering.draw(key, len(made.elapsed), params, kind)
         start = 0.8 * truth + 30.0 * jax.random.normal(jax.random.fold_in(key, 1), (48, 2))
-        carry = filtering.begin(params, kind, noise)
+        carry = filtering.init(params, kind, noise)
         carry = dataclasses.replace(carry, particles=start, searching=jnp.asarray(False))
         _, told = filtering.run(params.with_raw(raw), kind, made, noise, carry)
         return jnp.mean(told.mean @ truth) / jnp.sum(truth**2)

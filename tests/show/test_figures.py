@@ -10,7 +10,7 @@ from noise import HEIGHT, WIDTH, small
 import jaxevent
 from jaxevent import events, show
 from jaxevent.blob.states import TrackStates
-from jaxevent.egomotion.motion import Motion
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import MissingExtra
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.video import ImageSequence
@@ -47,11 +47,11 @@ class Video(ImageSequence):
         yield times, Estimate(image, image * 0 + 0.04, image > 1)
 
 
-def motion() -> Motion:
+def motion() -> MotionEstimate:
     n = 20
     mean = np.stack([np.linspace(-5, 5, n), np.full(n, 2.0)], 1)
     covariance = np.broadcast_to(np.eye(2) * 0.25, (n, 2, 2))
-    return Motion.of("planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3)
+    return MotionEstimate.of("planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3)
 
 
 def test_events_are_drawn_where_they_are():

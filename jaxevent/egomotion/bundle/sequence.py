@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.bundle.hypotheses import Hypothesis, WindowFit, WindowFitter, is_near
 from jaxevent.egomotion.bundle.warp import Path, predict_path
 from jaxevent.egomotion.bundle.windows import Params
-from jaxevent.egomotion.estimator import COMMON, Given, OnHost
+from jaxevent.egomotion.estimator import COMMON_OPTIONS, HostEstimator, HostInputs
 from jaxevent.egomotion.models import General
-from jaxevent.egomotion.motion import Motion
-from jaxevent.egomotion.patches import Speed
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.progress import bar
 
 WINDOW_PX_RANGE = (
@@ -28,7 +28,7 @@ MAX_AMBIGUITY_RAD = 1.0  # of a window whose path is followed into the next one
 LOST_COST_RATIO = 4  # times the least cost of the windows before: the path is not followed
 
 
-def estimate_motion(params: Params, given: Given) -> Motion:
+def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
     """Estimate the general motion of a camera from windows that overlap.
 
     The motion at a time is the mean of those of the windows around it, those nearer weighted more
@@ -37,15 +37,15 @@ def estimate_motion(params: Params, given: Given) -> Motion:
     Args:
         params: Parameters.
         given: Recording, camera, seed of the choice of events, and the option `gyro`
-            (`twists.from_gyro`), which gives Omega.
+            (`truth.from_gyro`), which gives Omega.
 
     Returns:
         The motion, lost at times that no window determines.
     """
-    recording, camera, gyro = given.recording, given.camera, given.more.get("gyro")
+    recording, camera, gyro = given.recording, given.camera, given.options.get("gyro")
     assert camera is not None
     if not len(recording.events):
-        return Motion.nothing(given.model)
+        return MotionEstimate.empty(given.model)
     windows = WindowFitter(recording, params, camera, gyro, given.seed)
     first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
@@ -161,7 +161,7 @@ def _blend(
     half: int,
     step: int,
     span: tuple[int, int],
-) -> Motion:
+) -> MotionEstimate:
     """Blend the motions of overlapping windows.
 
     Of a window the middle two thirds count, those beyond `step` hardly. The covariance contains the
@@ -205,7 +205,7 @@ def _blend(
     size = np.linalg.norm(heading, axis=1, keepdims=True)
     heading = np.where(size > 0, heading / np.where(size > 0, size, 1), np.array([0.0, 0, 1]))
     mean = np.concatenate([heading, Omega / safe[:, None]], 1)
-    found = Motion.of(General, t, mean, covariance / safe[:, None, None], ~lost)
+    found = MotionEstimate.from_arrays(General, t, mean, covariance / safe[:, None, None], ~lost)
     return dataclasses.replace(found, agreement=agreement / safe)
 
 
@@ -251,23 +251,23 @@ def _disagreements(
     return [np.mean(squares, 0) if squares else np.zeros((6, 6)) for squares in found]
 
 
-def adapt_lengths(params: Params, speed: Speed) -> dict[str, float]:
+def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """Return `half_window` and `step` for windows in which the image moves by some pixels."""
-    way = 2 * float(params.half_window) * speed.usual
+    way = 2 * float(params.half_window) * speed.median
     low, high = WINDOW_PX_RANGE
     if low <= way <= high:
         return {}
-    half = (low if way < low else high) / speed.usual / 2
+    half = (low if way < low else high) / speed.median / 2
     half = min(max(half, MIN_HALF_WINDOW_S), MAX_HALF_WINDOW_S)
     return {"half_window": half, "step": half * float(params.step) / float(params.half_window)}
 
 
-batch = OnHost(
+batch = HostEstimator(
     "batch",
     Params,
     estimate_motion,
     models=(General.name,),
-    options=COMMON | {"gyro"},
+    options=COMMON_OPTIONS | {"gyro"},
     lengths=adapt_lengths,
     about="General motion by fitting a whole window of events: the camera's path and the scene's "
     "depth. Estimates of overlapping windows are blended, a fifth of a `step` apart.",

@@ -25,9 +25,9 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.bundle.alignment import WindowEvents
 from jaxevent.egomotion.bundle.residuals import PixelSeries
 from jaxevent.egomotion.bundle.warp import N_SEGMENTS, Prior, segment_times
-from jaxevent.egomotion.candidates import coordinates
-from jaxevent.egomotion.motion import left_by_lens
-from jaxevent.egomotion.twists import Twists
+from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.motion import lens_error
+from jaxevent.egomotion.truth import Twists
 from jaxevent.parameters import Choice, Count, Number, Parameters, Positive
 from jaxevent.recording import Recording
 
@@ -264,12 +264,12 @@ class Windows:
         seed: int = 0,
     ):
         self.recording, self.params, self.gyro, self.seed = recording, params, gyro, seed
-        self.lens = left_by_lens(camera)
+        self.lens = lens_error(camera)
         self.sigma_floor: dict[int, float] = {}  # C, least sigma, by centres
         # Stages read the same window one after another.
         self.read_frame_pixels = functools.lru_cache(2)(self._read_frame_pixels)
         self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
-        self.xi, self.f = coordinates(recording.width, recording.height, camera)
+        self.xi, self.f = pixel_coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)
         lower, upper = np.floor(flat.min(0)) - MARGIN_PX, np.ceil(flat.max(0)) + MARGIN_PX
         cells = np.ceil((upper - lower + 1) / params.cell).astype(int)

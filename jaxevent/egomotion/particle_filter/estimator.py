@@ -15,84 +15,102 @@ from numpy.typing import NDArray
 from jaxevent import dispatch
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen.module import make_kernel
+from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import make_mesh, shard
-from jaxevent.egomotion.candidates import Candidates, Expected, Gatherer
-from jaxevent.egomotion.estimator import COMMON, Batch, MotionEstimator, Stretch, truth_of
+from jaxevent.egomotion.candidates import Candidates, CandidateSampler, ExpectedFlow
+from jaxevent.egomotion.estimator import (
+    COMMON_OPTIONS,
+    MotionEstimator,
+    TrainingRuns,
+    TrainingSegment,
+)
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
-from jaxevent.egomotion.motion import Calibration, Motion
+from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.engine.running import FusedRun
-from jaxevent.egomotion.particle_filter.filtering import Info, Noise, State
-from jaxevent.egomotion.particle_filter.parameters import Params
-from jaxevent.egomotion.particle_filter.smoothing import smoothed
-from jaxevent.egomotion.patches import Speed
+from jaxevent.egomotion.particle_filter.engine import CompiledFilter
+from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
+from jaxevent.egomotion.particle_filter.params import Params
+from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
-CHUNK = 1024  # scored events after which the host looks where the motion is
-SPAN = 0.1  # of tau_max, or after so long
-CHANGE = 1.2  # factor by which speeds are expected to change until then
-GATE = 3.5  # sigma_x, how far from the flow of the mean candidates are still looked at, at least
-CELL = 16  # px: which candidates are looked at is chosen for parts of the sensor of about this size
-AGES, OLDEST = 1.2, 1.0  # of the oldest candidates: in baselines of the usual speed, s at most
-PLANAR, OTHERS = Calibration(change=0.12), Calibration(factor=0.7, change=0.05)
-FASTEST = 2.5  # usual speeds, that a search goes to at least
-KERNEL_EVENTS = 100_000  # scored ones, from which on a kernel is compiled
-SPREAD = 0.2  # of the first particles of a fit, in shares of the true motion
+CHUNK_EVENTS = 1024  # scored events after which the range of candidates is updated
+CHUNK_TAUS = 0.1  # tau_max, time after which it is updated at the latest
+SPEED_CHANGE = 1.2  # largest factor by which speeds are expected to change until then
+GATE_SIGMAS = 3.5  # sigma_x, margin of candidates around the expected flow
+CELL_PX = 16  # approximate size of the parts of the sensor with a range of candidates each
+AGE_BASELINES = 1.2  # largest age of candidates, in baselines of the fast quarter of the image
+MAX_AGE_S = 1.0
+SEARCH_SPEEDS = 2.5  # median image speeds, least largest speed of a search
+KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
+TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
+PLANAR_CALIBRATION = CovarianceCalibration(change=0.12)
+CALIBRATION = CovarianceCalibration(factor=0.7, change=0.05)  # of other models
 
 _run = eqx.filter_jit(filtering.run)
-_begin = eqx.filter_jit(filtering.begin)
+_init = eqx.filter_jit(filtering.init)
 _draw = eqx.filter_jit(filtering.draw)
 
 
 class Features(eqx.Module):
-    """What the filter needs of a recording."""
+    """A recording prepared for the filter."""
 
     model: Model
     candidates: Candidates
-    noise: Noise
+    noise: RandomNumbers
 
 
-class ReadOut(eqx.Module):
-    """Between which batches times lie, and how far on; see `Motion`."""
+class ReadoutTimes(eqx.Module):
+    """Positions of times between batches."""
 
-    before: Any  # (times,)
-    after: Any
-    share: Float[Array | np.ndarray, " times"]
+    before: Any  # (times,) batch
+    after: Any  # (times,) batch
+    fraction: Float[Array | np.ndarray, " times"]
     inside: Bool[Array | np.ndarray, " times"]  # of the recording, from the first batch on
 
 
+@renamed_methods(gatherer="sampler")
 @dataclasses.dataclass(frozen=True, repr=False)
-class Voting(MotionEstimator[Params]):
+class VotingEstimator(MotionEstimator[Params]):
     """Motion by voting, batch by batch, as events arrive.
 
-    `estimate` looks, after every few batches, only at candidates that the motion found so far can
-    need. `prepare` knows no motion and gathers candidates for all that a search looks at; of more
-    than `params.candidates` it takes these many evenly.
+    After every few batches `estimate` updates the range of candidates that the motion found so far
+    can need. `prepare` knows no motion and samples candidates for the whole range of a search; of
+    more than `params.candidates` these many evenly.
     """
 
-    def start(self, model: type[Model]) -> Params:
+    def initial_params(self, model: type[Model]) -> Params:
         return Params(preset=model.preset)
 
-    def gatherer(
+    def sampler(
         self,
         recording: Recording,
         params: Params | None = None,
         model: str | type[Model] | None = None,
         camera: PinholeCamera | None = None,
-    ) -> tuple[Model, Gatherer]:
-        """The model, and its candidates: `gatherer(...)[1].whole(youngest, oldest)`.
+    ) -> tuple[Model, CandidateSampler]:
+        """Make the sampler of candidates: `sampler(...)[1].sample_all(youngest, oldest)`.
 
-        `camera` is by default the recording's. Raises `InputError` as `estimate` does.
+        Args:
+            recording: The recording.
+            params: The parameters.
+            model: Motion model, or its name.
+            camera: The camera; by default the recording's.
+
+        Returns:
+            The model with its focal length, and the sampler.
+
+        Raises:
+            InputError: The model is unknown, or it needs a camera and there is none.
         """
-        kind, camera = self.place(recording, model, camera)
-        params = self.start(kind) if params is None else params
+        kind, camera = self.find_model_and_camera(recording, model, camera)
+        params = self.initial_params(kind) if params is None else params
         if params.undistort is False and camera is not None:
             camera = dataclasses.replace(camera, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
-        gatherer = Gatherer(
+        sampler = CandidateSampler(
             recording,
             camera,
             radius=params.radius,
@@ -103,7 +121,7 @@ class Voting(MotionEstimator[Params]):
             longest=float(params.longest),
             silence=float(params.tau_max),
         )
-        return kind(gatherer.f), gatherer
+        return kind(sampler.f), sampler
 
     def prepare(
         self,
@@ -115,52 +133,48 @@ class Voting(MotionEstimator[Params]):
         camera: PinholeCamera | None = None,
         seed: int = 0,
         extrapolate: bool = False,
-    ) -> tuple[Features, ReadOut]:
-        """A recording for `run`, with the random numbers of a seed, and `times` for `read`.
-
-        Raises `InputError` as `estimate` does, for a recording without events and, unless told to
-        `extrapolate`, for times outside the recording.
-        """
+    ) -> tuple[Features, ReadoutTimes]:
         self.check_options(seed=seed)
-        kind, gatherer = self.gatherer(recording, params, model, camera)
+        kind, sampler = self.sampler(recording, params, model, camera)
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
         if not extrapolate:
             check_times(times, recording.start, recording.stop, recording.name)
-        params = self.start(type(kind)) if params is None else params
-        looked = look(params, kind, _corners(kind, gatherer), None)
-        whole = gatherer.whole(looked.youngest, looked.oldest)
+        params = self.initial_params(type(kind)) if params is None else params
+        ages = candidate_range(params, kind, _basis_at_corners(kind, sampler), None)
+        whole = sampler.sample_all(ages.youngest, ages.oldest)
         noise = _draw(jax.random.key(seed), len(whole.t), params, kind)
         us, n = np.atleast_1d(microseconds(times)), len(whole.t)
-        place = np.searchsorted(whole.t, us, "right")
-        after, before = np.minimum(place, n - 1), np.maximum(place - 1, 0)
+        row = np.searchsorted(whole.t, us, "right")
+        after, before = np.minimum(row, n - 1), np.maximum(row - 1, 0)
         gap = whole.t[after] - whole.t[before]
-        share = np.clip((us - whole.t[before]) / np.maximum(gap, 1), 0, 1)
+        fraction = np.clip((us - whole.t[before]) / np.maximum(gap, 1), 0, 1)
         inside = (us >= whole.t[0]) & (us <= recording.stop)
         real = np.dtype(jnp.result_type(float))
         features = Features(kind, jax.device_put(whole.candidates), noise)
-        return features, ReadOut(before, after, share.astype(real), inside)
+        return features, ReadoutTimes(before, after, fraction.astype(real), inside)
 
     def run(
-        self, params: Params, features: Features, state: State | None = None
-    ) -> tuple[tuple[Model, Info], State]:
-        """The filter over all batches: what each tells, and the particles at the end."""
+        self, params: Params, features: Features, state: ParticleState | None = None
+    ) -> tuple[tuple[Model, BatchInfo], ParticleState]:
         state, info = filtering.run(
             params, features.model, features.candidates, features.noise, state
         )
         return (features.model, info), state
 
-    def read(self, params: Params, trajectory: tuple[Model, Info], out: ReadOut) -> Estimate:
+    def read(
+        self, params: Params, trajectory: tuple[Model, BatchInfo], out: ReadoutTimes
+    ) -> Estimate:
         model, info = trajectory
-        before, after, share = (jnp.asarray(v) for v in (out.before, out.after, out.share))
+        before, after, fraction = (jnp.asarray(v) for v in (out.before, out.after, out.fraction))
 
-        def between(values: Array) -> Array:
-            s = share.reshape(-1, *[1] * (values.ndim - 1))
+        def interpolate(values: Array) -> Array:
+            s = fraction.reshape(-1, *[1] * (values.ndim - 1))
             return (1 - s) * values[before] + s * values[after]
 
         valid = ~info.searching[before] & ~info.searching[after] & jnp.asarray(out.inside)
-        mean = jax.vmap(model.on_manifold)(between(info.mean))
-        return Estimate(mean, between(info.covariance), valid)
+        mean = jax.vmap(model.project)(interpolate(info.mean))
+        return Estimate(mean, interpolate(info.covariance), valid)
 
     def estimate(
         self,
@@ -174,171 +188,176 @@ class Voting(MotionEstimator[Params]):
         smooth: bool = False,
         cloud: int = 0,
         compiler: str | None = None,
-    ) -> Motion:
-        """The motion of a camera, batch by batch, as events arrive.
+    ) -> MotionEstimate:
+        """Estimate the motion of a camera, batch by batch, as events arrive.
 
         Args:
-            recording: Events; nothing else is looked at but the calibration.
-            params: See `Params`; by default as they are there, with the model's `preset` and ages
-                that `suit` the recording.
-            model: What moves: see `models`.
-            camera: The calibration, by default the recording's.
-            seed: Of the particles; the same seed gives the same motion.
-            progress: Show a bar on stderr; None: where somebody looks on.
-            smooth: `smoothed` by later events, for use after the recording.
-            cloud: So many particles of each batch, drawn by weight, are the motion's `cloud`.
+            recording: Recording whose events and calibration are used.
+            params: The parameters; by default with the model's `preset` and ages adapted to the
+                recording.
+            model: Motion model, or its name; see `models`.
+            camera: The calibration; by default the recording's.
+            seed: Seed of the random numbers; it makes the estimate reproducible.
+            progress: Whether to show a progress bar; by default in a terminal.
+            smooth: Whether to smooth by later events, for use after the recording.
+            cloud: Number of particles of each batch, drawn by weight, in the result's `cloud`.
             compiler: "numba" runs a kernel made of the filter's own functions, "xla" the `run` that
-                is differentiated. Log-likelihoods of the two are the same to rounding, and weights
-                to `params.off` where the kernel interpolates; which particles are resampled may
-                differ then, as with another seed. None: in single precision and from 100,000 scored
-                events on (one in `params.every` is) numba, where there is a kernel: for all but the
-                literal likelihood.
+                is differentiated. Their log-likelihoods are equal to rounding, and weights to
+                `params.off` where the kernel interpolates. Then other particles may be resampled,
+                as with another seed. By default numba is used in single precision from 100,000
+                scored events on, if there is a kernel: for all but the literal likelihood.
+
+        Returns:
+            The motion.
 
         Raises:
-            InputError: The model is unknown, or it needs a camera and there is none, or numba is
-                asked for and has no kernel.
+            InputError: The model is unknown, it needs a camera and there is none, or the compiler
+                is "numba" and there is no kernel.
         """
         self.check_options(seed=seed, progress=progress, smooth=smooth, cloud=cloud)
         dispatch.check_threads()
         if params is None:
-            found, _ = self.place(recording, model, camera)
-            params = self.suit(recording, self.start(found), camera=camera).params
-        kind, gatherer = self.gatherer(recording, params, model, camera)
-        batches = -(-CHUNK // params.batch)
+            found, _ = self.find_model_and_camera(recording, model, camera)
+            start = self.initial_params(found)
+            params = self.adapt_params(recording, start, camera=camera).params
+        kind, sampler = self.sampler(recording, params, model, camera)
+        batches = -(-CHUNK_EVENTS // params.batch)
         events = len(recording.events) // params.every
         run = self._kernel(params, kind, compiler, events) or functools.partial(_run, params, kind)
-        key, corners = jax.random.key(seed), _corners(kind, gatherer)
-        state, parts, number, span = None, [], 0, SPAN * float(params.tau_max)
+        key, corners = jax.random.key(seed), _basis_at_corners(kind, sampler)
+        state, parts, number, span = None, [], 0, CHUNK_TAUS * float(params.tau_max)
         with bar(
-            total=len(recording.events),
-            desc="find motion",
-            unit="event",
-            unit_scale=True,
+            total=len(recording.events), desc="find motion", unit="event", unit_scale=True,
             progress=progress,
-        ) as shown:
-            while not gatherer.done:
+        ) as shown:  # fmt: skip
+            while not sampler.is_exhausted:
                 noise = _draw(jax.random.fold_in(key, number), batches, params, kind)
                 if state is None:
-                    state = _begin(params, kind, noise)
-                looked = look(params, kind, corners, state)
-                made = gatherer.gather(
-                    batches, looked.youngest, looked.oldest, span, looked.expected
-                )
-                state, info = run(made.candidates, noise, state, cloud)
-                used = int((made.row >= 0).any(1).sum())
+                    state = _init(params, kind, noise)
+                ages = candidate_range(params, kind, corners, state)
+                sample = sampler.sample(batches, ages.youngest, ages.oldest, span, ages.expected)
+                state, info = run(sample.candidates, noise, state, cloud)
+                used = int((sample.row >= 0).any(1).sum())
                 info = jax.tree.map(lambda a, n=used: np.asarray(a)[:n], info)
-                parts.append((made.t[:used], info))
-                shown.update(int(made.row.max(initial=0)) + 1 - shown.n)
+                parts.append((sample.t[:used], info))
+                shown.update(int(sample.row.max(initial=0)) + 1 - shown.n)
                 number += 1
 
-        motion = _told(kind, parts, cloud > 0).within(recording)
+        motion = _join_reports(kind, parts, cloud > 0).with_recording(recording)
         if not parts:
             return motion
-        by = (PLANAR if kind.uniform else OTHERS).behind(camera or recording.camera)
-        return (smoothed(motion, params) if smooth else motion).calibrated(by, 2 * motion.lag)
+        calibration = PLANAR_CALIBRATION if kind.uniform else CALIBRATION
+        calibration = calibration.with_lens(camera or recording.camera)
+        smoothed = filtering.smooth(motion, params) if smooth else motion
+        return smoothed.with_calibrated_covariance(calibration, 2 * motion.lag)
 
     def _kernel(
         self, params: Params, model: Model, compiler: str | None, events: int
-    ) -> FusedRun | None:
-        """The filter as a kernel; None where XLA compiles it."""
-        serves = jnp.result_type(float) == np.float32 and events >= KERNEL_EVENTS
-        return make_kernel(self.name, compiler, serves, lambda: FusedRun(params, model))
+    ) -> CompiledFilter | None:
+        """Return the filter as a kernel, or None where XLA compiles it."""
+        is_faster = jnp.result_type(float) == np.float32 and events >= KERNEL_EVENTS
+        return make_kernel(self.name, compiler, is_faster, lambda: CompiledFilter(params, model))
 
-    def follow(
+    def training_runs(
         self,
-        stretches: Sequence[Stretch],
+        segments: Sequence[TrainingSegment],
         params: Params,
         model: type[Model],
         runs: int,
         settle: float | int,
-    ) -> list[Batch]:
-        """Stretches with particles that start around the true motion, so that no search is fitted.
-
-        Filled up to one shape, so that one program serves all; random numbers stay the same.
-        """
-        made = [self._gathered(stretch, params, model) for stretch in stretches]
-        most = max((len(candidates.elapsed) for _, candidates, _ in made), default=0)
+    ) -> list[TrainingRuns]:
+        # Particles start around the true motion, so that no search is fitted. Segments are padded
+        # to one shape, so that one program serves all; random numbers stay the same.
+        sampled = [self._sample_segment(segment, params, model) for segment in segments]
+        most = max((len(candidates.elapsed) for _, candidates, _ in sampled), default=0)
         real = np.dtype(jnp.result_type(float))
-        batches: list[Batch] = []
-        for number, (stretch, (kind, candidates, t)) in enumerate(
-            zip(stretches, made, strict=True)
+        prepared: list[TrainingRuns] = []
+        for number, (segment, (kind, candidates, t)) in enumerate(
+            zip(segments, sampled, strict=True)
         ):
             n = len(t)
 
-            def fill(array: Any, n: int = n) -> NDArray:
+            def pad(array: Any, n: int = n) -> NDArray:
                 array = np.asarray(array)
                 return np.pad(array, [(0, most - n), *[(0, 0)] * (array.ndim - 1)])
 
-            time = (t - stretch.start) * 1e-6
-            grid, truth = truth_of(stretch)
-            counted = candidates.valid[:n].any(1) & (time >= settle) & stretch.known.within(t)
+            time, grid, truth, counted, _ = segment.truth(t, settle)
+            counted = candidates.valid[:n].any(1) * counted
             key = jax.random.key(number)
-            cloud = jax.random.normal(
+            start = jax.random.normal(
                 jax.random.fold_in(key, runs), (params.particles, kind.dimension), real
             )
             noise = jax.vmap(lambda k: filtering.draw(k, most, params, kind))(  # noqa: B023
                 jax.random.split(key, runs)
             )
-            batches.append(
-                Followed(
-                    fill(time).astype(real),
+            prepared.append(
+                WarmStartedRuns(
+                    pad(time).astype(real),
                     grid.astype(real),
                     truth.astype(real),
-                    fill(counted).astype(real),
+                    pad(counted).astype(real),
                     np.asarray(max(counted.sum(), 1e-9), real),
                     kind,
-                    jax.tree.map(fill, candidates),
+                    jax.tree.map(pad, candidates),
                     noise,
-                    cloud,
+                    start,
                 )
             )
-        return jax.device_put(batches)
+        return jax.device_put(prepared)
 
-    def _gathered(
-        self, stretch: Stretch, params: Params, model: type[Model]
+    def _sample_segment(
+        self, segment: TrainingSegment, params: Params, model: type[Model]
     ) -> tuple[Model, Candidates, NDArray[np.int64]]:
-        """The candidates of a stretch, of the ages that half to double the true speeds look at."""
-        kind, gatherer = self.gatherer(stretch.cut(), params, model)
+        """Sample the candidates that half to double the true speeds need."""
+        kind, sampler = self.sampler(segment.crop(), params, model)
         youngest, oldest = 0.0, float(params.tau_max)
         if params.likelihood != "literal" and not model.half_line:
-            times = np.linspace(stretch.start, stretch.stop, 32).astype(np.int64)
-            times = times[stretch.known.within(times)]
-            places = gatherer.xi[:: max(1, len(gatherer.xi) // 8), ::16].reshape(-1, 2)
-            basis = np.asarray(kind.basis(jnp.asarray(places)))
-            speed = np.linalg.norm(np.einsum("kid,td->kti", basis, stretch.known(times)), axis=-1)
+            times = np.linspace(segment.start, segment.stop, 32).astype(np.int64)
+            times = times[segment.known.covers(times)]
+            xi = sampler.xi[:: max(1, len(sampler.xi) // 8), ::16].reshape(-1, 2)
+            basis = np.asarray(kind.basis(jnp.asarray(xi)))
+            speed = np.linalg.norm(np.einsum("kid,td->kti", basis, segment.known(times)), axis=-1)
             b = float(params.baseline)
             youngest = min(b / max(speed.max(), 1e-9), oldest) / 4
             oldest = min(2 * b / max(speed.min(), 1e-9), oldest)
-        whole = gatherer.whole(youngest, oldest)
+        whole = sampler.sample_all(youngest, oldest)
         return kind, whole.candidates, whole.t
 
 
-class Followed(Batch):
-    """A stretch whose motion is followed from its true beginning on, in some runs."""
+class WarmStartedRuns(TrainingRuns):
+    """Runs of the filter over a segment, with particles that start around the true motion."""
 
     candidates: Candidates
-    noise: Noise  # leaves begin with [runs]
+    noise: RandomNumbers  # leaves begin with [runs]
     start: Float[Array | np.ndarray, "N d"]  # standard normal, of the first particles
 
     def estimates(self, params: Params) -> tuple[Array, Array]:
-        return jax.vmap(lambda noise: self.one(params, noise))(self.noise)
+        return jax.vmap(lambda noise: self.estimates_of_run(params, noise))(self.noise)
 
-    def one(self, params: Params, noise: Noise) -> tuple[Array, Array]:
-        """Of one run."""
+    def estimates_of_run(self, params: Params, noise: RandomNumbers) -> tuple[Array, Array]:
+        """Return the means (T, d) and lags (T,) of one run.
+
+        Args:
+            params: The parameters.
+            noise: Random numbers of the run.
+
+        Returns:
+            Means and lags (s).
+        """
         first, normal = jnp.asarray(self.truth)[0], jnp.asarray(self.start)
         particles = []
         for part in self.model.parts:
             middle, normal_part = first[part.rows], normal[:, part.rows]
-            near = middle + SPREAD * jnp.sqrt((middle**2).mean()) * normal_part
+            near = middle + TRAINING_SPREAD * jnp.sqrt((middle**2).mean()) * normal_part
             if part.direction:
                 near = near / length(near)[:, None]
             particles.append(near)
-        state = filtering.around(params, jnp.concatenate(particles, 1))
+        state = filtering.init_near(params, jnp.concatenate(particles, 1))
         _, info = filtering.run(params, self.model, self.candidates, noise, state)
         return info.mean, info.lag
 
-    def over(self, devices: Sequence[Any]) -> "Followed":
-        """Runs shared out, or particles if runs are too few."""
+    def over(self, devices: Sequence[Any]) -> "WarmStartedRuns":
+        # Runs are distributed, or particles if runs are too few.
         runs, particles = self.noise.normal.shape[0], self.start.shape[0]
         chosen = make_mesh(devices, runs)
         by_run = chosen is not None and chosen.size == len(devices)
@@ -357,104 +376,124 @@ class Followed(Batch):
         )
 
 
-def _told(model: Model, parts: list[tuple[NDArray, Any]], cloud: bool) -> Motion:
-    """The motion of what a filter says, times and `Info` of one stretch after another."""
+def _join_reports(model: Model, parts: list[tuple[NDArray, Any]], cloud: bool) -> MotionEstimate:
+    """Join the times and reports of chunks to an estimate."""
     if not parts:
-        return Motion.nothing(type(model))
+        return MotionEstimate.empty(type(model))
 
-    def whole(name: str) -> NDArray:
+    def join(name: str) -> NDArray:
         return np.concatenate([getattr(info, name) for _, info in parts])
 
-    return Motion(
+    return MotionEstimate(
         type(model),
         np.concatenate([t for t, _ in parts]),
-        whole("mean"),
-        whole("covariance"),
-        ~whole("searching"),
-        whole("lag"),
-        whole("contrast"),
-        whole("evidence"),
-        whole("cloud") if cloud else None,
+        join("mean"),
+        join("covariance"),
+        ~join("searching"),
+        join("lag"),
+        join("contrast"),
+        join("evidence"),
+        join("cloud") if cloud else None,
     )
 
 
-def _corners(model: Model, gatherer: Gatherer) -> NDArray[np.floating]:
-    """The model's basis (rows, columns, 2, d) at the corners of equal parts of the sensor.
+def _basis_at_corners(model: Model, sampler: CandidateSampler) -> NDArray[np.floating]:
+    """Return the model's basis (rows, columns, 2, d) at the corners of equal parts of the sensor.
 
-    Where the flow is the same everywhere one part is enough, and where it is not linear no more
-    are used.
+    One part is enough where the flow is the same everywhere, or not linear.
     """
     parts = (1, 1)
     if not (model.uniform or model.half_line):
-        parts = tuple(max(1, n // CELL) for n in gatherer.xi.shape[:2])
+        parts = tuple(max(1, n // CELL_PX) for n in sampler.xi.shape[:2])
     lines, columns = (
         np.rint(np.linspace(0, n - 1, k + 1)).astype(int)
-        for n, k in zip(gatherer.xi.shape[:2], parts, strict=True)
+        for n, k in zip(sampler.xi.shape[:2], parts, strict=True)
     )
-    xi = gatherer.xi[np.ix_(lines, columns)]
+    xi = sampler.xi[np.ix_(lines, columns)]
     return np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
 
 
-def lengths(params: Params, speed: Speed) -> dict[str, float]:
-    """The oldest candidates, so old that a quarter of the image has moved by the baseline.
+def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
+    """Adapt the age of the oldest candidates, and the largest speed of a search.
 
-    They stay where they are half as old at least: a motion that changes is told worse by old ones.
+    The oldest candidates are so old that the fast quarter of the image has moved by the baseline.
+    They stay as they are if they are at least half as old: old ones blur a motion that changes.
+
+    Args:
+        params: The parameters.
+        speed: Speed of the image.
+
+    Returns:
+        Values by parameter.
     """
     if params.likelihood == "literal":
         return {}
-    chosen, oldest = {}, AGES * float(params.baseline) / speed.fast
+    chosen, oldest = {}, AGE_BASELINES * float(params.baseline) / speed.fast
     if oldest > 2 * float(params.tau_max):
-        chosen["tau_max"] = min(oldest, OLDEST)
-    if FASTEST * speed.usual > float(params.speed_max):
-        chosen["speed_max"] = FASTEST * speed.usual
+        chosen["tau_max"] = min(oldest, MAX_AGE_S)
+    if SEARCH_SPEEDS * speed.median > float(params.speed_max):
+        chosen["speed_max"] = SEARCH_SPEEDS * speed.median
     return chosen
 
 
-class Looked(NamedTuple):
-    """At which candidates the next batches can need to look; see `Gatherer.gather`."""
+class CandidateRange(NamedTuple):
+    """Candidates that the next batches can need; see `CandidateSampler.sample`."""
 
     youngest: float | NDArray[np.floating]
     oldest: float | NDArray[np.floating]
-    expected: Expected | None
+    expected: ExpectedFlow | None
 
 
-def look(params: Params, model: Model, corners: NDArray, state: State | None) -> Looked:
-    """By parts of the sensor: those whose flow is about what the mean makes there.
+def candidate_range(
+    params: Params, model: Model, corners: NDArray, state: ParticleState | None
+) -> CandidateRange:
+    """Return the candidates near the flow of the mean, by parts of the sensor.
 
-    While the motion is searched for, without a state and in the literal likelihood: all.
+    In a search, without a state and for the literal likelihood, all candidates are in the range.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        corners: Basis at the corners of parts of the sensor, see `_basis_at_corners`.
+        state: The state, or None.
+
+    Returns:
+        The range.
     """
-    tau_max, b, share = (float(v) for v in (params.tau_max, params.baseline, params.youngest))
+    tau_max, b, youngest = (float(v) for v in (params.tau_max, params.baseline, params.youngest))
     if params.likelihood == "literal":
-        return Looked(0.0, tau_max, None)
+        return CandidateRange(0.0, tau_max, None)
     if model.half_line:
         tau = float(params.tau_general)
-        return Looked(share * tau, tau, None)
+        return CandidateRange(youngest * tau, tau, None)
     if params.likelihood == "band" or state is None or bool(state.searching):
-        widest = np.full(model.dimension, float(model.extent(params)))
+        widest = np.full(model.dimension, float(model.search_bound(params)))
         fastest = float(np.sqrt(((np.abs(corners) @ widest) ** 2).sum(-1)).max())
-        return Looked(share * min(b / fastest, tau_max / 2), tau_max, None)
+        return CandidateRange(youngest * min(b / fastest, tau_max / 2), tau_max, None)
     particles, weights = np.asarray(state.particles), np.exp(np.asarray(state.log_weights))
     mean = weights @ particles
     spread = np.sqrt(weights @ (particles - mean) ** 2)
-    U, wider = corners @ mean, np.sqrt(((corners**2) @ spread**2).sum(-1)).max()
+    U, flow_sigma = corners @ mean, np.sqrt(((corners**2) @ spread**2).sum(-1)).max()
     four = np.stack([U[:-1, :-1], U[1:, :-1], U[:-1, 1:], U[1:, 1:]])
     # All flows of a part are about within a circle that holds those of its corners.
     centre = four.mean(0)
     radius = np.sqrt(((four - centre) ** 2).sum(-1)).max(0)
     speed = np.sqrt((centre**2).sum(-1))
-    fastest, slowest = CHANGE * (speed + radius), np.maximum(speed - radius, 0) / CHANGE
+    fastest = SPEED_CHANGE * (speed + radius)
+    slowest = np.maximum(speed - radius, 0) / SPEED_CHANGE
     young = np.minimum(b / np.maximum(fastest, 1e-9), tau_max)
     old = np.minimum(b / np.maximum(slowest, 1e-9), tau_max)
-    slack = radius + 3 * wider + (CHANGE - 1) * (speed + radius)
-    expected = Expected(np.moveaxis(centre, -1, 0), slack, GATE * float(params.sigma_x))
-    return Looked(share * young, old, expected)
+    slack = radius + 3 * flow_sigma + (SPEED_CHANGE - 1) * (speed + radius)
+    margin = GATE_SIGMAS * float(params.sigma_x)
+    expected = ExpectedFlow(np.moveaxis(centre, -1, 0), slack, margin)
+    return CandidateRange(youngest * young, old, expected)
 
 
-voting = Voting(
+voting = VotingEstimator(
     "voting",
     Params,
     lengths=lengths,
-    options=COMMON | {"smooth", "cloud", "compiler"},
-    about="Motion by voting: a particle filter whose likelihood asks the earlier neighbours of "
-    "events (Egomotion thesis, chapters 5 and 6, with all neighbours voting, softly).",
+    options=COMMON_OPTIONS | {"smooth", "cloud", "compiler"},
+    about="Motion by voting: a particle filter whose likelihood is the vote of the earlier "
+    "neighbours of events (Egomotion thesis, chapters 5 and 6, with soft votes of all neighbours).",
 )

@@ -1,10 +1,12 @@
-"""The particle filter: propagate, score, weigh, tell the mean, resample, batch after batch."""
+"""The particle filter: predict, score, reweight, resample, batch after batch; and its smoother."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.nn import logsumexp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -12,297 +14,438 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxevent.devices import full_precision
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
-from jaxevent.egomotion.particle_filter.likelihood import score
-from jaxevent.egomotion.particle_filter.parameters import Params
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.particle_filter.likelihood import score_batch
+from jaxevent.egomotion.particle_filter.params import Params
 
-HISTORY = 5.0  # over how many times `memory` it is learnt how many votes are usual
-JITTER = 0.1  # noise of particles while searching, per batch, in standard deviations of the cloud
-STEP = 0.5  # largest standard deviation over particles of a batch's log weights while searching
+CONTRAST_MEMORIES = 5.0  # time constant of the mean contrast, in `Params.memory`
+SEARCH_NOISE = 0.1  # noise of a search, per batch, in standard deviations of the particles
+MAX_LOG_WEIGHT_STD = 0.5  # of a batch over particles, in a search
+MIN_HISTORY = 0.99  # of the oldest candidates of a search
 
 
-class Noise(eqx.Module):
-    """All random numbers of a stretch of batches."""
+class RandomNumbers(eqx.Module):
+    """All random numbers of some batches."""
 
     normal: Float[Array, "batches N d"]
     uniform: Float[Array, " batches"]
-    cloud: Float[Array, "N d"]  # in [-1, 1]; where a search begins in this stretch
+    cloud: Float[Array, "N d"]  # in [-1, 1], for a search that begins in these batches
 
 
-class State(eqx.Module):
-    """What is carried from batch to batch."""
+class ParticleState(eqx.Module):
+    """State that is carried from batch to batch."""
 
     particles: Float[Array, "N d"]
     log_weights: Float[Array, " N"]  # normalised
     searching: Bool[Array, ""]
-    votes: Float[Array, ""]  # of the cloud, lately
-    chance: Float[Array, ""]  # of candidates without order, lately
-    usual: Float[Array, ""]  # what votes / chance has been since the motion was found
+    votes: Float[Array, ""]  # recent votes for the particles
+    chance: Float[Array, ""]  # recent votes that are expected by chance
+    mean_contrast: Float[Array, ""]  # mean of votes / chance since the motion was found
     age: Float[Array, ""]  # batches since then
 
 
-class Info(eqx.Module):
-    """What a batch tells; an axis of batches leads where stacked."""
+class BatchInfo(eqx.Module):
+    """Results that are reported for a batch; an axis of batches leads where stacked."""
 
     mean: Float[Array, "*batches d"]  # before resampling
     covariance: Float[Array, "*batches d d"]  # of the weighted particles
     searching: Bool[Array, "*batches"]
-    contrast: Float[Array, "*batches"]  # votes in units of chance's
-    lag: Float[Array, "*batches"]  # s, how much older than the last event is what is seen
+    contrast: Float[Array, "*batches"]  # votes relative to chance
+    lag: Float[Array, "*batches"]  # s, by which the observed motion precedes the last event
     evidence: Float[Array, "*batches"]  # log of the mean likelihood of the batch
-    cloud: Float[Array, "*batches thinned d"]  # some particles, in proportion to weights
+    cloud: Float[Array, "*batches n_cloud d"]  # some particles, drawn by weight
 
 
-class Passed(eqx.Module):
-    """A batch's times, and whether it holds an event."""
+class BatchTiming(eqx.Module):
+    """Times of a batch, and whether it holds an event."""
 
-    elapsed: Float[Array, ""]
-    history: Float[Array, ""]
-    some: Bool[Array, ""]
+    elapsed: Float[Array, ""]  # s
+    history: Float[Array, ""]  # s
+    has_events: Bool[Array, ""]
 
 
-class Told(eqx.Module):
-    """What all events of a batch say: see `Score`."""
+class BatchLikelihood(eqx.Module):
+    """Likelihood of all events of a batch; see `EventScores`."""
 
     log_likelihood: Float[Array, " N"]
     votes: Float[Array, ""]
     chance: Float[Array, ""]
 
 
-class Weighed(eqx.Module):
-    """Particles after a batch, and what becomes of the state and of what is told."""
+class ReweightResult(eqx.Module):
+    """Weights after a batch, and what becomes of the state and the report."""
 
     log_weights: Float[Array, " N"]
     mean: Float[Array, " d"]
     covariance: Float[Array, "d d"]
     contrast: Float[Array, ""]
     evidence: Float[Array, ""]
-    sound: Bool[Array, ""]  # whether all numbers are finite
+    is_finite: Bool[Array, ""]
     lost: Bool[Array, ""]
-    searching: Bool[Array, ""]  # as it is told
-    searches: Bool[Array, ""]  # and as it goes on
-    few: Bool[Array, ""]  # whether few particles are effective
+    reported_searching: Bool[Array, ""]
+    searching: Bool[Array, ""]  # in the state
+    resample: Bool[Array, ""]
     votes: Float[Array, ""]
     chance: Float[Array, ""]
-    usual: Float[Array, ""]
+    mean_contrast: Float[Array, ""]
     age: Float[Array, ""]
 
 
-def draw(key: PRNGKeyArray | Array, batches: int, params: Params, model: Model) -> Noise:
-    """The random numbers of so many batches, at once: one by one they cost more than all else.
+def draw(key: PRNGKeyArray | Array, batches: int, params: Params, model: Model) -> RandomNumbers:
+    """Draw the random numbers of some batches at once, which is far faster than one by one.
 
-    The same key gives the same numbers, in single or double precision as JAX is set.
+    Args:
+        key: Key of the random numbers. It gives the same numbers in single and double precision.
+        batches: Number of batches.
+        params: The parameters.
+        model: Motion model.
+
+    Returns:
+        The random numbers.
     """
     one, two, three = jax.random.split(key, 3)
     N, real = params.particles, jnp.result_type(float)
-    return Noise(
+    return RandomNumbers(
         jax.random.normal(one, (batches, N, model.dimension), real),
         jax.random.uniform(two, (batches,), real),
         jax.random.uniform(three, (N, model.dimension), real, -1, 1),
     )
 
 
-def begin(params: Params, model: Model, noise: Noise) -> State:
-    """Nothing known: particles everywhere."""
-    state = around(params, anywhere(params, model, noise))
+def init(params: Params, model: Model, noise: RandomNumbers) -> ParticleState:
+    """Start without knowledge, with particles everywhere.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        noise: Random numbers.
+
+    Returns:
+        The state.
+    """
+    state = init_near(params, init_uniform(params, model, noise))
     return eqx.tree_at(lambda s: s.searching, state, jnp.asarray(params.likelihood != "literal"))
 
 
-def around(params: Params, particles: Float[Array, "N d"]) -> State:
-    """Particles that are about right."""
+def init_near(params: Params, particles: Float[Array, "N d"]) -> ParticleState:
+    """Start with particles (N, d) near the motion, of equal weights."""
     N, zero = params.particles, jnp.zeros((), particles.dtype)
-    even = jnp.full(N, -jnp.log(N), particles.dtype)
-    return State(particles, even, jnp.asarray(False), zero, zero, zero, zero)
+    equal = jnp.full(N, -jnp.log(N), particles.dtype)
+    return ParticleState(particles, equal, jnp.asarray(False), zero, zero, zero, zero)
 
 
-def anywhere(params: Params, model: Model, noise: Noise) -> Float[Array, "N d"]:
-    """First particles."""
-    return jax.vmap(functools.partial(model.first, params))(noise.cloud)
+def init_uniform(params: Params, model: Model, noise: RandomNumbers) -> Float[Array, "N d"]:
+    """Place the particles (N, d) of a search."""
+    return jax.vmap(functools.partial(model.initial_particle, params))(noise.cloud)
 
 
 def resample(
     log_weights: Float[Array, " N"], uniform: Float[Array, ""]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """Systematic resampling: whom each particle descends from, and the new log weights.
+    """Resample systematically.
 
-    The weights' gradient goes on: lw_new = -log N + (lw - stop_gradient(lw))[ancestor], whose value
-    is 1/N and whose derivative is the ancestor's score (Scibior & Wood, "Differentiable Particle
-    Filtering without Modifying the Forward Pass"). Without that the gradient is biased.
+    The weights keep their gradient: lw_new = -log N + (lw - stop_gradient(lw))[ancestor], whose
+    value is 1/N and whose derivative is the ancestor's score (Scibior & Wood, "Differentiable
+    Particle Filtering without Modifying the Forward Pass"). Without it the gradient is biased.
+
+    Args:
+        log_weights: (N,) normalised log weights.
+        uniform: Random number in [0, 1).
+
+    Returns:
+        The ancestor of each particle (N,), and the new log weights (N,).
     """
     N = len(log_weights)
-    ancestor = _drawn(jnp.exp(lax.stop_gradient(log_weights)), N, uniform)
+    ancestor = _systematic_rows(jnp.exp(lax.stop_gradient(log_weights)), N, uniform)
     carried = log_weights - lax.stop_gradient(log_weights)
     return ancestor, carried[ancestor] - jnp.log(N).astype(log_weights.dtype)
 
 
-def _drawn(
+def _systematic_rows(
     weights: Float[Array, " N"], number: int, uniform: Float[Array, ""]
 ) -> Int[Array, " number"]:
-    """Particles at even steps of their summed weights."""
+    """Return the particles at equal steps of their summed weights."""
     edges = jnp.cumsum(weights)
     points = (jnp.arange(number) + uniform) * (edges[-1] / number)
     return jnp.minimum((edges[None, :] <= points[:, None]).sum(1), len(weights) - 1)
 
 
-def propagate(
+def predict(
     params: Params,
     model: Model,
-    state: State,
-    passed: Passed,
+    state: ParticleState,
+    timing: BatchTiming,
     normal: Float[Array, "N d"],
 ) -> tuple[Float[Array, "N d"], Float[Array, " N"]]:
-    """Particles at a batch's end, before it is looked at, and their weights."""
+    """Predict the particles at the end of a batch.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        state: State after the batch before.
+        timing: Times of the batch.
+        normal: (N, d) normal random numbers.
+
+    Returns:
+        Particles (N, d) and their weights (N,).
+    """
     weights = jnp.exp(state.log_weights)
     mean = model.mean(state.particles, weights)
-    apart = jax.vmap(model.apart, (0, None))
-    fixed, far = lax.stop_gradient((weights, apart(state.particles, mean)))
-    spread = model.spreads(_covariance(far, fixed))
-    std = model.diffusion(params, mean) * jnp.sqrt(passed.elapsed)
-    enough = _covered(params, model, passed) & passed.some
-    jitter = JITTER * spread * enough * model.share(state.particles, fixed)
-    noise = jnp.where(state.searching, jitter, std) * normal
-    return jax.vmap(model.moved)(state.particles, noise), weights
+    deviation = jax.vmap(model.deviation, (0, None))
+    fixed, far = lax.stop_gradient((weights, deviation(state.particles, mean)))
+    spread = model.standard_deviations(_covariance(far, fixed))
+    std = model.diffusion(params, mean) * jnp.sqrt(timing.elapsed)
+    enough = _has_history(params, model, timing) & timing.has_events
+    search_std = SEARCH_NOISE * spread * enough * model.relative_size(state.particles, fixed)
+    noise = jnp.where(state.searching, search_std, std) * normal
+    return jax.vmap(model.retract)(state.particles, noise), weights
 
 
-def _covered(params: Params, model: Model, passed: Passed) -> Bool[Array, ""]:
-    """With less history than slow hypotheses look at, only fast ones find candidates."""
-    return passed.history >= 0.99 * lax.stop_gradient(model.oldest(params))
+def _has_history(params: Params, model: Model, timing: BatchTiming) -> Bool[Array, ""]:
+    """Return whether slow hypotheses have candidates; with less history only fast ones have."""
+    return timing.history >= MIN_HISTORY * lax.stop_gradient(model.max_age(params))
 
 
-def weigh(
+def reweight(
     params: Params,
     model: Model,
-    state: State,
-    passed: Passed,
+    state: ParticleState,
+    timing: BatchTiming,
     particles: Float[Array, "N d"],
-    told: Told,
-) -> Weighed:
-    """What particles are worth after a batch; and whether the motion is found, or lost."""
+    likelihood: BatchLikelihood,
+) -> ReweightResult:
+    """Update the weights by a batch, and decide whether the motion is found or lost.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        state: State after the batch before.
+        timing: Times of the batch.
+        particles: (N, d) predicted particles.
+        likelihood: Likelihood of the batch.
+
+    Returns:
+        The weights, and what becomes of the state and the report.
+    """
     N, searching = params.particles, state.searching
-    covered = _covered(params, model, passed)
-    gain, fixed = told.log_likelihood, lax.stop_gradient(told.log_likelihood)
+    has_history = _has_history(params, model, timing)
+    gain, fixed = likelihood.log_likelihood, lax.stop_gradient(likelihood.log_likelihood)
     deviation = jnp.sqrt(((fixed - fixed.sum() / N) ** 2).sum() / N + 1e-12)
-    gain = gain * jnp.where(searching, jnp.minimum(1, STEP / deviation) * covered, 1)
+    annealed = jnp.minimum(1, MAX_LOG_WEIGHT_STD / deviation) * has_history
+    gain = gain * jnp.where(searching, annealed, 1)
     joint = state.log_weights + gain
     evidence = logsumexp(joint)
     log_weights = joint - evidence
     weights = jnp.exp(log_weights)
     mean = model.mean(particles, weights)
-    apart = jax.vmap(model.apart, (0, None))
-    covariance = _covariance(apart(particles, mean), weights)
+    covariance = _covariance(jax.vmap(model.deviation, (0, None))(particles, mean), weights)
 
     memory = jnp.exp(-1 / lax.stop_gradient(params.memory))
-    votes, chance = memory * state.votes + told.votes, memory * state.chance + told.chance
+    votes = memory * state.votes + likelihood.votes
+    chance = memory * state.chance + likelihood.chance
     contrast = jnp.where(chance > 0, votes / jnp.where(chance > 0, chance, 1), 1)
-    counted = told.chance > 0
+    counted = likelihood.chance > 0
     age = state.age + counted
-    sound = jnp.isfinite(evidence) & jnp.isfinite(particles).all()
-    searches = params.likelihood != "literal"
-    certain = model.certain(*lax.stop_gradient((params, mean, covariance)))
-    found = searching & covered & counted & certain
-    forget = (1 - memory) / HISTORY
-    usual = state.usual + jnp.where(counted, forget * (contrast - state.usual), 0)
-    least = lax.stop_gradient(params.drop * usual)
-    if not model.half_line:  # there chance's votes along a half-line are most of them
+    is_finite = jnp.isfinite(evidence) & jnp.isfinite(particles).all()
+    can_search = params.likelihood != "literal"
+    converged = model.is_converged(*lax.stop_gradient((params, mean, covariance)))
+    found = searching & has_history & counted & converged
+    forget = (1 - memory) / CONTRAST_MEMORIES
+    change = jnp.where(counted, forget * (contrast - state.mean_contrast), 0)
+    mean_contrast = state.mean_contrast + change
+    least = lax.stop_gradient(params.drop * mean_contrast)
+    if not model.half_line:  # where chance is the larger part of all votes
         least = jnp.maximum(lax.stop_gradient(params.contrast), least)
     poor = ~searching & (age > params.memory) & (contrast < least)
-    lost = ~sound | (poor & searches)
+    lost = ~is_finite | (poor & can_search)
     over = lost | found
-    return Weighed(
+    return ReweightResult(
         log_weights,
         mean,
         covariance,
-        jnp.where(sound, contrast, 0),
-        jnp.where(sound, evidence, 0),
-        sound,
+        jnp.where(is_finite, contrast, 0),
+        jnp.where(is_finite, evidence, 0),
+        is_finite,
         lost,
         (searching & ~found) | lost,
-        (searching & ~found) | (lost & searches),
+        (searching & ~found) | (lost & can_search),
         1 / (weights**2).sum() <= params.resample_below * N,
-        *(jnp.where(over, 0, value) for value in (votes, chance, usual, age)),
+        *(jnp.where(over, 0, value) for value in (votes, chance, mean_contrast, age)),
     )
 
 
 def restart(
     params: Params, model: Model, cloud: Float[Array, "N d"]
 ) -> tuple[Float[Array, "N d"], Float[Array, " d"], Float[Array, "d d"]]:
-    """First particles of a search, from even numbers; their mean, and how wide they are."""
-    anew = jax.vmap(functools.partial(model.first, params))(cloud)
-    even = jnp.full(len(anew), 1 / params.particles, anew.dtype)
-    return anew, model.mean(anew, even), jnp.eye(model.dimension) * model.extent(params) ** 2 / 3
+    """Start a search.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        cloud: (N, d) random numbers in [-1, 1].
+
+    Returns:
+        Particles (N, d), their mean (d,), and a covariance (d, d) of their range.
+    """
+    particles = jax.vmap(functools.partial(model.initial_particle, params))(cloud)
+    equal = jnp.full(len(particles), 1 / params.particles, particles.dtype)
+    covariance = jnp.eye(model.dimension) * model.search_bound(params) ** 2 / 3
+    return particles, model.mean(particles, equal), covariance
+
+
+class BatchNoise(eqx.Module):
+    """Random numbers of one batch, see `RandomNumbers`."""
+
+    normal: Float[Array, "N d"]
+    uniform: Float[Array, ""]
+    cloud: Float[Array, "N d"]
 
 
 def step(
     params: Params,
     model: Model,
-    state: State,
+    state: ParticleState,
     batch: Candidates,
-    normal: Float[Array, "N d"],
-    uniform: Float[Array, ""],
-    cloud: Float[Array, "N d"],
-    thinned: int = 0,
-) -> tuple[State, Info]:
-    """One batch: propagate, score, weigh, tell the mean, resample; search where it is lost.
+    noise: BatchNoise,
+    n_cloud: int = 0,
+) -> tuple[ParticleState, BatchInfo]:
+    """Process one batch: predict, score, reweight, report, resample; restart where lost.
 
-    `cloud` are even numbers, of which a new search makes particles; `thinned` particles, drawn by
-    weight, are told.
+    Args:
+        params: The parameters.
+        model: Motion model.
+        state: State after the batch before.
+        batch: The candidates.
+        noise: Random numbers.
+        n_cloud: Number of particles to report, drawn by weight.
+
+    Returns:
+        The state, and the report.
     """
-    passed = Passed(*map(jnp.asarray, (batch.elapsed, batch.history, batch.valid.any())))
-    particles, before = propagate(params, model, state, passed, normal)
-    voted = score(params, model, batch, particles, before, state.searching)
-    told = Told(voted.log_likelihood.sum(0), voted.votes, voted.chance)
-    found = weigh(params, model, state, passed, particles, told)
+    timing = BatchTiming(*map(jnp.asarray, (batch.elapsed, batch.history, batch.valid.any())))
+    particles, before = predict(params, model, state, timing, noise.normal)
+    scores = score_batch(params, model, batch, particles, before, state.searching)
+    likelihood = BatchLikelihood(scores.log_likelihood.sum(0), scores.votes, scores.chance)
+    found = reweight(params, model, state, timing, particles, likelihood)
 
     weights = jnp.exp(found.log_weights)
-    shown = particles[_drawn(weights, thinned, jnp.asarray(0.5))] if thinned else particles[:0]
-    ancestor, renewed = resample(found.log_weights, uniform)
-    particles = jnp.where(found.few, particles[ancestor], particles)
-    log_weights = jnp.where(found.few, renewed, found.log_weights)
-    anew, middle, widest = restart(params, model, cloud)
-    after = State(
-        jnp.where(found.lost, anew, particles),
+    cloud = particles[:0]
+    if n_cloud:
+        cloud = particles[_systematic_rows(weights, n_cloud, jnp.asarray(0.5))]
+    ancestor, renewed = resample(found.log_weights, noise.uniform)
+    particles = jnp.where(found.resample, particles[ancestor], particles)
+    log_weights = jnp.where(found.resample, renewed, found.log_weights)
+    restarted, middle, widest = restart(params, model, noise.cloud)
+    after = ParticleState(
+        jnp.where(found.lost, restarted, particles),
         jnp.where(found.lost, -jnp.log(params.particles), log_weights),
-        found.searches,
+        found.searching,
         found.votes,
         found.chance,
-        found.usual,
+        found.mean_contrast,
         found.age,
     )
-    info = Info(
-        jnp.where(found.sound, found.mean, middle),
-        jnp.where(found.sound, found.covariance, widest),
-        found.searching,
+    info = BatchInfo(
+        jnp.where(found.is_finite, found.mean, middle),
+        jnp.where(found.is_finite, found.covariance, widest),
+        found.reported_searching,
         found.contrast,
-        voted.lag,
+        scores.lag,
         found.evidence,
-        jnp.where(found.sound, shown, 0),
+        jnp.where(found.is_finite, cloud, 0),
     )
     return after, info
 
 
 @full_precision
-def _covariance(apart: Float[Array, "N d"], weights: Float[Array, " N"]) -> Float[Array, "d d"]:
-    return (apart * weights[:, None]).T @ apart
+def _covariance(deviation: Float[Array, "N d"], weights: Float[Array, " N"]) -> Float[Array, "d d"]:
+    return (deviation * weights[:, None]).T @ deviation
 
 
 def run(
     params: Params,
     model: Model,
     candidates: Candidates,
-    noise: Noise,
-    state: State | None = None,
-    thinned: int = 0,
-) -> tuple[State, Info]:
-    """The filter over stacked batches: pure, differentiable, and vmap-able over all its arguments.
+    noise: RandomNumbers,
+    state: ParticleState | None = None,
+    n_cloud: int = 0,
+) -> tuple[ParticleState, BatchInfo]:
+    """Run the filter over stacked batches: pure, differentiable, and to be mapped by vmap.
 
-    Without `state` it begins with a wide cloud; `thinned` particles of each batch are told.
-    Derivatives are those of weights and particles while the motion is followed; ranges of ages,
-    when to resample and all that a search adds are held fixed.
+    Derivatives are those of weights and particles while the motion is tracked. Ranges of ages, the
+    times of resampling and all that a search adds are constant.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        candidates: Stacked batches.
+        noise: Random numbers.
+        state: State at the start; by default particles are everywhere.
+        n_cloud: Number of particles to report for each batch.
+
+    Returns:
+        The state at the end, and the stacked reports.
     """
-    state = begin(params, model, noise) if state is None else state
+    state = init(params, model, noise) if state is None else state
 
-    def body(state, at):
-        batch, normal, uniform = at
-        return step(params, model, state, batch, normal, uniform, noise.cloud, thinned)
+    def body(state, inputs):
+        batch, normal, uniform = inputs
+        drawn = BatchNoise(normal, uniform, noise.cloud)
+        return step(params, model, state, batch, drawn, n_cloud)
 
     batches = jax.tree.map(jnp.asarray, candidates)
     return lax.scan(body, state, (batches, noise.normal, noise.uniform))
+
+
+_diffusions = eqx.filter_jit(
+    lambda model, params, means: jax.vmap(model.diffusion, (None, 0))(params, means)
+)
+
+
+def smooth(motion: MotionEstimate, params: Params | None = None) -> MotionEstimate:
+    """Smooth an estimate by later events, and remove its lag.
+
+    The filter's means and covariances are treated as those of a Kalman filter with the process
+    noise of `params`, and passed backwards (Rauch, Tung & Striebel 1965): with G = P (P + Q)^-1,
+
+        m_s = m + G (m_s' - m),  P_s = P + G (P_s' - P - Q) G',
+
+    where ' is the next batch. That halves the variance, and removes the delay with which the filter
+    follows a change. Nothing passes a search.
+
+    Args:
+        motion: The filter's estimate.
+        params: The filter's parameters; by default those of the model.
+
+    Returns:
+        The smoothed estimate, with `lag` subtracted from its times.
+    """
+    model = motion.model()
+    params = Params(preset=model.preset) if params is None else params
+    if not len(motion):
+        return motion
+    m, P = motion.mean.astype(float), motion.covariance.astype(float)
+    padded = np.zeros((1 << (len(m) - 1).bit_length(), model.dimension))  # compiles for few sizes
+    padded[: len(m)] = m
+    noise = np.asarray(_diffusions(model, params, jnp.asarray(padded)))[: len(m)]
+    dt = np.diff(motion.t, append=motion.t[-1]) * 1e-6
+    Q = np.eye(model.dimension) * (noise**2 * dt[:, None])[:, None, :]
+    # Covariances of headings have no spread along them, and those of few particles none at all.
+    tiny = 1e-9 * np.trace(P, axis1=1, axis2=2)[:, None, None] + 1e-12
+    G = np.linalg.solve(P + Q + tiny * np.eye(model.dimension), P).transpose(0, 2, 1)
+    for k in range(len(m) - 2, -1, -1):
+        if not (motion.valid[k] and motion.valid[k + 1]):
+            continue
+        m[k] += G[k] @ (m[k + 1] - m[k])
+        P[k] += G[k] @ (P[k + 1] - P[k] - Q[k]) @ G[k].T
+        for part in model.parts:
+            if part.direction:
+                m[k, part.rows] /= np.linalg.norm(m[k, part.rows])
+    lag = np.rint(1e6 * motion.lag).astype(np.int64)
+    return dataclasses.replace(
+        motion,
+        t=np.maximum.accumulate(motion.t - lag),
+        mean=m.astype(motion.mean.dtype),
+        covariance=P.astype(motion.mean.dtype),
+        lag=np.zeros_like(motion.lag),
+    )

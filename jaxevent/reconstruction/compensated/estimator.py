@@ -492,7 +492,7 @@ class CompensatedVideo(ImageSequence[Params]):
         params: Its parameters.
         window_events: Events per window of the smoother.
         motion: Flow that trajectories start from, for instance of a rigid scene
-            (`jaxevent.egomotion.field.RigidFlow`). Where it is not finite, motion is sought from
+            (`jaxevent.egomotion.flow.RigidFlow`). Where it is not finite, motion is sought from
             nothing.
         refine: Whether images may correct `motion`.
         progress: Whether to show progress; None: on a terminal.

@@ -16,8 +16,8 @@ class Params(Parameters):
             "tau_max": 8e-4,
             "noise": 1.2,
         },
-        # As the thesis has it: the single best of 5 x 5 pixels' events. Of the latest ones, for
-        # rotation and general motion: among all there is one for every slow motion.
+        # The thesis' single best of 5 x 5 pixels' events. Of the latest ones for rotation and
+        # general motion: among all there is one for every slow motion.
         "literal": {
             "likelihood": "literal",
             "radius": 2,
@@ -39,68 +39,66 @@ class Params(Parameters):
 
     likelihood = Choice(
         ("soft", "band", "literal"),
-        "all candidates of a common range of ages; of each hypothesis' own; the thesis' (biased)",
+        "all candidates in a common range of ages; in each hypothesis' own; the thesis' (biased)",
     )
-    undistort = Choice((True, False), "displacements in undistorted px, where there is a camera")
+    undistort = Choice((True, False), "undistort displacements, if there is a camera")
 
-    radius = Count(8, "px", "candidates are so near, in x and y; baseline + 1.5 or more")
-    per_pixel = Count(8, "", "latest events of a pixel that are candidates")
+    radius = Count(8, "px", "largest distance of candidates in x and y; baseline + 1.5 or more")
+    per_pixel = Count(8, "", "number of latest events of a pixel that are candidates")
     candidates = Count(128, "", "most candidates of an event; of more, these many in even steps")
     every = Count(4, "", "one event in so many is scored; neighbours are correlated")
     batch = Count(64, "", "scored events per update of the weights; 1: one by one, as the thesis")
     longest = Positive(
-        0.01, "s", "a batch with fewer events than that ends after this time", gradient=False
+        0.01, "s", "longest duration of a batch, which may hold fewer events", gradient=False
     )
     particles = Count(200, "", "100 are enough for planar motion, 500 for general motion")
 
     baseline = Positive(
-        6.5, "px", "b: how far a point moves in the ages that are looked at", gradient=False
+        6.5, "px", "b: distance that a point moves within the range of ages", gradient=False
     )
     youngest = UnitInterval(
-        0.7, "", "youngest candidates that are looked at, in oldest ones' ages", gradient=False
+        0.7, "", "least age of candidates, as a fraction of the largest", gradient=False
     )
     tau_max = Positive(0.1, "s", "oldest candidates; 2 b / (expected speed)", gradient=False)
     sigma_x = Positive(0.6, "px", "spread of a candidate; from 0.5 the pixel grid does not show")
     s0 = Positive(10.0, "", "score from which an event's vote grows like its logarithm")
     alpha = Positive(5.0, "", "weight of one event's vote; larger with larger `every`")
-    noise = Positive(0.2, "1/sqrt(s)", "planar: change of the velocity, in shares of the speed")
+    noise = Positive(0.2, "1/sqrt(s)", "planar: change of the velocity, relative to the speed")
     noise_rotation = Positive(1.0, "rad/s/sqrt(s)", "change of the angular velocity")
     noise_heading = Positive(1.0, "1/sqrt(s)", "general: change of the heading")
     resample_below = Number(
-        0.5, "", "resample when so many of the particles are effective; 0: not", gradient=False
+        0.5, "", "resample below this fraction of effective particles; 0: never", gradient=False
     )
 
     speed_max = Positive(
-        600.0, "px/s", "planar: the first particles are no faster than this", gradient=False
+        600.0, "px/s", "planar: largest speed of the first particles", gradient=False
     )
     omega_max = Positive(
-        4.0, "rad/s", "first angular velocities are in +- this, in each component", gradient=False
+        4.0, "rad/s", "largest component of the first angular velocities", gradient=False
     )
     tau_general = Positive(
         0.02, "s", "general: oldest candidates, as depth is not known", gradient=False
     )
     rho_max = Positive(150.0, "px/s", "general: fastest flow due to translation", gradient=False)
     found = Positive(
-        0.12,
-        "",
-        "search ends when each component's spread is this share of the mean",
+        0.12, "", "spread of the particles at which a search ends, relative to the mean",
         gradient=False,
-    )
+    )  # fmt: skip
     found_heading = Positive(
-        0.3, "", "general: is so many rad, and this share of omega_max", gradient=False
+        0.3, "", "general: that spread in rad, and relative to omega_max", gradient=False
     )
     contrast = Positive(
-        1.1, "", "search anew when votes are fewer than this, in chance's votes", gradient=False
+        1.1, "", "votes, relative to chance, below which a search starts anew", gradient=False
     )
-    drop = UnitInterval(0.25, "", "or fewer than this share of what they were", gradient=False)
+    drop = UnitInterval(0.25, "", "votes, relative to their mean so far, for that", gradient=False)
     off = Positive(
         0.03,
         "",
-        "kernels: particles' weights may be off by so much of the largest, where log-likelihoods "
-        "are interpolated between motions; 0: they are not",
+        "kernels: error of particles' weights, relative to the largest, where log-likelihoods are "
+        "interpolated between motions; 0: they are not",
         gradient=False,
     )
-    memory = Positive(6.0, "", "batches over which votes are counted for that", gradient=False)
+    memory = Positive(6.0, "", "batches over which votes are averaged for that", gradient=False)
 
     alpha_literal = Positive(2.0, "1/px", "literal: decay of the likelihood (alpha_p)")
     r_t = Positive(1e4, "px/s", "literal: penalty of a wrong time")
@@ -108,7 +106,7 @@ class Params(Parameters):
     V_max = Positive(3.0, "px", "literal, rotation and general: largest distance", gradient=False)
     horizon = Choice(
         ("crossing", "fixed"),
-        "literal, planar: the predecessor was when the hypothesis was 1 px back, or at `past`",
+        "literal, planar: age of the predecessor; one pixel of the hypothesis' motion, or `past`",
     )
     past = Positive(50e-6, "s", "literal, planar: age of the predecessor, if fixed")
     edge = Number(
@@ -120,7 +118,7 @@ class Params(Parameters):
     )
 
     def without_gradient(self) -> dict[str, str]:
-        """Those of the other likelihood too."""
+        # Parameters of the other likelihood have none either.
         literal = self.likelihood == "literal"
         others = {"sigma_x", "s0", "alpha"} if literal else {"r_t", "alpha_literal"}
         if not (literal and self.horizon == "fixed"):

@@ -1,0 +1,622 @@
+"""Motion that makes the image of warped events sharpest: contrast maximisation, as a baseline.
+
+After Gallego, Rebecq & Scaramuzza, "A Unifying Contrast Maximization Framework for Event Cameras"
+(CVPR 2018) and Gallego & Scaramuzza, "Accurate Angular Velocity Estimation with an Event Camera"
+(RA-L 2017). In a window of time events are moved along a constant motion to the window's middle,
+
+    planar:    x' = x - U t
+    rotation:  X' = exp(Omega t) X,  x' = f (X'_x, X'_y) / X'_z,  X = (x, y, f)
+
+with t (s) from the middle, and are summed, by polarity, into an image J, bilinearly and blurred.
+The estimate maximises the mean square or the variance of J: events of one point of the scene then
+fall together. It is found from coarse to fine, with much blur at first, from the motion of the
+window before. For the first window, and when the motion was lost, all motions are searched.
+SciPy's BFGS uses one compiled gradient for all blurs.
+
+Points that enter or leave the sensor within the window pull the motion towards 0, for a slower one
+keeps their cut tracks together as well. So J only counts where a point is in view for the whole
+window. That region is computed from the motion that an ascent starts with, and then fixed; events
+count less towards the window's ends.
+
+An event gives its pixel, not its position in it. If all were at the pixels' middles, an image along
+whose rows or columns objects about move would become sharper by the grid alone, and the motion
+across too large, whatever the blur and the number of events. Events that are spread over their
+pixels do not show the grid.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
+
+from jaxevent import dispatch
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion.baselines.fits import Fit, motion_of_fits
+from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.estimator import HostEstimator, HostInputs
+from jaxevent.egomotion.geometry import blur, splat
+from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
+from jaxevent.egomotion.patches import ImageSpeed
+from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterval
+from jaxevent.progress import bar
+from jaxevent.recording import Recording
+
+COARSE_BLUR = 8  # times [1 2 1] in a search: 2 px
+MIDDLE_BLUR = 2  # times, next
+GRID_SPACING_PX = 2.0  # at the end of a short window, between motions of its grid
+GRID_FACTOR = 4.0  # between the ranges of the grids of a search
+N_CANDIDATES = 4  # motions of a grid that are refined
+CELL_PX = 24  # of the parts of the image whose errors are independent
+PROBE_PX = 0.5  # at the window's end, from the maximum, where the curvature is measured
+MIN_SLOPE = 1e-3  # 1/px, relative to the objective, at which an ascent ends
+WINDOW_DISPLACEMENT_PX = 10.0  # of the image in a window, at best
+DISPLACEMENT_LIMITS_PX = (5.0, 60.0)  # within which the default is kept
+DURATION_LIMITS_S = (0.002, 2.0)
+CALIBRATION = CovarianceCalibration(change=0.09)
+INITIAL_VARIANCE = 2.0  # px^2, inverse curvature relative to the objective, at the start
+
+Numeric = Array | np.ndarray
+
+
+class Params(Parameters):
+    """Parameters of contrast maximisation."""
+
+    window = Choice(("duration", "events"), "windows of `duration`, or of `events` events each")
+    polarity = Choice(("signed", "ignored"), "OFF counts -1, or as ON")
+    measure = Choice(("mean square", "variance"), "of the image of warped events")
+    taper = Choice((True, False), "weight events by cos(pi t / length), or all alike")
+    whole = Choice((True, False), "count points that are in view all the time only, or all")
+    dither = Choice((True, False), "place events anywhere in their pixels, randomly, or at middles")
+
+    events = Count(20000, "", "events of a window; of more within `duration`, these many evenly")
+    fewest = Count(300, "", "least number of events of an estimate")
+    blur = Count(1, "", "times [1 2 1] / 4 over the image, at last")
+    steps = Count(20, "", "most steps of the ascent at each blur")
+    starts = Count(7, "", "motions of each of the search's grids in each component")
+    margin = Count(16, "px", "of the image around the sensor")
+
+    duration = Positive(0.1, "s", "length of a window, in which the motion is constant")
+    overlap = UnitInterval(0.5, "", "fraction of a window that the next one has too")
+    speed_max = Positive(4000.0, "px/s", "planar: largest component of motions of the search")
+    omega_max = Positive(30.0, "rad/s", "rotation: largest component of motions of the search")
+    contrast = Positive(1.2, "", "square of J, relative to chance, below which the motion is lost")
+
+
+class Window(eqx.Module):
+    """The events of a window, padded to a fixed number by events without weight."""
+
+    xi: Float[Numeric, "N 2"]  # px, see `pixel_coordinates`
+    t: Float[Numeric, " N"]  # s from the middle
+    weight: Float[Numeric, " N"]  # by polarity; 0 for padding
+    shuffled: Float[Numeric, " N"]  # s, the times in random order
+    mask: Float[Numeric, "height width"]  # 1 where the image counts; see `mask_visible`
+    ends: Float[Numeric, "2"]  # s from the middle
+    scale: Float[Numeric, " dimension"]  # motion per px of displacement at the window's end
+    model: Model
+    shape: tuple[int, int] = eqx.field(static=True)  # of the image, height and width
+    offset: tuple[float, float] = eqx.field(static=True)  # px, position of its pixel [0, 0]
+    box: tuple[float, float, float, float] = eqx.field(static=True)  # px, x0, y0, x1, y1 of events
+
+    def warp(self, xi: Array, t: Array, motion: Array) -> Float[Array, "n 2"]:
+        """Move positions from their times to the middle.
+
+        Args:
+            xi: (n, 2) positions, px.
+            t: (n,) times from the middle, s.
+            motion: (d,) motion.
+
+        Returns:
+            (n, 2) positions, px.
+        """
+        return self.model.warp(xi, motion * t[:, None])
+
+    @property
+    def total_weight(self) -> Float[Array, ""]:
+        """Sum of squared weights, at least 1: the number of events without a taper."""
+        return jnp.maximum(jnp.sum(jnp.asarray(self.weight) ** 2), 1)
+
+
+def mask_visible(window: Window, motion: Float[Numeric, " dimension"]) -> Window:
+    """Mask the points that the sensor sees from the start of the window to its end.
+
+    All points count where the visible ones are less than a quarter of the sensor. The mask is
+    constant for derivatives.
+
+    Args:
+        window: The window.
+        motion: (d,) motion.
+
+    Returns:
+        The window with the mask.
+    """
+    height, width = window.shape
+    y, x = jnp.mgrid[:height, :width].reshape(2, -1)
+    xi = jnp.stack([x + window.offset[0], y + window.offset[1]], -1)
+    x0, y0, x1, y1 = window.box
+    xi, motion = xi.astype(window.mask.dtype), lax.stop_gradient(jnp.asarray(motion))
+    inside = jnp.ones(len(xi), bool)
+    # The displacement from the middle to the time t is that from -t to the middle.
+    for t in jnp.asarray(window.ends):
+        at = window.warp(xi, jnp.full(len(xi), -t), motion)
+        inside &= (at >= jnp.array([x0, y0])).all(1) & (at <= jnp.array([x1, y1])).all(1)
+    enough = inside.sum() * 4 >= (x1 - x0 + 1) * (y1 - y0 + 1)
+    mask = jnp.where(enough, inside, True).astype(window.mask.dtype)
+    return dataclasses.replace(window, mask=mask.reshape(height, width))
+
+
+def warped_image(
+    params: Params,
+    window: Window,
+    motion: Float[Numeric, " dimension"],
+    times: int | Int[Array, ""] | None = None,
+) -> Float[Array, "height width"]:
+    """Make the blurred image of warped events J.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        motion: (d,) motion.
+        times: Number of blurs; by default `params.blur`. Traced, it is at most the larger of 8 and
+            `params.blur`.
+
+    Returns:
+        (height, width) image.
+    """
+    weight = jnp.asarray(window.weight)
+    if params.polarity == "ignored":
+        weight = jnp.abs(weight)
+    at = window.warp(jnp.asarray(window.xi), jnp.asarray(window.t), jnp.asarray(motion))
+    image = splat(at, weight, window.shape, window.offset)
+    if times is None or isinstance(times, int):
+        return blur(image, params.blur if times is None else times)
+
+    def blur_again(J, k):
+        return lax.cond(k < times, blur, lambda J: J, J), None
+
+    return lax.scan(blur_again, image, jnp.arange(max(COARSE_BLUR, params.blur)))[0]
+
+
+def objective(
+    params: Params,
+    window: Window,
+    motion: Float[Numeric, " dimension"],
+    times: int | Int[Array, ""] | None = None,
+) -> Float[Array, ""]:
+    """Compute sum J^2, or sum (J - mean J)^2, per event, over the window's mask.
+
+    It is differentiable in the motion and in the events' positions, times and weights. Bilinear
+    weights have no second derivative, so curvatures are differences of the gradient.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        motion: (d,) motion.
+        times: Number of blurs, see `warped_image`.
+
+    Returns:
+        The value.
+    """
+    J, mask = warped_image(params, window, motion, times), jnp.asarray(window.mask)
+    if params.measure == "variance":
+        J = J - jnp.sum(mask * J) / jnp.maximum(jnp.sum(mask), 1)
+    return jnp.sum(mask * J**2) / window.total_weight
+
+
+@eqx.filter_jit
+def _value_and_grad(params: Params, window: Window, z: Array, times: Array) -> tuple[Array, Array]:
+    """Return the objective and its gradient for a motion in px at the window's end."""
+    scale = jnp.asarray(window.scale)
+    return jax.value_and_grad(lambda z: objective(params, window, z * scale, times))(z)
+
+
+_mask_visible = eqx.filter_jit(mask_visible)
+
+
+@eqx.filter_jit
+def _cell_gradients(params: Params, window: Window, z: Array) -> Float[Array, "cells dimension"]:
+    """Return the gradient of each image cell's part of the objective, without that of the mean."""
+
+    def parts(z: Array) -> Array:
+        J = warped_image(params, window, z * jnp.asarray(window.scale)) * window.mask
+        height, width = (-(-n // CELL_PX) for n in J.shape)
+        J = jnp.pad(J, [(0, height * CELL_PX - J.shape[0]), (0, width * CELL_PX - J.shape[1])])
+        squares = (J**2).reshape(height, CELL_PX, width, CELL_PX).sum((1, 3)).reshape(-1)
+        return squares / window.total_weight
+
+    return jax.jacfwd(parts)(z)
+
+
+def _evaluate(
+    params: Params, window: Window, z: NDArray, times: int
+) -> tuple[float, NDArray[np.float64]]:
+    """Return the objective and its gradient on the host, in double precision."""
+    real, number = jnp.result_type(float), jnp.asarray(times)
+    value, slope = _value_and_grad(params, window, jnp.asarray(z, real), number)
+    return float(value), np.asarray(slope, np.float64)
+
+
+def ascend(
+    params: Params, window: Window, motion: NDArray[np.floating], times: int | None = None
+) -> tuple[NDArray[np.float64], float]:
+    """Maximise the objective from a motion, by BFGS on motions in px at the window's end.
+
+    Args:
+        params: The parameters; `steps` is the largest number of steps.
+        window: The window.
+        motion: (d,) motion at the start.
+        times: Number of blurs; by default `params.blur`.
+
+    Returns:
+        The motion (d,) at the maximum, and the objective there.
+    """
+    times = params.blur if times is None else times
+    scale = np.asarray(window.scale, np.float64)
+    begin = np.asarray(motion, np.float64) / scale
+    unit = max(_evaluate(params, window, begin, times)[0], 1e-12)
+
+    def loss(z: NDArray) -> tuple[float, NDArray]:
+        value, slope = _evaluate(params, window, z, times)
+        return -value / unit, -slope / unit
+
+    initial = INITIAL_VARIANCE * np.eye(len(begin))
+    options = {"gtol": MIN_SLOPE, "maxiter": params.steps, "hess_inv0": initial}
+    found = minimize(loss, begin, jac=True, method="BFGS", options=options)
+    return found.x * scale, -float(found.fun) * unit
+
+
+class WindowEstimate(NamedTuple):
+    """The motion of a window."""
+
+    motion: NDArray[np.float64]
+    contrast: float  # the objective relative to that with shuffled times
+    covariance: NDArray[np.float64] | None  # see `covariance`
+
+
+def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> WindowEstimate:
+    """Refine a motion at two blurs, 2 and `params.blur`.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        motion: (d,) motion at the start.
+
+    Returns:
+        The estimate.
+    """
+    for times in (MIDDLE_BLUR, params.blur):
+        if params.whole:
+            window = _mask_visible(window, jnp.asarray(motion, window.xi.dtype))
+        motion, value = ascend(params, window, motion, times)
+    z = motion / np.asarray(window.scale, np.float64)
+    shuffled = dataclasses.replace(window, t=window.shuffled)
+    chance, _ = _evaluate(params, shuffled, z, params.blur)
+    return WindowEstimate(motion, value / max(chance, 1e-12), covariance(params, window, motion))
+
+
+def covariance(
+    params: Params, window: Window, motion: NDArray[np.floating]
+) -> NDArray[np.float64] | None:
+    """Return the sandwich covariance H^-1 (sum_c g_c g_c') H^-1 of a motion.
+
+    H is the objective's curvature at its maximum, from differences of gradients. g_c is the
+    gradient of the part of the objective in cell c of the image (24 px). The sum of these is 0, and
+    their scatter gives the error of the maximum, if cells are independent. Changes of the motion
+    within the window are not in it; see `CovarianceCalibration`. A direction with less than 1 % of
+    the largest curvature is assumed to have that much.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        motion: (d,) motion at the maximum.
+
+    Returns:
+        (d, d) covariance, or None if there is no maximum.
+    """
+    scale = np.asarray(window.scale, np.float64)
+    z = np.asarray(motion, np.float64) / scale
+    probes = PROBE_PX * np.eye(len(z))
+    H = [
+        _evaluate(params, window, z + h, params.blur)[1]
+        - _evaluate(params, window, z - h, params.blur)[1]
+        for h in probes
+    ]
+    H = np.array(H) / (2 * PROBE_PX)
+    g = np.asarray(_cell_gradients(params, window, jnp.asarray(z, window.xi.dtype)), np.float64)
+    if not (np.isfinite(H).all() and np.isfinite(g).all()):
+        return None
+    values, vectors = np.linalg.eigh(-(H + H.T) / 2)
+    if not values[-1] > 0:
+        return None
+    inverse = vectors / np.maximum(values, 0.01 * values[-1]) @ vectors.T
+    return inverse @ (g.T @ g) @ inverse * np.outer(scale, scale)
+
+
+class EventRange(NamedTuple):
+    """The events of a window."""
+
+    middle: int  # us
+    begin: int  # row of the first event
+    end: int  # row after the last event
+
+
+class WindowSequence:
+    """The windows of a recording: `for part in windows` are ranges of events.
+
+    Args:
+        recording: The recording.
+        params: The parameters.
+        model: Motion model, or its name.
+        camera: The camera; by default the recording's.
+        seed: Seed of the random numbers.
+
+    Raises:
+        InputError: The model is unknown, or it needs a camera and there is none.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params | None = None,
+        model: str | type[Model] = "planar",
+        camera: PinholeCamera | None = None,
+        seed: int = 0,
+    ):
+        self.recording, self.params = recording, params or Params()
+        kind, camera = contrast.find_model_and_camera(recording, model, camera)
+        self.xi, f = pixel_coordinates(recording.width, recording.height, camera)
+        self.model = kind(f)
+        margin = self.params.margin
+        low = np.floor(self.xi.min((0, 1))) - margin
+        width, height = (np.ceil(self.xi.max((0, 1))) + margin - low).astype(int) + 1
+        self.shape, self.offset = (int(height), int(width)), (float(low[0]), float(low[1]))
+        x0, y0, x1, y1 = (float(v) for v in (*self.xi.min((0, 1)), *self.xi.max((0, 1))))
+        self.box = x0, y0, x1, y1
+        self.pixel_scale = self.model.pixel_scale(self.xi)
+        p = self.params
+        self.search_bound = float(self.model.search_bound(p))
+        self._rng = np.random.default_rng(seed)
+        advance = max(1 - float(p.overlap), 0.01)
+        events = recording.events
+        n = len(events)
+        whole = int(events[n - 1 :].t[0] - events[:1].t[0]) + 1 if n else 1
+        self._length = min(max(round(1e6 * float(p.duration)), 2), whole)
+        self._step = max(round(advance * self._length), 1)
+        self._stride = max(round(advance * p.events), 1)
+
+    def __len__(self) -> int:
+        return len(self._begins)
+
+    @functools.cached_property
+    def _begins(self) -> NDArray[np.int64]:
+        """Times (us) at which windows begin, or rows of events."""
+        events, n = self.recording.events, len(self.recording.events)
+        if not n:
+            return np.zeros(0, np.int64)
+        if self.params.window == "events":
+            return np.arange(0, max(n - self.params.events, 0) + 1, self._stride)
+        first, last = int(events[:1].t[0]), int(events[n - 1 :].t[0])
+        return np.arange(first, max(last - self._length, first) + 1, self._step)
+
+    def __iter__(self) -> Iterator[EventRange]:
+        events, n = self.recording.events, len(self.recording.events)
+        for begin in self._begins:
+            if self.params.window == "events":
+                first, end = int(begin), min(int(begin) + self.params.events, n)
+                ends = events[first : first + 1].t[0], events[end - 1 : end].t[0]
+                yield EventRange(int(ends[0] + ends[1]) // 2, first, end)
+            else:
+                first, end = (events.index(int(begin) + k) for k in (0, self._length))
+                yield EventRange(int(begin) + self._length // 2, first, end)
+
+    def length(self, part: EventRange) -> float:
+        """Return the length (s) of a window."""
+        if self.params.window == "duration":
+            return 1e-6 * self._length
+        events = self.recording.events
+        ends = events[part.begin : part.begin + 1].t, events[part.end - 1 : part.end].t
+        return 1e-6 * float(ends[1][0] - ends[0][0]) if len(ends[0]) and len(ends[1]) else 0.0
+
+    def half_length(self, part: EventRange) -> float:
+        """Return half the length (s) of a window, about its middle."""
+        if self.params.window == "duration":
+            return self._length * 0.5e-6
+        events = self.recording.events[part.begin : part.end]
+        return max(np.abs(events.t - part.middle).max(initial=0) * 1e-6, 1e-6)
+
+    def crop(self, part: EventRange, half: float | None = None) -> Window:
+        """Make a window.
+
+        Args:
+            part: The range of events.
+            half: Half the length of the middle part to crop, s, for a search. It has space for a
+                quarter of the events. By default the whole window is made.
+
+        Returns:
+            The window.
+        """
+        events, t = self.recording.events[part.begin : part.end], part.middle
+        size = self.params.events
+        rows = np.arange(len(events))
+        if half is None:
+            half = self.half_length(part)
+        else:
+            size = -(-size // 4)
+            rows = np.flatnonzero(np.abs(events.t - t) <= 1e6 * half)
+        if len(rows) > size:
+            rows = rows[np.linspace(0, len(rows) - 1, size).round().astype(int)]
+        real, n = np.dtype(jnp.result_type(float)), len(rows)
+        xi, times, weight = (np.zeros(s, real) for s in ((size, 2), (2, size), size))
+        xi[:n] = self.xi[events.y[rows].astype(int), events.x[rows].astype(int)]
+        if self.params.dither:
+            xi[:n] += self._rng.uniform(-0.5, 0.5, (n, 2))
+        times[:, :n] = (events.t[rows] - t) * 1e-6
+        weight[:n] = np.where(events.p[rows], 1, -1)
+        if self.params.taper:
+            weight *= np.cos(np.clip(times[0] / half, -1, 1) * np.pi / 2)
+        times[1, :n] = self._rng.permutation(times[1, :n])
+        scale = (1 / (self.pixel_scale * half)).astype(real)
+        ends, mask = np.array([-half, half], real), np.ones(self.shape, real)
+        return Window(
+            xi, times[0], weight, times[1], mask, ends, scale,
+            self.model, self.shape, self.offset, self.box,
+        )  # fmt: skip
+
+    def measure_change(self, part: EventRange, motion: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Measure the change of the motion in a window, by its halves.
+
+        Args:
+            part: The range of events.
+            motion: (d,) motion of the whole window.
+
+        Returns:
+            (d,) change; 0 if a half is lost.
+        """
+        quarter = self.half_length(part) / 2
+        middles = [part.middle + round(1e6 * side * quarter) for side in (-1, 1)]
+        first, second = (
+            refine(self.params, self.crop(part._replace(middle=middle), quarter), motion)
+            for middle in middles
+        )
+        if min(first.contrast, second.contrast) < float(self.params.contrast):
+            return np.zeros(len(motion))
+        return 2 * (second.motion - first.motion)
+
+    def search(self, part: EventRange) -> NDArray[np.float64]:
+        """Search all motions for that of a window.
+
+        By grids of motions. Each has a window so short that its motions differ by `GRID_SPACING_PX`
+        at the end. The widest grid, of all motions, has the shortest window. Each further grid is
+        `GRID_FACTOR` narrower, and its window as much longer, up to the whole one. The best of each
+        grid, and of the windows before, are refined in the next window. So a motion is found at any
+        speed, and where several explain a short window a longer one separates them.
+
+        Args:
+            part: The range of events.
+
+        Returns:
+            (d,) motion.
+        """
+        params, whole = self.params, self.half_length(part)
+        # Range of a grid in px, in units of the motion times s.
+        reach = GRID_SPACING_PX * (params.starts - 1) / 2 / self.pixel_scale.max()
+        bounds = [self.search_bound]
+        while params.starts > 1 and reach / bounds[-1] < whole:
+            bounds.append(bounds[-1] / GRID_FACTOR)
+        found: list[NDArray[np.float64]] = []
+        for bound in bounds:
+            half = min(max(reach / bound, 1e-6), whole)
+            window = self.crop(part, half)
+            if np.count_nonzero(window.weight) < params.fewest and bound != bounds[-1]:
+                continue
+            starts = [*found, *self._grid_peaks(window, bound)]
+            refined = [ascend(params, window, motion, COARSE_BLUR) for motion in starts]
+            found = _drop_duplicates(refined, np.asarray(window.scale, np.float64))[:N_CANDIDATES]
+        window = self.crop(part)
+        refined = [ascend(params, window, motion, COARSE_BLUR) for motion in found]
+        return max(refined, key=lambda one: one[1])[0]
+
+    def _grid_peaks(self, window: Window, bound: float) -> list[NDArray[np.float64]]:
+        """Return the best local maxima of a grid of motions within +- bound."""
+        dimension, number = self.model.dimension, self.params.starts
+        axis = np.linspace(-bound, bound, number) if number > 1 else np.zeros(1)
+        motions = np.stack(np.meshgrid(*[axis] * dimension, indexing="ij"), -1)
+        steps = motions.reshape(-1, dimension) / np.asarray(window.scale, np.float64)
+        values = np.array([_evaluate(self.params, window, z, COARSE_BLUR)[0] for z in steps])
+        values = values.reshape(motions.shape[:-1])
+        peaks = np.where(values == maximum_filter(values, 3), values, -np.inf).ravel()
+        best = np.argsort(-peaks, kind="stable")[:N_CANDIDATES]
+        return [motions.reshape(-1, dimension)[row] for row in best if np.isfinite(peaks[row])]
+
+
+def _drop_duplicates(
+    refined: list[tuple[NDArray[np.float64], float]], scale: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Sort motions by their values, the best first, and keep one of those that are near."""
+    kept: list[NDArray[np.float64]] = []
+    for motion, _ in sorted(refined, key=lambda one: -one[1]):
+        if all(np.abs((motion - other) / scale).max() > GRID_SPACING_PX / 2 for other in kept):
+            kept.append(motion)
+    return kept
+
+
+def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
+    """Estimate the motion in overlapping windows of time; estimates are at their middles.
+
+    `contrast` is the objective relative to that with shuffled times. Where it is too small, or
+    events are too few, the motion is lost. Then its mean is that of the window before, and all
+    motions are searched for the next window. The first and the last estimate are extended to their
+    windows' ends.
+
+    Args:
+        params: The parameters.
+        inputs: Recording, model and options.
+
+    Returns:
+        The estimate.
+    """
+    dispatch.check_threads()
+    windows = WindowSequence(inputs.recording, params, inputs.model, inputs.camera, inputs.seed)
+    if not len(windows):
+        return MotionEstimate.empty(inputs.model)
+    motion, fits, contrasts = None, [], []
+    parts: list[EventRange] = []
+    for part in bar(windows, desc="sharpen windows", unit="window", progress=inputs.progress):
+        parts.append(part)
+        if part.end - part.begin < params.fewest:
+            motion = None
+            fits.append(None)
+            contrasts.append(0.0)
+            continue
+        if motion is None:
+            motion = windows.search(part)
+        found = refine(params, windows.crop(part), motion)
+        is_sharp = found.contrast >= float(params.contrast)
+        is_found = is_sharp and found.covariance is not None
+        fit = Fit(found.motion, found.covariance) if is_found else None
+        motion = None if fit is None else fit.mean
+        fits.append(fit)
+        contrasts.append(found.contrast)
+    t = np.array([part.middle for part in parts])
+    spans = np.array([windows.length(part) for part in parts])
+    estimate = motion_of_fits(inputs.model, t, fits, np.array(contrasts))
+    change = rate = None
+    if estimate.valid.sum() == 1:
+        k = int(estimate.valid.argmax())
+        change = windows.measure_change(parts[k], estimate.mean[k])
+        rate = np.outer(change, change) / max(1e6 * spans[k], 1) ** 2
+    calibration = CALIBRATION.with_lens(inputs.camera)
+    estimate = estimate.with_calibrated_covariance(calibration, spans, change)
+    before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))
+    return estimate.extended_to(int(t[0]) - before, int(t[-1]) + after, rate)
+
+
+def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
+    """Return a duration in which the image moves by some pixels, if the default is far off."""
+    displacement = speed.fast * float(params.duration)
+    low, high = DISPLACEMENT_LIMITS_PX
+    if params.window != "duration" or low <= displacement <= high:
+        return {}
+    shortest, longest = DURATION_LIMITS_S
+    return {"duration": min(max(WINDOW_DISPLACEMENT_PX / speed.fast, shortest), longest)}
+
+
+contrast = HostEstimator(
+    "contrast",
+    Params,
+    solve,
+    linear=True,
+    lengths=lengths,
+    about="The motion that makes the image of warped events sharpest (Gallego et al., CVPR 2018), "
+    "in overlapping windows of time, each by itself.",
+)

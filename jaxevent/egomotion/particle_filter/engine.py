@@ -1,0 +1,441 @@
+"""The particle filter as a CPU kernel, which numba compiles from the filter's own functions.
+
+Functions of one event and all particles (`likelihood`, `filtering`) are traced for any number of
+particles, and become expressions (`jaxevent.codegen`), then the text of a module. One loop
+(`engine_loop`), the same for all models, passes over batches, events and candidates, as
+`filtering.run` does. That one is differentiated, and used wherever there is no kernel.
+
+While the particles are narrow, the loop scores a few motions that span them, and interpolates
+between these.
+"""
+
+import copy
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import (
+    ELEMENTS,
+    TracedFunction,
+    TracedProgram,
+    name_leaves,
+    name_numbers,
+    translate_function,
+)
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
+from jaxevent.egomotion.candidates import Candidates
+from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.particle_filter import engine_loop, filtering, likelihood
+from jaxevent.egomotion.particle_filter.engine_loop import (
+    BLOCK,
+    CELLS,
+    BatchArrays,
+    InfoArrays,
+    Memory,
+    ModelFunctions,
+    RowIndices,
+)
+from jaxevent.egomotion.particle_filter.filtering import (
+    BatchInfo,
+    BatchLikelihood,
+    BatchTiming,
+    ParticleState,
+    RandomNumbers,
+)
+from jaxevent.egomotion.particle_filter.likelihood import Event
+from jaxevent.egomotion.particle_filter.params import Params
+
+FUNCTION = """@cfunc(types.void(CELLS, CELLS, NUMBERS, I), **OPTIONS)
+def {name}(cells, work, numbers, count):
+    zero = 0
+{body}
+
+
+"""
+# Candidates fill their entries from the first. Groups of `size` blocks of motions have one range of
+# ages.
+EVENT = """@cfunc(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **OPTIONS)
+def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
+    zero, begin, end = 0, 0, count
+{init}
+    if cells[{counts}] == 0:
+        return
+    for i in range(count * {BLOCK}):
+        work[{votes_row} + i] = REAL(0)
+    size = {size}
+    for begin in range(0, count, size):
+        end = begin + size
+{span}
+        youngest, oldest = cells[{youngest}], cells[{oldest}]
+        number = 0
+        for c in range(first, first + most):
+            age = ages[c]
+            if age <= 0:
+                break
+            chosen[number] = c
+            number += 1 if (age >= youngest) & (age <= oldest) else 0
+        for k in range(number):
+            c = chosen[k]
+            cells[{dx}] = d[2 * c]
+            cells[{dy}] = d[2 * c + 1]
+            cells[{dt}] = ages[c]
+{accumulate}
+    begin, end = 0, count
+{likelihood}
+
+
+"""
+PARTICLES = ElementLoop("i", "count", ("work", "numbers", "count"))
+LANES = ElementLoop("i", f"begin * {BLOCK}, end * {BLOCK}", ("work", "numbers", "begin", "end"))
+MAX_OPERATIONS = 6000  # beyond, numba compiles longer than XLA's scan takes
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Positions of numbers by name: single ones in cells, those of all particles in rows."""
+
+    cells: dict[str, int]
+    rows: dict[str, int]
+    booleans: frozenset[str]
+    row_size: int
+
+    def places(self) -> dict[str, Address]:
+        """Return from where each number is read."""
+        places = {name: ("work", "i", row * self.row_size) for name, row in self.rows.items()}
+        return places | {name: ("cells", "zero", at) for name, at in self.cells.items()}
+
+    def stores(self) -> dict[str, str]:
+        """Return the text that writes each number."""
+        stores = {
+            name: f"work[i + {row * self.row_size}] = {{}}" for name, row in self.rows.items()
+        }
+        for name, at in self.cells.items():
+            value = "REAL(1) if {} else REAL(0)" if name in self.booleans else "{}"
+            stores[name] = f"cells[{at}] = {value}"
+        return stores
+
+    def rows_of(self, name: str) -> NDArray[np.int64]:
+        """Return the rows of an array of all particles."""
+        found = {n: row for n, row in self.rows.items() if n.rpartition(".")[0] == name}
+        return np.array([found[f"{name}.{k}"] for k in range(len(found))], np.int64)
+
+
+def _with_focal_length(model: Model, f: Any) -> Model:
+    """Return the model with another focal length: an input, so that one program serves all."""
+    model = copy.copy(model)
+    object.__setattr__(model, "f", f)
+    return model
+
+
+class FunctionTracer:
+    """Tracer of functions, with the positions of their inputs and results."""
+
+    def __init__(self, params: Params, model: Model, dtype: np.dtype):
+        self.params, self.model, self.dtype = params, model, dtype
+        self.graph, self.host = Graph(), ParameterProgram()
+        for leaf in jax.tree.leaves(params):
+            self.host.add_input(np.asarray(leaf))
+        self.cells = {name: at for at, name in enumerate(CELLS)}
+        self.rows: dict[str, int] = {}
+        self.booleans: set[str] = set()
+        self.functions: dict[str, TracedFunction] = {}
+        self.f = self.shape()
+
+    def shape(self, *size: int, kind: Any = None) -> jax.ShapeDtypeStruct:
+        """Return the shape of an array, by default of real numbers."""
+        return jax.ShapeDtypeStruct(size, self.dtype if kind is None else kind)
+
+    def add(
+        self, name: str, function: Any, inputs: dict[str, Any], alias: bool = False
+    ) -> dict[str, Any]:
+        """Translate `function(params, model, **inputs)`, which returns a dict.
+
+        A result that is equal for all particles becomes one number for the functions that read it.
+
+        Args:
+            name: Name of the function.
+            function: The function.
+            inputs: Trees of shapes.
+            alias: Whether results that are inputs stay where these are.
+
+        Returns:
+            Trees of shapes of the results, to be inputs of other functions.
+        """
+        inputs, trees = {**inputs, "f": self.f}, {}
+
+        def call(params: Any, f: Any, **inputs: Any) -> dict[str, Any]:
+            results = function(params, _with_focal_length(self.model, f), **inputs)
+            trees.update(jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), results))
+            return results
+
+        translated = translate_function(call, self.params, inputs, self.graph, self.host)
+        for key, tree in inputs.items():
+            self._lay_out(key, tree)
+        self.functions[name] = translated
+        return {key: self._lay_out(key, tree, translated, alias) for key, tree in trees.items()}
+
+    def _lay_out(
+        self, key: str, tree: Any, translated: TracedFunction | None = None, alias: bool = False
+    ) -> Any:
+        """Give each number of a tree a cell or a row, and return the tree's shapes."""
+        leaves = []
+        for name, leaf in name_leaves(key, tree).items():
+            names = name_numbers(name, leaf)
+            of_all = ELEMENTS in leaf.shape
+            if translated is not None and of_all:
+                nodes = [translated.results[number] for number in names]
+                of_all = any(node.level == Level.ELEMENT for node in nodes)
+                if of_all:
+                    of_elements = map(self._of_all, nodes)
+                    translated.results.update(zip(names, of_elements, strict=True))
+            where = self.rows if of_all else self.cells
+            for number in names:
+                source = translated.results[number] if translated is not None else None
+                if alias and of_all and source is not None and source.op == "input":
+                    where.setdefault(number, where[source.args[0]])
+                where.setdefault(number, len(set(where.values())))
+                if leaf.dtype == bool:
+                    self.booleans.add(number)
+            leaves.append(leaf if of_all or ELEMENTS not in leaf.shape else self.shape())
+        return jax.tree.unflatten(jax.tree.structure(tree), leaves)
+
+    def _of_all(self, node: Node) -> Node:
+        """Return a number of all particles, even where it is equal for all."""
+        if node.level == Level.ELEMENT:
+            return node
+        return self.graph.node("max", (node, node), node.kind, Level.ELEMENT)
+
+
+def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
+    """Translate the functions of the filter.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        dtype: Type of real numbers.
+
+    Returns:
+        The program.
+
+    Raises:
+        TranslationError: A function has no translation.
+    """
+    if params.likelihood == "literal":
+        raise TranslationError('likelihood = "literal"')
+    tracer = FunctionTracer(params, model, dtype)
+    shape, d = tracer.shape, model.dimension
+    cloud, each, flag = shape(ELEMENTS, d), shape(ELEMENTS), shape(kind=bool)
+    # Classes that check their fields take shapes in a trace.
+    state, timing, event, of_batch = jax.eval_shape(
+        lambda cloud, each, flag, one, two, four: (
+            ParticleState(cloud, each, flag, one, one, one, one),
+            BatchTiming(one, one, flag),
+            Event(two, four, flag, one, one),
+            BatchLikelihood(each, one, one),
+        ),
+        *(cloud, each, flag, shape(), shape(2), shape(2, 2)),
+    )
+
+    def predict(params, model, state, timing, normal):
+        predicted, weights = filtering.predict(params, model, state, timing, normal)
+        return {"predicted": predicted, "weights": weights}
+
+    def reweight(params, model, state, timing, predicted, likelihood):
+        found = filtering.reweight(params, model, state, timing, predicted, likelihood)
+        return {"found": found}
+
+    def restart(params, model, cloud):
+        restarted, middle, widest = filtering.restart(params, model, cloud)
+        return {"restarted": restarted, "middle": middle, "widest": widest}
+
+    tracer.add("predict", predict, {"state": state, "timing": timing, "normal": cloud})
+    for name, searching in (("track", False), ("search", True)):
+        _add_event(tracer, name, searching, event, cloud, each)
+    tracer.add(
+        "reweight",
+        reweight,
+        {"state": state, "timing": timing, "predicted": cloud, "likelihood": of_batch},
+    )
+    tracer.add("restart", restart, {"cloud": cloud})
+    row_size = BLOCK * -(-params.particles // BLOCK)
+    layout = Layout(tracer.cells, tracer.rows, frozenset(tracer.booleans), row_size)
+    return TracedProgram(tracer.functions, tracer.host, layout, dtype)
+
+
+def _add_event(
+    tracer: FunctionTracer, name: str, searching: bool, event: Any, cloud: Any, each: Any
+) -> None:
+    """Translate the steps of one event: before, for and after its candidates, and of their ages."""
+    key, shape = f"{name}_votes", tracer.shape
+
+    def init(params, model, event, motions, motion_weights):
+        votes = likelihood.init_votes(params, model, event, motions, motion_weights, searching)
+        lag = likelihood.candidate_lag(params, votes.tau)
+        return {key: votes, "counts": votes.counts, "lag": lag}
+
+    def span(params, model, **votes):
+        ages = votes[key].ages
+        return {"youngest": ages.youngest.min(), "oldest": ages.oldest.max()}
+
+    def accumulate(params, model, d, dt, S, **votes):
+        return {"S": likelihood.accumulate_votes(params, d, dt, votes[key], S, searching)}
+
+    def finish(params, model, *, event, S, motion_weights, radius, total, **votes):
+        found = likelihood.event_log_likelihood(
+            params, model, event, votes[key], S, motion_weights, searching=searching, radius=radius
+        )
+        return {"total": total + found.log_likelihood, "votes": found.votes, "chance": found.chance}
+
+    inputs = {"event": event, "motions": cloud, "motion_weights": each}
+    votes = {key: tracer.add(f"{name}_init", init, inputs, alias=True)[key]}
+    tracer.add(f"{name}_span", span, votes)
+    tracer.add(f"{name}_accumulate", accumulate, {"d": shape(2), "dt": shape(), "S": each, **votes})
+    inputs = {"event": event, "S": each, "motion_weights": each, "radius": shape(), "total": each}
+    tracer.add(f"{name}_likelihood", finish, {**inputs, **votes})
+
+
+def write(program: TracedProgram) -> ModuleText:
+    """Write the text of a program's module."""
+    layout = program.layout
+    places, stores = layout.places(), layout.stores()
+    writer, out = Writer(program, places), []
+
+    def body(name: str, indent: int = 4, loop: ElementLoop = LANES) -> str:
+        function = program.functions[name]
+        changed = {
+            key: stores[key]
+            for key, node in function.results.items()
+            if node.op != "input" or places[node.args[0]] != places[key]
+        }
+        return "\n".join(writer.body(name, function, changed, loop, indent))
+
+    for name in ("predict", "reweight", "restart"):
+        out.append(FUNCTION.format(name=name, body=body(name, loop=PARTICLES)))
+    at = {key.partition(".")[0]: n for key, n in layout.cells.items()}
+    for name in ("track", "search"):
+        has_own_ages = any(key.startswith(f"{name}_votes.ages") for key in layout.rows)
+        out.append(
+            EVENT.format(
+                name=name,
+                BLOCK=BLOCK,
+                size="1" if has_own_ages else "count",
+                init=body(f"{name}_init"),
+                span=body(f"{name}_span", 8),
+                accumulate=body(f"{name}_accumulate", 12),
+                likelihood=body(f"{name}_likelihood"),
+                votes_row=layout.rows["S.0"] * layout.row_size,
+                dx=layout.cells["d.0"],
+                dy=layout.cells["d.1"],
+                **{key: at[key] for key in ("counts", "youngest", "oldest", "dt")},
+            )
+        )
+    about = "The functions of voting (`jaxevent.egomotion.particle_filter.engine`)."
+    return writer.module(about, out, layout)
+
+
+_kernels = KernelCache(ModelFunctions, write, max_nodes=MAX_OPERATIONS)
+
+
+class CompiledFilter:
+    """The filter as a kernel, called as `filtering.run`.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+
+    Raises:
+        TranslationError: There is no kernel.
+    """
+
+    def __init__(self, params: Params, model: Model):
+        self.dtype = np.dtype(jnp.result_type(float))
+        fields, kind = jax.tree.flatten(_with_focal_length(model, 1.0))
+        if fields:
+            raise TranslationError("numbers that the model holds")
+        key = kind, jax.tree.structure(params), self.dtype
+        kernel = _kernels.get(key, params, lambda: program_of(params, model, self.dtype))
+        self._functions, self._numbers = kernel.functions, kernel.numbers
+        self._layout, self._count, self._model = kernel.places, params.particles, model
+        of, rows, d = self._layout.rows_of, self._layout.rows, model.dimension
+        self._rows = RowIndices(
+            particles=of("state.particles"),
+            normal=of("normal"),
+            predicted=of("predicted"),
+            motions=of("motions"),
+            cloud=of("cloud"),
+            restarted=of("restarted"),
+            log_weights=rows["state.log_weights.0"],
+            weights=rows["weights.0"],
+            motion_weights=rows["motion_weights.0"],
+            total=rows["total.0"],
+            log_likelihood=rows["likelihood.log_likelihood.0"],
+            new_log_weights=rows["found.log_weights.0"],
+            youngest=rows.get("search_votes.ages.youngest.0", -1),
+            mean=self._report_cells("found.mean", "found.covariance"),
+            widest=self._report_cells("middle", "widest"),
+        )
+        self._nodes = engine_loop.init_interpolation(float(params.off), self._count, d, self.dtype)
+
+    def _report_cells(self, mean: str, covariance: str) -> NDArray[np.int64]:
+        """Return the cells of a mean, and then of a covariance."""
+        d, cells = self._model.dimension, self._layout.cells
+        names = [f"{mean}.{k}" for k in range(d)] + [f"{covariance}.{k}" for k in range(d * d)]
+        return np.array([cells[name] for name in names], np.int64)
+
+    @property
+    def n_interpolated(self) -> int:
+        """Number of batches whose log-likelihoods have been interpolated."""
+        return int(self._nodes.counters[engine_loop.USED])
+
+    def __call__(
+        self, candidates: Candidates, noise: RandomNumbers, state: ParticleState, n_cloud: int = 0
+    ) -> tuple[ParticleState, BatchInfo]:
+        """Run the filter over stacked batches, on the host.
+
+        Args:
+            candidates: Stacked batches.
+            noise: Random numbers.
+            state: State at the start.
+            n_cloud: Number of particles to report for each batch.
+
+        Returns:
+            The state at the end, and the stacked reports.
+        """
+        layout, rows, count = self._layout, self._rows, self._count
+        cells = np.zeros(len(layout.cells), self.dtype)
+        work = np.zeros((1 + max(layout.rows.values()), layout.row_size), self.dtype)
+        work[rows.particles, :count] = np.asarray(state.particles).T
+        work[rows.log_weights, :count] = state.log_weights
+        names = ("searching", "votes", "chance", "mean_contrast", "age")
+        for name in names:
+            cells[layout.cells[f"state.{name}.0"]] = getattr(state, name)
+        cells[layout.cells["f.0"]], cells[engine_loop.RADIUS] = self._model.f, candidates.radius
+        batches = BatchArrays(
+            *(np.asarray(getattr(candidates, name)) for name in BatchArrays._fields[:9]),
+            *map(np.asarray, (noise.normal, noise.uniform, noise.cloud)),
+        )
+        n, d, real = len(batches.elapsed), self._model.dimension, self.dtype
+        out = InfoArrays(
+            mean=np.zeros((n, d), real),
+            covariance=np.zeros((n, d, d), real),
+            searching=np.zeros(n, bool),
+            contrast=np.zeros(n, real),
+            lag=np.zeros(n, real),
+            evidence=np.zeros(n, real),
+            cloud=np.zeros((n, n_cloud, d), real),
+        )
+        memory = Memory(cells, work, self._numbers)
+        engine_loop.run(self._functions, memory, rows, batches, out, self._nodes)
+        after = [
+            work[rows.particles, :count].T.copy(),
+            work[rows.log_weights, :count].copy(),
+            cells[layout.cells["state.searching.0"]] != 0,
+            *(cells[layout.cells[f"state.{name}.0"]] for name in names[1:]),
+        ]
+        return ParticleState(*map(jnp.asarray, after)), BatchInfo(*map(jnp.asarray, out))

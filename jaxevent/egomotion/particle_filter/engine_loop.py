@@ -1,0 +1,465 @@
+"""Loop of the particle filter over batches and events, for the compiled functions of any model.
+
+The loop does what `filtering.run` does. Single numbers are in `cells`, the loop's own first, in the
+order of `CELLS`. Numbers of all particles are rows of `work`. What differs between models are the
+functions of `ModelFunctions`, which `engine` writes, so this module is compiled once.
+
+While the motion is tracked, the log-likelihood of a batch is a smooth function of the motion, a sum
+of logarithms of sums of Gaussians. So it is computed at the k Chebyshev nodes of each component's
+range. For particles it is the polynomial through the nodes, of degree k - 1 in each component. Some
+particles, others in every batch, are scored too, as a check. If one of them deviates by more than
+the bound, all are scored, and after that there are more nodes, or none for some batches.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.codegen import njit, njit_fastmath_inlined, njit_inlined
+
+CELLS = (
+    "event.xi.0", "event.xi.1", "event.bounds.0", "event.bounds.1", "event.bounds.2",
+    "event.bounds.3", "event.valid.0", "event.scale.0", "event.rate.0", "timing.elapsed.0",
+    "timing.history.0", "timing.has_events.0", "counts.0", "lag.0", "votes.0", "chance.0",
+    "likelihood.votes.0", "likelihood.chance.0", "radius.0", "state.searching.0", "state.votes.0",
+    "state.chance.0", "state.mean_contrast.0", "state.age.0", "found.searching.0", "found.votes.0",
+    "found.chance.0", "found.mean_contrast.0", "found.age.0", "found.is_finite.0", "found.lost.0",
+    "found.resample.0", "found.reported_searching.0", "found.contrast.0", "found.evidence.0",
+)  # fmt: skip
+(
+    XI, _, BOUNDS, _, _, _, VALID, SCALE, RATE, ELAPSED, HISTORY, HAS_EVENTS, COUNTS, LAG, VOTES,
+    CHANCE, BATCH_VOTES, BATCH_CHANCE, RADIUS, SEARCHING, _, _, _, _, NEXT_SEARCHING, _, _, _, _,
+    IS_FINITE, LOST, RESAMPLE, REPORTED_SEARCHING, CONTRAST, EVIDENCE,
+) = range(len(CELLS))  # fmt: skip
+N_STATE = 5  # cells of the state, from SEARCHING and from NEXT_SEARCHING on
+
+BLOCK = 16  # motions that are scored together
+MIN_CHECKS = 4  # particles that are scored beside the nodes
+MIN_NODES, MAX_NODES = 3, 7  # of a component
+MAX_FRACTION = 0.6  # of the particles, number of nodes and checks
+REST_BATCHES = 64  # without nodes, after MAX_NODES were too few
+REDUCE_BELOW = 0.05  # of the bound, error at which there may be fewer nodes
+K, WAIT, BATCH, USED = range(4)  # in `Interpolation.counters`
+
+
+class ModelFunctions(NamedTuple):
+    """Compiled functions of a model."""
+
+    predict: Any
+    track: Any
+    search: Any
+    reweight: Any
+    restart: Any
+
+
+class RowIndices(NamedTuple):
+    """Rows of `work` that the loop reads and writes, and cells of the report."""
+
+    particles: NDArray[np.int64]
+    normal: NDArray[np.int64]
+    predicted: NDArray[np.int64]
+    motions: NDArray[np.int64]  # that are scored: particles, or nodes and checks
+    cloud: NDArray[np.int64]
+    restarted: NDArray[np.int64]
+    log_weights: int
+    weights: int
+    motion_weights: int
+    total: int  # log-likelihood of motions
+    log_likelihood: int  # of particles
+    new_log_weights: int
+    youngest: int  # ages of the motions of a search; -1: they are all the same
+    mean: NDArray[np.int64]  # cells, of the mean and then of the covariance
+    widest: NDArray[np.int64]
+
+
+class BatchArrays(NamedTuple):
+    """The arrays of `Candidates`, and random numbers."""
+
+    d: NDArray  # (batches, K, C, 2)
+    age: NDArray
+    xi: NDArray
+    bounds: NDArray
+    valid: NDArray[np.bool_]
+    scale: NDArray
+    rate: NDArray
+    elapsed: NDArray
+    history: NDArray
+    normal: NDArray
+    uniform: NDArray
+    cloud: NDArray
+
+
+class InfoArrays(NamedTuple):
+    """The arrays of `filtering.BatchInfo`, to be filled."""
+
+    mean: NDArray
+    covariance: NDArray
+    searching: NDArray[np.bool_]
+    contrast: NDArray
+    lag: NDArray
+    evidence: NDArray
+    cloud: NDArray
+
+
+class Memory(NamedTuple):
+    """Numbers of the compiled functions."""
+
+    cells: NDArray  # single numbers
+    work: NDArray  # (rows, particles)
+    numbers: NDArray[np.float64]  # of the parameters
+
+
+class Interpolation(NamedTuple):
+    """State of the interpolation of log-likelihoods, and scratch memory."""
+
+    bound: float  # largest error of a weight, relative to the largest; 0: no interpolation
+    # Nodes of a component, batches to wait, batches so far, and batches with nodes.
+    counters: NDArray[np.int64]
+    basis: NDArray  # (d, MAX_NODES, N) polynomial of each node of a component at the particles
+    product: NDArray  # (N,) scratch
+    checked: NDArray[np.int64]  # particles
+
+
+class Context(NamedTuple):
+    """Everything that the parts of the loop share."""
+
+    functions: ModelFunctions
+    pointers: Any
+    rows: RowIndices
+    batches: BatchArrays
+    cells: NDArray
+    work: NDArray
+
+
+def init_interpolation(
+    bound: float, particles: int, dimension: int, dtype: np.dtype
+) -> Interpolation:
+    """Start with the fewest nodes.
+
+    Args:
+        bound: Largest error of a weight, relative to the largest.
+        particles: Number of particles, N.
+        dimension: Number of components, d.
+        dtype: Type of real numbers.
+
+    Returns:
+        The state.
+    """
+    basis, product = np.zeros((dimension, MAX_NODES, particles), dtype), np.zeros(particles, dtype)
+    checked = np.zeros(BLOCK + MIN_CHECKS, np.int64)
+    return Interpolation(bound, np.array([MIN_NODES, 0, 0, 0]), basis, product, checked)
+
+
+@njit
+def run(functions, memory, rows, batches, out, nodes):
+    """Run the filter over batches; `memory` holds the state, before and afterwards."""
+    cells, work, numbers = memory
+    chosen = np.empty(batches.age.shape[2] + 1, np.int64)
+    pointers = (
+        cells.ctypes, work.ctypes, numbers.ctypes, batches.d.ctypes, batches.age.ctypes,
+        chosen.ctypes,
+    )  # fmt: skip
+    context = Context(functions, pointers, rows, batches, cells, work)
+    count = batches.normal.shape[1]
+    for b in range(len(batches.elapsed)):
+        cells[ELAPSED], cells[HISTORY] = batches.elapsed[b], batches.history[b]
+        cells[HAS_EVENTS] = batches.valid[b].any()
+        for k in range(len(rows.normal)):
+            for i in range(count):
+                work[rows.normal[k], i] = batches.normal[b, i, k]
+        functions.predict(*pointers[:3], count)
+        out.lag[b] = _score(context, b, nodes)
+        functions.reweight(*pointers[:3], count)
+        if cells[LOST] != 0:
+            for k in range(len(rows.cloud)):
+                for i in range(count):
+                    work[rows.cloud[k], i] = batches.cloud[i, k]
+            functions.restart(*pointers[:3], count)
+        _report(context, b, out)
+        _resample(context, batches.uniform[b])
+        for k in range(N_STATE):
+            cells[SEARCHING + k] = cells[NEXT_SEARCHING + k]
+
+
+@njit_inlined
+def _score(context, b, nodes):
+    """Compute the log-likelihoods of a batch for all particles, into their row; return the lag."""
+    rows, cells, work = context.rows, context.cells, context.work
+    count = context.batches.normal.shape[1]
+    searching, d = cells[SEARCHING] != 0, len(rows.predicted)
+    if cells[HAS_EVENTS] == 0:
+        cells[BATCH_VOTES] = cells[BATCH_CHANCE] = 0
+        work[rows.log_likelihood, :count] = 0
+        return cells[BATCH_VOTES]
+    if not searching and _can_interpolate(nodes, d, count):
+        lanes = _place_nodes(nodes, work, rows, count)
+        lag = _score_events(context, b, lanes)
+        if _interpolate(nodes, work, rows, lanes, count):
+            return lag
+    order = np.arange(work.shape[1])
+    if rows.youngest >= 0 and searching:
+        _place_particles(rows, work, order, count)
+        cells[VALID] = 0
+        _score_event(context, b, 0, len(order) // BLOCK)
+        _sort(order[:count], work[rows.youngest])
+    _place_particles(rows, work, order, count)
+    lag = _score_events(context, b, len(order))
+    for i in range(count):
+        work[rows.log_likelihood, order[i]] = work[rows.total, i]
+    return lag
+
+
+@njit_inlined
+def _place_particles(rows, work, order, count):
+    """Copy particles in an order to the motions; the last is repeated, without weight."""
+    for i in range(work.shape[1]):
+        particle = order[min(i, count - 1)]
+        for k in range(len(rows.motions)):
+            work[rows.motions[k], i] = work[rows.predicted[k], particle]
+        work[rows.motion_weights, i] = work[rows.weights, particle] if i < count else 0
+
+
+@njit_inlined
+def _sort(order, values):
+    """Order numbers by their values, smallest first, by Shell's method."""
+    gap = len(order) // 2
+    while gap > 0:
+        for i in range(gap, len(order)):
+            one, j = order[i], i
+            while j >= gap and values[order[j - gap]] > values[one]:
+                order[j] = order[j - gap]
+                j -= gap
+            order[j] = one
+        gap //= 2
+
+
+@njit_inlined
+def _score_events(context, b, lanes):
+    """Sum the log-likelihoods of a batch's events for some motions; return the mean lag."""
+    cells, batches = context.cells, context.batches
+    context.work[context.rows.total, :lanes] = 0
+    cells[BATCH_VOTES] = cells[BATCH_CHANCE] = 0
+    lag, valid = cells[BATCH_VOTES], 0
+    for e in range(batches.age.shape[1]):
+        if not batches.valid[b, e]:
+            continue
+        valid += 1
+        cells[VALID] = 1
+        _score_event(context, b, e, lanes // BLOCK)
+        lag += cells[LAG]
+        cells[BATCH_VOTES] += cells[VOTES]
+        cells[BATCH_CHANCE] += cells[CHANCE]
+    return lag / cells.dtype.type(max(valid, 1))
+
+
+@njit_inlined
+def _score_event(context, b, e, blocks):
+    """Add the log-likelihoods of an event for some blocks of motions."""
+    cells, batches, functions = context.cells, context.batches, context.functions
+    most = batches.age.shape[2]
+    cells[XI], cells[XI + 1] = batches.xi[b, e, 0], batches.xi[b, e, 1]
+    for k in range(4):
+        cells[BOUNDS + k] = batches.bounds[b, e, k // 2, k % 2]
+    cells[SCALE], cells[RATE] = batches.scale[b, e], batches.rate[b, e]
+    cells[VOTES] = cells[CHANCE] = 0
+    first = (b * batches.age.shape[1] + e) * most
+    if cells[SEARCHING] != 0:
+        functions.search(*context.pointers, blocks, first, most)
+    else:
+        functions.track(*context.pointers, blocks, first, most)
+
+
+@njit_inlined
+def _report(context, b, out):
+    """Report a batch, before resampling."""
+    rows, cells, work = context.rows, context.cells, context.work
+    d, is_finite = out.mean.shape[1], cells[IS_FINITE] != 0
+    source = rows.mean if is_finite else rows.widest
+    for k in range(d):
+        out.mean[b, k] = cells[source[k]]
+        for j in range(d):
+            out.covariance[b, k, j] = cells[source[d + k * d + j]]
+    out.searching[b] = cells[REPORTED_SEARCHING] != 0
+    out.contrast[b], out.evidence[b] = cells[CONTRAST], cells[EVIDENCE]
+    if is_finite and out.cloud.shape[1]:
+        count = context.batches.normal.shape[1]
+        drawn = np.empty(out.cloud.shape[1], np.int64)
+        _draw(work[rows.new_log_weights], drawn, cells.dtype.type(0.5), count)
+        for i in range(len(drawn)):
+            for k in range(d):
+                out.cloud[b, i, k] = work[rows.predicted[k], drawn[i]]
+
+
+@njit_inlined
+def _resample(context, uniform):
+    """Write the particles of the state, and their weights."""
+    rows, cells, work = context.rows, context.cells, context.work
+    count = context.batches.normal.shape[1]
+    equal = cells.dtype.type(-np.log(count))
+    if cells[LOST] != 0 or cells[RESAMPLE] != 0:
+        drawn = np.arange(count)
+        source = rows.restarted
+        if cells[LOST] == 0:
+            _draw(work[rows.new_log_weights], drawn, uniform, count)
+            source = rows.predicted
+        for k in range(len(source)):
+            for i in range(count):
+                work[rows.particles[k], i] = work[source[k], drawn[i]]
+        work[rows.log_weights, :count] = equal
+    else:
+        for k in range(len(rows.predicted)):
+            _copy(work[rows.predicted[k]], work[rows.particles[k]], count)
+        _copy(work[rows.new_log_weights], work[rows.log_weights], count)
+
+
+@njit_inlined
+def _copy(source, out, count):
+    """Copy numbers; numba takes over a second to compile a copy of slices."""
+    for i in range(count):
+        out[i] = source[i]
+
+
+@njit_inlined
+def _draw(log_weights, drawn, uniform, count):
+    """Draw particles at equal steps of their summed weights."""
+    edges = np.empty(count, log_weights.dtype)
+    total = log_weights.dtype.type(0)
+    for i in range(count):
+        total += np.exp(log_weights[i])
+        edges[i] = total
+    step, at = total / log_weights.dtype.type(len(drawn)), 0
+    for i in range(len(drawn)):
+        point = (log_weights.dtype.type(i) + uniform) * step
+        while at < count - 1 and edges[at] <= point:
+            at += 1
+        drawn[i] = at
+
+
+@njit_inlined
+def _count_lanes(nodes, dimension):
+    """Return the number of nodes and checks together."""
+    number = nodes.counters[K] ** dimension
+    return (number + MIN_CHECKS + BLOCK - 1) // BLOCK * BLOCK
+
+
+@njit_inlined
+def _can_interpolate(nodes, dimension, count):
+    """Count a batch; return whether it may have nodes, and these are fewer than particles."""
+    nodes.counters[BATCH] += 1
+    if nodes.counters[WAIT] > 0:
+        nodes.counters[WAIT] -= 1
+        return False
+    return nodes.bound > 0 and _count_lanes(nodes, dimension) <= MAX_FRACTION * count
+
+
+@njit_inlined
+def _place_nodes(nodes, work, rows, count):
+    """Write nodes, and particles that check them, to the motions; return their number.
+
+    The weight of a node is the sum of its polynomial over the weighted particles.
+    """
+    motions, predicted, weights = rows.motions, rows.predicted, rows.motion_weights
+    real, d, k = work.dtype.type, len(predicted), nodes.counters[K]
+    number, lanes = k**d, _count_lanes(nodes, d)
+    for c in range(d):
+        row = work[predicted[c]]
+        low, high = row[0], row[0]
+        for i in range(count):
+            low = min(low, row[i])
+            high = max(high, row[i])
+        middle, half = (low + high) / real(2), (high - low) / real(2)
+        half = half if half > 0 else real(1)
+        for i in range(number):
+            work[motions[c], i] = middle + half * real(_chebyshev(k, i // k ** (d - 1 - c) % k))
+        for j in range(k):
+            _fill_basis(nodes.basis[c, j], row, middle, half, k, real(_chebyshev(k, j)))
+    for i in range(number, lanes):
+        particle = ((i - number) * count // (lanes - number) + nodes.counters[BATCH]) % count
+        nodes.checked[i - number] = particle
+        for c in range(d):
+            work[motions[c], i] = work[predicted[c], particle]
+    work[weights, :lanes] = 0
+    for j in range(number):
+        _fill_product(nodes, j, d)
+        work[weights, j] = _dot(nodes.product, work[rows.weights], count)
+    return lanes
+
+
+@njit_inlined
+def _interpolate(nodes, work, rows, lanes, count):
+    """Interpolate particles' log-likelihoods; return whether the checks are within the bound."""
+    of_particles, of_motions, d = rows.log_likelihood, rows.total, len(rows.motions)
+    number = nodes.counters[K] ** d
+    work[of_particles, :count] = 0
+    for j in range(number):
+        _fill_product(nodes, j, d)
+        _add_product(work[of_particles], nodes.product, work[of_motions, j], count)
+    top, before = -np.inf, work[rows.log_weights]
+    for i in range(number, lanes):
+        top = max(top, before[nodes.checked[i - number]] + work[of_motions, i])
+    error = 0.0
+    for i in range(number, lanes):
+        c = nodes.checked[i - number]
+        weight = np.exp(before[c] + work[of_motions, i] - top)
+        off = abs(np.exp(before[c] + work[of_particles, c] - top) - weight)
+        error = max(error, off) if off == off else np.inf
+    fits = error <= nodes.bound
+    if fits:
+        nodes.counters[USED] += 1
+        if error <= REDUCE_BELOW * nodes.bound and nodes.counters[K] > MIN_NODES:
+            nodes.counters[K] -= 1
+    else:
+        nodes.counters[K] += 1
+        if nodes.counters[K] > MAX_NODES or _count_lanes(nodes, d) > MAX_FRACTION * count:
+            nodes.counters[K] -= 1
+            nodes.counters[WAIT] = REST_BATCHES
+    return fits
+
+
+@njit_inlined
+def _chebyshev(k, j):
+    """Return node j of the k Chebyshev nodes on [-1, 1]."""
+    return np.cos((2 * j + 1) * np.pi / (2 * k))
+
+
+@njit_fastmath_inlined
+def _fill_basis(basis, row, middle, half, k, z):
+    """Evaluate Lagrange's polynomial of a node z at particles y: 2 / k sum_m' T_m(z) T_m(y)."""
+    real = row.dtype.type
+    for i in range(len(basis)):
+        y = (row[i] - middle) / half
+        before, now, of_before, of_now = real(1), y, real(1), z
+        total = real(0.5)
+        for _ in range(1, k):
+            total += now * of_now
+            before, now = now, real(2) * y * now - before
+            of_before, of_now = of_now, real(2) * z * of_now - of_before
+        basis[i] = total * real(2) / real(k)
+
+
+@njit_fastmath_inlined
+def _fill_product(nodes, j, d):
+    """Multiply the polynomials of the components of node j."""
+    k = nodes.counters[K]
+    product, one = nodes.product, nodes.basis[d - 1, j % k]
+    for i in range(len(product)):
+        product[i] = one[i]
+    for c in range(d - 1):
+        one = nodes.basis[c, j // k ** (d - 1 - c) % k]
+        for i in range(len(product)):
+            product[i] *= one[i]
+
+
+@njit_fastmath_inlined
+def _dot(one, other, count):
+    total = one.dtype.type(0)
+    for i in range(count):
+        total += one[i] * other[i]
+    return total
+
+
+@njit_fastmath_inlined
+def _add_product(out, product, value, count):
+    for i in range(count):
+        out[i] += product[i] * value
