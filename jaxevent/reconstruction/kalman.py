@@ -41,9 +41,9 @@ class Params(AugmentParams):
         "added to ln I of frames for noise (6): the frame rate; -1 as the paper prints it",
     )
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
-    above = Number(0.0, "ln I", "how far above the bound of clipping saturated pixels start")
-    below = Number(0.0, "ln I", "how far below the bound of clipping black pixels start")
-    one_sided = Choice((False, True), "whether clipped frames tell that L lies beyond the clip")
+    above = Number(0.0, "ln I", "initial distance of saturated pixels above the clipping bound")
+    below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
+    one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
     clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
 
     presets = {

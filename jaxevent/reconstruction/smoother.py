@@ -59,7 +59,7 @@ from jaxevent.reconstruction.features import (
 class Params(CertaintyParams):
     """Parameters of the smoother."""
 
-    sigma_event = Positive(0.3, "c", "noise of an event's step, as part of its threshold")
+    sigma_event = Positive(0.3, "c", "noise of an event's step, relative to its threshold")
     sigma_bg = Positive(0.25, "ln I / sqrt(s)", "drift without events")
     sigma_frame = Positive(0.007, "intensity", "noise of frames where the certainty w is 1")
     sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
@@ -78,7 +78,7 @@ class Params(CertaintyParams):
         },
     }
 
-    share = Positive(0.5, "1", "part of an event's change that belongs to its 8 neighbours")
+    share = Positive(0.5, "1", "fraction of an event's change that belongs to its 8 neighbours")
     spread = Positive(
         0.0,
         "s",
@@ -86,7 +86,7 @@ class Params(CertaintyParams):
         gradient=False,
         most=1e6,
     )
-    one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
+    one_sided = Choice((True, False), "use clipped frames as evidence that L lies beyond the clip")
 
 
 class Gaussian(eqx.Module):
@@ -686,7 +686,8 @@ class Smoother(KernelEstimator[Params]):
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
         """Return the steps of `run` and `read` at one pixel, for kernels.
 
-        See `engine.smoother_program`. They are functions of parameters, of what depends on these alone, and of numbers by name.
+        See `engine.smoother_program`. They are functions of parameters, of what depends on these
+        alone, and of numbers by name.
         """
 
         def lag(known):
