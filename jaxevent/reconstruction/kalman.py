@@ -129,13 +129,13 @@ class AugmentedFrameModel(FrameModel):
             self.image = FrameInterpolation(params, frames, jnp.asarray(frames.intensity))
             self.density = FrameInterpolation(params, frames, Rbar)
         side = clipped_side(params, frames)
-        # A clipped value tells its side, no more: dark ones differ by how noise is rounded.
+        # A clipped value gives its side alone: dark ones differ by the rounding of noise.
         edge = clipping_bound(params, frames)
         self.clipped = abs(side)
         self.begin = edge + jnp.where(side > 0, params.above, -params.below)
         self.bound = self.push = None
         if params.one_sided:
-            # What both frames of a gap say; where one is not clipped, events tell when it began.
+            # Both frames of a gap are needed: where one is not clipped, events show when it began.
             following = jnp.roll(side, -1, axis=0)
             both = jnp.where(side * following > 0, jnp.minimum(abs(side), abs(following)), 0)
             self.bound = edge
