@@ -22,6 +22,11 @@ RENAMED: dict[str, str] = {
     "jaxevent.arrays.find": "jaxevent.arrays.find_fields",
     "jaxevent.arrays.grey_of": "jaxevent.arrays.to_grey",
     "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
+    "jaxevent.blob.filter.Batch": "jaxevent.blob.filter.EventBatch",
+    "jaxevent.blob.filter.Expected": "jaxevent.blob.filter.PredictedMeasurement",
+    "jaxevent.blob.filter.choose": "jaxevent.blob.filter.where_tree",
+    "jaxevent.blob.losses.Positions": "jaxevent.blob.losses.PositionBatch",
+    "jaxevent.blob.tracks.Events": "jaxevent.blob.tracks.AssociatedEvents",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
     "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
@@ -222,6 +227,11 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.blob.association": "jaxevent.blob.filter",
+    "jaxevent.blob.filters.ellipse": "jaxevent.blob.filters.motion",
+    "jaxevent.blob.states": "jaxevent.blob.track",
+    "jaxevent.blob.steps": "jaxevent.blob.filter",
+    "jaxevent.blob.tables": "jaxevent.blob.tracks",
     "jaxevent.egomotion.choice": "jaxevent.egomotion.model_selection",
     "jaxevent.egomotion.field": "jaxevent.egomotion.flow",
     "jaxevent.egomotion.layers": "jaxevent.egomotion.patches",
@@ -249,6 +259,11 @@ MOVED_MODULES: dict[str, str] = {
     "jaxevent.reconstruction.fused.video": "jaxevent.reconstruction.engine.images",
     "jaxevent.reconstruction.prepared": "jaxevent.reconstruction.estimator",
     "jaxevent.sharing": "jaxevent.locks",
+    "jaxevent.show.motion_pictures": "jaxevent.show.motion_figures",
+    "jaxevent.show.notebook": "jaxevent.show.figures",
+    "jaxevent.show.report": "jaxevent.show.tables",
+    "jaxevent.show.track_pictures": "jaxevent.show.track_figures",
+    "jaxevent.show.track_plots": "jaxevent.show.track_figures",
     "jaxevent.shown": "jaxevent.display",
 }
 

@@ -19,7 +19,7 @@ import jaxevent
 from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
 from jaxevent.cli import motion as command
-from jaxevent.egomotion import choice, voting
+from jaxevent.egomotion import model_selection, voting
 from jaxevent.egomotion.estimator import AdaptedParams, MotionEstimator
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import MotionEstimate
@@ -32,7 +32,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.parameters import read_toml
 from jaxevent.recording import Events, Frames, Imu, Recording
 from jaxevent.show import motion as pictures
-from jaxevent.show.motion_pictures import warped_events
+from jaxevent.show.motion_figures import warped_events
 from jaxevent.simulate import motion_scene
 
 pytestmark = pytest.mark.slow
@@ -401,8 +401,8 @@ def test_nothing_found_is_said(tmp_path, capsys, monkeypatch):
     truth = ["--truth", tmp_path / "true.csv"]
     # Without --model it is chosen; nothing is seen to move here.
     fails(capsys, ["motion", tmp_path / "stray.h5", "--out", tmp_path / "out"], "stray.h5", "move")
-    chosen = choice.Choice(Planar, ("planar explains it",), {})
-    monkeypatch.setattr(choice, "choose", lambda recording: chosen)
+    chosen = model_selection.ModelSelection(Planar, ("planar explains it",), {})
+    monkeypatch.setattr(model_selection, "select_model", lambda recording: chosen)
     run(tmp_path, tmp_path / "stray.h5", "--flow", *truth)
     said = capsys.readouterr().out
     assert said.startswith("planar explains it\n") and "never found" in said
