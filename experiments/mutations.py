@@ -47,7 +47,7 @@ MUTATIONS = (
     Mutation(
         "AKF: the bound of the refractory period is left out",
         "jaxevent/reconstruction/kalman.py",
-        "return Q_proc + Q_iso + params.sigma_ref**2 * within(params, event.since)",
+        "return Q_proc + Q_iso + params.sigma_ref**2 * refractory_indicator(params, event.since)",
         "return Q_proc + Q_iso",
         f"{CHAIN} -k akf",
     ),
@@ -68,8 +68,8 @@ MUTATIONS = (
     Mutation(
         "a dead time is not made good",
         "jaxevent/reconstruction/augment.py",
-        "return brightness(params, polarity > 0, polarity < 0) * jnp.where(rho > 0, events, 1)",
-        "return brightness(params, polarity > 0, polarity < 0)",
+        "polarity < 0) * jnp.where(rho > 0, events, 1)",
+        "polarity < 0)",
         f"{CHAIN} -k cf",
     ),
     Mutation(
@@ -82,7 +82,7 @@ MUTATIONS = (
     Mutation(
         "threads read one video at the same time",
         "jaxevent/reconstruction/video.py",
-        "self._turns.each(self._read(times))",
+        "self._turns.iterate(self._read(times))",
         "self._read(times)",
         "tests/test_threads.py -k shared_video",
     ),

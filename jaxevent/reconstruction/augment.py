@@ -31,14 +31,14 @@ class FrameParams(Parameters):
     clock_offset = Number(
         0.0, "s", "added to the frames' time stamps", gradient=False, least=-1e10, most=1e10
     )
-    deblur = Choice((True, False), "whether events within an exposure sharpen its frame")
+    deblur = Choice((True, False), "deblur frames by the events within their exposures")
     exposure = Positive(
         0.0, "s", "exposure of frames whose own is not known", gradient=False, most=1e6
     )
     rho_ref = Positive(
         0.0,
         "s",
-        "dead time of a pixel after an event, its change made good",
+        "dead time of a pixel after an event; lost events are compensated",
         gradient=False,
         most=1e6,
     )
@@ -48,7 +48,7 @@ class CertaintyParams(FrameParams):
     """Parameters of the certainty of frames (4), as far as the response leaves it open."""
 
     w_min = Positive(
-        0.09, "1", "least certainty w of frames, of dark and saturated pixels", least=1e-9
+        0.09, "1", "least certainty w of frames, and that of clipped pixels", least=1e-9
     )
     margin = Positive(0.0, "grey / 255", "distance from black and white within which frames clip")
     certainty = Positive(
@@ -59,18 +59,18 @@ class CertaintyParams(FrameParams):
 class AugmentParams(CertaintyParams):
     """Parameters of the augmented frame: calibrated contrasts (10), weights of two frames."""
 
-    calibrate = Choice((True, False), "whether each pixel's threshold is fitted between frames")
+    calibrate = Choice((True, False), "fit each pixel's threshold between frames")
     ratio_min = Positive(
-        0.01, "1", "smallest calibrated over nominal threshold that is believed", gradient=False
+        0.01, "1", "smallest accepted ratio of calibrated to nominal threshold", gradient=False
     )
     ratio_max = Positive(
-        1 / 0.6, "1", "largest calibrated over nominal threshold believed", gradient=False
+        1 / 0.6, "1", "largest accepted ratio of calibrated to nominal threshold", gradient=False
     )
     ratio_width = Positive(
-        0.4, "1", "width about both bounds in which belief fades; 0: hard bounds", gradient=False
+        0.4, "1", "width about both bounds over which ratios fade to 1; 0: hard", gradient=False
     )
     weighting = Choice(
-        ("linear", "certainty"), "of two frames between them: by time alone, or by certainty too"
+        ("linear", "certainty"), "weights of two frames between them: by time, or by certainty too"
     )
 
 

@@ -41,9 +41,9 @@ class Params(AugmentParams):
         "added to ln I of frames for noise (6): the frame rate; -1 as the paper prints it",
     )
     P0 = Positive(0.09, "(ln I)^2", "variance at the start")
-    above = Number(0.0, "ln I", "how far above the bound of clipping saturated pixels start")
-    below = Number(0.0, "ln I", "how far below the bound of clipping black pixels start")
-    one_sided = Choice((False, True), "whether clipped frames tell that L lies beyond the clip")
+    above = Number(0.0, "ln I", "initial distance of saturated pixels above the clipping bound")
+    below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
+    one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
     clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
 
     presets = {
@@ -129,13 +129,13 @@ class AugmentedFrameModel(FrameModel):
             self.image = FrameInterpolation(params, frames, jnp.asarray(frames.intensity))
             self.density = FrameInterpolation(params, frames, Rbar)
         side = clipped_side(params, frames)
-        # A clipped value tells its side, no more: dark ones differ by how noise is rounded.
+        # A clipped value gives its side alone: dark ones differ by the rounding of noise.
         edge = clipping_bound(params, frames)
         self.clipped = abs(side)
         self.begin = edge + jnp.where(side > 0, params.above, -params.below)
         self.bound = self.push = None
         if params.one_sided:
-            # What both frames of a gap say; where one is not clipped, events tell when it began.
+            # Both frames of a gap are needed: where one is not clipped, events show when it began.
             following = jnp.roll(side, -1, axis=0)
             both = jnp.where(side * following > 0, jnp.minimum(abs(side), abs(following)), 0)
             self.bound = edge

@@ -166,8 +166,8 @@ class LiveVideo:
         start, stop = self.start, self.stop
         if len(us) and not start <= us.min() <= us.max() <= stop:
             raise InputError(
-                f"images from {us.min()} to {us.max()} us were asked for; those from {start} to "
-                f"{stop} us can be had, earlier ones are forgotten and later ones not known"
+                f"images from {us.min()} to {us.max()} us are not available, but from {start} to "
+                f"{stop} us; earlier ones are forgotten and later ones not known"
             )
         return self._updated_video()(us)
 

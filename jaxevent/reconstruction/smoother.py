@@ -59,7 +59,7 @@ from jaxevent.reconstruction.features import (
 class Params(CertaintyParams):
     """Parameters of the smoother."""
 
-    sigma_event = Positive(0.3, "c", "noise of an event's step, as part of its threshold")
+    sigma_event = Positive(0.3, "c", "noise of an event's step, relative to its threshold")
     sigma_bg = Positive(0.25, "ln I / sqrt(s)", "drift without events")
     sigma_frame = Positive(0.007, "intensity", "noise of frames where the certainty w is 1")
     sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
@@ -78,7 +78,7 @@ class Params(CertaintyParams):
         },
     }
 
-    share = Positive(0.5, "1", "part of an event's change that belongs to its 8 neighbours")
+    share = Positive(0.5, "1", "fraction of an event's change that belongs to its 8 neighbours")
     spread = Positive(
         0.0,
         "s",
@@ -86,7 +86,7 @@ class Params(CertaintyParams):
         gradient=False,
         most=1e6,
     )
-    one_sided = Choice((True, False), "whether clipped frames tell that L lies beyond the clip")
+    one_sided = Choice((True, False), "use clipped frames as evidence that L lies beyond the clip")
 
 
 class Gaussian(eqx.Module):
@@ -193,7 +193,7 @@ class SmoothedWindow(ShortRepr):
     first: Message  # (pixels,), at the first frame, of everything
     events: Float[Array, "2 frames pixels"]  # ON, OFF, from the frame to the next
     frames: FrameFeatures
-    kept: Any  # [frames, pixels], what else images need to know of frames
+    info: Any  # [frames, pixels], what else images need to know of frames
     link: MessageMap  # from the last frame of this window to the last one of the window before
     last: Message  # (pixels,), of the last frame and all later ones
     log_likelihood: Float[Array, " frames"]  # of the frames, a sum over pixels
@@ -383,12 +383,12 @@ def frame_update(
     # Of the intensity, not of its logarithm, whose density depends on I0: p(I) = p(z) dz/dI.
     log_gauss = -0.5 * (jnp.log(2 * jnp.pi * s2) + (row.z - state.m) ** 2 / s2)
     log_gauss = log_gauss + jnp.log(row.slope)
-    said, log_side = one_sided_message(state, row, params.sigma_floor**2)
-    said = said + Message(J * row.z, J)
-    P = state.P / (1 + state.P * said.J)
+    message, log_side = one_sided_message(state, row, params.sigma_floor**2)
+    message = message + Message(J * row.z, J)
+    P = state.P / (1 + state.P * message.J)
     # m + P (h - J m) is the information form's mean without its cancellation.
-    m = state.m + P * (said.h - said.J * state.m)
-    return Gaussian(m, P), said, row.clear * log_gauss + log_side
+    m = state.m + P * (message.h - message.J * state.m)
+    return Gaussian(m, P), message, row.clear * log_gauss + log_side
 
 
 def init(params: Params) -> Gaussian:
@@ -459,20 +459,20 @@ def filter_forward(params: Params, rows: FrameSteps, state: Gaussian) -> tuple[A
     """
 
     def step(at: Gaussian, row: FrameSteps) -> tuple[Gaussian, Any]:
-        after, said, log_likelihood = frame_update(params, at, row.measured)
-        return Gaussian(after.m + row.S, after.P + row.q), (at, after, said, log_likelihood)
+        after, message, log_likelihood = frame_update(params, at, row.measured)
+        return Gaussian(after.m + row.S, after.P + row.q), (at, after, message, log_likelihood)
 
     return lax.scan(step, state, rows)[1]
 
 
 def filter_backward(
-    rows: FrameSteps, said: Message, last: Message, number: Any
+    rows: FrameSteps, message: Message, last: Message, number: Any
 ) -> tuple[Message, Message]:
     """Run the information filter backwards over frames.
 
     Args:
         rows: Frames, arrays [frames, pixels].
-        said: Messages of the frames.
+        message: Messages of the frames.
         last: Message of the last of the `number` frames and all later ones.
         number: Number of frames.
 
@@ -486,16 +486,18 @@ def filter_backward(
         return jax.tree.map(lambda a, b: jnp.where(i == number - 1, a, b), last, here), later
 
     zero = jnp.zeros_like(rows.S[0])
-    steps = (jnp.arange(len(rows.S)), said, rows.S, rows.q)
+    steps = (jnp.arange(len(rows.S)), message, rows.S, rows.q)
     return lax.scan(step, Message(zero, zero), steps, reverse=True)
 
 
-def compose_message_maps(rows: FrameSteps, said: Message, anchor: Any, number: Any) -> MessageMap:
+def compose_message_maps(
+    rows: FrameSteps, message: Message, anchor: Any, number: Any
+) -> MessageMap:
     """Compose the maps from the last of the `number` frames to the frame `anchor`.
 
     Args:
         rows: Frames, arrays [frames, pixels].
-        said: Messages of the frames.
+        message: Messages of the frames.
         anchor: Row of the frame at which the map ends.
         number: Number of frames.
 
@@ -510,7 +512,7 @@ def compose_message_maps(rows: FrameSteps, said: Message, anchor: Any, number: A
         return jax.tree.map(lambda a, b: jnp.where(inside, a, b), longer, link), None
 
     zero, one = jnp.zeros_like(rows.S[0]), jnp.ones_like(rows.S[0])
-    steps = (jnp.arange(len(rows.S)), said, rows.S, rows.q)
+    steps = (jnp.arange(len(rows.S)), message, rows.S, rows.q)
     return lax.scan(step, MessageMap(one, zero, zero, zero, zero), steps)[0]
 
 
@@ -593,13 +595,13 @@ class Smoother(KernelEstimator[Params]):
         """
         return ()
 
-    def readout(self, params: Params, state: Gaussian, kept: Any, here: Array) -> Estimate:
+    def readout(self, params: Params, state: Gaussian, info: Any, here: Array) -> Estimate:
         """Make images of smoothed states.
 
         Args:
             params: Parameters.
             state: Smoothed states (times, pixels).
-            kept: `frame_info` of the frames before.
+            info: `frame_info` of the frames before.
             here: Whether the time is the middle of the exposure of the frame before.
 
         Returns:
@@ -634,17 +636,17 @@ class Smoother(KernelEstimator[Params]):
         rows, counts = make_frame_steps(params, frames)
         state = self.init_state(params, features) if state is None else state
         number, anchor, onward = frames.rows
-        ahead, past, said, likelihood = filter_forward(params, rows, state)
-        last = jax.tree.map(lambda v: v[number - 1], said) if future is None else future
-        first, later = filter_backward(rows, said, last, number)
-        link = compose_message_maps(rows, said, anchor, number)
+        ahead, past, message, likelihood = filter_forward(params, rows, state)
+        last = jax.tree.map(lambda v: v[number - 1], message) if future is None else future
+        first, later = filter_backward(rows, message, last, number)
+        link = compose_message_maps(rows, message, anchor, number)
         first = first + state_to_message(state)
         events = None
         if frames.head is not None and frames.tail is not None:
             events = (jnp.asarray(frames.head) + frames.tail).sum(0)
-        kept = self.frame_info(params, frames, rows.measured, events)
+        info = self.frame_info(params, frames, rows.measured, events)
         window = SmoothedWindow(
-            past, later, first, counts, frames, kept, link, last, likelihood.sum(1)
+            past, later, first, counts, frames, info, link, last, likelihood.sum(1)
         )
         return window, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
 
@@ -662,13 +664,13 @@ class Smoother(KernelEstimator[Params]):
         precision = jnp.where(behind, 0, 1 / jnp.where(behind, 1, trajectory.past.P[f] + q))
         # Times are whole microseconds, the middle of an exposure may lie up to one before.
         here = ~behind & (jnp.asarray(points.elapsed)[:, None] < 1e-6)
-        kept = jax.tree.map(lambda v: v[f], trajectory.kept)
-        return self.readout(params, combine(m, precision, later), kept, here)
+        info = jax.tree.map(lambda v: v[f], trajectory.info)
+        return self.readout(params, combine(m, precision, later), info, here)
 
     def pixel_state_spec(self, number: Array) -> dict[str, Any]:
         """Return the pytrees that `pixel_functions` refer to, every leaf the given number."""
-        state, said = Gaussian(number, number), Message(number, number)
-        return {"state": state, "said": said, "link": MessageMap(*[number] * 5)}
+        state, message = Gaussian(number, number), Message(number, number)
+        return {"state": state, "message": message, "link": MessageMap(*[number] * 5)}
 
     def apply_message_map(self, link: NDArray, later: NDArray) -> NDArray:
         """Return the message before several frames, as numbers for kernels.
@@ -686,8 +688,8 @@ class Smoother(KernelEstimator[Params]):
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
         """Return the steps of `run` and `read` at one pixel, for kernels.
 
-        See `engine.smoother_program`. They are functions of parameters, of quantities that depend on
-        parameters alone, and of numbers by name.
+        See `engine.smoother_program`. They are functions of parameters, of what depends on these
+        alone, and of numbers by name.
         """
 
         def lag(known):
@@ -704,42 +706,45 @@ class Smoother(KernelEstimator[Params]):
             z = jnp.log(frames.intensity + params.I0)
             z = deblur_level(params, z, total) if exposed else z
             measured = measure_frames(params, frames, z, exists)
-            kept = self.frame_info(params, frames, measured, inside if exposed else None)
+            info = self.frame_info(params, frames, measured, inside if exposed else None)
             side = measured.side
             if not clipped:
                 measured = dataclasses.replace(measured, side=jnp.zeros_like(side))
-            past, said, _ = frame_update(params, state, measured)
-            return {"past": past, "said": said, "kept": kept, "side": side}
+            past, message, _ = frame_update(params, state, measured)
+            return {"past": past, "message": message, "info": info, "side": side}
 
         def move(known, past, seconds, **counts):
             on, off = counted(known[0], **counts)
             S, q = change_between(known[0], on, off, seconds)
             return {"moved_on": on, "moved_off": off, "state": Gaussian(past.m + S, past.P + q)}
 
-        def link(known, link, said, moved_on, moved_off, seconds):
+        def link(known, link, message, moved_on, moved_off, seconds):
             S, q = change_between(known[0], moved_on, moved_off, seconds)
-            return {"link": link.compose(MessageMap(jnp.ones_like(S), S, q, said.h, said.J))}
+            return {"link": link.compose(MessageMap(jnp.ones_like(S), S, q, message.h, message.J))}
 
-        def back(known, later, said, moved_on, moved_off, seconds):
+        def back(known, later, message, moved_on, moved_off, seconds):
             here = (
-                later.propagate_back(*change_between(known[0], moved_on, moved_off, seconds)) + said
+                later.propagate_back(*change_between(known[0], moved_on, moved_off, seconds))
+                + message
             )
-            return {"said": later, "later": here}
+            return {"message": later, "later": here}
 
-        def show(known, past, said, *, moved_on, moved_off, kept, elapsed, seconds, here, **counts):
+        def show(
+            known, past, message, *, moved_on, moved_off, info, elapsed, seconds, here, **counts
+        ):
             on, off = counted(known[0], **counts)
             rest = jnp.where(seconds > 0, seconds + lag(known), 0)
             left = change_between(known[0], moved_on - on, moved_off - off, rest)
             S, q = change_between(known[0], on, off, elapsed - lag(known))
-            state = combine(past.m + S, 1 / (past.P + q), said.propagate_back(*left))
-            return {"image": self.readout(known[0], state, kept, here)}
+            state = combine(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
+            return {"image": self.readout(known[0], state, info, here)}
 
-        def before(known, later, kept, seconds, **counts):
+        def before(known, later, info, seconds, **counts):
             left = change_between(known[0], *counted(known[0], **counts), seconds + lag(known))
             first = later + state_to_message(init(known[0]))
             zero = jnp.zeros_like(later.h)
             state = combine(zero, zero, first.propagate_back(*left))
-            return {"image": self.readout(known[0], state, kept, zero > 0)}
+            return {"image": self.readout(known[0], state, info, zero > 0)}
 
         def start(known):
             return {"state": init(known[0])}

@@ -79,7 +79,7 @@ def test_what_cannot_be_added_is_said():
     live.add(events[50:60])
     with pytest.raises(InputError, match="in order of time"):
         live.add(events[40:50])
-    with pytest.raises(InputError, match="outside the"):
+    with pytest.raises(InputError, match="event 11 has x = 99"):
         live.add(dataclasses.replace(events[60:62], x=np.array([1, 99], np.uint16)))
     live.add_frame(0.01, image)
     with pytest.raises(InputError, match="not after the one before"):

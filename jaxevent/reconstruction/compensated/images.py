@@ -80,11 +80,11 @@ class InstantSmoother(Smoother):
             z, V = blurred + trust * change, V + trust * error
         return FrameLevels(z, V, measured.clear)
 
-    def readout(self, params: Params, state: Gaussian, kept: FrameLevels, here: Array) -> Estimate:
+    def readout(self, params: Params, state: Gaussian, info: FrameLevels, here: Array) -> Estimate:
         L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
-        shown = here & (kept.clear > 0.5)
-        V = jnp.where(shown, jnp.minimum(state.P, kept.V), state.P)
-        return Estimate(jnp.where(shown, kept.z, L), V, shown)
+        shown = here & (info.clear > 0.5)
+        V = jnp.where(shown, jnp.minimum(state.P, info.V), state.P)
+        return Estimate(jnp.where(shown, info.z, L), V, shown)
 
 
 instant_smoother = InstantSmoother("instant-smoother", Params, fuses=False)

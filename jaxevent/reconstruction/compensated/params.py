@@ -56,12 +56,12 @@ class Params(smoother.Params):
     c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
     I0 = Positive(0.3, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
     w_min = Positive(
-        0.6, "1", "least certainty w of frames, of dark and saturated pixels", least=1e-9
+        0.6, "1", "least certainty w of frames, and that of clipped pixels", least=1e-9
     )
-    sigma_event = Positive(0.6, "c", "noise of an event's step, as part of its threshold")
+    sigma_event = Positive(0.6, "c", "noise of an event's step, relative to its threshold")
     sigma_bg = Positive(0.05, "ln I / sqrt(s)", "drift without events")
     sigma_frame = Positive(0.002, "intensity", "noise of frames where the certainty w is 1")
-    share = Positive(0.7, "1", "part of an event's change that belongs to its 8 neighbours")
+    share = Positive(0.7, "1", "fraction of an event's change that belongs to its 8 neighbours")
 
     sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
     floor = Positive(2e-4, "(ln I)^2", "least variance of an image read between pixels")

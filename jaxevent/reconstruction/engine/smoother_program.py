@@ -38,13 +38,13 @@ COUNTS = ("on", "off", "around_on", "around_off", "given")
 STATE, LATER = ("state.m", "state.P"), ("later.h", "later.J")
 LINK = tuple(f"link.{name}" for name in "AbChJ")
 WORK = (*IMAGE_FIELDS, "total", "inside", "side", *COUNTS, *STATE, *LATER, *LINK)
-ROW = ("moved_on", "moved_off", "past.m", "past.P", "said.h", "said.J")
+ROW = ("moved_on", "moved_off", "past.m", "past.P", "message.h", "message.J")
 
 # Trees of numbers that have derivatives by parameters.
-MOVING = ("total", "state", "later", "moved_on", "moved_off", "past", "said", "kept")
+MOVING = ("total", "state", "later", "moved_on", "moved_off", "past", "message", "info")
 # Derivatives that do not depend on their own value before.
 NEVER_CARRIED = tuple(
-    f"sensitivities['{name}']" for name in ("total", "moved_on", "moved_off", "kept")
+    f"sensitivities['{name}']" for name in ("total", "moved_on", "moved_off", "info")
 )
 
 # Numbers that are equal for all pixels, by function.
@@ -138,10 +138,10 @@ def translate_smoother(
     counts, moved, seconds = tree(*COUNTS), tree("moved_on", "moved_off"), tree("seconds")
     given: dict[str, Any] = tree(*IMAGE_FIELDS, "gain", "exists", "total", "inside")
     held = jax.eval_shape(method.pixel_state_spec, shape)
-    state, said = held["state"], held["said"]
+    state, message = held["state"], held["message"]
     try:
         frame = functools.partial(functions["frame"], known[:2])
-        kept = jax.eval_shape(lambda v: frame(**v), given | {"state": state})["kept"]
+        info = jax.eval_shape(lambda v: frame(**v), given | {"state": state})["info"]
     except Exception as error:  # whatever a method's functions raise
         about = f"its functions fail for one pixel: {error}"
         raise TranslationError(about.partition("\n")[0]) from error
@@ -152,11 +152,11 @@ def translate_smoother(
         "start": {},
         "frame": {**given, "state": state},
         "clipped": {**given, "state": state},
-        "link": {"link": held["link"], "said": said, **moved, **seconds},
-        "back": {"later": said, "said": said, **moved, **seconds},
-        "show": {"past": state, "said": said, **moved, "kept": kept, **counts, **seconds,
+        "link": {"link": held["link"], "message": message, **moved, **seconds},
+        "back": {"later": message, "message": message, **moved, **seconds},
+        "show": {"past": state, "message": message, **moved, "info": info, **counts, **seconds,
                  "elapsed": shape, "here": jax.ShapeDtypeStruct((1, 1), bool)},
-        "before": {"later": said, "kept": kept, **counts, **seconds},
+        "before": {"later": message, "info": info, **counts, **seconds},
     }  # fmt: skip
     dead, seeds = set[str](), len(jax.tree.leaves(known[2:]))
     for name, values in wanted.items():
@@ -173,7 +173,7 @@ def translate_smoother(
             zeros = {key for key, node in results if constant_value(node) == 0}
             dead |= {key for key in zeros if key.startswith(NEVER_CARRIED)}
     work = tuple(f"{name}.0" for name in WORK)
-    row = tuple(f"{name}.0" for name in (*ROW, *name_leaves("kept", kept)))
+    row = tuple(f"{name}.0" for name in (*ROW, *name_leaves("info", info)))
     program = SmootherProgram(made, host, work, row, kind.dtype, directions)
     moving = [n for n in work if n.partition(".")[0] in MOVING]
     work_derivatives = [s for n in moving for s in program.derivatives(n)]
