@@ -103,7 +103,7 @@ class Params(Parameters):
     edge = Number(
         0.0,
         "s",
-        "literal: leave out candidates so young, if the events before at both pixels are as near in "
+        "literal: leave out candidates so young, if events before at both pixels are as near in "
         "time: these are of one edge (6.6.5); 0: none",
         gradient=False,
     )
