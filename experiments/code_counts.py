@@ -37,6 +37,8 @@ NOUNS = {
     "Speed",
     "Feed",
     "Bed",
+    "Setting",
+    "Warning",
 }
 
 # Words of the left column of the glossary that name nothing any more: in names of classes,

@@ -71,6 +71,7 @@ RENAMED: dict[str, str] = {
     "jaxevent.io.aedat4.read": "jaxevent.io.aedat.read_aedat4",
     "jaxevent.io.calibrated": "jaxevent.io.checks.make_supported_camera",
     "jaxevent.io.check_unfolded": "jaxevent.io.checks.check_unfolded",
+    "jaxevent.io.checked_events": "jaxevent.io.checks.check_events",
     "jaxevent.io.columns.find": "jaxevent.io.columns.find_fields",
     "jaxevent.io.columns.read_npy": "jaxevent.io.tables.read_npy",
     "jaxevent.io.columns.read_text": "jaxevent.io.tables.read_text",

@@ -8,7 +8,7 @@ float means seconds, both on the recording's clock.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -264,13 +264,8 @@ class Events:
         Raises:
             InputError: An event is outside.
         """
-        for name, values, size in (("x", self.x, width), ("y", self.y, height)):
-            if len(values) and int(values.max()) >= size:
-                row = int(np.argmax(values >= size))
-                raise InputError(
-                    f"{source}: event {first_row + row} has {name} = {values[row]} outside the "
-                    f"{width}x{height} sensor; give the sensor's size or remove the event"
-                )
+        for name, values in (("x", self.x), ("y", self.y)):
+            arrays.coordinates(name, values, (width, height), source, first_row=first_row)
 
 
 def _check_rows(rows: Any, what: str) -> None:
@@ -535,46 +530,44 @@ def _set_rows(part: Any, what: str, **columns: tuple[tuple[int, ...], Any]) -> N
 
 
 @dataclasses.dataclass(frozen=True)
-class Poses:
-    """Ground-truth camera poses: t (us), position (n, 3) in m, quaternion (n, 4) as x y z w."""
+class _TimedRows:
+    """Rows of measurements at sorted times; subclasses have further columns."""
 
     t: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice | NDArray) -> Self:
+        return type(self)(*(values[rows] for values in vars(self).values()))
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses(_TimedRows):
+    """Ground-truth camera poses: t (us), position (n, 3) in m, quaternion (n, 4) as x y z w."""
+
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
 
     def __post_init__(self):
         _set_rows(self, "pose", position=((3,), np.float64), quaternion=((4,), np.float64))
 
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, rows: slice) -> "Poses":
-        return Poses(self.t[rows], self.position[rows], self.quaternion[rows])
-
 
 @dataclasses.dataclass(frozen=True)
-class Imu:
+class Imu(_TimedRows):
     """Inertial measurements: t (us), gyro (samples, 3) in rad/s, acc (samples, 3) in m/s^2."""
 
-    t: NDArray[np.int64]
     gyro: NDArray[np.float64]
     acc: NDArray[np.float64]
 
     def __post_init__(self):
         _set_rows(self, "IMU", gyro=((3,), np.float64), acc=((3,), np.float64))
 
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, rows: slice) -> "Imu":
-        return Imu(self.t[rows], self.gyro[rows], self.acc[rows])
-
 
 @dataclasses.dataclass(frozen=True)
-class Triggers:
+class Triggers(_TimedRows):
     """Signals from outside: t (us), edge (1 rising, 0 falling, -1 unknown), channel, each (n,)."""
 
-    t: NDArray[np.int64]
     edge: NDArray[np.int8]
     channel: NDArray[np.uint8]
 
@@ -582,12 +575,6 @@ class Triggers:
         _set_rows(self, "trigger", edge=((), np.int8), channel=((), np.uint8))
         if not np.isin(self.edge, (-1, 0, 1)).all():
             raise InputError("triggers need an edge, -1, 0 or 1, for each time; correct them")
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, rows: slice | NDArray) -> "Triggers":
-        return Triggers(self.t[rows], self.edge[rows], self.channel[rows])
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -601,8 +588,7 @@ class Recording(HtmlRepr):
 
     `notes` are remarks of the reader, one sentence without a full stop each, that `jaxevent info`
     prints: the unit of time it inferred, the number of words it skipped. `left_out` describes, by
-        the
-    name of a field that is None ("frames", "camera"), the data of the file and how to have them
+    the name of a field that is None ("frames", "camera"), the data of the file and how to have them
     read; messages that miss the field end with that.
     """
 
@@ -630,29 +616,22 @@ class Recording(HtmlRepr):
             object.__setattr__(self, side, pixels)
         events = _checked_source(self.events, size, self.name)
         object.__setattr__(self, "events", events)
-        parts = {
-            "frames": Frames, "camera": PinholeCamera, "poses": Poses, "imu": Imu,
-            "triggers": Triggers,
-        }  # fmt: skip
-        for field, kind in parts.items():
+        parts = {"camera": PinholeCamera, "frames": Frames, "poses": Poses, "imu": Imu}
+        parts["triggers"] = Triggers
+        for field, kind, remedy in (
+            *(
+                (name, one, f"{one.__module__}.{one.__name__} or None")
+                for name, one in parts.items()
+            ),
+            ("extra", Mapping, "a dictionary by name"),
+            ("left_out", Mapping, "a dictionary by name"),
+            ("notes", tuple | list, "a tuple of sentences"),
+        ):
             part = getattr(self, field)
-            if part is not None and not isinstance(part, kind):
-                raise InputError(
-                    f"{self.name}: {field} is a {type(part).__name__}; give "
-                    f"{kind.__module__}.{kind.__name__} or None"
-                )
+            if not isinstance(part, kind) and (part is not None or field not in parts):
+                raise InputError(f"{self.name}: {field} is a {type(part).__name__}; give {remedy}")
         if self.frames is not None:
             self.frames.check_shape(self.width, self.height, self.name)
-        for field in ("extra", "left_out"):
-            if not isinstance(getattr(self, field), Mapping):
-                raise InputError(
-                    f"{self.name}: {field} is a {type(getattr(self, field)).__name__}; give a "
-                    "dictionary by name"
-                )
-        if not isinstance(self.notes, tuple | list):
-            raise InputError(
-                f"{self.name}: notes is a {type(self.notes).__name__}; give a tuple of sentences"
-            )
 
     @classmethod
     def from_arrays(

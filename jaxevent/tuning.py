@@ -327,7 +327,10 @@ def optimise(
     prepare = PreparedBatches.of(batches, validation, settings.batch)
     fresh = run is None
     run = begin(params, names, settings, search) if run is None else run
-    loop = _Loop(loss, params, prepare, settings, search or {}, run, save or (lambda *_: None))
+    loop = _Loop(
+        loss, params, prepare, settings=settings, intervals=search or {}, run=run,
+        save=save or (lambda *_: None),
+    )  # fmt: skip
     total = settings.rounds * settings.iterations * bool(names)
     with bar(total=total, desc=title, unit="step", progress=progress) as loop.bar:
         if fresh:
@@ -531,6 +534,7 @@ class _Loop:
         loss: Loss,
         params: Parameters,
         prepare: PreparedBatches,
+        *,
         settings: Settings,
         intervals: Mapping[str, Interval],
         run: Run,

@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import refuses
 
 from jaxevent import Events, InputError, Recording
 from jaxevent.camera import (
@@ -77,8 +78,7 @@ def recorded(**extra) -> Recording:
     ("levels", "weights"), [([0, 1], None), ([0, 0.6, 0.4], None), ([0, 0.5, 1], [1, 2])]
 )
 def test_tables_that_mean_nothing_are_refused(levels, weights):
-    with pytest.raises(InputError, match="camera response"):
-        TableResponse(levels, weights)
+    refuses("camera response", TableResponse, levels, weights)
 
 
 CAMERAS = [
@@ -185,8 +185,7 @@ def test_tables_are_differentiable_in_their_intensities(at):
 
 @pytest.mark.parametrize("settings", [(-1, 8), (127.5, 8), (50, 0), (50, 21), (50, np.nan)])
 def test_s_curves_that_mean_nothing_are_refused(settings):
-    with pytest.raises(InputError, match="camera"):
-        SCurve(*settings)
+    refuses("camera", SCurve, *settings)
 
 
 EXPOSURES = np.array([2.0, 1 / 8, 1 / 4, 8, 1 / 2, 1, 4])
@@ -281,14 +280,12 @@ STACK = np.tile(np.arange(256, dtype=np.uint8), (2, 4, 1))
     ],
 )
 def test_stacks_that_tell_no_response_are_refused(images, exposures, message):
-    with pytest.raises(InputError, match=message):
-        estimate_response(images, exposures)
+    refuses(message, estimate_response, images, exposures)
 
 
 @pytest.mark.parametrize("setting", [{"smoothness": 0}, {"samples": 0}, {"margin": 100}])
 def test_settings_without_sense_are_refused(setting):
-    with pytest.raises(InputError, match="margin"):
-        estimate_response(STACK, [1.0, 2.0], **setting)
+    refuses("margin", estimate_response, STACK, [1.0, 2.0], **setting)
 
 
 @pytest.mark.parametrize("camera", [SCurve(50), GAMMA, UnknownResponse()])
@@ -328,7 +325,5 @@ def test_frames_of_one_exposure_merge_to_their_intensity():
 
 
 def test_merging_refuses_bad_stacks():
-    with pytest.raises(InputError, match="uint8"):
-        merge_exposures(STACK.astype(float), [1.0, 2.0], UnknownResponse())
-    with pytest.raises(InputError, match="reference"):
-        merge_exposures(STACK, [1.0, 2.0], UnknownResponse(), reference=0)
+    refuses("uint8", merge_exposures, STACK.astype(float), [1.0, 2.0], UnknownResponse())
+    refuses("reference", merge_exposures, STACK, [1.0, 2.0], UnknownResponse(), reference=0)

@@ -254,7 +254,7 @@ def test_what_cannot_be_is_said():
         (lambda: events.voxel_grid(part, 0, size=size), "0 bins"),
         (lambda: events.to_device(part, 3, size=size), "do not fit"),
         (lambda: events.to_device(part, origin=-(10**10), size=size), "2\\^31 us"),
-        (lambda: events.event_image(part, size=(3, 5)), "outside the 3x5 sensor"),
+        (lambda: events.event_image(part, size=(3, 5)), "on the 3x5 sensor"),
         (lambda: events.remove_hot_pixels(part, np.zeros((2, 2), bool), size=size), "give bool of"),
     ):
         with pytest.raises(InputError, match=said):

@@ -543,7 +543,7 @@ def _read_others(
                 first_pass.add_triggers(number, signals["t"].astype(np.int64), edge, kind)
 
     def decode(row: int) -> Iterator[NDArray]:
-        for packet in _packets(path, strict=True):
+        for packet in _packets(path):
             if packet["stream_id"] == chosen["frame"]:
                 pixels = packet["frame"]["pixels"]
                 if row <= 0:
@@ -575,8 +575,9 @@ def _packets(path: Path, *, strict: bool = False) -> Iterator[dict[str, Any]]:
     with _decoding(path):
         packets = iter(aedat.Decoder(path))
         while True:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error" if strict else "ignore")
+            with warnings.catch_warnings() if strict else contextlib.nullcontext():
+                if strict:
+                    warnings.simplefilter("error")
                 packet = next(packets, None)
             if packet is None:
                 return

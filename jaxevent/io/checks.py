@@ -158,7 +158,17 @@ def check_unfolded(size: int, stored: int, source: object) -> None:
 
 
 def check_whole_records(path: Path, n_bytes: int, width: int, what: str = "a record") -> None:
-    """Raise `InputError` if `n_bytes` of a file are not whole records of `width` bytes."""
+    """Check that the bytes of a file are whole records.
+
+    Args:
+        path: The file.
+        n_bytes: Number of its bytes that hold records.
+        width: Number of bytes of a record.
+        what: Words for a record, for the message.
+
+    Raises:
+        InputError: The last record is cut off.
+    """
     if rest := n_bytes % width:
         raise InputError(
             f"{path}: ends inside {what}, {rest} bytes after the last whole one of {width} bytes; "
@@ -176,7 +186,10 @@ def open_archive(file: Path) -> zipfile.ZipFile:
 
 
 def check_events(
-    columns: Sequence[NDArray],
+    t: NDArray,
+    x: NDArray,
+    y: NDArray,
+    p: NDArray,
     size: tuple[int, int],
     source: str,
     *,
@@ -186,7 +199,10 @@ def check_events(
     """Check the columns of a file and make events of them.
 
     Args:
-        columns: t (int64 us), x, y and p, each (events,); polarity is bool, 0/1 or -1/1.
+        t: (events,) times in us, int64.
+        x: (events,) columns in px.
+        y: (events,) rows in px.
+        p: (events,) polarities, bool, 0/1 or -1/1.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
         first_row: Row of the first event in the file.
@@ -199,7 +215,6 @@ def check_events(
         InputError: An event is not valid; the message names the first.
     """
     arrays.as_size(*size, source)
-    t, x, y, p = columns
     arrays.check_lengths(t, x, y, p, source)
     events = Events.of_checked(
         arrays.as_plain(t, np.int64),
@@ -306,7 +321,19 @@ def whole_number(value: Any, source: object, what: str) -> int:
 
 
 def whole_size(width: Any, height: Any, source: object) -> tuple[int, int]:
-    """Return two numbers of a file, the sensor's width and height in px, as whole numbers."""
+    """Return the sensor's size of a file as whole numbers.
+
+    Args:
+        width: Width in px, a number or an array of one.
+        height: Height in px.
+        source: Name of the file for messages.
+
+    Returns:
+        (width, height).
+
+    Raises:
+        InputError: A side is no whole number.
+    """
     with reading(source):
         return whole_number(width, source, "width"), whole_number(height, source, "height")
 

@@ -302,6 +302,7 @@ def read_columns(
     usual: str | None = None,
     unit: str | None = None,
     origin: int = 0,
+    block: int | None = None,
 ) -> ColumnEvents:
     """Read events of which any range of rows can be had.
 
@@ -315,6 +316,7 @@ def read_columns(
         usual: Usual unit of the layout, see `infer_unit`.
         unit: Unit of the times where the layout fixes it.
         origin: Number of the first column and row of the sensor, 0 or 1.
+        block: Number of events that are read together; None takes `decoded.BLOCK`.
 
     Returns:
         The events, in memory or left in the file, their clock and notes.
@@ -324,13 +326,16 @@ def read_columns(
     """
     if unit is None:
         sample = sample_ends(fields, count)
+        if block is not None:  # all are in memory
+            sample["p"] = fields(slice(0, count))["p"]
         found = infer_format(sample, count, size, source, options, name=name, usual=usual)
     else:
         found = ColumnFormat(InferredUnit(unit))
 
     def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
-        for row in range(state or 0, count, decoded.BLOCK):
-            held = fields(slice(row, row + decoded.BLOCK))
+        size_of_block = block or decoded.BLOCK
+        for row in range(state or 0, count, size_of_block):
+            held = fields(slice(row, row + size_of_block))
             yield row, found.convert(held, source, row)
 
     events = read_events(decode, size, source, options, origin)
@@ -374,7 +379,7 @@ def read_whole_columns(
     whole = dataclasses.replace(options, in_memory=True, progress=False, notes=options.notes)
     return read_columns(
         lambda rows: {key: columns[key][rows] for key in "txyp"},
-        len(t), size, source, whole, name=name, usual=usual, origin=origin,
+        len(t), size, source, whole, name=name, usual=usual, origin=origin, block=len(t),
     )  # fmt: skip
 
 

@@ -208,7 +208,7 @@ def read_events(
             if not len(columns[0]):
                 continue
             try:
-                events = check_events(columns, size, source, first_row=row, origin=origin)
+                events = check_events(*columns, size, source, first_row=row, origin=origin)
             except OrderError:
                 raise _find_disorder(decode, source).explain(source) from None
             first, last = int(events.t[0]), int(events.t[-1])
@@ -401,7 +401,7 @@ class DecodedEvents(EventsInFile):
         if columns is None or len(columns[0]) != count:
             raise _changed(self._source, "events")
         events = check_events(
-            columns,
+            *columns,
             self.checked_size,
             self._source,
             first_row=int(self._rows[number]),

@@ -246,7 +246,7 @@ class StoredEvents(EventsInFile):
         lead = min(start, 1)
         columns = self._read(start - lead, stop)
         try:
-            events = check_events(columns, self.checked_size, self._source, first_row=start - lead)
+            events = check_events(*columns, self.checked_size, self._source, first_row=start - lead)
         except OrderError:
             times_of_blocks = (columns[0] for _, columns in self.decode(None))
             raise find_disorder(times_of_blocks, source=self._source).explain(

@@ -17,7 +17,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -222,6 +222,9 @@ class DeadTimeDerivative(eqx.Module):
     rho_ref: Float[Numeric, ""]  # s, for which the counts were made
 
 
+C = TypeVar("C", bound="EventCounts")
+
+
 class EventCounts(ShortRepr):
     """Prepared arrays of which some count events, perhaps with derivatives by the dead time."""
 
@@ -231,7 +234,7 @@ class EventCounts(ShortRepr):
     def counts(self) -> list[Any]:
         """Return the arrays that count events."""
 
-    def at_dead_time(self, rho_ref: Array) -> Self:
+    def at_dead_time(self: C, rho_ref: Array) -> C:
         """Continue the counts linearly to a dead time (s) near the one that they were made for."""
         derivative = self.derivative
         if derivative is None:
@@ -240,7 +243,7 @@ class EventCounts(ShortRepr):
         pairs = zip(self.counts(), derivative.counts, strict=True)
         return eqx.tree_at(lambda c: c.counts(), self, [n + change * g for n, g in pairs])
 
-    def _scale(self, factors: list[Any]) -> Self:
+    def _scale(self: C, factors: list[Any]) -> C:
         """Multiply every array of counts, and its derivative, by a factor."""
 
         def times(counts: list[Any]) -> list[Any]:

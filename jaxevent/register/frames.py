@@ -15,8 +15,8 @@ from jaxevent.io.images import Scale, is_series, kept_colours, read_series
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.register.geometry import Grid, Registration, pixel_scale
 
-_I0 = 0.05  # intensity inside logarithms: noise of dark pixels stays small
-_CLIPPED = 0.012  # grey from either end within which frames say nothing: three grey values of 255
+_DARK = 0.05  # intensity, added inside logarithms against the noise of dark pixels
+_CLIPPED = 0.012  # grey, distance from either end below which pixels are clipped: 3 of 255
 
 
 def read_frames(
@@ -60,7 +60,7 @@ def read_frames(
         recording = load(path, in_memory=False, stream=stream, frames=frames, progress=progress)
         if exposure is not None or white is not None:
             name = "exposure" if white is None else "white"
-            raise InputError(f"{path}: is a recording, which tells its own; leave out {name}")
+            raise InputError(f"{path}: is a recording, which has its own {name}; leave out {name}")
         if reference and {"hdr", "hdr_t"} <= set(recording.extra):
             images = np.asarray(recording.extra["hdr"], np.float32)
             t = np.atleast_1d(np.asarray(recording.extra["hdr_t"], np.int64))
@@ -101,7 +101,7 @@ def _read_image_series(
             )
         images.append(image)
     if exposure is not None and series.exposure.any():
-        raise InputError(f"{path}: its timestamps tell the exposures; leave out exposure")
+        raise InputError(f"{path}: its timestamps hold the exposures; leave out exposure")
     length = series.exposure
     if exposure is not None:
         length = np.full(len(series.t), round(exposure * 1e6), np.int64)
@@ -123,7 +123,7 @@ def log_image(other: Recording, row: int) -> tuple[NDArray[np.float64], NDArray[
         good = (grey > _CLIPPED) & (grey < 1 - _CLIPPED)
         intensity = np.asarray(other.response.intensity(np.nan_to_num(grey)), np.float64)
         intensity = intensity / other.gain[row]
-    return np.log(np.maximum(intensity, 0) + _I0), good
+    return np.log(np.maximum(intensity, 0) + _DARK), good
 
 
 def event_span(recording: Recording) -> tuple[int, int]:
@@ -321,10 +321,10 @@ def apply_registration(
         return dataclasses.replace(recording, extra={**extra, "hdr": images, "hdr_t": t[rows]})
     for name in _FRAME_EXTRAS:
         extra.pop(name, None)
-    told = other.with_frames(rows).extra
-    extra |= {name: told[name] for name in _FRAME_EXTRAS if name in told}
-    if "rgb" in told:
-        extra["rgb"] = np.asarray(ResampledImages(told["rgb"], found.grid))
+    theirs = other.with_frames(rows).extra
+    extra |= {name: theirs[name] for name in _FRAME_EXTRAS if name in theirs}
+    if "rgb" in theirs:
+        extra["rgb"] = np.asarray(ResampledImages(theirs["rgb"], found.grid))
     images = ResampledImages(other.frames.images[rows], found.grid)
     frames = Frames(t[rows], images, other.frames.exposure[rows])
     result = dataclasses.replace(

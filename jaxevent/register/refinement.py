@@ -30,7 +30,7 @@ _SMOOTHINGS_PX = (4.0, 2.0, 1.2)  # px of the event camera by which changes are 
 _MAX_STEPS = 12  # Gauss-Newton steps of a smoothing at most
 _N_PAIRS = 32  # pairs of frames that are compared
 _MAX_PIXELS = 40_000  # of a pair that are compared
-_MIN_KNOWN = 0.75  # of a smoothed change that unclipped pixels tell, where it counts
+_MIN_KNOWN = 0.75  # weight of unclipped pixels in a smoothed change that counts
 MIN_AGREEMENT = 0.25  # correlation of changes below which a registration is refused
 
 
@@ -123,7 +123,9 @@ class _Alignment:
         homography: NDArray[np.float64] | None,
         keep_offset: bool,
     ):
+        assert other.frames is not None
         self.recording, self.other, self.keep_offset = recording, other, keep_offset
+        self.frames = other.frames
         self.size = recording.width, recording.height
         width, height = self.size
         self.shape = other.height, other.width
@@ -131,18 +133,18 @@ class _Alignment:
         self.stride = self.finest
         self.fixed = None if grid is None or homography is not None else grid
         self.corners = np.empty(0)
-        self.frame = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        self.outline = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
         if homography is not None:
-            self.corners = apply_homography(homography, self.frame).ravel()
+            self.corners = apply_homography(homography, self.outline).ravel()
         self.pixels = undistorted_pixels(recording.camera, self.size).reshape(height, width, 2)
-        self.pairs: NDArray[np.intp] | None = None
+        self.pairs = np.empty((0, 2), np.intp)
         self._near: tuple[float, list] | None = None
         self._images: tuple[Any, Any] = None, None
 
     def homography(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the homography that maps the corners to at[:8] (Hartley & Zisserman, 4.1)."""
         rows, values = [], []
-        for (x, y), (u, v) in zip(self.frame, at[:8].reshape(4, 2), strict=True):
+        for (x, y), (u, v) in zip(self.outline, at[:8].reshape(4, 2), strict=True):
             rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
             values += [u, v]
         return np.append(np.linalg.solve(np.array(rows), values), 1.0).reshape(3, 3)
@@ -158,8 +160,7 @@ class _Alignment:
 
     def choose_pairs(self, offset: float) -> None:
         """Choose the pairs of frames with the most events, with about an event per pixel each."""
-        assert self.other.frames is not None
-        t = self.other.frames.t + round(offset * 1e6)
+        t = self.frames.t + round(offset * 1e6)
         begin, end = event_span(self.recording)
         inside = np.flatnonzero((t >= begin) & (t <= end))
         if len(inside) < 2:
@@ -199,8 +200,7 @@ class _Alignment:
             offset: Offset of the clocks, s.
             sigma: Smoothing, px of the event camera.
         """
-        assert self.other.frames is not None and self.pairs is not None
-        t = self.other.frames.t[self.pairs] + offset * 1e6
+        t = self.frames.t[self.pairs] + offset * 1e6
         width, height = self.size
         s, out = self.stride, []
         for (begin, end), (place, first, last) in zip(
@@ -216,10 +216,9 @@ class _Alignment:
     def _event_intervals(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
         """Return place and polarity of each pair's events, and begin and end (us) of each."""
         if self._near is None or abs(offset - self._near[0]) * 1e6 > self.apart / 2:
-            assert self.other.frames is not None and self.pairs is not None
             width, height = self.size
             found = []
-            for begin, end in self.other.frames.t[self.pairs] + round(offset * 1e6):
+            for begin, end in self.frames.t[self.pairs] + round(offset * 1e6):
                 around = (begin - 2 * self.apart, end + 2 * self.apart)
                 rows = slice(*(self.recording.events.index(int(one)) for one in around))
                 events = self.recording.events[rows]
@@ -256,7 +255,6 @@ class _Alignment:
         """Return D of each pair, its gradient and if it is known, (other pixels, pairs * 4)."""
         blur = sigma * scale
         if self._images[0] is None or abs(math.log(self._images[0] / blur)) > 0.1:
-            assert self.pairs is not None
             images = []
             for one, two in self.pairs:
                 (low, known), (high, well) = (log_image(self.other, int(k)) for k in (one, two))
@@ -272,7 +270,7 @@ class _Alignment:
     def solve(self, at: NDArray[np.float64], sigma: float) -> tuple[NDArray[np.float64], float]:
         """Take Gauss-Newton steps until they are small; return the unknowns and the correlation."""
         self.choose_pairs(float(at[-1]))
-        self.stride = max(self.finest, int(sigma / 1.3))  # smooth images say the same next door
+        self.stride = max(self.finest, int(sigma / 1.3))  # neighbours in smooth images are alike
         fit = self.fit(at, sigma)
         for _ in range(_MAX_STEPS):
             step, moved = self.step(at, sigma, fit), None

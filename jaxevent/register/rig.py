@@ -178,7 +178,7 @@ class Rig:
             size: (width, height) of the event camera.
             other: (width, height) of the other one.
             depth: Z in m in the event camera, one number or (height, width); infinite: so far
-                that the translation does not matter, NaN: not known. What is hidden from the other
+                that the translation does not matter, NaN: not known. Occlusion in the other
                 camera by something nearer is not noticed.
             plane: (a, b, c, d): the scene is a X + b Y + c Z = d, m, in the event camera's axes,
                 instead of `depth`.

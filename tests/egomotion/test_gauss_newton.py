@@ -1,4 +1,4 @@
-"""What the fits of a window share: acceptance, limits, bonds, rows and the priors' pull."""
+"""Step control, and rows of a path: units, derivatives, priors and smoothness."""
 
 import dataclasses
 
@@ -55,7 +55,7 @@ def test_rows_are_put_back():
 
 
 @pytest.mark.parametrize("k", [K, 5])
-def test_coefficients_change_with_rows_as_told(k):
+def test_jacobian_of_coefficients(k):
     """Against differences of the polynomials, in half windows."""
     path = a_path()
     unit = warp.row_units(path, 80.0, HALF, k)
@@ -85,7 +85,7 @@ def test_the_size_of_the_translation_is_held():
     np.testing.assert_allclose(gauge, expected)
 
 
-def test_priors_pull_as_written():
+def test_cost_of_priors():
     rng = np.random.default_rng(2)
     now, unit = rng.normal(size=6 * K), rng.uniform(0.5, 2, 6 * K)
     gyro = rng.normal(size=(N_SEGMENTS, 3))

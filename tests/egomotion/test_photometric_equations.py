@@ -1,4 +1,4 @@
-"""The photometric fit's equations: slopes against differences, pieces against the dense matrix."""
+"""Normal equations: derivatives against differences, blocks against the dense matrix."""
 
 import functools
 import math
@@ -129,7 +129,7 @@ def some_directions(equations: fit.NormalEquations) -> np.ndarray:
     return np.concatenate([maps, np.eye(size)[n:]])
 
 
-def test_misfits_change_as_linearised():
+def test_jacobian_of_residuals():
     """By every row of the path, the skew, every depth, and some changes of the map."""
     seen, equations = linearised()
     series, directions = equations.problem.series, some_directions(equations)
@@ -155,7 +155,7 @@ def test_the_skew_stays_near_that_of_counts(skew, known):
 # Log depths of tilts of a plane that faces the camera are linear between nodes; others' nearly, and
 # there the factors of the plane's normal are not all the same.
 @pytest.mark.parametrize("normal, near", [((0.0, 0.0, 0.6), 1e-7), ((0.2, -0.1, 0.6), 0.02)])
-def test_misfits_change_with_a_plane_as_linearised(normal, near):
+def test_jacobian_with_a_plane(normal, near):
     seen, equations = linearised(normal)
     series, scene = equations.problem.series, seen.scene
     rays, rho = rays_of_nodes(series), np.exp(scene.path.log_rho)
@@ -171,17 +171,8 @@ def test_misfits_change_with_a_plane_as_linearised(normal, near):
     assert (equations.jacobian.by_depth == 0).all()
 
 
-def test_values_of_events_are_taken_back():
-    """The transpose of what changes of the unknowns make of misfits."""
-    _, equations = linearised()
-    J = dense_jacobian(equations)
-    z = np.random.default_rng(3).normal(size=PIXELS * EACH)
-    found = joined(equations.transpose_product(z), size_of(equations)[1])
-    np.testing.assert_allclose(found, J @ z, atol=1e-12 * abs(J @ z).max())
-
-
-def test_the_gradient_is_that_of_what_is_minimised():
-    """Of misfits less their means, the weights held, and the priors."""
+def test_gradient_of_the_objective():
+    """Of residuals less their means, the weights held, and the priors."""
     seen, equations = linearised()
     problem, scene = equations.problem, seen.scene
     prior, (rows, columns) = problem.prior, problem.series.nodes
@@ -241,7 +232,7 @@ def between_coarse(equations: fit.NormalEquations) -> np.ndarray:
 
 
 def test_the_matrix_is_that_of_least_squares():
-    """J' W J of misfits less their means; what is kept of it are its blocks."""
+    """J' W J of residuals less their means; what is kept of it are its blocks."""
     seen, equations = linearised()
     (n, free, _), begin = size_of(equations), equations.problem.series.begin
     m = n + free

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 from commands import described, fails
+from refusals import refuses
 from rigs import turned
 
 import jaxevent
@@ -145,10 +146,8 @@ def test_a_rig_is_two_cameras_of_a_chain(stored):
         ("no camera 'cam9'", {"cameras": ("cam0", "cam9")}),
         ("not of the sizes", {"sizes": ((14, 10), (3, 3))}),
     ):
-        with pytest.raises(InputError, match=match):
-            Rig.read(three, **more)
-    with pytest.raises(InputError, match="holds one camera, dvs"):
-        Rig.read(stored / "info.yaml")
+        refuses(match, Rig.read, three, **more)
+    refuses("holds one camera, dvs", Rig.read, stored / "info.yaml")
 
 
 def test_register_takes_a_chain(stored, capsys):
@@ -191,8 +190,7 @@ def test_what_cannot_be_used_is_named(old, new, message, stored):
     with pytest.raises(InputError, match=message) as refused:
         jaxevent.load(stored / "a.h5", camera=bad)
     assert "bad.yaml" in str(refused.value)
-    with pytest.raises(InputError, match=message):
-        Rig.read(bad)
+    refuses(message, Rig.read, bad)
 
 
 def test_the_parser_is_of_an_extra(stored, monkeypatch):

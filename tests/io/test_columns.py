@@ -95,7 +95,7 @@ def test_arrays_in_which_no_order_fits_are_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize("bits", [8, 16, 32, 64])
 def test_minus_one_without_its_sign(bits, tmp_path):
-    """As v2e writes its HDF5: -1 in uint32 is 4294967295."""
+    """HDF5 of v2e holds -1 in uint32, which is 4294967295."""
     c = columns(3)
     p = np.where(c["p"] == 1, 1, -1).astype(f"i{bits // 8}").view(f"u{bits // 8}")
     stored = c | {"p": p}

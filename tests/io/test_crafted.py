@@ -6,9 +6,9 @@ import crafted
 import h5py
 import numpy as np
 import pytest
+from refusals import refuses
 
 from jaxevent import cli, io
-from jaxevent.errors import InputError
 from jaxevent.io import hdf5_files
 
 NEEDS = {"bag": "rosbags", "aedat4": "aedat"}
@@ -52,8 +52,9 @@ def test_strings_are_found_wherever_blocks_of_the_search_end(tmp_path, monkeypat
         monkeypatch.setattr(hdf5_files, "_BLOCK", block)
         hdf5_files.search_heaps.__wrapped__(good, ())
         for path in bad:
-            with pytest.raises(InputError, match="a string or its heap is not valid"):
-                hdf5_files.search_heaps.__wrapped__(path, ())
+            refuses(
+                "a string or its heap is not valid", hdf5_files.search_heaps.__wrapped__, path, ()
+            )
 
 
 @pytest.mark.slow
@@ -65,9 +66,8 @@ def test_crafted_files_are_refused(build, tmp_path):
     whole = build.__name__.startswith(("text", "npz", "mat"))
     for in_memory in (True,) if whole else (True, False):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        with pytest.raises(InputError, match=crafted.FILES[build]) as error:
-            io.load(path, crafted.SIZE, in_memory)
-        assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+        said = refuses(crafted.FILES[build], io.load, path, crafted.SIZE, in_memory)
+        assert str(tmp_path) in said
         # A bag is unfolded up to the bound, 128 MB.
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1000
         assert grown < 300, f"{grown:.0f} MB"

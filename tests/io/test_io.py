@@ -18,6 +18,7 @@ import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from refusals import refuses
 
 from jaxevent import io
 from jaxevent.camera import PinholeCamera
@@ -178,7 +179,7 @@ def mat_arrays(recording, minus=True):
 
 
 def write_v73(path, arrays):
-    """What MATLAB's save -v7.3 writes: a 512-byte header, then HDF5 with all axes reversed."""
+    """Write a file as MATLAB's -v7.3 does: a 512-byte header, then HDF5 with axes reversed."""
     with File(path, "w", userblock_size=512) as file:
         for name, value in arrays.items():
             value = np.asarray(value)
@@ -206,8 +207,7 @@ def test_text_round_trip(recording, header, minus, where):
         if where != "folder":
             written = zip_folder(written, path / "random.zip", where)
         if not header and recording.frames is None:
-            with pytest.raises(InputError, match="sensor's size; give size="):
-                load(written)
+            refuses("sensor's size; give size=", load, written)
         size = None if header or recording.frames else (recording.width, recording.height)
         assert_same(load(written, size), recording, exposure=False)
 
@@ -280,9 +280,7 @@ def test_text_images_become_grey_or_stay_16_bit(tmp_path):
 )
 def test_text_bad_events(tmp_path, lines, message):
     (tmp_path / "events.txt").write_bytes(lines.encode("latin-1"))
-    with pytest.raises(InputError, match=message) as error:
-        load(tmp_path, size=(9, 9))
-    assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+    assert str(tmp_path) in refuses(message, load, tmp_path, size=(9, 9))
 
 
 @pytest.mark.parametrize(
@@ -311,16 +309,14 @@ def test_text_bad_other_files(tmp_path, file, content, message):
     Image.fromarray(np.zeros((1, 2), np.uint8)).save(tmp_path / "small.png")
     (tmp_path / "bad.png").write_bytes(b"not a png")
     (tmp_path / file).write_text(content)
-    with pytest.raises(InputError, match=message):
-        load(tmp_path, size=(9, 9))
+    refuses(message, load, tmp_path, size=(9, 9))
 
 
 def test_zip_of_two_recordings(tmp_path):
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
         archive.writestr("a/events.txt", "0 0 0 1\n")
         archive.writestr("b/events.txt", "0 0 0 1\n")
-    with pytest.raises(InputError, match="holds 2 events.txt"):
-        load(tmp_path / "two.zip")
+    refuses("holds 2 events.txt", load, tmp_path / "two.zip")
 
 
 # MATLAB
@@ -442,14 +438,12 @@ def changed(row, column, value):
 )
 def test_mat_bad(tmp_path, write_mat, changes, message):
     write_mat(tmp_path / "a.mat", bad_mat(**changes))
-    with pytest.raises(InputError, match=message):
-        load(tmp_path / "a.mat")
+    refuses(message, load, tmp_path / "a.mat")
 
 
 def test_mat_without_events(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"events": "text", "image": np.zeros((3, 4))})
-    with pytest.raises(InputError, match="no numeric variable events"):
-        load(tmp_path / "a.mat")
+    refuses("no numeric variable events", load, tmp_path / "a.mat")
 
 
 # NumPy archives
@@ -511,9 +505,7 @@ def test_npz_size_from_frames_and_times_without_exposure(tmp_path):
 def test_npz_bad(tmp_path, changes, message):
     arrays = dict(t=[1, 2, 3], x=[0, 1, 2], y=[0, 1, 2], p=[0, 1, 1], width=4, height=3) | changes
     np.savez(tmp_path / "a.npz", **{k: v for k, v in arrays.items() if v is not None})
-    with pytest.raises(InputError, match=message) as error:
-        load(tmp_path / "a.npz")
-    assert str(tmp_path / "a.npz") in str(error.value) and "\n" not in str(error.value)
+    assert str(tmp_path / "a.npz") in refuses(message, load, tmp_path / "a.npz")
 
 
 # HDF5
@@ -623,8 +615,7 @@ def test_dsec_layout(tmp_path):
         file["t_offset"] = 50_000_000_000
         last_ms = int(events.t[-1]) // 1000
         file["ms_to_idx"] = np.searchsorted(events.t, 1000 * np.arange(last_ms + 1)).astype("u8")
-    with pytest.raises(InputError, match="no attributes width and height; give size="):
-        load(tmp_path / "events.h5")
+    refuses("no attributes width and height; give size=", load, tmp_path / "events.h5")
     for in_memory in (True, False):
         got = load(tmp_path / "events.h5", (40, 40), in_memory)
         np.testing.assert_array_equal(got.events[:].t, events.t + 50_000_000_000)
@@ -692,8 +683,7 @@ def test_stored_index_notices_a_wrong_table(tmp_path):
         with File(tmp_path / "a.h5", "r+") as file:
             file["ms_to_idx"][1:] = wrong
         events = load(tmp_path / "a.h5", in_memory=False).events
-        with pytest.raises(InputError, match="ms_to_idx does not fit events/t at"):
-            events.index(int(recording.events.t[30]))
+        refuses("ms_to_idx does not fit events/t at", events.index, int(recording.events.t[30]))
         del events
 
 
@@ -701,8 +691,7 @@ def test_hdf5_of_a_later_version(tmp_path):
     save(random_recording(13, events=5), tmp_path / "a.h5")
     with File(tmp_path / "a.h5", "r+") as file:
         file.attrs["version"] = 2
-    with pytest.raises(InputError, match="has version 2 .* update jaxevent"):
-        load(tmp_path / "a.h5")
+    refuses("has version 2 .* update jaxevent", load, tmp_path / "a.h5")
 
 
 def test_save_refuses_what_it_cannot_write(tmp_path):
@@ -716,12 +705,11 @@ def test_save_refuses_what_it_cannot_write(tmp_path):
         (replace(good, extra={"thing": np.array([{}])}), "extra/thing .object. cannot"),
         (changed, "sort the events"),
     ):
-        with pytest.raises(InputError, match=message):
-            save(bad, path)
-    with pytest.raises(InputError, match="compression 'zip' is unknown"):
-        save(good, path, "zip")
-    with pytest.raises(InputError, match="the folder .*missing does not exist; create it"):
-        save(good, tmp_path / "missing" / "a.h5")
+        refuses(message, save, bad, path)
+    refuses("compression 'zip' is unknown", save, good, path, "zip")
+    refuses(
+        "the folder .*missing does not exist; create it", save, good, tmp_path / "missing" / "a.h5"
+    )
     assert os.listdir(tmp_path) == ["a.h5"] and path.read_bytes() == before
 
 
@@ -744,10 +732,8 @@ def test_content_tells_the_format_not_the_name(tmp_path):
 
 
 def test_load_refuses_other_things(tmp_path):
-    with pytest.raises(InputError, match="no such file or folder"):
-        load(tmp_path / "missing")
-    with pytest.raises(InputError, match="holds no events.txt; readable are a folder or zip"):
-        load(tmp_path)
+    refuses("no such file or folder", load, tmp_path / "missing")
+    refuses("holds no events.txt; readable are a folder or zip", load, tmp_path)
     other = tmp_path / "other"
     for content, message in (
         (b"", "is empty"),
@@ -756,18 +742,14 @@ def test_load_refuses_other_things(tmp_path):
         (b"PK\x03\x04 cut off", "cannot be read .*zip"),
     ):
         other.write_bytes(content)
-        with pytest.raises(InputError, match=message):
-            load(other)
+        refuses(message, load, other)
     with zipfile.ZipFile(other, "w") as archive:
         archive.writestr("readme.txt", "nothing")
-    with pytest.raises(InputError, match="neither events.txt nor .npy arrays"):
-        load(other)
+    refuses("neither events.txt nor .npy arrays", load, other)
     with File(other, "w") as file:
         file["data"] = 1
-    with pytest.raises(InputError, match="neither events/t, x, y and p nor"):
-        load(other)
-    with pytest.raises(InputError, match="two positive numbers of pixels"):
-        load(other, size=(0, 5))
+    refuses("neither events/t, x, y and p nor", load, other)
+    refuses("two positive numbers of pixels", load, other, size=(0, 5))
 
 
 def damaged(tmp_path, format):
@@ -790,9 +772,7 @@ def test_cut_files_are_refused(tmp_path, format):
     content = path.read_bytes()
     for part in (0.01, 0.1, 0.3, 0.5, 0.8, 0.99):
         path.write_bytes(content[: int(part * len(content))])
-        with pytest.raises(InputError) as error:
-            load(path)
-        assert str(path) in str(error.value) and "\n" not in str(error.value)
+        assert str(path) in refuses("", load, path)
 
 
 @pytest.mark.parametrize("format", ["zip", "npz", "v5"])
@@ -868,8 +848,12 @@ def test_complete_refuses_what_cannot_be_written(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "touch", denied)
-    with pytest.raises(InputError, match="a.h5: cannot be written .Permission denied"):
-        save(random_recording(17, events=3), tmp_path / "a.h5")
+    refuses(
+        "a.h5: cannot be written .Permission denied",
+        save,
+        random_recording(17, events=3),
+        tmp_path / "a.h5",
+    )
     assert os.listdir(tmp_path) == ["file"]
 
 
@@ -877,21 +861,21 @@ def test_complete_refuses_what_cannot_be_written(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name, events, frames, size, parts",
+    "name, counts, size, parts",
     [
-        ("slider_depth.zip", 1_078_541, 87, (240, 180), "camera poses"),
-        ("davis346_street.npz", 78_830, 59, (346, 260), "imu"),
-        ("rotating_disk_imu.npz", 374_296, 0, (240, 180), "imu"),
-        ("spinning_dot.npz", 539_481, 0, (640, 480), ""),
-        ("tubrip_boxes_rotation.npz", 30_000, 0, (240, 180), "camera"),
-        ("tubrip_shapes_rotation.npz", 20_000, 0, (240, 180), "camera"),
-        ("evbench_seq3.npz", 321_343, 16, (190, 180), ""),
+        ("slider_depth.zip", (1_078_541, 87), (240, 180), "camera poses"),
+        ("davis346_street.npz", (78_830, 59), (346, 260), "imu"),
+        ("rotating_disk_imu.npz", (374_296, 0), (240, 180), "imu"),
+        ("spinning_dot.npz", (539_481, 0), (640, 480), ""),
+        ("tubrip_boxes_rotation.npz", (30_000, 0), (240, 180), "camera"),
+        ("tubrip_shapes_rotation.npz", (20_000, 0), (240, 180), "camera"),
+        ("evbench_seq3.npz", (321_343, 16), (190, 180), ""),
     ],
 )
-def test_real_recordings(data, tmp_path, name, events, frames, size, parts):
+def test_real_recordings(data, tmp_path, name, counts, size, parts):
     recording = load(data / name)
-    assert len(recording.events) == events and (recording.width, recording.height) == size
-    assert (len(recording.frames) if recording.frames else 0) == frames
+    assert (len(recording.events), len(recording.frames or ())) == counts
+    assert (recording.width, recording.height) == size
     for part in ("camera", "poses", "imu"):
         assert (getattr(recording, part) is not None) == (part in parts)
     save(recording, tmp_path / "a.h5")

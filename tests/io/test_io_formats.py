@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
 from jaxevent import io
 from jaxevent.errors import InputError, install_command
@@ -135,15 +136,13 @@ def test_sensor_size_is_told_or_asked_for(name, tmp_path):
     elif name == "aedat2":
         assert (load(path).width, load(path).height) == (240, 180)  # by the chip's name
     else:
-        with pytest.raises(InputError, match=r"size=\(width, height\)"):
-            load(path)
+        refuses(r"size=\(width, height\)", load, path)
     # A smaller sensor than the events need is refused, at the event.
-    with pytest.raises(InputError, match="event [0-9]+ has [xy] = "):
-        load(path, (20, 15))
+    refuses("event [0-9]+ has [xy] = ", load, path, (20, 15))
 
 
 def test_events_left_on_disk_need_no_memory(tmp_path):
-    """What a pass holds does not grow with the file, but for the index of its blocks.
+    """The memory of a pass does not grow with the file, but for the index of its blocks.
 
     In a process of its own, as the checks of argument types that tests add hold memory too.
     """
@@ -224,8 +223,7 @@ def test_a_clock_that_steps_back_over_its_end_is_not_continued_twice(tmp_path):
         words += [8 << 28 | high, 1 << 28 | 3 << 11 | 4]
     content = b"% evt 2.0\n% geometry 40x30\n% end\n" + np.array(words, "<u4").tobytes()
     (tmp_path / "a.raw").write_bytes(content)
-    with pytest.raises(InputError, match=f"event 2 is at {2**34 - 64} us, earlier"):
-        load(tmp_path / "a.raw")
+    refuses(f"event 2 is at {2**34 - 64} us, earlier", load, tmp_path / "a.raw")
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -265,8 +263,7 @@ def test_evt3_is_its_state_machine(words, data):
         path = Path(folder) / "a.raw"
         path.write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
         if not want:
-            with pytest.raises(InputError, match="holds no event"):
-                load(path, (4096, 4096))
+            refuses("holds no event", load, path, (4096, 4096))
             return
         got = load(path, (4096, 4096))
         assert list(formats.rows(got.events)) == want
@@ -305,11 +302,9 @@ def test_reserved_words_are_skipped_and_counted_unless_many_differ(tmp_path, in_
         differ = b"".join(bytes([n] * (width - 1)) + b"\xb0" for n in range(17))
         path.write_bytes(content[: start + 8 * width] + differ + content[start + 8 * width :])
         message = f"the word at byte {start + 8 * width} has the type 0xb"
-        with pytest.raises(InputError, match=message):
-            load(path)
+        refuses(message, load, path)
         path.write_bytes(content[:-1])
-        with pytest.raises(InputError, match=rf"drop these bytes: truncate -s -{width - 1} FILE"):
-            load(tmp_path / "a.raw")
+        refuses(rf"drop these bytes: truncate -s -{width - 1} FILE", load, tmp_path / "a.raw")
 
 
 def test_events_before_the_first_time_are_counted(tmp_path):
@@ -347,11 +342,9 @@ def test_headers_of_prophesee(tmp_path):
         ("% format EVT21\n% geometry 9x9\n", "order of the halves .* is not known"),
     ):
         path.write_bytes(header.encode() + words)
-        with pytest.raises(InputError, match=message):
-            load(path)
+        refuses(message, load, path)
     path.write_bytes(formats.dat(events, SIZE, kind=1))
-    with pytest.raises(InputError, match="holds DAT events of type 01 and 8 bytes"):
-        load(path)
+    refuses("holds DAT events of type 01 and 8 bytes", load, path)
 
 
 def test_data_that_begin_like_a_header(tmp_path):
@@ -410,14 +403,11 @@ def test_frames_of_aedat_2(tmp_path, small_blocks):
 def test_other_versions_and_chips_of_aedat(tmp_path):
     path = tmp_path / "a.aedat"
     path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(200))
-    with pytest.raises(InputError, match="is AEDAT 3.1; only AEDAT 2 and 4"):
-        load(path)
+    refuses("is AEDAT 3.1; only AEDAT 2 and 4", load, path)
     path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: ch.unizh.DVS128StereoBoard\r\n" + bytes(80))
-    with pytest.raises(InputError, match="by the chip DVS128StereoBoard, but only DAVIS"):
-        load(path)
+    refuses("by the chip DVS128StereoBoard, but only DAVIS", load, path)
     path.write_bytes(b"#!AER-DAT2.0\r\n# AEChip: x.DAVIS240C\r\n" + bytes(81))
-    with pytest.raises(InputError, match="ends inside a record, 1 bytes after"):
-        load(path)
+    refuses("ends inside a record, 1 bytes after", load, path)
 
 
 def test_aedat_4_in_its_parts(tmp_path, small_blocks):
@@ -435,8 +425,7 @@ def test_aedat_4_in_its_parts(tmp_path, small_blocks):
         np.testing.assert_array_equal(np.asarray(got.frames.images[::-1]), images[::-1])
     for part in (0.001, 0.02, 0.5, 0.999):
         path.write_bytes(content[: int(part * len(content))])
-        with pytest.raises(InputError, match="cut off|damaged|cannot be read|is AEDAT"):
-            load(path)
+        refuses("cut off|damaged|cannot be read|is AEDAT", load, path)
 
 
 def test_damage_that_the_decoder_does_not_survive(tmp_path):
@@ -444,8 +433,7 @@ def test_damage_that_the_decoder_does_not_survive(tmp_path):
     pytest.importorskip("aedat")
     content = formats.aedat4(formats.events_of(0, 9, SIZE), SIZE)
     (tmp_path / "a.aedat4").write_bytes(content.replace(b"sizeX", b"size\xca"))
-    with pytest.raises(InputError, match="its header is not valid"):
-        load(tmp_path / "a.aedat4")
+    refuses("its header is not valid", load, tmp_path / "a.aedat4")
 
 
 def test_aedat_4_of_several_cameras(tmp_path):
@@ -453,10 +441,8 @@ def test_aedat_4_of_several_cameras(tmp_path):
     events = formats.events_of(0, 100, SIZE)
     path = tmp_path / "a.aedat4"
     path.write_bytes(formats.aedat4(events, SIZE, streams=2))
-    with pytest.raises(InputError, match=r"2 cameras, 0 \(40x30\), 1 .*--stream"):
-        load(path)
-    with pytest.raises(InputError, match="has no stream of events '7'; its .* are 0, 1"):
-        load(path, stream="7")
+    refuses(r"2 cameras, 0 \(40x30\), 1 .*--stream", load, path)
+    refuses("has no stream of events '7'; its .* are 0, 1", load, path, stream="7")
     got = load(path, stream="1")
     assert_events(got.events, events)
     assert got.extra["streams_left_out"].tolist() == ["0 events"]
@@ -481,11 +467,9 @@ def test_aedat_4_of_several_streams_of_frames(tmp_path):
     assert got.left_out == {}
     alone = load(path, stream="none", frames="2")
     assert not len(alone.events) and alone.frames.t.tolist() == [1010, 3010]
-    with pytest.raises(InputError, match="has no stream of frames '0'; its .* of frames are 1, 2"):
-        load(path, frames="0")
+    refuses("has no stream of frames '0'; its .* of frames are 1, 2", load, path, frames="0")
     path.write_bytes(formats.aedat4(events, SIZE, streams=0, **shots))
-    with pytest.raises(InputError, match="holds no events, and frames in the streams 0, 1; choose"):
-        load(path)
+    refuses("holds no events, and frames in the streams 0, 1; choose", load, path)
 
 
 # ROS
@@ -512,8 +496,7 @@ def test_bags_in_their_parts(tmp_path, small_blocks):
         camera = got.camera
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (5, 6, 2, 3)
         assert camera.distortion == (0.1, 0.2, 0.3, 0.4, 0.5)
-    with pytest.raises(InputError, match="has no topic of events 'left'; .* are /dvs/events"):
-        load(path, stream="left")
+    refuses("has no topic of events 'left'; .* are /dvs/events", load, path, stream="left")
 
 
 def test_raw_bytes_are_what_rosbags_serialises(tmp_path):
@@ -574,8 +557,7 @@ def test_filters_that_cannot_be_had(tmp_path):
         h5py.h5d.create(group.id, b"events", kind, space, plist)
     plugin = importlib.util.find_spec("hdf5plugin")
     message = "filter 777" if plugin else re.escape(install_command("dsec"))
-    with pytest.raises(InputError, match=message):
-        load(path, SIZE)
+    refuses(message, load, path, SIZE)
 
 
 def test_event_utils_and_mvsec_have_frames(tmp_path):
@@ -603,10 +585,8 @@ def test_two_cameras_in_hdf5(tmp_path):
     events = formats.events_of(0, 300, SIZE)
     path = tmp_path / "a.h5"
     path.write_bytes(formats.m3ed(events, SIZE))
-    with pytest.raises(InputError, match="2 cameras, left, right; choose .*--stream"):
-        load(path)
-    with pytest.raises(InputError, match="has no camera 'up'; its cameras are left, right"):
-        load(path, stream="up")
+    refuses("2 cameras, left, right; choose .*--stream", load, path)
+    refuses("has no camera 'up'; its cameras are left, right", load, path, stream="up")
     for in_memory in (False, True):
         got = load(path, None, in_memory, stream="right")
         assert_events(got.events, events)
@@ -614,8 +594,7 @@ def test_two_cameras_in_hdf5(tmp_path):
         assert got.camera.distortion == (-0.1, 0.1, 0.001, 0.002, 0)
         assert got.events.index(int(events.t[99])) == events.index(int(events.t[99]))
     path.write_bytes(formats.rvt(events, SIZE))
-    with pytest.raises(InputError, match="one camera only; leave out stream="):
-        load(path, stream="left")
+    refuses("one camera only; leave out stream=", load, path, stream="left")
 
 
 def test_files_that_claim_more_than_they_hold(tmp_path):
@@ -623,8 +602,7 @@ def test_files_that_claim_more_than_they_hold(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in "txyp":
             file.create_dataset(f"events/{name}", (2**40,), "i8", chunks=(1 << 16,))
-    with pytest.raises(InputError, match="events/t claims 1099511627776 values but holds 0 bytes"):
-        load(tmp_path / "a.h5", SIZE)
+    refuses("events/t claims 1099511627776 values but holds 0 bytes", load, tmp_path / "a.h5", SIZE)
 
 
 # Tables
@@ -654,14 +632,11 @@ def test_structured_arrays_by_the_names_of_their_fields(tmp_path, names, dtypes)
 
 def test_arrays_without_names_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((5, 3)))
-    with pytest.raises(InputError, match="records with the fields t, x, y and p"):
-        load(tmp_path / "a.npy", SIZE)
+    refuses("records with the fields t, x, y and p", load, tmp_path / "a.npy", SIZE)
     np.save(tmp_path / "a.npy", np.zeros(5, [("t", "i8"), ("x", "i2"), ("y", "i2")]))
-    with pytest.raises(InputError, match="holds an array of t, x, y of shape"):
-        load(tmp_path / "a.npy", SIZE)
+    refuses("holds an array of t, x, y of shape", load, tmp_path / "a.npy", SIZE)
     np.save(tmp_path / "a.npy", np.array([{}]))
-    with pytest.raises(InputError, match="cannot be read .*pickle|object"):
-        load(tmp_path / "a.npy", SIZE)
+    refuses("cannot be read .*pickle|object", load, tmp_path / "a.npy", SIZE)
 
 
 @pytest.mark.parametrize("minus", [False, True])
@@ -711,9 +686,7 @@ def test_tables_tell_the_size(tmp_path, before):
 )
 def test_bad_tables_of_text(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(InputError, match=message) as error:
-        load(tmp_path / "a.csv", SIZE)
-    assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+    assert str(tmp_path) in refuses(message, load, tmp_path / "a.csv", SIZE)
 
 
 def test_true_and_false_are_polarities(tmp_path):
@@ -853,45 +826,3 @@ def test_evt3_and_dat_are_the_same_recording(data):
     for name in ("x", "y", "p"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     assert set((a.t - b.t).tolist()) == {11_194_368}
-
-
-def test_event_stream_decodes_the_same(data):
-    other = pytest.importorskip("event_stream")
-    events = np.concatenate(list(other.Decoder(str(data / "atis.es"))))
-    got = load(data / "atis.es")
-    change = events[~events["exposure"]]
-    assert got.extra["intensity_events"] == len(events) - len(change) == 852_792
-    for name, want in (
-        ("t", change["t"]),
-        ("x", change["x"]),
-        ("y", 239 - change["y"]),
-        ("p", change["polarity"]),
-    ):
-        np.testing.assert_array_equal(getattr(got.events, name), want)
-
-
-@given(st.lists(st.integers(0, 255), min_size=1, max_size=60), st.booleans())
-def test_event_stream_decodes_the_same_bytes(body, is_atis):
-    """Any first byte, in any order: the library is asked about each."""
-    other = pytest.importorskip("event_stream")
-    content = bytearray(b"Event Stream\x02\x00\x00")
-    content += bytes([2 if is_atis else 1, 40, 0, 30, 0])
-    for byte in body:
-        is_time = byte >> 2 == 63 if is_atis else byte >> 1 == 127
-        content += bytes([byte] if is_time else [byte, byte % 40, 0, byte % 30, 0])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.es"
-        path.write_bytes(content)
-        chunks = list(other.Decoder(str(path)))
-        events: Any = np.concatenate(chunks) if chunks else np.empty(0, other.dvs_dtype)
-        if is_atis and len(events):
-            events = events[~events["exposure"]]
-        if not len(events):
-            with pytest.raises(InputError, match="holds no event"):
-                load(path)
-            return
-        got = load(path).events
-        np.testing.assert_array_equal(got.t, events["t"])
-        np.testing.assert_array_equal(got.x, events["x"])
-        np.testing.assert_array_equal(got.y, 29 - events["y"])
-        np.testing.assert_array_equal(got.p, events["polarity" if is_atis else "on"])

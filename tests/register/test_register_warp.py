@@ -12,7 +12,7 @@ from jaxevent.register.frames import largest_rectangle
 
 
 def ramp(width: int, height: int) -> np.ndarray:
-    """An image that tells its coordinates: x + 1000 y."""
+    """An image of its coordinates: x + 1000 y."""
     y, x = np.mgrid[:height, :width]
     return (x + 1000.0 * y)[None]
 
@@ -47,7 +47,7 @@ def test_clipped_pixels_stay_clipped_and_nothing_overshoots():
     assert more[0, 9] == 255
 
 
-def test_warped_images_are_read_when_asked_for():
+def test_resampled_images_are_lazy():
     images = np.random.default_rng(0).integers(0, 255, (5, 20, 30, 3), dtype=np.uint8)
     grid = np.full((4, 6, 2), np.nan)
     grid[:, :3] = 7.25

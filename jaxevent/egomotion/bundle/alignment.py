@@ -17,30 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
+from jaxevent.egomotion.bundle import warp
 from jaxevent.egomotion.bundle.cg import cholesky, cholesky_solve
-from jaxevent.egomotion.bundle.warp import (
-    MAX_DEPTH_STEP,
-    N_ROWS,
-    N_SEGMENTS,
-    CellGrid,
-    Path,
-    Points,
-    Positions,
-    Prior,
-    assign_cells,
-    coefficient_jacobian,
-    gauge_direction,
-    normalise,
-    pack_rows,
-    point_derivatives,
-    replace_rows,
-    row_priors,
-    row_units,
-    segment_times,
-    smoothness_weights,
-    step_fraction,
-    warp,
-)
 
 BORDER_PX = 3  # at the sensor's border, that is not compared
 SCORE_BLOCK_PX = 12  # of the image, whose contrast is scored
@@ -98,28 +76,10 @@ class ContrastMaps(NamedTuple):
 
 
 class Displacements(NamedTuple):
-    """Displacements of cells in segments (S, cells), as information and its product with them."""
+    """Displacements of cells in segments."""
 
-    xx: NDArray[np.float64]
-    xy: NDArray[np.float64]
-    yy: NDArray[np.float64]
-    vx: NDArray[np.float64]
-    vy: NDArray[np.float64]
-
-
-class CellTracks(NamedTuple):
-    """Centres of cells (S, cells) in all segments, px; `tau` (s) are the segments' middles."""
-
-    X: NDArray[np.float64]
-    Y: NDArray[np.float64]
-    tau: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, window: WindowEvents) -> "CellTracks":
-        """Return the centres at rest."""
-        times = segment_times(window.half)[:, None]
-        parts = np.broadcast_arrays(*window.cell_positions, times)
-        return cls(*(np.array(part, np.float64) for part in parts))
+    information: NDArray[np.float64]  # (S * cells, 2, 2) 1/px^2
+    product: NDArray[np.float64]  # (S * cells, 2) information times displacement
 
 
 class VisibleRegion(NamedTuple):
@@ -248,38 +208,28 @@ def _accumulate_gradients(images, others, gain, cell, sums):
 
 
 @njit_fastmath
-def _contrast_by_block(window, block, scratch, out):
-    """Write the `ContrastMaps` of blocks (rows, columns), `block` px wide, of warped events."""
-    images, S, N = scratch.images, out.contrast, out.number
-    images[:] = 0
+def _accumulate_events(window, images):
+    """Add the signed image and the number of warped events to images (2, height, width)."""
     for e in range(len(window.x)):
         x, y = window.x[e] - window.corner[0], window.y[e] - window.corner[1]
         splat(images[0], x, y, window.p[e])
         splat(images[1], x, y, images.dtype.type(1))
-    blur(images[0], scratch.work, 1)
-    blur(images[1], scratch.work, 1)
-    S[:] = 0
-    N[:] = 0
-    for j in range(S.shape[0] * block):
-        for i in range(S.shape[1] * block):
-            S[j // block, i // block] += images[0, j, i] ** 2
-            N[j // block, i // block] += images[1, j, i]
 
 
-def _warp_by_cells(path: Path, window: WindowEvents) -> WindowEvents:
+def _warp_by_cells(path: warp.Path, window: WindowEvents) -> WindowEvents:
     """Warp events to the reference view, with the depths of their cells."""
     index = np.empty(len(window.x), np.int32)
-    out = Positions(np.empty_like(window.x), np.empty_like(window.x))
+    out = warp.Positions(np.empty_like(window.x), np.empty_like(window.x))
     rho = np.exp(path.log_rho.astype(np.float64))
-    points = Points(window.x, window.y, window.tau)
-    cells = CellGrid(window.corner, window.cell, *window.cells)
-    assign_cells(points, path.motion(window.f), rho, cells, index, out)
+    points = warp.Points(window.x, window.y, window.tau)
+    cells = warp.CellGrid(window.corner, window.cell, *window.cells)
+    warp.assign_cells(points, path.motion(window.f), rho, cells, index, out)
     return window._replace(x=out.X, y=out.Y)
 
 
 def align_segments(
-    window: WindowEvents, path: Path, prior: Prior, *, degree: int, blurs: int, steps: int
-) -> Path:
+    window: WindowEvents, path: warp.Path, prior: warp.Prior, *, degree: int, blurs: int, steps: int
+) -> warp.Path:
     """Refine a path by the alignment of segments.
 
     Args:
@@ -290,26 +240,28 @@ def align_segments(
         blurs: Number of times that images are blurred by [1 2 1] / 4.
         steps: Number of Gauss-Newton steps.
     """
-    centres = CellTracks.of(window)
+    times = warp.segment_times(window.half)[:, None]
+    parts = np.broadcast_arrays(*window.cell_positions, times)
+    centres = warp.Points(*(np.array(part, np.float64) for part in parts))
     for _ in range(steps):
         tracks = _trace_cells(path, window, centres)
-        shifts = Positions(tracks.X - centres.X, tracks.Y - centres.Y)
+        shifts = warp.Positions(tracks.x - centres.x, tracks.y - centres.y)
         found = _measure_displacements(path, window, shifts, blurs)
         path = _take_step(path, window, tracks, found, prior, degree)
     return path
 
 
-def _trace_cells(path: Path, window: WindowEvents, centres: CellTracks) -> CellTracks:
-    """Find the positions of the cells' centres at the segments' times."""
+def _trace_cells(path: warp.Path, window: WindowEvents, centres: warp.Points) -> warp.Points:
+    """Find the positions of the cells' centres (S, cells) at the segments' times."""
     rho, (x, y, tau) = np.exp(path.log_rho), centres
     for _ in range(4):
-        X, Y = warp(path, window.f, Points(x, y, tau), rho)
-        x, y = x - (X - centres.X), y - (Y - centres.Y)
-    return CellTracks(x, y, tau)
+        X, Y = warp.warp(path, window.f, warp.Points(x, y, tau), rho)
+        x, y = x - (X - centres.x), y - (Y - centres.y)
+    return warp.Points(x, y, tau)
 
 
 def _measure_displacements(
-    path: Path, window: WindowEvents, shifts: Positions, blurs: int
+    path: warp.Path, window: WindowEvents, shifts: warp.Positions, blurs: int
 ) -> Displacements:
     """Measure the displacements of cells by Lucas and Kanade's equations.
 
@@ -320,7 +272,7 @@ def _measure_displacements(
         blurs: Number of times that images are blurred.
     """
     real, cells = window.x.dtype, shifts.X.shape[1]
-    own = np.zeros((N_SEGMENTS, *window.shape), real)
+    own = np.zeros((warp.N_SEGMENTS, *window.shape), real)
     _accumulate_segments(_warp_by_cells(path, window), own)
     work = np.empty(window.shape, real)
     for image in own:
@@ -328,13 +280,13 @@ def _measure_displacements(
     low, high = (
         np.array([window.box[k], window.box[2 + k]]) - np.array(window.corner) for k in (0, 1)
     )
-    others, share = np.empty_like(own), np.zeros((N_SEGMENTS, cells))
-    both = np.zeros((N_SEGMENTS, cells, 3))
+    others, share = np.empty_like(own), np.zeros((warp.N_SEGMENTS, cells))
+    both = np.zeros((warp.N_SEGMENTS, cells, 3))
     region = VisibleRegion(low + BORDER_PX, high - BORDER_PX, *shifts)
     _compare_segments(own, window.cell, region, others, share, both)
     share /= window.cell**2
     gain = both[..., 0] / np.maximum(both[..., 1], 1e-6)
-    sums = np.zeros((N_SEGMENTS, cells, 6))
+    sums = np.zeros((warp.N_SEGMENTS, cells, 6))
     _accumulate_gradients(own, others, gain, window.cell, sums)
     # Noise (per px) of a cell; blurring correlates it.
     noise = sums[..., 0].sum(0) / np.maximum(share.sum(0), 1) / window.cell**2
@@ -346,52 +298,53 @@ def _measure_displacements(
     det = (xx + small) * (yy + small) - xy**2
     dx, dy = ((yy + small) * vx - xy * vy) / det, ((xx + small) * vy - xy * vx) / det
     robust = 1 / (1 + (dx**2 + dy**2) / (1 + 0.5 * blurs) ** 2) ** 2
-    return Displacements(*(robust * part for part in (xx, xy, yy, vx, vy)))
+    xx, xy, yy, vx, vy = (robust * part for part in (xx, xy, yy, vx, vy))
+    information, product = np.stack([xx, xy, xy, yy], -1), np.stack([vx, vy], -1)
+    return Displacements(information.reshape(-1, 2, 2), product.reshape(-1, 2))
 
 
 def _take_step(
-    path: Path,
+    path: warp.Path,
     window: WindowEvents,
-    tracks: CellTracks,
+    tracks: warp.Points,
     found: Displacements,
-    prior: Prior,
+    prior: warp.Prior,
     degree: int,
-) -> Path:
+) -> warp.Path:
     """Take a Gauss-Newton step of the rows up to `degree` and the depths of cells.
 
     Unknowns are the path's first rows, in px at the window's end, and the cells' log depths.
     """
-    f, half, (_, cells), n = window.f, window.half, tracks.X.shape, tracks.X.size
-    rho = np.broadcast_to(np.exp(path.log_rho), tracks.X.shape)
-    unit = row_units(path, f, half, N_ALIGNED_ROWS)
+    f, half, (_, cells), n = window.f, window.half, tracks.x.shape, tracks.x.size
+    rho = np.broadcast_to(np.exp(path.log_rho), tracks.x.shape)
+    unit = warp.row_units(path, f, half, N_ALIGNED_ROWS)
     by, r = np.empty((n, 6, 2)), np.empty((n, 2))
     parts = [np.ascontiguousarray(part, np.float64).ravel() for part in (*tracks, rho)]
-    point_derivatives(Points(*parts[:3]), parts[3], path.motion(f), by, r)
-    powers = (parts[2] / half)[:, None] ** np.arange(1, N_ROWS + 1)
-    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * N_ROWS, 2)
-    J = J.transpose(0, 2, 1) @ coefficient_jacobian(path, unit, half, N_ALIGNED_ROWS)
-    now = pack_rows(path, N_ALIGNED_ROWS) / unit
-    W = np.stack([found.xx, found.xy, found.xy, found.yy], -1).reshape(n, 2, 2)
-    v = np.stack([found.vx, found.vy], -1).reshape(n, 2)
+    warp.point_derivatives(warp.Points(*parts[:3]), parts[3], path.motion(f), by, r)
+    powers = (parts[2] / half)[:, None] ** np.arange(1, warp.N_ROWS + 1)
+    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * warp.N_ROWS, 2)
+    J = J.transpose(0, 2, 1) @ warp.coefficient_jacobian(path, unit, half, N_ALIGNED_ROWS)
+    now = warp.pack_rows(path, N_ALIGNED_ROWS) / unit
+    W, v = found
     MJ = W @ J
     # By einsum: larger products wake BLAS's threads, which spin then, beside other starts' steps.
     upper = np.einsum("ep,eq->pq", J.reshape(-1, N_ALIGNED), MJ.reshape(-1, N_ALIGNED))
-    mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(N_SEGMENTS, cells, N_ALIGNED).sum(0).T
-    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(N_SEGMENTS, cells).sum(0)
+    mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(warp.N_SEGMENTS, cells, N_ALIGNED).sum(0).T
+    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(warp.N_SEGMENTS, cells).sum(0)
     H = np.block([[upper, mixed], [mixed.T, np.diag(lower)]])
     g = np.concatenate(
-        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(N_SEGMENTS, cells).sum(0)]
+        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(warp.N_SEGMENTS, cells).sum(0)]
     )
     depth = path.log_rho.reshape(window.cells)
-    bound = _smoothness_matrix(*smoothness_weights(depth, prior.smooth, CELL_EDGE)[:2])
+    bound = _smoothness_matrix(*warp.smoothness_weights(depth, prior.smooth, CELL_EDGE)[:2])
     H[N_ALIGNED:, N_ALIGNED:] += bound
     g[N_ALIGNED:] += np.einsum("ij,j->i", bound, path.log_rho)
     H[N_ALIGNED:, N_ALIGNED:] += prior.relief * np.eye(cells)
     g[N_ALIGNED:] += prior.relief * (path.log_rho - path.log_rho.mean())
-    known, side, _ = row_priors(prior, unit, half)
+    known, side, _ = warp.row_priors(prior, unit, half)
     H[:N_ALIGNED, :N_ALIGNED] += known
     g[:N_ALIGNED] += known @ now - side
-    gauge = gauge_direction(path, unit, len(g))
+    gauge = warp.gauge_direction(path, unit, len(g))
     H = H + 100 * np.trace(upper) / N_ALIGNED * gauge[:, None] * gauge
     H = H + np.diag(1e-3 * np.diag(H) + 1e-6)
 
@@ -405,10 +358,12 @@ def _take_step(
     change[moves] = down
     if not np.isfinite(change).all():
         return path
-    change *= step_fraction(change[:N_ALIGNED])
-    path = replace_rows(path, (now + change[:N_ALIGNED]) * unit)
-    deeper = np.clip(change[N_ALIGNED:], -MAX_DEPTH_STEP, MAX_DEPTH_STEP)
-    return normalise(Path(path.O, path.D, path.log_rho + deeper.astype(path.log_rho.dtype)))
+    change *= warp.step_fraction(change[:N_ALIGNED])
+    path = warp.replace_rows(path, (now + change[:N_ALIGNED]) * unit)
+    deeper = np.clip(change[N_ALIGNED:], -warp.MAX_DEPTH_STEP, warp.MAX_DEPTH_STEP)
+    return warp.normalise(
+        warp.Path(path.O, path.D, path.log_rho + deeper.astype(path.log_rho.dtype))
+    )
 
 
 def _smoothness_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
@@ -424,12 +379,16 @@ def _smoothness_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
     return found
 
 
-def contrast_score(window: WindowEvents, path: Path) -> float:
+def contrast_score(window: WindowEvents, path: warp.Path) -> float:
     """Score a path by the mean over blocks of n (log S - 1.5 log n) / N, S the contrast."""
-    warped, real = _warp_by_cells(path, window), window.x.dtype
-    shape = tuple(size // SCORE_BLOCK_PX for size in window.shape)
-    out = ContrastMaps(np.empty(shape), np.empty(shape))
-    scratch = ImageScratch.of(window.shape, real, np.empty(0))
-    _contrast_by_block(warped, SCORE_BLOCK_PX, scratch, out)
-    S, n = (part[out.number > 5] for part in out)
+    images = np.zeros((2, *window.shape), window.x.dtype)
+    work = np.empty_like(images[0])
+    _accumulate_events(_warp_by_cells(path, window), images)
+    for image in images:
+        blur(image, work, 1)
+    rows, columns = (size // SCORE_BLOCK_PX for size in window.shape)
+    images[0] *= images[0]
+    images = images[:, : rows * SCORE_BLOCK_PX, : columns * SCORE_BLOCK_PX].astype(np.float64)
+    blocks = images.reshape(2, rows, SCORE_BLOCK_PX, columns, SCORE_BLOCK_PX).sum((2, 4))
+    S, n = blocks[:, blocks[1] > 5]
     return float((n * (np.log(S + 1e-6) - 1.5 * np.log(n))).sum()) / max(len(window.x), 1)

@@ -96,18 +96,12 @@ def _add_depth_priors(hold, across, down, begin, out):
                 bond = (down[j, i] if j else 0.0) if axis else (across[j, i] if i else 0.0)
                 if bond == 0:
                     continue
-                before = (j - 1, i) if axis else (j, i - 1)
+                above, left = (1, 0) if axis else (0, 1)
                 for p in range(8):
-                    k, a = (
-                        _coarse_node(j, i, p, wide) if p < 4 else _coarse_node(*before, p - 4, wide)
-                    )
+                    k, a = _coarse_node(j - above * (p // 4), i - left * (p // 4), p % 4, wide)
                     a = a if p < 4 else -a
                     for q in range(8):
-                        m, b = (
-                            _coarse_node(j, i, q, wide)
-                            if q < 4
-                            else _coarse_node(*before, q - 4, wide)
-                        )
+                        m, b = _coarse_node(j - above * (q // 4), i - left * (q // 4), q % 4, wide)
                         out[begin + k, begin + m] += bond * a * (b if q < 4 else -b)
 
 
@@ -170,12 +164,7 @@ def coarse_factor(
 @njit_fastmath
 def precondition_path_and_depths(system, t, depth, out_t, out_depth):
     """Write the preconditioned unknowns of path (n,) and depths (rows, columns)."""
-    lower, preconditioner, side = (
-        system.preconditioner_coarse,
-        system.preconditioner_depth,
-        system.side,
-    )
-    n, (rows, columns) = len(t), depth.shape
+    side, n, (rows, columns) = system.side, len(t), depth.shape
     wide = (columns - 1) // COARSE_NODES + 2
     for i in range(n):
         side[i] = t[i]
@@ -183,11 +172,11 @@ def precondition_path_and_depths(system, t, depth, out_t, out_depth):
         side[i] = 0
     for j in range(rows):
         for i in range(columns):
-            out_depth[j, i] = depth[j, i] * preconditioner[j, i]
+            out_depth[j, i] = depth[j, i] * system.preconditioner_depth[j, i]
             for p in range(4):
                 k, share = _coarse_node(j, i, p, wide)
                 side[n + k] += share * depth[j, i]
-    cholesky_solve(lower, side)
+    cholesky_solve(system.preconditioner_coarse, side)
     for i in range(n):
         out_t[i] = side[i]
     for j in range(rows):
@@ -200,19 +189,13 @@ def precondition_path_and_depths(system, t, depth, out_t, out_depth):
 @njit_fastmath_inlined
 def _add_prior_products(system, vector, out):
     """Add the products of the priors' part of H with map and depths."""
-    map_, depth, diagonal, lumped = (
-        vector.map,
-        vector.depth,
-        system.map_damping,
-        system.depth_damping,
-    )
-    across, down, out_depth = system.across, system.down, out.depth
-    height, width = map_.shape
+    map_, depth, out_depth, lumped = vector.map, vector.depth, out.depth, system.depth_damping
+    across, down, (height, width) = system.across, system.down, map_.shape
     real = map_.dtype.type
     flat, ridge = real(system.flat), real(system.ridge)
     for j in range(height):
         row, above, below = map_[j], map_[max(j - 1, 0)], map_[min(j + 1, height - 1)]
-        to, own = out.map[j], diagonal[j]
+        to, own = out.map[j], system.map_damping[j]
         for i in range(1, width - 1):
             four = real(4) * row[i] - row[i - 1] - row[i + 1] - above[i] - below[i]
             to[i] += flat * four + (ridge + own[i]) * row[i]
@@ -275,10 +258,6 @@ def _dot(a, b):
     return s
 
 
-# Rows of the stack of vectors that conjugate gradients keep.
-_SOLUTION, _RESIDUAL, _DIRECTION, _PRODUCT, _PRECONDITIONED = range(5)
-
-
 def conjugate_gradients(
     system: System, side: BlockVector, steps: int, tolerance: float
 ) -> tuple[BlockVector, int]:
@@ -294,33 +273,29 @@ def conjugate_gradients(
     Returns:
         x, and the number of steps taken.
     """
-    stack = BlockVector(*(np.zeros((5, *part.shape), part.dtype) for part in side))
-    for part, values in zip(stack, side, strict=True):
-        part[_RESIDUAL] = values
+    residual = BlockVector(*(part.copy() for part in side))
+    vectors = residual, *(BlockVector(*(np.zeros_like(part) for part in side)) for _ in range(4))
     value = np.empty(len(system.weight), side.map.dtype)
-    done = _conjugate_gradients(system, stack, steps, tolerance, value)
-    return BlockVector(*(part[_SOLUTION] for part in stack)), done
+    done = _conjugate_gradients(system, vectors, steps, tolerance, value)
+    return vectors[1], done
+
+
+@njit_fastmath_inlined
+def _flat(vector):
+    """Return map, path and depths of a vector, each flat."""
+    return vector.map.reshape(-1), vector.t, vector.depth.reshape(-1)
 
 
 @njit_fastmath
-def _conjugate_gradients(system, stack, steps, tolerance, value):
-    """Solve in place, in a stack of five vectors; return the number of steps taken."""
-    way_t, out_t = stack.t[_DIRECTION], stack.t[_PRODUCT]
-    direction = BlockVector(stack.map[_DIRECTION], way_t, stack.depth[_DIRECTION])
-    out = BlockVector(stack.map[_PRODUCT], out_t, stack.depth[_PRODUCT])
-    found_t, left_t, better_t = stack.t[_SOLUTION], stack.t[_RESIDUAL], stack.t[_PRECONDITIONED]
-    left_depth, better = stack.depth[_RESIDUAL], stack.depth[_PRECONDITIONED]
-    ease, p, q, d, r, s = (
-        system.preconditioner_map.reshape(-1), stack.map[_SOLUTION].reshape(-1),
-        stack.map[_RESIDUAL].reshape(-1), direction.map.reshape(-1), out.map.reshape(-1), 0.0,
-    )  # fmt: skip
-    a, b, c, g, h = (
-        stack.depth[_SOLUTION].reshape(-1), left_depth.reshape(-1), direction.depth.reshape(-1),
-        out.depth.reshape(-1), better.reshape(-1),
-    )  # fmt: skip
+def _conjugate_gradients(system, vectors, steps, tolerance, value):
+    """Solve in place, in five vectors, the first the right side; return the number of steps."""
+    residual, found, direction, out, better = vectors
+    (q, left_t, b), (p, found_t, a), (d, way_t, c) = _flat(residual), _flat(found), _flat(direction)
+    (r, out_t, g), (_, better_t, h) = _flat(out), _flat(better)
+    ease, s = system.preconditioner_map.reshape(-1), 0.0
     for i in range(len(p)):
         d[i] = q[i] * ease[i]
-    precondition_path_and_depths(system, left_t, left_depth, way_t, direction.depth)
+    precondition_path_and_depths(system, left_t, residual.depth, way_t, direction.depth)
     size = _dot(q, d) + _dot(left_t, way_t) + _dot(b, c)
     first, done = size, 0
     while done < steps and size > tolerance * tolerance * first:
@@ -340,7 +315,7 @@ def _conjugate_gradients(system, stack, steps, tolerance, value):
         for i in range(len(a)):
             a[i] += step * c[i]
             b[i] -= step * g[i]
-        precondition_path_and_depths(system, left_t, left_depth, better_t, better)
+        precondition_path_and_depths(system, left_t, residual.depth, better_t, better.depth)
         new += _dot(left_t, better_t) + _dot(b, h)
         share = new / max(size, 1e-30)
         more = out.map.dtype.type(share)

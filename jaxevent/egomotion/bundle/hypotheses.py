@@ -173,7 +173,7 @@ class WindowFitter(Windows):
             planes: Motions before planes.
         """
         params, half = self.params, self.half / 3
-        window, prior = self.sample_events(centre, half, ALIGNED_EVENTS), self.prior(centre, half)
+        window = self.sample_events(centre, half, ALIGNED_EVENTS)
         found = [plane.path(window.cell_positions, self.f, self.real) for plane in planes]
         cuts = [self.sample_events(centre, length, FLOW_EVENTS) for length in (half / 2, half)]
         flow_max = float(params.flow_max)
@@ -182,38 +182,30 @@ class WindowFitter(Windows):
                 best = search_headings(flows, self.f, Omega, params.starts, self.omega_weight)
                 found += [one.path(window, flows) for one in best]
 
-        def align(path: Path) -> tuple[float, Path]:
-            path = align_segments(window, path, prior, degree=0, blurs=4, steps=6)
-            path = align_segments(window, path, prior, degree=0, blurs=1, steps=6)
-            return self.score(window, path), path
-
-        return self._drop_near(map_parallel(align, found))[:MAX_INITIAL_PATHS]
+        return self._align(window, centre, found, (0, 4, 6), (0, 1, 6))[:MAX_INITIAL_PATHS]
 
     def align(self, centre: int, paths: list[Path]) -> list[Path]:
         """Align paths over longer windows; return the best, some degrees apart."""
         middle = self.sample_events(centre, 2 * self.half / 3, ALIGNED_EVENTS)
         last = self.sample_events(centre, self.half, SCORED_EVENTS)
+        best = self._align(middle, centre, paths, (1, 2, 8))[: 2 * self.params.rivals]
+        steps = self.params.iterations
+        return self._align(last, centre, best, (2, 2, steps))[: self.params.rivals]
 
-        def align(paths: list[Path], window: WindowEvents, degree: int, steps: int) -> list[Path]:
-            prior = self.prior(centre, window.half)
+    def _align(
+        self, window: WindowEvents, centre: int, paths: list[Path], *passes: tuple[int, int, int]
+    ) -> list[Path]:
+        """Align paths in passes of some degree, blurs and steps; sort them by their score."""
+        prior = self.prior(centre, window.half)
 
-            def one(path: Path) -> tuple[float, Path]:
-                path = align_segments(window, path, prior, degree=degree, blurs=2, steps=steps)
-                return self.score(window, path), path
+        def align(path: Path) -> tuple[float, Path]:
+            for degree, blurs, steps in passes:
+                path = align_segments(window, path, prior, degree=degree, blurs=blurs, steps=steps)
+            return contrast_score(window, path) - self.rotation_prior(path), path
 
-            return self._drop_near(map_parallel(one, paths))
-
-        best = align(paths, middle, 1, 8)[: 2 * self.params.rivals]
-        return align(best, last, 2, self.params.iterations)[: self.params.rivals]
-
-    def score(self, window: WindowEvents, path: Path) -> float:
-        """Score a path by its contrast and the prior of |Omega|."""
-        return float(contrast_score(window, path)) - self.rotation_prior(path)
-
-    def _drop_near(self, scored: list[tuple[float, Path]]) -> list[Path]:
-        """Sort paths by score, without those near to a better one."""
-        sound = sorted((pair for pair in scored if np.isfinite(pair[0])), key=lambda one: -one[0])
-        return _drop_near([path for _, path in sound], lambda path: path)
+        scored = [pair for pair in map_parallel(align, paths) if np.isfinite(pair[0])]
+        scored.sort(key=lambda pair: -pair[0])
+        return _drop_near([path for _, path in scored], lambda path: path)
 
     def interpolate_to_nodes(self, path: Path, series: PixelSeries) -> Path:
         """Return a path with depths of cells as one with depths at nodes."""

@@ -417,9 +417,9 @@ class InitialMotion(NamedTuple):
         x, y = window.cell_positions
         far = (x[:, None] - flows.xi[:, 0]) ** 2 + (y[:, None] - flows.xi[:, 1]) ** 2
         weight, rho = self.information, self.rho
-        usual = max(float(np.average(rho, weights=weight + 1e-12)), 1e-3)
+        mean_rho = max(float(np.average(rho, weights=weight + 1e-12)), 1e-3)
         share = np.exp(-far / (2 * PATCH_PX**2)) * weight / max(weight.mean(), 1e-12) + 1e-6
-        depth = (share * np.clip(rho, 0.15 * usual, 6 * usual)).sum(1) / share.sum(1)
+        depth = (share * np.clip(rho, 0.15 * mean_rho, 6 * mean_rho)).sum(1) / share.sum(1)
         return Path.constant_twist(self.heading, self.Omega, np.log(depth).astype(window.x.dtype))
 
 

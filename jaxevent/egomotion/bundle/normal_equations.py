@@ -10,16 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
-from jaxevent.egomotion.bundle.cg import (
-    COARSE_NODES,
-    MAX_BLOCK_STEPS,
-    BlockVector,
-    System,
-    coarse_factor,
-    coarse_shape,
-    conjugate_gradients,
-    solve_columns,
-)
+from jaxevent.egomotion.bundle import cg, warp
 from jaxevent.egomotion.bundle.residuals import (
     Direction,
     FreeUnknowns,
@@ -37,21 +28,10 @@ from jaxevent.egomotion.bundle.residuals import (
     sample_map,
     subtract_mean,
 )
-from jaxevent.egomotion.bundle.warp import (
-    N_ROWS,
-    Prior,
-    bilinear_weight,
-    coefficient_jacobian,
-    gauge_direction,
-    is_twist_change,
-    normalise,
-    pack_rows,
-    row_priors,
-    row_units,
-    smoothness_weights,
-)
 
-N_PATH = 6 * N_ROWS  # numbers of a path's rows; after them come the skew and the plane's normal
+N_PATH = (
+    6 * warp.N_ROWS
+)  # numbers of a path's rows; after them come the skew and the plane's normal
 NODE_EDGE = 0.1  # a larger difference of log depth between nodes is an edge
 # Less accurate solutions save a sixth of the time and lose 0.3 degrees of heading on slider_depth.
 MAX_CG_STEPS, CG_TOLERANCE = 40, 0.01
@@ -86,11 +66,11 @@ def _write_jacobian_row(jacobian, e, row):
     t = jacobian.tau[e]
     for axis in range(6):
         value = jacobian.base[axis, e]
-        for k in range(N_ROWS):
+        for k in range(warp.N_ROWS):
             value *= t
-            row[axis * N_ROWS + k] = value
+            row[axis * warp.N_ROWS + k] = value
     for k in range(len(jacobian.more)):
-        row[6 * N_ROWS + k] = jacobian.more[k, e]
+        row[6 * warp.N_ROWS + k] = jacobian.more[k, e]
 
 
 @njit_fastmath_inlined
@@ -119,9 +99,9 @@ def _coarse_corner(jacobian, e):
     columns = jacobian.columns
     row = jacobian.node[e] // columns
     x, y = jacobian.node[e] - row * columns + jacobian.across[e], row + jacobian.down[e]
-    i, j = int(x / COARSE_NODES), int(y / COARSE_NODES)
-    wide = (columns - 1) // COARSE_NODES + 2
-    return j * wide + i, x / COARSE_NODES - i, y / COARSE_NODES - j
+    i, j = int(x / cg.COARSE_NODES), int(y / cg.COARSE_NODES)
+    wide = (columns - 1) // cg.COARSE_NODES + 2
+    return j * wide + i, x / cg.COARSE_NODES - i, y / cg.COARSE_NODES - j
 
 
 @njit_fastmath
@@ -136,7 +116,7 @@ def path_blocks(jacobian, weight, begin, scratch, path_block, coupling):
         path_block: (n, n) output, coefficients axis by axis, each with its powers, and `more`.
         coupling: (coarse nodes, n) output.
     """
-    wide = (jacobian.columns - 1) // COARSE_NODES + 2
+    wide = (jacobian.columns - 1) // cg.COARSE_NODES + 2
     rows, weights, mean, _ = scratch
     n, filled, series = len(path_block), 0, len(begin) - 1
     path_block[:] = 0
@@ -160,7 +140,7 @@ def path_blocks(jacobian, weight, begin, scratch, path_block, coupling):
             at, u, v = _coarse_corner(jacobian, e)
             for p in range(4):
                 to = coupling[at + p % 2 + p // 2 * wide]
-                factor = weight[e] * jacobian.by_depth[e] * bilinear_weight(u, v, p)
+                factor = weight[e] * jacobian.by_depth[e] * warp.bilinear_weight(u, v, p)
                 scale = weight.dtype.type(factor)
                 for k in range(n):
                     to[k] += scale * row[k]
@@ -186,7 +166,7 @@ def depth_blocks(jacobian, weight, begin, scratch, coarse_block, lumped):
         lumped: (nodes,) output, without the means of series.
     """
     columns = jacobian.columns
-    wide = (columns - 1) // COARSE_NODES + 2
+    wide = (columns - 1) // cg.COARSE_NODES + 2
     mean, touched, latest = scratch
     latest[:] = -1
     coarse_block[:] = 0
@@ -197,17 +177,17 @@ def depth_blocks(jacobian, weight, begin, scratch, coarse_block, lumped):
             w, by = weight[e], jacobian.by_depth[e]
             total += w
             for p in range(4):
-                share = bilinear_weight(jacobian.across[e], jacobian.down[e], p)
+                share = warp.bilinear_weight(jacobian.across[e], jacobian.down[e], p)
                 lumped[jacobian.node[e] + p % 2 + p // 2 * columns] += w * by * by * share
             at, u, v = _coarse_corner(jacobian, e)
             for p in range(4):
-                k, value = at + p % 2 + p // 2 * wide, w * by * bilinear_weight(u, v, p)
+                k, value = at + p % 2 + p // 2 * wide, w * by * warp.bilinear_weight(u, v, p)
                 if latest[k] != one:
                     latest[k], touched[number], mean[k] = one, k, 0
                     number += 1
                 mean[k] += value
                 for q in range(4):
-                    product = value * by * bilinear_weight(u, v, q)
+                    product = value * by * warp.bilinear_weight(u, v, q)
                     coarse_block[k, at + q % 2 + q // 2 * wide] += product
         total = max(total, 1e-3)
         for p in range(number):
@@ -232,7 +212,7 @@ class Problem(NamedTuple):
     """Data and settings of a bundle adjustment, the same in all of its steps."""
 
     series: PixelSeries
-    prior: Prior
+    prior: warp.Prior
     sigma: float  # C, of residuals
     plane: bool  # whether depths are a plane's
     typical_cost: float  # C^2, of positions from which events count less
@@ -249,7 +229,7 @@ class Problem(NamedTuple):
 
     def path_prior(self, unit: NDArray) -> tuple[NDArray, NDArray, float]:
         """Return K, b and c of the priors on path and skew, t' K t / 2 - b' t + c."""
-        K, b, c = row_priors(self.prior, unit, self.series.half)
+        K, b, c = warp.row_priors(self.prior, unit, self.series.half)
         matrix, side = np.zeros((N_PATH + 4, N_PATH + 4)), np.zeros(N_PATH + 4)
         matrix[:N_PATH, :N_PATH], side[:N_PATH] = K, b
         weight, skew = float(self.prior.skew_weight), float(self.prior.skew)
@@ -270,7 +250,7 @@ class Evaluation(NamedTuple):
 
 def path_unknowns(scene: Scene, unit: NDArray) -> NDArray[np.float64]:
     """Return the path's rows in units `unit`, the skew, and 0 for the change of the plane."""
-    return np.concatenate([pack_rows(scene.path) / unit, [scene.skew, 0, 0, 0]])
+    return np.concatenate([warp.pack_rows(scene.path) / unit, [scene.skew, 0, 0, 0]])
 
 
 def laplacian(image: NDArray) -> NDArray:
@@ -299,18 +279,18 @@ def evaluate(
     most = MAX_SKEW_SIGMAS / math.sqrt(float(prior.skew_weight))
     skew = min(max(float(scene.skew), prior.skew - most), prior.skew + most)
     same_path = before is not None and before.scene.path is scene.path
-    scene = Scene(scene.path if same_path else normalise(scene.path), scene.map, skew)
+    scene = Scene(scene.path if same_path else warp.normalise(scene.path), scene.map, skew)
     samples = sample_map(scene, series, before.samples if before else None, same_path=same_path)
     residual = samples.value - series.level - series.x.dtype.type(scene.skew) * series.count
     weight, scratch = weight.copy(), WeightScratch.of(series.shape, residual)
     of_positions, cost = robust_weights(residual, samples, series, problem.loss, scratch, weight)
-    unit = row_units(scene.path, series.f, series.half)
+    unit = warp.row_units(scene.path, series.f, series.half)
     matrix, side, constant = problem.path_prior(unit)
     t = path_unknowns(scene, unit)
     objective = t @ matrix @ t / 2 - side @ t + constant
     if not plane:
         depth = scene.path.log_rho.reshape(series.nodes)
-        objective += smoothness_weights(depth, float(prior.bond), NODE_EDGE)[2]
+        objective += warp.smoothness_weights(depth, float(prior.bond), NODE_EDGE)[2]
     image = scene.map
     differences = sum(float(np.vdot(d, d)) for d in (np.diff(image, axis=k) for k in (0, 1)))
     objective += (float(prior.flat) * differences + MAP_RIDGE * float(np.vdot(image, image))) / 2
@@ -349,7 +329,7 @@ class NormalEquations(NamedTuple):
         """Return the changes of residuals (E,) by unknowns, before means are subtracted."""
         image, t, depth = v
         real, value = image.dtype.type, np.empty_like(self.residual)
-        coefficients = (self.coefficient_jacobian @ t[:N_PATH]).reshape(6, N_ROWS).astype(real)
+        coefficients = (self.coefficient_jacobian @ t[:N_PATH]).reshape(6, warp.N_ROWS).astype(real)
         more = t[N_PATH : self.n].astype(real)
         direction = Direction(image.ravel(), coefficients, more, depth.astype(real))
         multiply_jacobian(self.jacobian, direction, value)
@@ -359,7 +339,7 @@ class NormalEquations(NamedTuple):
         """Return J' z of values z (E,)."""
         real, series, n = z.dtype, self.problem.series, len(self.jacobian.more)
         image, depth = np.empty(series.shape, real), np.empty(math.prod(series.nodes), real)
-        coefficients, more = np.empty((6, N_ROWS), real), np.empty(n, real)
+        coefficients, more = np.empty((6, warp.N_ROWS), real), np.empty(n, real)
         multiply_transpose(
             self.jacobian, z, Direction(image.reshape(-1), coefficients, more, depth)
         )
@@ -378,17 +358,17 @@ def linearise(problem: Problem, evaluation: Evaluation, map_only: bool) -> Norma
     series, prior, _, plane, _ = problem
     scene, weight, real = evaluation.scene, evaluation.weight, series.x.dtype
     path, moves = scene.path, float(prior.moves)
-    unit = row_units(path, series.f, series.half)
+    unit = warp.row_units(path, series.f, series.half)
     median_rho = float(np.exp(np.median(path.log_rho)))
     free = None if map_only else FreeUnknowns(plane, moves, median_rho)
     jacobian = residual_jacobian(scene, series, evaluation.samples, free)
-    by = coefficient_jacobian(path, unit, series.half)
-    by[:, 3 * N_ROWS :] *= moves
+    by = warp.coefficient_jacobian(path, unit, series.half)
+    by[:, 3 * warp.N_ROWS :] *= moves
     n = N_PATH + len(jacobian.more)
     residual = evaluation.residual.copy()
     subtract_mean(residual, weight, series.begin)
 
-    coarse = math.prod(coarse_shape(*series.nodes))
+    coarse = math.prod(cg.coarse_shape(*series.nodes))
     raw, diagonal = np.zeros((n, n)), np.zeros(series.shape, real)
     mixed, coarse_block = np.zeros((coarse, n)), np.zeros((coarse, coarse))
     lumped = np.zeros(series.nodes)
@@ -402,12 +382,12 @@ def linearise(problem: Problem, evaluation: Evaluation, map_only: bool) -> Norma
     information = problem.information
     path_prior, side, _ = problem.path_prior(unit)
     # Changes of the twist and the skew have priors, the rest may be undetermined.
-    held = np.append(~is_twist_change(), [False, True, True, True])
-    gauge = gauge_direction(path, unit, N_PATH + 4)
+    held = np.append(~warp.is_twist_change(), [False, True, True, True])
+    gauge = warp.gauge_direction(path, unit, N_PATH + 4)
     held = np.diag(np.where(held, 1e-3, 0)) + 1e4 * gauge[:, None] * gauge
     path_block = information * whole.T @ raw @ whole + path_prior + held
     depth = path.log_rho.reshape(series.nodes)
-    across, down, _ = smoothness_weights(depth, float(prior.bond), NODE_EDGE)
+    across, down, _ = warp.smoothness_weights(depth, float(prior.bond), NODE_EDGE)
     if plane:
         across, down = np.zeros_like(across), np.zeros_like(down)
     lumped = information * lumped + 1e-2
@@ -444,7 +424,7 @@ def gradient(equations: NormalEquations) -> Unknowns:
     )
 
 
-def damped_system(equations: NormalEquations, damping: float) -> System:
+def damped_system(equations: NormalEquations, damping: float) -> cg.System:
     """Return H with its diagonal enlarged by a fraction `damping`, and its preconditioner."""
     series, real = equations.problem.series, equations.evaluation.residual.dtype
     n = equations.n
@@ -452,18 +432,18 @@ def damped_system(equations: NormalEquations, damping: float) -> System:
     path_prior = (equations.path_prior + equations.regularisation)[:n, :n] + damped
     hold, bonds = 1e-3 + damping * equations.lumped, (equations.across, equations.down)
     blocks = equations.path_block[:n, :n] + damped, equations.coupling[:, :n]
-    lower = coarse_factor((*blocks, equations.coarse_block), hold, bonds)
+    lower = cg.coarse_factor((*blocks, equations.coarse_block), hold, bonds)
 
     def on(values: NDArray) -> NDArray:
         return np.ascontiguousarray(values.astype(real))
 
     diagonal, lumped = (1 + damping) * equations.diagonal, (1 + damping) * equations.lumped
-    return System(
+    return cg.System(
         equations.jacobian, equations.evaluation.weight, equations.problem.information,
         series.begin, equations.coefficient_jacobian, path_prior,
         float(equations.problem.prior.flat), MAP_RIDGE, on(damping * equations.diagonal), on(hold),
         on(bonds[0]), on(bonds[1]), on(1 / diagonal), on(1 / lumped), lower,
-        np.empty((6, N_ROWS), real), np.empty(n - N_PATH, real), np.empty(len(lower)),
+        np.empty((6, warp.N_ROWS), real), np.empty(n - N_PATH, real), np.empty(len(lower)),
     )  # fmt: skip
 
 
@@ -473,12 +453,12 @@ def inverse_columns(equations: NormalEquations, rows: list[int]) -> list[Unknown
     sides = np.zeros((len(rows), n))
     sides[range(len(rows)), rows] = equations.unit[rows]
     system, shape = damped_system(equations, 0.0), equations.problem.series.shape
-    found, size = solve_columns(system, sides), math.prod(shape)
+    found, size = cg.solve_columns(system, sides), math.prod(shape)
     # Rounding may fail to separate similar directions; a side alone has only one.
     for row in np.flatnonzero(~np.isfinite(found.t).all(1)):
         none, depths = np.zeros(shape, found.rest.dtype), np.zeros_like(system.across)
-        side = BlockVector(none, sides[row], depths)
-        one, _ = conjugate_gradients(system, side, MAX_BLOCK_STEPS, SINGLE_SIDE_TOLERANCE)
+        side = cg.BlockVector(none, sides[row], depths)
+        one, _ = cg.conjugate_gradients(system, side, cg.MAX_BLOCK_STEPS, SINGLE_SIDE_TOLERANCE)
         found.t[row] = one.t
         found.rest[row] = np.concatenate([one.map.ravel(), one.depth.ravel()])
     return [
@@ -492,11 +472,11 @@ def solve(
 ) -> Unknowns:
     """Solve the damped normal equations for a right side by conjugate gradients."""
     n, real = equations.n, equations.evaluation.residual.dtype
-    vector = BlockVector(
+    vector = cg.BlockVector(
         np.ascontiguousarray(side[0], real),
         np.ascontiguousarray(side[1][:n], np.float64),
         np.ascontiguousarray(side[2], real).reshape(equations.problem.series.nodes),
     )
     system = damped_system(equations, damping)
-    (image, t, depth), _ = conjugate_gradients(system, vector, MAX_CG_STEPS, tolerance)
+    (image, t, depth), _ = cg.conjugate_gradients(system, vector, MAX_CG_STEPS, tolerance)
     return image, np.append(t, np.zeros(N_PATH + 4 - n)), depth.ravel()

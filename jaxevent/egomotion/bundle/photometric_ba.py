@@ -34,6 +34,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath
+from jaxevent.egomotion.bundle import warp
 from jaxevent.egomotion.bundle.alignment import ContrastMaps, ImageScratch, blur, splat
 from jaxevent.egomotion.bundle.normal_equations import (
     N_PATH,
@@ -47,19 +48,6 @@ from jaxevent.egomotion.bundle.normal_equations import (
     solve,
 )
 from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, subtract_mean
-from jaxevent.egomotion.bundle.warp import (
-    MAX_DEPTH_STEP,
-    MIN_RELATIVE_RHO,
-    N_ROWS,
-    Path,
-    Points,
-    Prior,
-    normalise,
-    pixel_rays,
-    replace_rows,
-    step_fraction,
-    warp,
-)
 
 # A step that costs more is taken back and damped, first by FIRST_DAMPING, then by DAMPING_GROWTH
 # times more, until no step helps. One that costs less leaves DAMPING_DECAY of the damping, and is
@@ -123,7 +111,7 @@ class FitReport(NamedTuple):
 def adjust(
     series: PixelSeries,
     scene: Scene,
-    prior: Prior,
+    prior: warp.Prior,
     *,
     sigma: float | int,
     map_steps: int,
@@ -162,7 +150,7 @@ def adjust(
 
 
 def init_problem(
-    series: PixelSeries, scene: Scene, prior: Prior, sigma: float, plane: bool
+    series: PixelSeries, scene: Scene, prior: warp.Prior, sigma: float, plane: bool
 ) -> tuple[Problem, Evaluation]:
     """Return the problem of a bundle adjustment, and the evaluation of its first scene."""
     weight = np.ones_like(series.x)
@@ -187,11 +175,11 @@ def extrapolate(scene: Scene, last: Scene, factor: float, plane: bool) -> Scene:
     depth = here.log_rho + factor * (here.log_rho - there.log_rho)
     if plane:
         near, nearer = np.exp(there.log_rho), np.exp(here.log_rho)
-        far = MIN_RELATIVE_RHO * np.median(nearer)
+        far = warp.MIN_RELATIVE_RHO * np.median(nearer)
         depth = np.log(np.maximum(nearer + factor * (nearer - near), far))
     skew = scene.skew + factor * (scene.skew - last.skew)
     real = scene.map.dtype
-    return Scene(Path(O, D, depth.astype(real)), image.astype(real), skew)
+    return Scene(warp.Path(O, D, depth.astype(real)), image.astype(real), skew)
 
 
 def gauss_newton_step(problem: Problem, kept: Evaluation, damping: float, map_only: bool) -> Scene:
@@ -204,18 +192,20 @@ def gauss_newton_step(problem: Problem, kept: Evaluation, damping: float, map_on
         return scene
     if map_only:
         return Scene(scene.path, scene.map + image, scene.skew)
-    fraction = step_fraction(t[:N_PATH])
+    fraction = warp.step_fraction(t[:N_PATH])
     rows = (equations.t + fraction * t)[:N_PATH] * equations.unit
-    path = replace_rows(scene.path, rows)
+    path = warp.replace_rows(scene.path, rows)
     if problem.plane:
         depth = update_plane_normal(path, problem.series, fraction * t[N_PATH + 1 :])
     else:
-        depth = path.log_rho + np.clip(fraction * q, -MAX_DEPTH_STEP, MAX_DEPTH_STEP)
-    path = normalise(Path(path.O, path.D, depth.astype(scene.map.dtype)))
+        depth = path.log_rho + np.clip(fraction * q, -warp.MAX_DEPTH_STEP, warp.MAX_DEPTH_STEP)
+    path = warp.normalise(warp.Path(path.O, path.D, depth.astype(scene.map.dtype)))
     return Scene(path, scene.map + image, scene.skew + fraction * t[N_PATH])
 
 
-def update_plane_normal(path: Path, series: PixelSeries, change: NDArray) -> NDArray[np.float64]:
+def update_plane_normal(
+    path: warp.Path, series: PixelSeries, change: NDArray
+) -> NDArray[np.float64]:
     """Return log depths at nodes after a change of their plane's normal.
 
     Args:
@@ -225,12 +215,12 @@ def update_plane_normal(path: Path, series: PixelSeries, change: NDArray) -> NDA
     """
     level = np.exp(path.log_rho.astype(np.float64))
     median = float(np.median(level))
-    rays = pixel_rays(*series.node_positions, series.f)
-    known = np.where(level > 1.5 * MIN_RELATIVE_RHO * median, rays.T, 0)
+    rays = warp.pixel_rays(*series.node_positions, series.f)
+    known = np.where(level > 1.5 * warp.MIN_RELATIVE_RHO * median, rays.T, 0)
     # By einsum: larger products wake BLAS's threads, which spin then.
     normal = np.linalg.solve(known @ rays + 1e-6 * np.eye(3), np.einsum("in,n->i", known, level))
     level = np.einsum("ni,i->n", rays, normal + median * change)
-    return np.log(np.maximum(level, MIN_RELATIVE_RHO * median))
+    return np.log(np.maximum(level, warp.MIN_RELATIVE_RHO * median))
 
 
 def summarise(problem: Problem, kept: Evaluation) -> FitReport:
@@ -246,13 +236,13 @@ def summarise(problem: Problem, kept: Evaluation) -> FitReport:
 
 
 def compute_covariance(
-    series: PixelSeries, scene: Scene, prior: Prior, *, sigma: float | int, plane: bool = False
+    series: PixelSeries, scene: Scene, prior: warp.Prior, *, sigma: float | int, plane: bool = False
 ) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of heading C1 and Omega O0 of a scene that was adjusted."""
     path = scene.path
     median = np.median(path.log_rho)
     depth = np.clip(path.log_rho, median - MAX_DEPTH_SPREAD, median + MAX_DEPTH_SPREAD)
-    scene = scene._replace(path=Path(path.O, path.D, depth))
+    scene = scene._replace(path=warp.Path(path.O, path.D, depth))
     problem, evaluation = init_problem(series, scene, prior, float(sigma), plane)
     return sandwich_covariance(linearise(problem, evaluation, map_only=False))
 
@@ -274,7 +264,7 @@ def sandwich_covariance(equations: NormalEquations) -> NDArray[np.float64]:
     down, across = ((series.y - series.corner[1]), (series.x - series.corner[0]))
     cell = (down // small * columns + across // small).astype(np.int64)
     sums, own = [], []
-    for v in inverse_columns(equations, [*range(3 * N_ROWS, 3 * N_ROWS + 3), *range(3)]):
+    for v in inverse_columns(equations, [*range(3 * warp.N_ROWS, 3 * warp.N_ROWS + 3), *range(3)]):
         score = problem.information * weight * left * equations.jacobian_product(v)
         sums.append(np.bincount(cell, score, rows * columns))
         own.append(v[1])
@@ -328,13 +318,13 @@ def _contrast_by_depth(rays, p, depths, series, scratch, out):
                 out.contrast[n, j, i], out.number[n, j, i] = s, t
 
 
-def _contrast_of_depths(path: Path, series: PixelSeries, depths: NDArray) -> ContrastMaps:
+def _contrast_of_depths(path: warp.Path, series: PixelSeries, depths: NDArray) -> ContrastMaps:
     """Return contrast and number of events about nodes by inverse depth, (n, rows, columns)."""
     events = slice(series.n_events)
-    at = Points(series.x[events], series.y[events], series.tau[events])
+    at = warp.Points(series.x[events], series.y[events], series.tau[events])
     real, none = series.x.dtype, np.zeros_like(at.x)
-    rx, ry = warp(path, series.f, at, none)
-    X, Y = warp(path, series.f, at, none + 1)
+    rx, ry = warp.warp(path, series.f, at, none)
+    X, Y = warp.warp(path, series.f, at, none + 1)
     rays = np.stack([rx, ry, X - rx, Y - ry]).astype(real)
     sums = np.empty((2, series.nodes[0], series.shape[1]))
     out = ContrastMaps(*(np.empty((len(depths), *series.nodes)) for _ in range(2)))
@@ -343,7 +333,7 @@ def _contrast_of_depths(path: Path, series: PixelSeries, depths: NDArray) -> Con
     return out
 
 
-def search_depths(path: Path, series: PixelSeries) -> NDArray:
+def search_depths(path: warp.Path, series: PixelSeries) -> NDArray:
     """Search the depth of highest contrast around each node, for a fixed path.
 
     Depths are tried from 2.5 times nearer to 2.5 times farther than those of the path. Nodes with

@@ -11,20 +11,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
-from jaxevent.egomotion.bundle.warp import (
-    MIN_RAY_DERIVATIVE,
-    CameraMotion,
-    DepthField,
-    MapGrid,
-    Path,
-    Points,
-    Positions,
-    bilinear_corner,
-    coefficient_gradient,
-    interpolate_depth,
-    project,
-    reference_ray,
-)
+from jaxevent.egomotion.bundle import warp
 
 DEPTH_BOUND_NODES = 4  # about an event, among whose depths the event's lies
 
@@ -51,9 +38,9 @@ class PixelSeries(NamedTuple):
     node: int  # px between nodes of depth
 
     @property
-    def points(self) -> Points:
+    def points(self) -> warp.Points:
         """Pixels and times of all rows."""
-        return Points(self.x, self.y, self.tau)
+        return warp.Points(self.x, self.y, self.tau)
 
     @property
     def nodes(self) -> tuple[int, int]:
@@ -62,10 +49,10 @@ class PixelSeries(NamedTuple):
         return (height - 2) // self.node + 2, (width - 2) // self.node + 2
 
     @property
-    def grid(self) -> MapGrid:
+    def grid(self) -> warp.MapGrid:
         """Positions of the map's pixels and of the nodes."""
         (x, y), (height, width), (rows, columns) = self.corner, self.shape, self.nodes
-        return MapGrid(float(x), float(y), height, width, float(self.node), rows, columns)
+        return warp.MapGrid(float(x), float(y), height, width, float(self.node), rows, columns)
 
     @property
     def node_positions(self) -> tuple[NDArray, NDArray]:
@@ -81,7 +68,7 @@ class Scene(NamedTuple):
     The map is in units of the mean threshold C; C (1 + skew) is that of ON, C (1 - skew) of OFF.
     """
 
-    path: Path
+    path: warp.Path
     map: NDArray  # (height, width)
     skew: float
 
@@ -245,8 +232,8 @@ def robust_weights(residual, samples, series, loss, scratch, weight):
 
 
 def project_events(
-    path: Path, series: PixelSeries, log_rho: NDArray | None = None
-) -> tuple[Positions, NDArray]:
+    path: warp.Path, series: PixelSeries, log_rho: NDArray | None = None
+) -> tuple[warp.Positions, NDArray]:
     """Project events into the reference view.
 
     Args:
@@ -257,14 +244,14 @@ def project_events(
     Returns:
         Positions in px, and log inverse depths (E,).
     """
-    out = Positions(np.empty_like(series.x), np.empty_like(series.x))
+    out = warp.Positions(np.empty_like(series.x), np.empty_like(series.x))
     root = np.full_like(series.x, -np.inf) if log_rho is None else log_rho.copy()
     depth = np.ascontiguousarray(path.log_rho)
     of, size = depth.reshape(series.nodes), 2 * DEPTH_BOUND_NODES + 1
     high = scipy.ndimage.maximum_filter(of, size, mode="nearest").ravel()
     low = scipy.ndimage.minimum_filter(of, size, mode="nearest").ravel()
-    field = DepthField(depth, high, low, series.grid)
-    project(series.points, path.motion(series.f), field, root, out)
+    field = warp.DepthField(depth, high, low, series.grid)
+    warp.project(series.points, path.motion(series.f), field, root, out)
     return out, root
 
 
@@ -311,7 +298,7 @@ class MapField(NamedTuple):
 
     image: NDArray
     log_rho: NDArray
-    grid: MapGrid
+    grid: warp.MapGrid
 
 
 class Direction(NamedTuple):
@@ -363,10 +350,10 @@ def differentiate_residuals(series, samples, motion, field, free, jacobian):
     X, Y, f, grid, image = samples.X, samples.Y, motion.f, field.grid, field.image
     for e in range(len(x)):
         t = tau[e]
-        rx, ry, dx, dy = reference_ray(motion, x[e], y[e], t)
-        log_rho, lx, ly = interpolate_depth(field.log_rho, X[e], Y[e], grid)
+        rx, ry, dx, dy = warp.reference_ray(motion, x[e], y[e], t)
+        log_rho, lx, ly = warp.interpolate_depth(field.log_rho, X[e], Y[e], grid)
         rho = np.exp(log_rho)
-        k, jacobian.across[e], jacobian.down[e] = bilinear_corner(X[e], Y[e], grid)
+        k, jacobian.across[e], jacobian.down[e] = warp.bilinear_corner(X[e], Y[e], grid)
         jacobian.node[e] = k
         a, b, gx, gy = jacobian.u[e], jacobian.v[e], 0.0, 0.0
         k = jacobian.first[e]
@@ -376,10 +363,10 @@ def differentiate_residuals(series, samples, motion, field, free, jacobian):
                 gx += bspline(m, b) * bspline_derivative(n, a) * value
                 gy += bspline_derivative(m, b) * bspline(n, a) * value
         dx, dy = rho * dx, rho * dy
-        slope = (gx * dx + gy * dy) / max(1 - lx * dx - ly * dy, MIN_RAY_DERIVATIVE)
+        slope = (gx * dx + gy * dy) / max(1 - lx * dx - ly * dy, warp.MIN_RAY_DERIVATIVE)
         hx, hy = gx + slope * lx, gy + slope * ly
         here = samples.inside[e]
-        by = coefficient_gradient(motion, t, (rx, ry), rho, here * hx, here * hy)
+        by = warp.coefficient_gradient(motion, t, (rx, ry), rho, here * hx, here * hy)
         for n in range(6):
             jacobian.base[n, e] = by[n]
         by_depth = here * (hx * dx + hy * dy)
@@ -407,7 +394,7 @@ def residual_jacobian(
     if free is not None:
         depth = np.ascontiguousarray(scene.path.log_rho)
         field = MapField(scene.map.ravel(), depth, series.grid)
-        motion: CameraMotion = scene.path.motion(series.f)
+        motion: warp.CameraMotion = scene.path.motion(series.f)
         differentiate_residuals(series, samples, motion, field, free, jacobian)
     return jacobian
 

@@ -69,26 +69,30 @@ FramePair = tuple[NDArray, NDArray, NDArray]
 class Params(Parameters):
     """Parameters of the fit of a window, and of the sequence of windows."""
 
-    half_window = Positive(0.15, "s", "half the length of the last window; earlier: 1/3, 2/3")
-    step = Positive(0.1, "s", "from one window to the next")
+    half_window = Positive(
+        0.15, "s", "half the length of a window; first alignments use 1/3 and 2/3 of it"
+    )
+    step = Positive(0.1, "s", "time from one window to the next")
     events = Count(60000, "", "most events of a window, of pixels taken at random")
     fewest = Count(2000, "", "events that a window needs")
     fresh = Count(5, "", "windows until new starts compete; twice as many each time they agree")
-    starts = Count(3, "", "headings that are followed, of each of two short windows")
-    cell = Count(24, "px", "of one depth")
+    starts = Count(3, "", "headings that are refined, of each of two short windows")
+    cell = Count(24, "px", "size of a cell of one depth")
     iterations = Count(8, "", "steps of the alignment of segments on the whole window")
-    rivals = Count(3, "", "aligned starts, some degrees apart, that go on to the photometric fit")
+    rivals = Count(3, "", "aligned starts, some degrees apart, that the bundle adjustment refines")
 
     smooth = Positive(1.0, "", "weight of differences of log depth between cells")
     relief = Positive(0.1, "", "weight of differences of log depth from its mean")
     change = Positive(0.02, "1/px^2", "weight of changes of the twist, in px at the window's end")
     bond = Positive(1.0, "", "weight of differences of log depth between nodes")
     flat = Positive(0.01, "1/C^2", "weight of differences of log intensity between pixels")
-    alike = Positive(10.0, "", "how many events together tell as much as one: errors are alike")
-    omega_scale = Number(0.0, "rad/s", "prior: |Omega| is about so much or less; 0: not known")
-    gyro_std = Positive(0.03, "rad/s", "of a gyro, if one is given")
+    alike = Positive(10.0, "", "number of events that count as one, as their errors are alike")
+    omega_scale = Number(0.0, "rad/s", "standard deviation of |Omega| by a prior; 0: no prior")
+    gyro_std = Positive(0.03, "rad/s", "standard deviation of a gyro, if one is given")
     frames = Choice((True, False), "whether frames are fitted beside the events")
-    flow_max = Positive(220.0, "px/s", "flows of patches that are tried, without the rotation")
+    flow_max = Positive(
+        220.0, "px/s", "largest flow of patches that is tried, without the rotation"
+    )
 
 
 class FramePixels(NamedTuple):

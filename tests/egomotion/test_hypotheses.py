@@ -1,4 +1,4 @@
-"""Rivals of a window, compared on pixels left out; the thresholds' skew by counts."""
+"""Hypotheses of a window, compared on held-out pixels; the thresholds' skew by counts."""
 
 import inspect
 from types import SimpleNamespace
@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.bundle import hypotheses
-from jaxevent.egomotion.bundle.hypotheses import (
-    HeldOutTest,
-    WindowFitter,
-    error_inflation,
-)
+from jaxevent.egomotion.bundle import hypotheses as h
+from jaxevent.egomotion.bundle.hypotheses import HeldOutTest, WindowFitter
 from jaxevent.egomotion.bundle.photometric_ba import FitReport
 from jaxevent.egomotion.bundle.residuals import Scene
 from jaxevent.egomotion.bundle.warp import Path
@@ -38,8 +34,8 @@ def test_cells_err_independently():
     assert z == pytest.approx(D.sum() / np.sqrt((D**2).sum()), rel=1e-4)
 
 
-def test_the_first_rival_gives_way_if_it_is_refuted(monkeypatch):
-    """By what is furthest before it on pixels left out."""
+def test_the_first_hypothesis_gives_way_if_it_is_refuted(monkeypatch):
+    """By the one with the largest z on held-out pixels."""
     before = {("b", "a"): 2.1, ("c", "a"): 2.4, ("b", "c"): 1.9}  # z of the first over the second
     z = before | {(two, one): -value for (one, two), value in before.items()}
     monkeypatch.setattr(HeldOutTest, "z", lambda self, one, other: z[other, one])
@@ -53,33 +49,32 @@ def test_the_first_rival_gives_way_if_it_is_refuted(monkeypatch):
 def test_rotation_alone_makes_about_the_same_flow():
     heading, Omega, f, rho = np.array([0.6, -0.8, 0.0]), np.array([0.1, 0.2, 0.3]), 200.0, 0.2
     path = Path.constant_twist(heading, Omega, np.full(4, np.log(rho)))
-    still = hypotheses.without_translation(path)
+    still = h.without_translation(path)
     assert np.exp(still.log_rho).max() < 1e-3
     middle = np.asarray(A(0.0, 0.0, f)) @ heading * rho + np.asarray(B(0.0, 0.0, f)) @ Omega
     np.testing.assert_allclose(np.asarray(B(0.0, 0.0, f)) @ still.O[0], middle, rtol=1e-5)
 
 
-@pytest.mark.parametrize("told", [2.9, 3.1])
-@pytest.mark.parametrize("better", [0.1, -0.1])
+@pytest.mark.parametrize("least_z, better", [(2.9, 0.1), (2.9, -0.1), (3.1, 0.1), (3.1, -0.1)])
 @pytest.mark.parametrize("least", ["turn", "sharpest"])
-def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, told, least):
-    """That one is taken which events left out tell; the path's turn may be false.
+def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, least_z, least):
+    """The rotation that held-out events favour is taken; the path's turn may be false.
 
-    Where these tell of a translation as it is, its map alone is made. Both have to be refuted.
+    If both are refuted with their maps alone, they are not fitted further.
     """
     path = Path.constant_twist(np.array([1.0, 0, 0]), np.array([0.0, 0.9, 0]), np.full(4, -1.0))
     sharpest = np.array([0.3, 0.1, -0.2])
     monkeypatch.setattr(
         HeldOutTest,
         "fit",
-        lambda self, path, moves, steps=hypotheses.N_TEST_STEPS: (path, moves, steps),
+        lambda self, path, moves, steps=h.N_TEST_STEPS: (path, moves, steps),
     )
-    turn = hypotheses.without_translation(path).O[0]
+    turn = h.without_translation(path).O[0]
     refuted_least = turn if least == "turn" else sharpest
 
     def z(self, one, other):
         if other == "moving":
-            return told if np.allclose(one[0].O[0], refuted_least) else told + 0.5
+            return least_z if np.allclose(one[0].O[0], refuted_least) else least_z + 0.5
         return better
 
     monkeypatch.setattr(HeldOutTest, "z", z)
@@ -88,31 +83,29 @@ def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, told, 
     (found, moves, steps), refuted = inspect.unwrap(HeldOutTest.fit_rotation)(
         object.__new__(HeldOutTest), path, sharpest, "moving"
     )
-    assert refuted == told
-    assert steps == (
-        hypotheses.N_TEST_STEPS if told < hypotheses.MIN_TRANSLATION_Z else hypotheses.N_MAP_STEPS
-    )
+    assert refuted == least_z
+    assert steps == (h.N_TEST_STEPS if least_z < h.MIN_TRANSLATION_Z else h.N_MAP_STEPS)
     expected = sharpest if better > 0 else turn
     np.testing.assert_allclose(found.O[0], expected)
     assert not moves and not found.O[1:].any() and np.exp(found.log_rho).max() < 1e-3
 
 
-def test_motions_before_a_plane_that_cost_about_the_same_go_on(monkeypatch):
-    """Which of two is true shows in the end: the false one may cost less until then."""
+def test_motions_before_a_plane_of_similar_cost_remain(monkeypatch):
+    """The false one may cost less until the end."""
     path = Path.constant_twist(np.array([1.0, 0, 0]), np.zeros(3), np.full(4, -1.0))
     found = [(Scene(path, None, 0.0), FitReport(0.1, cost, 1.0)) for cost in (5e-5, 6e-5, 9e-5)]
     monkeypatch.setattr(WindowFitter, "rotation", lambda self, centre: np.zeros(3))
     monkeypatch.setattr(WindowFitter, "sample_events", lambda self, centre, half, most: None)
     monkeypatch.setattr(WindowFitter, "planar_hypotheses", lambda self, centre, planes: found)
-    monkeypatch.setattr(hypotheses, "homography_flow", lambda cut, Omega: None)
-    monkeypatch.setattr(hypotheses, "planar_solutions", lambda M: [])
+    monkeypatch.setattr(h, "homography_flow", lambda cut, Omega: None)
+    monkeypatch.setattr(h, "planar_solutions", lambda M: [])
     windows = object.__new__(WindowFitter)
     windows.params = Params()
     assert inspect.unwrap(WindowFitter.hypotheses)(windows, 0) == found[:2]
 
 
 @pytest.mark.parametrize(("z", "cost"), [(1.9, 1.2), (9.0, 1.2), (1.9, 1.6)])
-def test_a_rival_that_is_not_refuted_leaves_the_heading_open(monkeypatch, z, cost):
+def test_a_hypothesis_that_is_not_refuted_leaves_the_heading_open(monkeypatch, z, cost):
     """Though most events agree: by its likelihood, if it costs about as little."""
     turned = np.array([0.8, 0.6, 0.0]), np.array([0.0, 0.0, 0.3])
     paths = [
@@ -135,19 +128,18 @@ def test_a_rival_that_is_not_refuted_leaves_the_heading_open(monkeypatch, z, cos
     }.items():
         monkeypatch.setattr(WindowFitter, name, lambda *_, value=value: value)
     monkeypatch.setattr(WindowFitter, "lens_covariance", lambda self, path: np.zeros((6, 6)))
-    monkeypatch.setattr(hypotheses, "adjust", lambda series, scene, *_, **__: (scene, report))
-    monkeypatch.setattr(hypotheses, "_refine", lambda one, *_, **__: one)
-    monkeypatch.setattr(
-        hypotheses, "_ambiguity_covariance", inspect.unwrap(hypotheses._ambiguity_covariance)
-    )
-    monkeypatch.setattr(hypotheses, "compute_covariance", lambda *_, **__: 1e-6 * np.eye(6))
-    monkeypatch.setattr(hypotheses, "WindowFit", lambda *values: values)
+    monkeypatch.setattr(h, "adjust", lambda series, scene, *_, **__: (scene, report))
+    monkeypatch.setattr(h, "_refine", lambda one, *_, **__: one)
+    ambiguity = inspect.unwrap(h._ambiguity_covariance)  # without checks of types
+    monkeypatch.setattr(h, "_ambiguity_covariance", ambiguity)
+    monkeypatch.setattr(h, "compute_covariance", lambda *_, **__: 1e-6 * np.eye(6))
+    monkeypatch.setattr(h, "WindowFit", lambda *values: values)
     windows = object.__new__(WindowFitter)
     windows.params, windows.sigma_floor = Params(), {}
     _, covariance, *_, ambiguity = inspect.unwrap(WindowFitter.refine_final)(windows, 0, found)
     apart = np.concatenate([turned[0] - [1, 0, 0], turned[1]])
-    more = np.exp(-(z**2) / 2) * np.outer(apart, apart) if cost < hypotheses.SIMILAR_COST else 0.0
-    told = error_inflation(0.9) * 1e-6 * np.eye(6)
+    more = np.exp(-(z**2) / 2) * np.outer(apart, apart) if cost < h.SIMILAR_COST else 0.0
+    told = h.error_inflation(0.9) * 1e-6 * np.eye(6)
     np.testing.assert_allclose(covariance, told + more, rtol=1e-9)
     assert ambiguity**2 == pytest.approx(np.trace((covariance - told)[:3, :3]))
 
@@ -171,12 +163,12 @@ def test_skew_is_that_by_which_pixels_end_where_they_began():
 
 
 def test_errors_grow_where_little_is_explained():
-    assert error_inflation(1.0) == error_inflation(0.95) == pytest.approx(2.5**2)
-    assert np.sqrt(error_inflation(0.58)) == pytest.approx(2.5 * np.exp(5 * 0.37))
+    assert h.error_inflation(1.0) == h.error_inflation(0.95) == pytest.approx(2.5**2)
+    assert np.sqrt(h.error_inflation(0.58)) == pytest.approx(2.5 * np.exp(5 * 0.37))
 
 
 @pytest.mark.parametrize("first", [30, 101, 160])
-def test_pixels_left_out_are_others_and_no_more_events(first):
+def test_held_out_pixels_are_others(first):
     rng = np.random.default_rng(3)
     pixel = np.repeat(np.arange(60), rng.integers(2, 40, 60))
     t = rng.permutation(len(pixel)) + 1
