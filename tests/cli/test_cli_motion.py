@@ -19,7 +19,7 @@ import jaxevent
 from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
 from jaxevent.cli import motion as command
-from jaxevent.egomotion import choice, voting
+from jaxevent.egomotion import model_selection, voting
 from jaxevent.egomotion.estimator import AdaptedParams, MotionEstimator
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import MotionEstimate
@@ -85,14 +85,14 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsy
     monkeypatch.setattr(
         VotingEstimator, "estimate", lambda self, *_, model, **__: MotionEstimate.empty(model)
     )
-    monkeypatch.setattr(Planar, "otherwise", "planes")
+    monkeypatch.setattr(Planar, "fallback_method", "planes")
     found, asked = ImageSpeed(9.0, 8.0, 10.0, ()), []
 
     def suit(self, _, params, speed=None, **__):
         asked.append(speed)
         return AdaptedParams(params, found, "the image moves at 9: px/s", "window = 2 s")
 
-    monkeypatch.setattr(MotionEstimator, "suit", suit)
+    monkeypatch.setattr(MotionEstimator, "adapt_params", suit)
     words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
     assert cli.main(words) == 0
     printed = capsys.readouterr().out
@@ -126,9 +126,9 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
         )
 
     monkeypatch.setattr(command, "_told", told)
-    monkeypatch.setattr(Planar, "otherwise", "planes")
+    monkeypatch.setattr(Planar, "fallback_method", "planes")
     suited = AdaptedParams(voting.Params(), None, "", "")
-    monkeypatch.setattr(MotionEstimator, "suit", lambda *_, **__: suited)
+    monkeypatch.setattr(MotionEstimator, "adapt_params", lambda *_, **__: suited)
     used, seen, _ = command.estimated(voting, recording, None, {"model": Planar}, None, True)
     assert used.name == taken and seen.valid.any() == (first is not None)
     late = " before the recording's middle" if first else ""
@@ -401,8 +401,8 @@ def test_nothing_found_is_said(tmp_path, capsys, monkeypatch):
     truth = ["--truth", tmp_path / "true.csv"]
     # Without --model it is chosen; nothing is seen to move here.
     fails(capsys, ["motion", tmp_path / "stray.h5", "--out", tmp_path / "out"], "stray.h5", "move")
-    chosen = choice.Choice(Planar, ("planar explains it",), {})
-    monkeypatch.setattr(choice, "choose", lambda recording: chosen)
+    chosen = model_selection.ModelSelection(Planar, ("planar explains it",), {})
+    monkeypatch.setattr(model_selection, "select_model", lambda recording: chosen)
     run(tmp_path, tmp_path / "stray.h5", "--flow", *truth)
     said = capsys.readouterr().out
     assert said.startswith("planar explains it\n") and "never found" in said
