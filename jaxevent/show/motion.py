@@ -406,7 +406,7 @@ def _write_flow(
     with complete_hdf5(path, "flow", params) as (file, check):
         file.attrs["format"] = "jaxevent event flow"
         stored = {name: file.create_dataset(name, (total,), kind) for name, kind in kinds.items()}
-        for part in event_flow.iterate(recording, motion, params, progress=progress):
+        for part in event_flow.iterate_flow(recording, motion, params, progress=progress):
             stop = row + len(part.valid)
             columns = {
                 "t": recording.events[row:stop].t, "u": part.flow[:, 0], "v": part.flow[:, 1],

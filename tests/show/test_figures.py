@@ -51,7 +51,9 @@ def motion() -> MotionEstimate:
     n = 20
     mean = np.stack([np.linspace(-5, 5, n), np.full(n, 2.0)], 1)
     covariance = np.broadcast_to(np.eye(2) * 0.25, (n, 2, 2))
-    return MotionEstimate.of("planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3)
+    return MotionEstimate.from_arrays(
+        "planar", np.arange(n) * 1000, mean, covariance, np.arange(n) > 3
+    )
 
 
 def test_events_are_drawn_where_they_are():
