@@ -127,7 +127,7 @@ def plot_motion(
     """Draw a motion's components over time, with bands of two standard deviations.
 
     Grey spans are those in which it is lost. `times` are by default spread over the estimates;
-    against a `truth` (`egomotion.known`) errors are drawn too. Raises `InputError` where there is
+    against a `truth` (`egomotion.known_motion`) errors are drawn too. Raises `InputError` where there is
     no estimate and no time.
     """
     if times is None and not len(motion):
