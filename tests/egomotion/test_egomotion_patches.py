@@ -117,8 +117,8 @@ def test_models_are_distinguished():
         rho = np.where((x[:, 1] // 24) % 2 == 0, 1.0, 0.5)
         return rates(x, np.array([-0.9, 0.0, 0.2]), np.zeros(3), rho)
 
-    turning, sliding = moving(turn, 0.4, 400), moving(deep, 0.6, 900)
-    turns, slides = select_model(turning), select_model(sliding)
+    turning, sliding = moving(turn, 0.6), moving(deep, 0.6, 900)
+    turns, slides = select_model(moving(turn, 0.4, 400)), select_model(sliding)
     assert turns.model.name == "rotation" and slides.model.name == "general"
     assert turns.z["rotation", "planar"] > 3 and "better than" in " ".join(turns.lines)
     assert "not sure" in turns.lines[-1] and "not sure" not in " ".join(slides.lines)
