@@ -14,11 +14,11 @@ import numpy as np
 from timing import cpu_seconds, least_cpu
 
 from jaxevent.blob import find, moment
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.filters.ellipse import truncation
-from jaxevent.blob.lifecycle import begin as begin_state
-from jaxevent.blob.prepare import Packing
-from jaxevent.blob.steps import Batch
+from jaxevent.blob.engine.runner import KernelRunner
+from jaxevent.blob.filter import EventBatch
+from jaxevent.blob.filters.motion import gated_moments
+from jaxevent.blob.lifecycle import init_state as begin_state
+from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate import Line, Target, blob_scene, simulate_blobs
 
@@ -124,7 +124,7 @@ def blob_loop(t, x, y, start, size, Q, P0, kappa, fourth, limits):
     return out
 
 
-def blob_steps(recording: Recording, M: int) -> tuple[np.ndarray, Batch]:
+def blob_steps(recording: Recording, M: int) -> tuple[np.ndarray, EventBatch]:
     """All events in steps of M: seconds between the steps, and the steps' batches."""
     e = recording.events
     assert isinstance(e, Events)
@@ -135,7 +135,7 @@ def blob_steps(recording: Recording, M: int) -> tuple[np.ndarray, Batch]:
     polarity = np.where(e.p[:n], 1.0, -1.0).reshape(-1, M)
     age = (t[:, -1:] - t) * 1e-6
     arrays = (jax.numpy.asarray(part, np.float32) for part in (xi, age, polarity))
-    return dt.astype(np.float32), Batch(*arrays)
+    return dt.astype(np.float32), EventBatch(*arrays)
 
 
 def blob_numbers() -> tuple:
@@ -146,7 +146,7 @@ def blob_numbers() -> tuple:
     P0 = np.array([float(getattr(p, f"P0_{name}")) for name in numbers])
     P0[2] /= float(p.lambda0) ** 2
     limits = np.array([float(v) for v in (p.lambda_min, p.lambda_max, p.P_theta_max)])
-    kappa, fourth = (float(v) for v in truncation(p))
+    kappa, fourth = (float(v) for v in gated_moments(p))
     return 20.0, Q, P0, kappa, fourth, limits
 
 
@@ -165,14 +165,15 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
     for M in (1, 32):
         params, seeds = moment.Params(events_per_step=M), [(*start, 20.0)]
         many, _ = blob_scene("lissajous", 0, rate=3e6 if M > 1 else 3e5)
-        packing = Packing(many, params, seeds)
-        packing.lengthen()  # as `estimate` does
-        stretch = packing.pack(packing.first)
-        state = begin_state(moment.filter, params, stretch.features)
-        kernel = FusedRun(moment.filter, params, packing)
+        packing = ChunkPacker(
+            many, params, seeds, events_per_segment=KernelRunner.events_per_segment
+        )
+        segment = packing.pack(packing.first)
+        state = begin_state(moment.filter, params, segment.features)
+        kernel = KernelRunner(moment.filter, params)
         name = f"tracker, M = {M}, loop over packed events"
-        tasks[name] = functools.partial(kernel.follow, state, stretch.features)
-        events[name] = int(np.count_nonzero(stretch.features.valid))
+        tasks[name] = functools.partial(kernel.run, state, segment.features)
+        events[name] = int(np.count_nonzero(segment.features.valid))
         for compiler in ("numba", "xla"):
             name = f"tracker, M = {M}, `estimate` by {compiler}"
             tasks[name] = functools.partial(
@@ -213,12 +214,12 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
             dt, batch = part
             weight = jax.numpy.ones(len(batch.age), dt.dtype)
             if len(weight) == 1:  # as the tracker does
-                batch = Batch(batch.xi, 0 * weight, batch.polarity)
+                batch = EventBatch(batch.xi, 0 * weight, batch.polarity)
             state = blob.update(params, blob.predict(params, state, dt), batch, weight)
-            now = blob.expected(params, state)
+            now = blob.predicted_measurement(params, state)
             return state, None if length else jax.numpy.concatenate([now.p, now.size])
 
-        begin = blob.start(params, start.astype(dt.dtype), jax.numpy.full((), 20.0, dt.dtype))
+        begin = blob.init(params, start.astype(dt.dtype), jax.numpy.full((), 20.0, dt.dtype))
         if not length:
             return jax.lax.scan(step, begin, (dt, batch))[1]
         parts = jax.tree.map(lambda a: a.reshape(-1, length, *a.shape[1:]), (dt, batch))
@@ -227,7 +228,7 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     def seconds(function, given, repeat=15):
         return cpu_seconds(lambda: jax.block_until_ready(function(*given)), repeat)
 
-    told = jax.jit(functools.partial(scan, 0))
+    info = jax.jit(functools.partial(scan, 0))
     targets = {
         length: jax.jit(jax.vmap(functools.partial(scan, length), (None, 0, None, 0)))
         for length in (64, 256)
@@ -236,7 +237,7 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     for M in (1, 32):
         params = moment.Params(events_per_step=M)
         given = jax.device_put((params, start, *blob_steps(recording, M)))
-        states = np.asarray(told(*given), float)
+        states = np.asarray(info(*given), float)
         t = e.t[M - 1 :: M][: len(states)]
         error = (states[:, :2] - truth(t)[:, 0, :2])[t > 100_000]
         rmse[M] = float(np.sqrt((error**2).sum(1).mean()))
@@ -251,7 +252,7 @@ def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
     batch = jax.tree.map(
         lambda part: jax.numpy.broadcast_to(part[:2048], (64, *part[:2048].shape)), batch
     )
-    batch = Batch(batch.xi + shift[:, None, None, None], batch.age, batch.polarity)
+    batch = EventBatch(batch.xi + shift[:, None, None, None], batch.age, batch.polarity)
     given = jax.device_put((moment.Params(), start + shift[:, None], dt[:2048], batch))
     many = 64 * 2048 / 1e6 / seconds(targets[256], given, 40)
 

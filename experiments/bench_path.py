@@ -20,7 +20,7 @@ from bench_images import NUMBERS, OF_AKF, images, losses, program, stream
 from timing import least_cpu
 
 from jaxevent.io import load, save
-from jaxevent.reconstruction.engine import bands, passes
+from jaxevent.reconstruction.engine import bands, filter_loop
 from jaxevent.recording import Events
 
 Seconds = defaultdict[str, float]
@@ -54,8 +54,8 @@ def least_parts(run: Callable[[], object], columns: type) -> tuple[float, float,
         start, cpu = time.perf_counter(), time.process_time()
         with timed(
             parts,
-            passes=(passes.Passes, "run"),
-            division=(bands.BandLayout, "divide"),
+            passes=(filter_loop.FilterPasses, "run"),
+            division=(bands.BandLayout, "partition"),
             columns=(columns, "columns"),
         ):
             run()

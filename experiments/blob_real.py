@@ -24,8 +24,8 @@ from scipy import ndimage, optimize
 import jaxevent
 from jaxevent.blob import Tracker, Tracks, chi2, chi2_split, constant_velocity, moment
 from jaxevent.io.output import complete
-from jaxevent.recording import Events, Recording
-from jaxevent.show.track_pictures import track_colour, track_frames
+from jaxevent.recording import Recording
+from jaxevent.show.track_figures import track_colour, track_frames
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
 DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}
@@ -375,29 +375,6 @@ def draw_street(out: Path, recording: Recording, tracks: Tracks, cars: list[Car]
     keep(figure, out / "street.png")
 
 
-def read_dat(path: Path) -> Recording:
-    """A Prophesee DAT file: 8 bytes per event, us and then 14 bits of x, 14 of y, 4 of p."""
-    raw = path.read_bytes()
-    sizes, start = {"Width": 1280, "Height": 720}, 0
-    while raw[start : start + 1] == b"%":
-        end = raw.index(b"\n", start)
-        word = raw[start + 1 : end].decode("latin-1").split()
-        if len(word) == 2 and word[0] in sizes:
-            sizes[word[0]] = int(word[1])
-        start = end + 1
-    kind, size = raw[start : start + 2]  # 0 and 12 are contrast events
-    if kind not in (0, 12) or size != 8:
-        raise SystemExit(f"{path}: events of type {kind} and {size} bytes; contrast events needed")
-    rows = (len(raw) - start - 2) // 8
-    pairs = np.frombuffer(raw, "<u4", 2 * rows, start + 2).reshape(-1, 2)
-    where = pairs[:, 1]
-    x, y = where & 0x3FFF, (where >> 14) & 0x3FFF
-    events = Events(
-        pairs[:, 0].astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), where >> 28 == 1
-    )
-    return Recording(path.name, sizes["Width"], sizes["Height"], events).check(str(path))
-
-
 def away(xy: NDArray) -> NDArray[np.bool_]:
     """Which positions (..., 2) are outside the glare."""
     outside = np.ones(xy.shape[:-1], bool)
@@ -611,9 +588,9 @@ def keep(figure, path: Path) -> None:
 
 
 PARTS = {
-    "spinning_dot": ("spinning_dot.npz", "A spinning dot", jaxevent.load, spinning_dot),
-    "street": ("davis346_street.npz", "Cars on a street", jaxevent.load, street),
-    "sky": ("gen4.dat", "A night sky", read_dat, sky),
+    "spinning_dot": ("spinning_dot.npz", "A spinning dot", spinning_dot),
+    "street": ("davis346_street.npz", "Cars on a street", street),
+    "sky": ("gen4.dat", "A night sky", sky),
 }
 
 
@@ -631,8 +608,8 @@ def main() -> None:
     stored = out / "results.json"
     results = json.loads(stored.read_text()) if stored.exists() else {}
     for name in arguments.only:
-        file, title, load, part = PARTS[name]
-        values, text = part(load(arguments.data / file), out)
+        file, title, part = PARTS[name]
+        values, text = part(jaxevent.load(arguments.data / file), out)
         results[name] = {"title": f"{title} ({file})", "values": values, "table": text}
         print(f"{title}\n\n{text}\n", flush=True)
         with complete(stored) as partial:

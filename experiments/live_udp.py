@@ -96,7 +96,7 @@ class Targets:
         apart = np.abs(now.mean[0, :, :2] - whole.mean[0, shown, :2])
         return (
             f"{len(now.id)} targets at the end, the whole's within {apart.max(initial=0):.1e} px; "
-            f"{self.live._count} in all, {len(tracks)} of the whole"
+            f"{self.live._n_ids} in all, {len(tracks)} of the whole"
         )
 
 

@@ -130,9 +130,9 @@ MUTATIONS = (
     ),
     Mutation(
         "blob: nearest association takes the farthest",
-        "jaxevent/blob/association.py",
-        "jnp.argmax(density)",
-        "jnp.argmin(density)",
+        "jaxevent/blob/filter.py",
+        "jnp.argmax(value)",
+        "jnp.argmin(value)",
         "tests/blob/test_blob_tracker.py -k plain_loop",
     ),
     Mutation(

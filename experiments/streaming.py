@@ -28,7 +28,7 @@ from bench import machine
 from jaxevent.io import save
 from jaxevent.io.output import complete
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.show.report import aligned
+from jaxevent.show.tables import results_table
 
 WIDTH, HEIGHT, RATE, FPS = 346, 260, 10_000_000, 25
 BLOCK = 1_000_000  # events
@@ -103,7 +103,7 @@ def recording(count: int) -> Recording:
     )
 
 
-def measured(arguments: list[str]) -> tuple[float, float, float]:
+def rows_of_method(arguments: list[str]) -> tuple[float, float, float]:
     """Seconds, CPU seconds and peak memory (GB) of a process; raises if it fails."""
     clock, spent, peak = time.perf_counter(), children_cpu(), 0
     process = subprocess.Popen(arguments)
@@ -141,7 +141,7 @@ def measure(count: int, disk: Path | None = None) -> dict[str, Any]:
         clock = time.perf_counter()
         save(recording(count), source, progress=sys.stderr.isatty())
         made = time.perf_counter() - clock
-        seconds, cpu, peak = measured(
+        seconds, cpu, peak = rows_of_method(
             [
                 *(sys.executable, "-m", "jaxevent.cli", "reconstruct", str(source)),
                 *("--method", "akf", "--rate", "100", "--out", str(images)),
@@ -179,7 +179,7 @@ def main() -> int:
         ("peak GB", "peak", 1, 2),
         ("images GB", "written", 1, 2),
     ]
-    table = aligned(
+    table = results_table(
         [{"recording": r["events"] + " events", "method": "akf", **r} for r in rows], columns
     )
     text = f"{machine()}\n\n{table}"

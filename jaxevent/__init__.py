@@ -119,7 +119,7 @@ dispatch.use_synchronous_dispatch()
 
 
 def _as_html(thing: Any) -> str:
-    return importlib.import_module("jaxevent.show.notebook").as_html(thing)
+    return importlib.import_module("jaxevent.show.figures").as_html(thing)
 
 
 display.as_html = _as_html  # whose module loads when something is shown

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-as_html: Callable[[Any], str] = repr  # `jaxevent` sets that of `jaxevent.show.notebook`
+as_html: Callable[[Any], str] = repr  # `jaxevent` sets that of `jaxevent.show.figures`
 
 
 class HtmlRepr:

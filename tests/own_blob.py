@@ -29,7 +29,7 @@ def log_likelihood(params, expected, e):
 
 def update(params, state, batch, weight):
     """Events far away count less, by (nu + 2) / (nu + d^2)."""
-    expected = constant_velocity.filter.expected(params, state)
+    expected = constant_velocity.filter.predicted_measurement(params, state)
     e = batch.xi - (expected.p - expected.v * batch.age[:, None])
     d2 = jax.vmap(lambda e: squared(expected, e)[0])(e)
     robust = jnp.minimum((params.nu + 2) / (params.nu + d2), 1)

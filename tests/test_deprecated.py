@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxevent
-from jaxevent import deprecated
+from jaxevent import blob, deprecated
 from jaxevent.reconstruction import augment, filtering, kalman
 from jaxevent.reconstruction.smoother import Smoother
 
@@ -98,3 +98,12 @@ def test_old_methods_can_be_overridden():
     assert Doubtful.readout is Doubtful.__dict__["tell"]
     with pytest.warns(DeprecationWarning, match="looks_ahead is deprecated"):
         assert method.looks_ahead
+
+
+def test_a_blob_filter_takes_and_gives_the_old_names_of_its_steps():
+    for old, new in (("share", "association_weights"), ("expected", "predicted_measurement")):
+        mine = lambda *given: None  # noqa: E731
+        with pytest.warns(DeprecationWarning, match=f"use Filter.{new}"):
+            filter = dataclasses.replace(blob.moment.filter, **{old: mine})
+        with pytest.warns(DeprecationWarning, match=f"use Filter.{new}"):
+            assert getattr(filter, new) is getattr(filter, old) is mine

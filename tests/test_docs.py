@@ -13,7 +13,7 @@ from pages import run_page, shortened
 
 import jaxevent
 from jaxevent.metrics import MEANINGS
-from jaxevent.show.report import COLUMNS
+from jaxevent.show.tables import COLUMNS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

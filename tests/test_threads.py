@@ -18,7 +18,8 @@ from jaxevent.codegen import module as kernel_module
 from jaxevent.codegen import run_over_rows
 from jaxevent.errors import InputError
 from jaxevent.io import decoded
-from jaxevent.reconstruction.engine import kernel, passes, pixel, smoothed, smoothing
+from jaxevent.reconstruction.engine import filter_loop, filter_program, smoother_program
+from jaxevent.reconstruction.engine import images as image_module
 
 # The default thresholds are not those of the texture.
 pytestmark = pytest.mark.filterwarnings("ignore:moving. events contradict frames")
@@ -88,11 +89,11 @@ def test_readings_of_one_video_may_alternate():
 
 
 def test_own_videos_translate_a_method_once(monkeypatch):
-    for module in (kernel, smoothing):
+    for module in (filter_program, smoother_program):
         monkeypatch.setattr(module._kernels, "_programs", {})
-    traced = []
+    traced, trace = [], filter_program.trace_filter
     monkeypatch.setattr(
-        kernel, "traced", lambda *given: traced.append(given) or pixel.traced(*given)
+        filter_program, "trace_filter", lambda *given: traced.append(given) or trace(*given)
     )
     recording = texture.moving()
     times = np.linspace(recording.start, recording.stop, 5).astype(int)
@@ -250,7 +251,7 @@ def test_a_copy_is_read_apart():
         assert_equal(video(int(times[8 - k])), [part[8 - k : 9 - k] for part in whole])
 
 
-@pytest.mark.parametrize(("name", "module"), [("akf", passes), ("aks", smoothed)])
+@pytest.mark.parametrize(("name", "module"), [("akf", filter_loop), ("aks", image_module)])
 def test_what_is_interrupted_is_read_anew(monkeypatch, name, module):
     recording, method = texture.moving(), jaxevent.METHODS[name]
     times = np.linspace(recording.start, recording.stop, 40).astype(int)

@@ -3,9 +3,10 @@
     tracks = blob.moment.estimate(recording)    # targets and parameters are found
     mean, covariance, valid = tracks(times)
 
-Every method here is used in this way, each with its own `Params`.
+Every method is used in this way, each with its own `Params`.
 """
 
+from jaxevent.blob.filter import Filter
 from jaxevent.blob.filters.chi2 import chi2, chi2_split
 from jaxevent.blob.filters.constant_velocity import constant_velocity
 from jaxevent.blob.filters.moment import moment
@@ -13,8 +14,7 @@ from jaxevent.blob.filters.moving_moments import moving_moments
 from jaxevent.blob.losses import negative_log_likelihood, position_error, prepare_positions
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.search import TargetSearchResult, find
-from jaxevent.blob.states import TrackStates
-from jaxevent.blob.steps import Filter
+from jaxevent.blob.track import TrackStates
 from jaxevent.blob.tracker import Tracker
 from jaxevent.blob.tracks import Tracks
 from jaxevent.deprecated import renamed_names

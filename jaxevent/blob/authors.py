@@ -1,14 +1,14 @@
-"""The association of the authors' program (`association = "authors"`), one target at a time.
+"""The association of the published program (`association = "authors"`), as a reference.
 
 Wang, Molloy, van Goor, Mahony, "Asynchronous Blob Tracker for Event Cameras": an event goes to the
-target whose last position is nearest, if it is less than the gate's radius away. What the paper
-does not say is that the program
+target whose last position is nearest, if it is less than the gate's radius away. The paper omits
+that the program
 
 - compares events with the position after the last update, not with a prediction,
 - lets the radius follow the size only where both variances of the position were small when images
-  were last displayed, and counts the time from the last event that was nearest, taken or not,
-- lets an event of the same time as the one before wait, and then puts all that wait, at even
-  distances of time and with its polarity, in the place of the next event that it takes.
+  were last displayed, and counts the time from the last event that was nearest, accepted or not,
+- keeps an event with the time of the one before pending, and then puts all pending events, at even
+  distances of time and with its polarity, in the place of the next event that it accepts.
 
 In the program all targets share one queue; here each target has its own.
 """
@@ -21,128 +21,160 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxevent.blob.association import gate_radius
+from jaxevent.blob.filter import EventBatch, Filter, gate_radius, where_tree
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import LONGEST
-from jaxevent.blob.steps import Batch, Filter, choose
+from jaxevent.blob.prepare import MAX_CHUNK_US
 
-DISPLAY = 25_000  # us between displayed images
-KNOWN = 3.0  # px^2; the radius follows the size where the position's variances are below
-BLOCK = 8
-WAITING = 8 * BLOCK  # most events of a target that wait; further ones are left out
+DISPLAY_PERIOD_US = 25_000  # between displayed images
+MAX_VARIANCE = 3.0  # px^2; the radius follows the size where the position's variances are below
+BLOCK_EVENTS = 8  # pending events that are applied together
+MAX_PENDING = 8 * BLOCK_EVENTS  # pending events of a target; further ones are left out
 
 
-class Memory(eqx.Module):
-    """What a target remembers of the events so far; times are us since the chunk's start."""
+class ReferenceState(eqx.Module):
+    """Association state of each target; times are us since the chunk's start."""
 
-    seen: Int[Array, "*targets"]  # of the last event, whoever's it was
-    assigned: Int[Array, "*targets"]  # of the last event that was nearest to this target
-    display: Int[Array, "*targets"]  # of the next displayed image
-    adapting: Bool[Array, "*targets"]  # whether the radius follows the size
-    waiting: Float[Array, "*targets n 2"]  # px, the first `number` count
-    number: Int[Array, "*targets"]
+    last_event: Int[Array, "*targets"]  # of any target
+    last_nearest: Int[Array, "*targets"]  # the last event that was nearest to this target
+    next_display: Int[Array, "*targets"]
+    is_adapting: Bool[Array, "*targets"]  # whether the radius follows the size
+    pending: Float[Array, "*targets n 2"]  # px, the first `n_pending` count
+    n_pending: Int[Array, "*targets"]
 
     @classmethod
-    def empty(cls, time: Int[Array, " targets"], dtype: Any) -> "Memory":
-        """Of targets that begin at some times."""
-        waiting = jnp.zeros((*time.shape, WAITING, 2), dtype)
-        none = jnp.zeros_like(time)
-        return cls(time - 1, time, time + DISPLAY, none > 0, waiting, none)
+    def init(cls, time: Int[Array, " targets"], dtype: Any) -> "ReferenceState":
+        """Initialise targets that begin at some times."""
+        pending = jnp.zeros((*time.shape, MAX_PENDING, 2), dtype)
+        zero = jnp.zeros_like(time)
+        return cls(time - 1, time, time + DISPLAY_PERIOD_US, zero > 0, pending, zero)
 
-    def shift(self, elapsed: Array) -> "Memory":
-        """The same with times since a later chunk's start."""
-        times = lambda m: (m.seen, m.assigned, m.display)  # noqa: E731
-        later = tuple(jnp.maximum(t - elapsed, -2 * LONGEST) for t in times(self))
+    def shift_times(self, elapsed: Array) -> "ReferenceState":
+        """Count times from the start of a chunk that begins `elapsed` us later."""
+        times = lambda s: (s.last_event, s.last_nearest, s.next_display)  # noqa: E731
+        later = tuple(jnp.maximum(t - elapsed, -2 * MAX_CHUNK_US) for t in times(self))
         return eqx.tree_at(times, self, later)
 
 
-class Taken(eqx.Module):
+class ReferenceStepResult(eqx.Module):
     """A target after an event that is nearest to it."""
 
     state: Any
     radius: Float[Array, ""]  # px
-    memory: Memory
+    reference: ReferenceState
     accepted: Bool[Array, ""]  # whether the event is inside the gate
-    updated: Bool[Array, ""]  # whether the state is of this event's time; otherwise it may wait
+    updated: Bool[Array, ""]  # whether the state is of this event's time; else it may be pending
 
 
-def take(
+class ReferenceEvent(eqx.Module):
+    """One event, and the time since a target's last update."""
+
+    batch: EventBatch  # of one event
+    time: Int[Array, ""]  # us since the chunk's start
+    since: Float[Array, ""]  # s
+
+
+def reference_step(
     filter: Filter,
     params: TrackerParams,
     state: Any,
     radius: Float[Array, ""],
-    memory: Memory,
-    time: Int[Array, ""],
-    since: Float[Array, ""],
-    batch: Batch,
-) -> Taken:
-    """One target after an event (`batch`) at a time, `since` seconds after its last update."""
-    fixed, now = lax.stop_gradient((params, filter.expected(params, state)))
-    idle = (time - memory.assigned).astype(radius.dtype) * 1e-6
-    followed = gate_radius(fixed, radius, now.size.max(), idle)
-    radius = jnp.where(memory.adapting, followed, radius)
+    reference: ReferenceState,
+    event: ReferenceEvent,
+) -> ReferenceStepResult:
+    """Update one target with an event that is nearest to it.
+
+    Args:
+        filter: Filter of the target.
+        params: Parameters of the target.
+        state: State of the filter, at the last update.
+        radius: Radius of the gate, px.
+        reference: Association state of the target.
+        event: The event.
+    """
+    time, batch = event.time, event.batch
+    fixed, now = lax.stop_gradient((params, filter.predicted_measurement(params, state)))
+    idle = (time - reference.last_nearest).astype(radius.dtype) * 1e-6
+    following = gate_radius(fixed, radius, now.size.max(), idle)
+    radius = jnp.where(reference.is_adapting, following, radius)
     accepted = jnp.hypot(*(batch.xi[0] - now.p)) < radius
-    tied = time == memory.seen
+    tied = time == reference.last_event
     waits, updated = accepted & tied, accepted & ~tied
 
-    def alone(state: Any) -> Any:
-        return filter.update(params, filter.predict(params, state, since), batch, jnp.ones(1))
+    def apply_event(state: Any) -> Any:
+        state = filter.predict(params, state, event.since)
+        return filter.update(params, state, batch, jnp.ones(1))
 
-    def move(state: Any) -> Any:
-        of_queue = lambda s: replay(filter, params, s, memory, time, since, batch)  # noqa: E731
-        return lax.cond(memory.number > 0, of_queue, alone, state)
+    def apply(state: Any) -> Any:
+        of_queue = lambda s: reapply_pending(filter, params, s, reference, event)  # noqa: E731
+        return lax.cond(reference.n_pending > 0, of_queue, apply_event, state)
 
-    state = lax.cond(updated, move, lambda s: s, state)
-    place = jnp.where(waits, memory.number, WAITING)  # beyond the queue: nowhere
-    waiting = memory.waiting.at[place].set(batch.xi[0], mode="drop")
-    number = jnp.minimum(jnp.where(updated, 0, memory.number + waits), WAITING).astype(jnp.int32)
-    memory = Memory(memory.seen, time, memory.display, memory.adapting, waiting, number)
-    return Taken(state, radius, memory, accepted, updated)
+    state = lax.cond(updated, apply, lambda s: s, state)
+    index = jnp.where(waits, reference.n_pending, MAX_PENDING)  # beyond the queue: dropped
+    pending = reference.pending.at[index].set(batch.xi[0], mode="drop")
+    n_pending = jnp.where(updated, 0, reference.n_pending + waits)
+    n_pending = jnp.minimum(n_pending, MAX_PENDING).astype(jnp.int32)
+    reference = ReferenceState(
+        reference.last_event, time, reference.next_display, reference.is_adapting, pending,
+        n_pending,
+    )  # fmt: skip
+    return ReferenceStepResult(state, radius, reference, accepted, updated)
 
 
-def replay(
+def reapply_pending(
     filter: Filter,
     params: TrackerParams,
     state: Any,
-    memory: Memory,
-    time: Int[Array, ""],
-    since: Float[Array, ""],
-    batch: Batch,
+    reference: ReferenceState,
+    event: ReferenceEvent,
 ) -> Any:
-    """The state after the events that wait, which take this event's place.
+    """Update a state with the pending events, which take the place of an accepted event.
 
-    They come at even distances between the last event, whoever's it was, and this one.
+    They come at even distances of time between the last event, of any target, and this one.
     """
-    whole = (time - memory.seen).astype(since.dtype) * 1e-6
-    each = whole / memory.number
+    batch, since = event.batch, event.since
+    whole = (event.time - reference.last_event).astype(since.dtype) * 1e-6
+    each = whole / reference.n_pending
 
     def one(state: Any, part: tuple[Array, Array]) -> tuple[Any, None]:
         xi, i = part
         dt = jnp.where(i == 0, jnp.maximum(since - whole, 0) + each, each)
-        new = Batch(xi[None], batch.age, batch.polarity)
+        new = EventBatch(xi[None], batch.age, batch.polarity)
         after = filter.update(params, filter.predict(params, state, dt), new, jnp.ones(1))
-        return choose(i < memory.number, after, state), None
+        return where_tree(i < reference.n_pending, after, state), None
 
     def block(state: Any, part: tuple[Array, Array]) -> tuple[Any, None]:
-        some = part[1][0] < memory.number
+        some = part[1][0] < reference.n_pending
         return lax.cond(some, lambda s: lax.scan(one, s, part)[0], lambda s: s, state), None
 
-    blocks = memory.waiting.reshape(-1, BLOCK, 2), jnp.arange(WAITING).reshape(-1, BLOCK)
+    blocks = (
+        reference.pending.reshape(-1, BLOCK_EVENTS, 2),
+        jnp.arange(MAX_PENDING).reshape(-1, BLOCK_EVENTS),
+    )
     return lax.scan(block, state, blocks)[0]
 
 
-def remember(
-    filter: Filter, params: TrackerParams, state: Any, memory: Memory, time: Int[Array, ""]
-) -> Memory:
-    """What any target remembers after an event, of this target or not."""
-    variances = jnp.diagonal(lax.stop_gradient(filter.expected(params, state)).P_p)
-    due = time >= memory.display
-    adapting = jnp.where(due, (variances < KNOWN).all(), memory.adapting)
-    display = memory.display + DISPLAY * due.astype(jnp.int32)
-    return Memory(time, memory.assigned, display, adapting, memory.waiting, memory.number)
+def update_reference(
+    filter: Filter,
+    params: TrackerParams,
+    state: Any,
+    reference: ReferenceState,
+    time: Int[Array, ""],
+) -> ReferenceState:
+    """Update the association state of any target after an event, of this target or not."""
+    predicted = filter.predicted_measurement(params, state)
+    variances = jnp.diagonal(lax.stop_gradient(predicted).P_p)
+    due = time >= reference.next_display
+    is_adapting = jnp.where(due, (variances < MAX_VARIANCE).all(), reference.is_adapting)
+    next_display = reference.next_display + DISPLAY_PERIOD_US * due.astype(jnp.int32)
+    return ReferenceState(
+        time, reference.last_nearest, next_display, is_adapting, reference.pending,
+        reference.n_pending,
+    )  # fmt: skip
 
 
-def nearest(p: Float[Array, "targets 2"], alive: Bool[Array, " targets"], xi: Array) -> Array:
-    """The number of the target whose position is nearest to an event."""
+def nearest_target(
+    p: Float[Array, "targets 2"], alive: Bool[Array, " targets"], xi: Float[Array, " 2"]
+) -> Int[Array, ""]:
+    """Return the index of the living target whose position (px) is nearest to an event."""
     distance = jax.vmap(jnp.hypot)(xi[0] - p[:, 0], xi[1] - p[:, 1])
     return jnp.argmin(jnp.where(alive, distance, jnp.inf))

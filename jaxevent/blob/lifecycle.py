@@ -1,7 +1,7 @@
-"""Births and deaths of tracks: events in nobody's gate are counted on a coarse grid.
+"""Track management: clutter is counted on a coarse grid, and tracks begin and end.
 
-At the end of every cycle tracks are confirmed, end and merge, and new ones begin where unassociated
-events were many. After jAER's RectangularClusterTracker.
+At the end of every cycle tracks are confirmed, deleted and merged, and new ones begin where
+unassociated events were many. After jAER's RectangularClusterTracker.
 """
 
 import functools
@@ -13,116 +13,146 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxevent.blob.association import Expected, largest_eigenvalue
+from jaxevent.blob.filter import Filter, PredictedMeasurement, largest_eigenvalue, where_tree
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import LONGEST, Features, Numeric
-from jaxevent.blob.steps import Filter, choose
-from jaxevent.blob.targets import (
-    Slots,
-    begin_slots,
-    own_params,
+from jaxevent.blob.prepare import MAX_CHUNK_US, Features, Numeric
+from jaxevent.blob.track import (
+    NewTracks,
+    TrackBuffer,
+    coast_limits_us,
+    init_reference,
+    init_states,
+    init_tracks,
     predict,
-    seconds,
-    shift_slots,
-    silence_limits,
-    start_memory,
-    start_states,
+    shift_times,
+    to_seconds,
+    track_params,
 )
 
-ENDS = ("end", "idle", "unconfirmed", "left", "size", "uncertain", "merged", "not finite")
+END_REASONS = ("end", "idle", "unconfirmed", "left", "size", "uncertain", "merged", "not finite")
 
 
-class Grid(eqx.Module):
-    """Unassociated events, exponentially forgotten: number and sums of x and y in each cell."""
+class ClutterGrid(eqx.Module):
+    """Unassociated events per cell, forgotten exponentially: number and sums of x and y."""
 
     sums: Float[Array, "3 rows columns"]
     time: Int[Array, ""]  # us since the chunk's start
 
 
-class State(eqx.Module):
-    """What is carried from chunk to chunk."""
+class TrackerState(eqx.Module):
+    """State of a tracker between two chunks."""
 
-    slots: Slots
-    grid: Grid | None
+    tracks: TrackBuffer
+    grid: ClutterGrid | None
     next_id: Int[Array, ""]
 
 
-class Log(eqx.Module):
-    """Births and deaths of a chunk, or of several, by slot; -1 where no track."""
+class LifecycleLog(eqx.Module):
+    """Births, confirmations and deaths of one or several chunks, by entry of the buffer."""
 
-    before: Int[Numeric, "*chunks targets"]
-    after: Int[Numeric, "*chunks targets"]
+    id_before: Int[Numeric, "*chunks targets"]  # -1: no track
+    id_after: Int[Numeric, "*chunks targets"]
     confirmed: Bool[Numeric, "*chunks targets"]
-    ended: Int[Numeric, "*chunks targets"]  # why, see ENDS; 0: it goes on
+    end_reason: Int[Numeric, "*chunks targets"]  # index of `END_REASONS`; 0: it goes on
     death: Int[Numeric, "*chunks targets"]  # us since the chunk's start
 
 
-def begin(filter: Filter, params: TrackerParams, features: Features) -> State:
-    """No track yet."""
+class TrackDecision(eqx.Module):
+    """Decision on a track at a chunk's end: confirm, delete or keep."""
+
+    confirmed: Bool[Array, "*targets"]
+    end_reason: Int[Array, "*targets"]  # index of `END_REASONS`; 0: it goes on
+    death: Int[Array, "*targets"]  # us since the chunk's start
+    last_apart: Int[Array, "*targets"]
+
+
+class TrackEvidence(eqx.Module):
+    """Evidence on a track at a chunk's end."""
+
+    predicted: PredictedMeasurement
+    merging: Bool[Array, "*targets"]  # within one lambda of an older track
+    detected: Bool[Array, "*targets"]  # born of clutter, not of a seed
+
+
+def init_state(filter: Filter, params: TrackerParams, features: Features) -> TrackerState:
+    """Return the state without any track, with room for all seeds and detected targets."""
     real = features.xi.dtype
     number = max(len(features.seed) + (params.max_targets if features.detect else 0), 1)
-    own = {} if not len(features.seed) else jax.tree.map(jnp.asarray, features.own)
-    none = jnp.zeros(number, jnp.int32)
+    overrides = {} if not len(features.seed) else jax.tree.map(jnp.asarray, features.overrides)
+    zero = jnp.zeros(number, jnp.int32)
     size = jnp.broadcast_to(params.lambda0, number).astype(real)
-    state = start_states(filter, params, own, jnp.zeros((number, 2), real), size)
-    free = jnp.zeros(number, bool)
-    memory = start_memory(params, none, real)
-    slots = Slots(state, size, 0 * size, none, none, none, none, none - 1, free, own, memory)
+    state = init_states(filter, params, overrides, jnp.zeros((number, 2), real), size)
+    tracks = TrackBuffer(
+        state, size, 0 * size, zero, zero, zero, zero, zero - 1, jnp.zeros(number, bool), overrides,
+        init_reference(params, zero, real),
+    )  # fmt: skip
     grid = None
     if features.detect:
-        grid = Grid(jnp.zeros((3, *features.cells), real), jnp.zeros((), jnp.int32))
-    return State(slots, grid, jnp.asarray(len(features.seed), jnp.int32))
+        grid = ClutterGrid(jnp.zeros((3, *features.grid_shape), real), jnp.zeros((), jnp.int32))
+    return TrackerState(tracks, grid, jnp.asarray(len(features.seed), jnp.int32))
 
 
-def shift(state: State, elapsed: Array) -> State:
-    """The same with times since a later moment; at most so far back that int32 lasts."""
+def shift_state(state: TrackerState, elapsed: Array) -> TrackerState:
+    """Count times from a moment `elapsed` us later; those that would not fit stay at the least."""
     grid = state.grid
     if grid is not None:
-        grid = Grid(grid.sums, jnp.maximum(grid.time - elapsed, -2 * LONGEST))
-    return State(shift_slots(state.slots, elapsed), grid, state.next_id)
+        grid = ClutterGrid(grid.sums, jnp.maximum(grid.time - elapsed, -2 * MAX_CHUNK_US))
+    return TrackerState(shift_times(state.tracks, elapsed), grid, state.next_id)
 
 
-def sow(
-    filter: Filter, params: TrackerParams, features: Features, due: Array, slots: Slots
-) -> Slots:
-    """Seed number k begins in slot k, of the seeds that are `due`."""
-    seeds, number = len(features.seed), len(slots.id)
+def spawn_seeded_tracks(
+    filter: Filter, params: TrackerParams, features: Features, due: Array, tracks: TrackBuffer
+) -> TrackBuffer:
+    """Start a confirmed track at each seed that is `due` (seeds,); seed k uses buffer entry k."""
+    seeds, number = len(features.seed), len(tracks.id)
     if seeds == 0:
-        return slots
+        return tracks
     due = jnp.pad(due, (0, number - seeds))
     size = jnp.where(features.seed_size > 0, features.seed_size, params.lambda0)
     size = jnp.concatenate(
         [size, jnp.broadcast_to(params.lambda0, number - seeds)]
     ).astype(features.xi.dtype)  # fmt: skip
     xi = jnp.pad(features.seed_xi, ((0, number - seeds), (0, 0)))
-    ids = jnp.arange(number, dtype=jnp.int32)
+    new = NewTracks(due, xi, size, jnp.arange(number, dtype=jnp.int32))
     now = jnp.zeros((), jnp.int32)
     return lax.cond(
         due.any(),
-        lambda s: begin_slots(filter, params, s, due, xi, size, now, ids, True),
+        lambda s: init_tracks(filter, params, s, new, now, True),
         lambda s: s,
-        slots,
+        tracks,
     )
 
 
-def count_strays(
-    params: TrackerParams, grid: Grid, stop: Array, t: Array, xi: Array, stray: Array
-) -> Grid:
-    """The grid at a chunk's end, with its unassociated events."""
+def accumulate_clutter(
+    params: TrackerParams, grid: ClutterGrid, stop: Array, t: Array, xi: Array, unassociated: Array
+) -> ClutterGrid:
+    """Add a chunk's unassociated events to the grid.
+
+    Args:
+        params: Size of the cells and time constant of the grid.
+        grid: The grid at the chunk's start.
+        stop: End of the chunk, us.
+        t: Times of the events (steps, M), us.
+        xi: Positions of the events (steps, M, 2), px.
+        unassociated: Whether each event is near no track.
+
+    Returns:
+        The grid at the chunk's end.
+    """
     tau, real = params.tau_birth, xi.dtype
     _, rows, columns = grid.sums.shape
-    kept = jnp.exp(-seconds(stop - grid.time, xi) / tau)
-    weight = jnp.where(stray, jnp.exp(-seconds(stop - t, xi) / tau), 0).ravel()
+    decay = jnp.exp(-to_seconds(stop - grid.time, xi) / tau)
+    weight = jnp.where(unassociated, jnp.exp(-to_seconds(stop - t, xi) / tau), 0).ravel()
     x, y = xi[..., 0].ravel(), xi[..., 1].ravel()
     column = jnp.clip(x / params.cell, 0, columns - 1).astype(jnp.int32)
     row = jnp.clip(y / params.cell, 0, rows - 1).astype(jnp.int32)
     values = jnp.stack([weight, weight * x, weight * y])
-    sums = (grid.sums * kept).reshape(3, -1).at[:, row * columns + column].add(values)
-    return Grid(sums.reshape(grid.sums.shape).astype(real), stop)
+    sums = (grid.sums * decay).reshape(3, -1).at[:, row * columns + column].add(values)
+    return ClutterGrid(sums.reshape(grid.sums.shape).astype(real), stop)
 
 
-def _around(counts: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
-    """Sums over 3x3 cells."""
+def _sum_3x3(counts: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
+    """Sum over the 3x3 cells around each cell."""
     a = jnp.pad(counts, 1)
     a = a[:-2] + a[1:-1] + a[2:]
     return a[:, :-2] + a[:, 1:-1] + a[:, 2:]
@@ -130,140 +160,146 @@ def _around(counts: Float[Array, "rows columns"]) -> Float[Array, "rows columns"
 
 def _find_births(
     params: TrackerParams, sums: Array, free: Array, next_id: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Where tracks are born: (slots, positions, ids, the grid without their events, next id).
+) -> tuple[Array, Array, Array, Array]:
+    """Find where tracks are born: entries of the buffer, positions, numbers, and the grid's rest.
 
     The cell whose 3x3 sum is largest comes first; the 5x5 cells around it are emptied.
     """
     number, (_, rows, columns) = len(free), sums.shape
 
     def more(loop):
-        sums, which, _, _ = loop
-        return (free & ~which).any() & (_around(sums[0]).max() > params.n_birth)
+        sums, begins, _, _ = loop
+        return (free & ~begins).any() & (_sum_3x3(sums[0]).max() > params.n_birth)
 
     def one(loop):
-        sums, which, xi, ids = loop
-        place = jnp.argmax(_around(sums[0]))
-        row, column = place // columns, place % columns
+        sums, begins, xi, ids = loop
+        cell = jnp.argmax(_sum_3x3(sums[0]))
+        row, column = cell // columns, cell % columns
         near = lax.dynamic_slice(
             jnp.pad(sums, ((0, 0), (1, 1), (1, 1))), (0, row, column), (3, 3, 3)
         ).sum((1, 2))
         centre = near[1:] / near[0]
-        slot = jnp.arange(number) == jnp.argmax(free & ~which)
+        entry = jnp.arange(number) == jnp.argmax(free & ~begins)
         here = (abs(jnp.arange(rows) - row) <= 2)[:, None] & (
             abs(jnp.arange(columns) - column) <= 2
         )
-        ids = jnp.where(slot, next_id + which.sum(), ids).astype(jnp.int32)
-        return jnp.where(here, 0, sums), which | slot, jnp.where(slot[:, None], centre, xi), ids
+        ids = jnp.where(entry, next_id + begins.sum(), ids).astype(jnp.int32)
+        xi = jnp.where(entry[:, None], centre, xi)
+        return jnp.where(here, 0, sums), begins | entry, xi, ids
 
     none = jnp.zeros(number, bool)
     start = (sums, none, jnp.zeros((number, 2), sums.dtype), jnp.zeros(number, jnp.int32))
-    sums, which, xi, ids = lax.while_loop(more, one, start)
-    return which, xi, ids, sums, next_id + which.sum().astype(jnp.int32)
+    sums, begins, xi, ids = lax.while_loop(more, one, start)
+    return begins, xi, ids, sums
 
 
-def expect(filter: Filter, params: TrackerParams, slot: Slots, stop: Array) -> Expected:
-    """What one target expects at a chunk's end."""
-    params = own_params(params, slot.own)
-    dt = jnp.where(slot.id >= 0, seconds(jnp.maximum(stop - slot.last, 0), slot.gate), 0)
-    return filter.expected(params, predict(filter, params, lax.stop_gradient(slot.state), dt))
+def predict_measurement(
+    filter: Filter, params: TrackerParams, track: TrackBuffer, stop: Array
+) -> PredictedMeasurement:
+    """Predict the events of one track at a chunk's end (us)."""
+    params = track_params(params, track.overrides)
+    dt = to_seconds(jnp.maximum(stop - track.last_update, 0), track.gate)
+    dt = jnp.where(track.id >= 0, dt, 0)
+    state = predict(filter, params, lax.stop_gradient(track.state), dt)
+    return filter.predicted_measurement(params, state)
 
 
-class Verdict(eqx.Module):
-    """What becomes of a target at a chunk's end."""
+def decide_track(
+    params: TrackerParams, frame: Array, track: TrackBuffer, evidence: TrackEvidence, stop: Array
+) -> TrackDecision:
+    """Decide whether one track is confirmed, goes on or ends.
 
-    confirmed: Bool[Array, "*targets"]
-    ended: Int[Array, "*targets"]  # why, see ENDS; 0: it goes on
-    death: Int[Array, "*targets"]  # us since the chunk's start
-    apart: Int[Array, "*targets"]
+    With `association = "authors"` a track ends by silence only.
 
-
-def judge(
-    params: TrackerParams,
-    frame: Array,
-    slot: Slots,
-    now: Expected,
-    inside: Array,
-    found: Array,
-    stop: Array,
-) -> Verdict:
-    """Whether one target is confirmed and whether it ends.
-
-    `now` is what it expects, `inside` whether it is within one lambda of an older one, `found`
-    whether it is no seed. With `association = "authors"` a track ends by silence only.
+    Args:
+        params: Parameters of the tracker.
+        frame: Width and height of the sensor, px.
+        track: The track.
+        evidence: Predicted events, and relation to other tracks.
+        stop: End of the chunk, us.
     """
-    alive = slot.id >= 0
-    age = seconds(stop - slot.born, slot.gate)
-    enough = (slot.hits >= params.n_confirm) & (age >= params.t_confirm)
+    predicted, merging = evidence.predicted, evidence.merging
+    alive = track.id >= 0
+    age = to_seconds(stop - track.birth, track.gate)
+    enough = (track.hits >= params.n_confirm) & (age >= params.t_confirm)
     finite = jnp.ones_like(alive)
-    for leaf in jax.tree.leaves((now, slot.state)):
+    for leaf in jax.tree.leaves((predicted, track.state)):
         finite &= jnp.isfinite(leaf).all()
-    long, short = now.size.max(), now.size.min()
-    limit = silence_limits(params, slot)
-    confirmed = slot.confirmed | (alive & enough & ~inside)
-    since = jnp.where(inside, slot.apart, stop)
+    long, short = predicted.size.max(), predicted.size.min()
+    limit = coast_limits_us(params, track)
+    confirmed = track.confirmed | (alive & enough & ~merging)
+    last_apart = jnp.where(merging, track.last_apart, stop)
     patience = jnp.where(confirmed, params.t_merge, params.t_tentative / 2)
     merged = jnp.where(
-        confirmed, seconds(stop - since, slot.gate) >= patience, inside & (age >= patience)
+        confirmed,
+        to_seconds(stop - last_apart, track.gate) >= patience,
+        merging & (age >= patience),
     )
-    one_pixel = found & (long <= 1.01 * params.lambda_min)  # a hot one, no blob
-    outside = ((now.p < -0.5) | (now.p > frame - 0.5)).any()
-    ended = jnp.select(
+    hot_pixel = evidence.detected & (long <= 1.01 * params.lambda_min)
+    outside = ((predicted.p < -0.5) | (predicted.p > frame - 0.5)).any()
+    reason = jnp.select(
         [
             ~alive,
             ~finite,
-            stop - slot.heard > limit,
+            stop - track.last_hit > limit,
             ~confirmed & (age >= 2 * params.t_tentative),
             outside,
-            one_pixel | (long >= 0.999 * params.lambda_max) | (long > params.aspect_max * short),
-            largest_eigenvalue(now.P_p) > params.sigma_max**2,
-            inside & merged,
+            hot_pixel | (long >= 0.999 * params.lambda_max) | (long > params.aspect_max * short),
+            largest_eigenvalue(predicted.P_p) > params.sigma_max**2,
+            merging & merged,
         ],
         [0, 7, 1, 2, 3, 4, 5, 6],
         0,
     ).astype(jnp.int32)
     if params.association == "authors":
-        ended = jnp.where((ended >= 3) & (ended <= 6), 0, ended)
-    return Verdict(confirmed, ended, jnp.where(ended == 1, slot.heard + limit, stop), since)
+        reason = jnp.where((reason >= 3) & (reason <= 6), 0, reason)
+    death = jnp.where(reason == 1, track.last_hit + limit, stop)
+    return TrackDecision(confirmed, reason, death, last_apart)
 
 
-def _judge(
-    filter: Filter, params: TrackerParams, features: Features, stop: Array, slots: Slots
-) -> tuple[Log, Array]:
-    """Which tracks are confirmed and which end at a chunk's end; and when each was last apart."""
-    now = jax.vmap(functools.partial(expect, filter, params), (0, None))(slots, stop)
-    apart = ((now.p[:, None] - now.p) ** 2).sum(-1) > now.size.max(-1) ** 2  # target i from j
-    older = (slots.id >= 0) & (slots.id < slots.id[:, None])
-    inside = (older & ~apart).any(1)
-    found = jnp.arange(len(slots.id)) >= len(features.seed)
-    frame = jnp.asarray(features.frame)
-    of_one = jax.vmap(functools.partial(judge, params, frame), (0, 0, 0, 0, None))
-    told = of_one(slots, now, inside, found, stop)
-    return Log(slots.id, slots.id, told.confirmed, told.ended, told.death), told.apart
-
-
-def end_cycle(
-    filter: Filter, params: TrackerParams, features: Features, stop: Array, state: State
-) -> tuple[State, Log]:
-    """Confirmations, deaths, mergers and births at a chunk's end."""
-    fixed = lax.stop_gradient(params)
-    log, since = _judge(filter, fixed, features, stop, state.slots)
-    dead = jnp.asarray(log.ended) > 0
-    slots: Any = eqx.tree_at(
-        lambda s: (s.id, s.confirmed, s.apart),
-        state.slots,
-        (jnp.where(dead, -1, log.before), log.confirmed & ~dead, since),
+def _decide_tracks(
+    filter: Filter, params: TrackerParams, features: Features, stop: Array, tracks: TrackBuffer
+) -> TrackDecision:
+    """Decide on all tracks at a chunk's end."""
+    predicted = jax.vmap(functools.partial(predict_measurement, filter, params), (0, None))(
+        tracks, stop
     )
-    real = slots.gate.dtype
+    distance2 = ((predicted.p[:, None] - predicted.p) ** 2).sum(-1)
+    apart = distance2 > predicted.size.max(-1) ** 2  # target i from j
+    older = (tracks.id >= 0) & (tracks.id < tracks.id[:, None])
+    merging = (older & ~apart).any(1)
+    detected = jnp.arange(len(tracks.id)) >= len(features.seed)
+    decide = functools.partial(decide_track, params, jnp.asarray(features.frame))
+    evidence = TrackEvidence(predicted, merging, detected)
+    return jax.vmap(decide, (0, 0, None))(tracks, evidence, stop)
+
+
+def manage_tracks(
+    filter: Filter, params: TrackerParams, features: Features, stop: Array, state: TrackerState
+) -> tuple[TrackerState, LifecycleLog]:
+    """Confirm, delete, merge and begin tracks at a chunk's end (us)."""
+    fixed = lax.stop_gradient(params)
+    decision = _decide_tracks(filter, fixed, features, stop, state.tracks)
+    id_before, dead = state.tracks.id, decision.end_reason > 0
+    tracks: Any = eqx.tree_at(
+        lambda s: (s.id, s.confirmed, s.last_apart),
+        state.tracks,
+        (jnp.where(dead, -1, id_before), decision.confirmed & ~dead, decision.last_apart),
+    )
+    real = tracks.gate.dtype
     size = jnp.broadcast_to(params.lambda0, len(dead)).astype(real)
-    nowhere = jnp.zeros((len(dead), 2), real)
-    empty = start_states(filter, params, slots.own, nowhere, size)
-    slots = eqx.tree_at(lambda s: s.state, slots, jax.vmap(choose)(dead, empty, slots.state))
-    state = State(slots, state.grid, state.next_id)
-    if state.grid is not None:
-        free = (slots.id < 0) & (jnp.arange(len(dead)) >= len(features.seed))
-        sums = state.grid.sums * jnp.exp(-seconds(stop - state.grid.time, size) / fixed.tau_birth)
-        which, xi, ids, sums, next_id = _find_births(fixed, sums.astype(real), free, state.next_id)
-        slots = begin_slots(filter, params, slots, which, xi, size, stop, ids, False)
-        state = State(slots, Grid(sums, stop), next_id)
-    return state, eqx.tree_at(lambda v: v.after, log, state.slots.id)
+    empty = init_states(filter, params, tracks.overrides, jnp.zeros((len(dead), 2), real), size)
+    after = jax.vmap(where_tree)(dead, empty, tracks.state)
+    tracks = eqx.tree_at(lambda s: s.state, tracks, after)
+    grid, next_id = state.grid, state.next_id
+    if grid is not None:
+        free = (tracks.id < 0) & (jnp.arange(len(dead)) >= len(features.seed))
+        sums = grid.sums * jnp.exp(-to_seconds(stop - grid.time, size) / fixed.tau_birth)
+        begins, xi, ids, sums = _find_births(fixed, sums.astype(real), free, next_id)
+        new = NewTracks(begins, xi, size, ids)
+        tracks = init_tracks(filter, params, tracks, new, stop, False)
+        grid, next_id = ClutterGrid(sums, stop), next_id + begins.sum().astype(jnp.int32)
+    log = LifecycleLog(
+        id_before, tracks.id, decision.confirmed, decision.end_reason, decision.death
+    )
+    return TrackerState(tracks, grid, next_id), log

@@ -1,19 +1,18 @@
-"""Tracks of events that are still coming: from a camera, a socket, any iterator.
+"""Tracks of a live stream of events: from a camera, a socket, any iterator.
 
     live = jaxevent.blob.moment.live((240, 180), params)
     for events in camera:  # `jaxevent.Events`, one chunk after another
         live.add(events)
         mean, covariance, valid = live(live.stop)
 
-States are those that `estimate` with `smooth=False` gives of all that has been added so far,
-however it is divided into chunks. Only the targets, and the events since the last end of a cycle,
-are held.
+States equal those of `estimate` with `smooth=False` on all events added so far, however they are
+divided into chunks. Only the targets, and the events since the last end of a cycle, are held.
 """
 
 import bisect
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -22,67 +21,63 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.lifecycle import Log, State, begin
+from jaxevent.blob.filter import Filter
+from jaxevent.blob.lifecycle import LifecycleLog, TrackerState, init_state
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import NEVER, Features, Numeric, Packing
-from jaxevent.blob.scan import ScanRun
+from jaxevent.blob.prepare import NEVER_US, ChunkPacker, Features, Numeric
 from jaxevent.blob.seeds import Seeds, read_seeds
-from jaxevent.blob.states import TrackStates, is_alive, tell
-from jaxevent.blob.steps import Filter
-from jaxevent.blob.targets import Slots
+from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.errors import InputError
 from jaxevent.events.tail import Tail
 from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
 from jaxevent.recording import Events, Recording, Times, microseconds
 
-STEPS, CHUNKS = 64, 8  # of a chunk, and chunks run together
-BORN = 1 << 20  # serial number of the first target that is born; those given have lower ones
+STEPS_PER_CHUNK, CHUNKS_PER_RUN = 64, 8
+FIRST_DETECTED_ID = 1 << 20  # serial number of the first detected target; seeds have lower ones
 
 
 @functools.partial(jax.jit, static_argnames="filter")
-def _read(
-    filter: Filter, params: TrackerParams, slots: Slots, time: Array
+def _read_all(
+    filter: Filter, params: TrackerParams, tracks: TrackBuffer, time: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Mean, covariance, seconds without events and whether alive, of all targets at a time."""
-    told = jax.vmap(functools.partial(tell, filter, params), (0, None))(slots, time)
-    return *told, is_alive(params, slots, time)
+    """Read out all tracks at a time: mean, covariance, s since the last event, and validity."""
+    states = jax.vmap(functools.partial(readout, filter, params), (0, None))(tracks, time)
+    return *states, is_alive(params, tracks, time)
 
 
 class LiveTracks:
     """Targets of all events added so far: `mean, covariance, valid = live(times)`.
 
-    Targets are given, at the start or by `add_target`, and with `detect` born where events belong
-    to none. Each has a number that is never used again: those given count from 0 in that order,
-    those born get theirs when they are confirmed, before which they are not told of. One thread may
+    Targets are given, at the start or by `add_target`, and with `detect` born of unassociated
+    events. Each has a number that is never used again. Given ones count from 0 in that order;
+    detected ones get theirs when they are confirmed, and are not reported before. One thread may
     add what another reads.
     """
 
     def __init__(
         self,
         filter: Filter,
-        params: TrackerParams,
+        runner: Any,
         size: tuple[int, int],
         *,
         seeds: Sequence[Any] | NDArray | None,
         start: int | float | None,
-        detect: bool | None,
-        kernel: Callable[[Packing], FusedRun | None],
+        detect: bool,
     ):
-        self.params, self._filter, self._kernel = params, filter, kernel
+        self.params, self._filter, self._runner = runner.params, filter, runner
         self._turns = TurnLock("live tracks")
         self._tail = Tail(*size)
         self._recording = Recording("live", *size, self._tail)
-        self._detect = seeds is None if detect is None else detect
-        self._packing: Packing | None = None
-        self._count = 0  # numbers given to targets
-        self._names: list[int] = []  # the number of each seed
-        self._born: dict[int, int] = {}  # numbers of those born, by serial number, while they live
-        self._waiting: list[Seeds] = []
+        self._detect = detect
+        self._packer: ChunkPacker | None = None
+        self._n_ids = 0  # numbers given to targets
+        self._seed_ids: list[int] = []  # the number of each seed
+        self._detected_ids: dict[int, int] = {}  # numbers of living targets by serial number
+        self._pending_seeds: list[Seeds] = []
         self._start = None if start is None else int(microseconds(start, "the start"))
         if self._start is not None:
-            self._open(self._start)
-        self._give(seeds)
+            self._start_tracking(self._start)
+        self._add_seeds(seeds)
 
     def __repr__(self) -> str:
         r = self._recording
@@ -90,20 +85,20 @@ class LiveTracks:
         return f"LiveTracks({method}, {r.width}x{r.height}, {len(self._tail):,} events)"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        refuse_to_pickle("live tracks", "keep what they tell, live(times)")
+        refuse_to_pickle("live tracks", "keep the states, live(times)")
 
     @property
     @synchronized
     def start(self) -> int:
-        """The first time (us) of which states can still be had."""
-        self._opened()
-        return self._mark.start
+        """The first time (us) of which states are still available."""
+        self._require_packer()
+        return self._cursor.start
 
     @property
     @synchronized
     def stop(self) -> int:
-        """The time (us) of the last event, or where tracking begins if there is none."""
-        return max(self._opened().start, self._tail.last)
+        """The time (us) of the last event, or the begin of tracking if there is none."""
+        return max(self._require_packer().start, self._tail.last)
 
     @synchronized
     def add(self, events: Events) -> None:
@@ -113,190 +108,207 @@ class LiveTracks:
         self._tail.add(events)
         if not len(events):
             return
-        if self._packing is None:
-            self._open(int(events.t[0]))
-        self._settle()
+        if self._packer is None:
+            self._start_tracking(int(events.t[0]))
+        self._run_complete_chunks()
 
     @synchronized
     def add_target(
         self, x: float | int, y: float | int, size: float | int, time: int | float | None = None
     ) -> int:
-        """Say where a target is, and return its number.
+        """Add a target, which is confirmed at once.
 
-        It is at (x, y), has `size`, about twice the standard deviation of its events (px), and is
-        confirmed at once. It begins at `time` (int us or float s), by default at the last event; if
-        there is none yet, with the first one. The step is compiled again when more are alive than
-        ever before. Raises `InputError` for a target outside the sensor or before `start`.
+        The step is compiled again when more targets are alive than ever before.
+
+        Args:
+            x: Column, px.
+            y: Row, px.
+            size: About twice the standard deviation of its events, px.
+            time: Begin of its track, int us or float s; None: the last event, or the first one if
+                there is none yet.
+
+        Returns:
+            The target's number.
+
+        Raises:
+            InputError: It is outside the sensor, or begins before `start`.
         """
-        self._give([(x, y, size) if time is None else (x, y, size, time)])
-        return self._count - 1
+        self._add_seeds([(x, y, size) if time is None else (x, y, size, time)])
+        return self._n_ids - 1
 
     @synchronized
     def __call__(self, times: Times) -> TrackStates:
-        """States at `times` from `start` on, of the targets alive at one of them.
+        """Read out the targets that are alive at one of some times.
 
-        After the last event they are predicted, as if no other came until then. `id` are the
-        targets' numbers, (tracks,). Raises `InputError` for times that are forgotten.
+        After the last event states are predicted, as if no other came until then.
+
+        Args:
+            times: Integers (us) or floats (s), from `start` on.
+
+        Returns:
+            States (times, tracks); `id` are the targets' numbers, (tracks,).
+
+        Raises:
+            InputError: A time is before `start`.
         """
         us = np.atleast_1d(microseconds(times))
         if len(us) and us.min() < self.start:
             raise InputError(
-                f"states at {us.min()} us were asked for, but those before {self.start} us are "
-                "forgotten; ask before more events are added"
+                f"states at {us.min()} us are not available, those before {self.start} us are "
+                "forgotten; read before more events are added"
             )
-        told = [self._read(int(time)) for time in us]
-        ids = np.array(sorted({int(one) for names, *_ in told for one in names}), np.int64)
+        states = [self._read(int(time)) for time in us]
+        ids = np.array(sorted({int(one) for numbers, *_ in states for one in numbers}), np.int64)
         shape, real = (len(us), len(ids)), np.dtype(jnp.result_type(float))
         mean, covariance = np.full((*shape, 8), np.nan, real), np.full((*shape, 8, 8), np.nan, real)
         idle, valid = np.full(shape, np.nan, real), np.zeros(shape, bool)
-        for row, (names, *values) in enumerate(told):
-            at = np.searchsorted(ids, names)
+        for row, (numbers, *values) in enumerate(states):
+            at = np.searchsorted(ids, numbers)
             for out, value in zip((mean, covariance, idle), values, strict=True):
                 out[row, at] = value
             valid[row, at] = True
         return TrackStates(mean, covariance, valid, idle, ids)
 
-    def _opened(self) -> Packing:
-        if self._packing is None:
+    def _require_packer(self) -> ChunkPacker:
+        if self._packer is None:
             raise InputError("nothing has been added yet; add events first")
-        return self._packing
+        return self._packer
 
-    def _open(self, start: int) -> None:
-        """Tracking begins."""
-        self._packing = packing = Packing(
-            self._recording, self.params, [], start, NEVER - 1, self._detect,
-            steps=STEPS, chunks=CHUNKS, as_stored=True,
+    def _start_tracking(self, start: int) -> None:
+        self._packer = packer = ChunkPacker(
+            self._recording, self.params, [], start, NEVER_US - 1, self._detect,
+            steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN, as_stored=True,
         )  # fmt: skip
-        self._runner: Any = self._kernel(packing) or ScanRun(self._filter, self.params)
-        self._mark = packing.first
-        self._state = self._nobody()
-        for name, seeds in enumerate(self._waiting):
-            self._insert(name, dataclasses.replace(seeds, t=np.maximum(seeds.t, start)))
-        self._waiting = []
+        self._cursor = packer.first
+        self._state = self._empty_state()
+        for number, seeds in enumerate(self._pending_seeds):
+            self._insert_seed(number, dataclasses.replace(seeds, t=np.maximum(seeds.t, start)))
+        self._pending_seeds = []
 
-    def _nobody(self) -> State:
-        features = self._opened().pack(self._mark, more=True).features
-        state = begin(self._filter, self.params, features)
-        return dataclasses.replace(state, next_id=jnp.asarray(BORN, jnp.int32))
+    def _empty_state(self) -> TrackerState:
+        features = self._require_packer().pack(self._cursor, more=True).features
+        state = init_state(self._filter, self.params, features)
+        return dataclasses.replace(state, next_id=jnp.asarray(FIRST_DETECTED_ID, jnp.int32))
 
-    def _give(self, seeds: Sequence[Any] | NDArray | None) -> None:
-        """Take seeds, or keep them until tracking begins."""
-        read = read_seeds(self._recording, seeds, -NEVER, NEVER)
-        for row in np.argsort(read.given):
+    def _add_seeds(self, seeds: Sequence[Any] | NDArray | None) -> None:
+        """Insert seeds, or keep them until tracking begins."""
+        read = read_seeds(self._recording, seeds, -NEVER_US, NEVER_US)
+        for row in np.argsort(read.index):
             one = Seeds(*(part[row : row + 1] for part in dataclasses.astuple(read)))
-            if self._packing is None:
-                self._waiting.append(one)
+            if self._packer is None:
+                self._pending_seeds.append(one)
             else:
-                if one.t[0] == -NEVER:
+                if one.t[0] == -NEVER_US:
                     one.t[0] = self.stop
-                if one.t[0] < self._mark.start:
+                if one.t[0] < self._cursor.start:
                     raise InputError(
-                        f"the target begins at {one.t[0]} us, but what was before "
-                        f"{self._mark.start} us is forgotten; give a later time"
+                        f"the target begins at {one.t[0]} us, but everything before "
+                        f"{self._cursor.start} us is forgotten; give a later time"
                     )
-                self._insert(self._count, one)
-            self._count += 1
+                self._insert_seed(self._n_ids, one)
+            self._n_ids += 1
 
-    def _insert(self, name: int, one: Seeds) -> None:
-        """Put a seed among those to come, by time."""
-        packing = self._opened()
+    def _insert_seed(self, number: int, one: Seeds) -> None:
+        """Insert a seed among those to come, by time."""
+        packer = self._require_packer()
         self._make_room()
-        used = len(self._names)
-        seeds, t = packing.seeds, int(one.t[0])
-        at = bisect.bisect_right(seeds.t[:used].tolist(), t, lo=self._mark.seed)
+        used = len(self._seed_ids)
+        seeds, t = packer.seeds, int(one.t[0])
+        at = bisect.bisect_right(seeds.t[:used].tolist(), t, lo=self._cursor.seed)
         for values, value in ((seeds.t, t), (seeds.xi, one.xi[0]), (seeds.size, one.size[0])):
             values[at + 1 : used + 1] = values[at:used].copy()
             values[at] = value
-        self._names.insert(at, name)
+        self._seed_ids.insert(at, number)
 
     def _make_room(self) -> None:
-        """Leave out the seeds whose targets have ended, and if all are alive double their number.
+        """Drop the seeds of ended targets; if all are alive, double the capacity.
 
-        A seed is the target of its slot, so these are moved alike.
+        A seed has the buffer's entry with its index, so both are moved alike.
         """
-        packing, sown = self._opened(), self._mark.seed
-        old, used = packing.seeds, len(self._names)
+        packer, begun = self._require_packer(), self._cursor.seed
+        old, used = packer.seeds, len(self._seed_ids)
         if used < len(old.t):
             return
-        id = np.asarray(self._state.slots.id)
-        kept = [k for k in range(used) if k >= sown or id[k] >= 0]
-        living = [k for k in kept if k < sown]
+        id = np.asarray(self._state.tracks.id)
+        kept = [k for k in range(used) if k >= begun or id[k] >= 0]
+        living = [k for k in kept if k < begun]
         number = max(len(old.t), 1) if len(kept) < len(old.t) else max(2 * len(old.t), 1)
-        t, xi, size = np.full(number, NEVER), np.zeros((number, 2)), np.ones(number)
-        t[: len(kept)], xi[: len(kept)], size[: len(kept)] = (
-            old.t[kept],
-            old.xi[kept],
-            old.size[kept],
-        )
-        packing.seeds = Seeds(t, xi, size, np.arange(number))
-        self._names = [self._names[k] for k in kept]
-        self._mark = self._mark._replace(seed=len(living))
-        born = len(old.t) if self._detect else len(id)  # the first slot of those born
+        t, xi, size = np.full(number, NEVER_US), np.zeros((number, 2)), np.ones(number)
+        for new, before in ((t, old.t), (xi, old.xi), (size, old.size)):
+            new[: len(kept)] = before[kept]
+        packer.seeds = Seeds(t, xi, size, np.arange(number))
+        self._seed_ids = [self._seed_ids[k] for k in kept]
+        self._cursor = self._cursor._replace(seed=len(living))
+        detected = len(old.t) if self._detect else len(id)  # the first entry of detected targets
 
         def move(new: Numeric, before: Numeric) -> Array:
             rows = [np.asarray(before)[living], np.asarray(new)[len(living) : number]]
-            rows.append(np.asarray(before)[born:])
+            rows.append(np.asarray(before)[detected:])
             return jnp.asarray(np.concatenate(rows))
 
         state = self._state
-        slots: Any = jax.tree.map(move, self._nobody().slots, state.slots)
-        serial = np.array(slots.id)
+        tracks: Any = jax.tree.map(move, self._empty_state().tracks, state.tracks)
+        serial = np.array(tracks.id)
         serial[: len(living)] = np.arange(len(living))
-        slots = dataclasses.replace(slots, id=jnp.asarray(serial))
-        self._state = State(slots, *jax.tree.map(jnp.asarray, (state.grid, state.next_id)))
+        tracks = dataclasses.replace(tracks, id=jnp.asarray(serial))
+        rest = jax.tree.map(jnp.asarray, (state.grid, state.next_id))
+        self._state = TrackerState(tracks, *rest)
 
-    def _settle(self) -> None:
-        """Track through the chunks that no event to come can change, and forget their events."""
-        packing = self._opened()
-        packing.rows = 0, len(self._tail)
+    def _run_complete_chunks(self) -> None:
+        """Run the chunks that no event to come can change, and forget their events."""
+        packer = self._require_packer()
+        packer.rows = 0, len(self._tail)
         while True:
-            stretch = packing.pack(self._mark, more=True)
-            assert stretch.next is not None
-            self._mark = stretch.next
-            if stretch.used:
-                self._state, log = self._runner.follow(self._state, stretch.features)
-                self._name(jax.tree.map(np.asarray, log))
-            if stretch.used < CHUNKS:
+            segment = packer.pack(self._cursor, more=True)
+            assert segment.next is not None
+            self._cursor = segment.next
+            if segment.n_chunks:
+                self._state, log = self._runner.run(self._state, segment.features)
+                self._assign_ids(jax.tree.map(np.asarray, log))
+            if segment.n_chunks < CHUNKS_PER_RUN:
                 break
-        needed = self._mark.row
-        if packing.prefilter:
+        needed = self._cursor.row
+        if packer.prefilter:
             waiting = self._tail[needed : needed + 1].t
             first = int(waiting[0]) if len(waiting) else self._tail.last
-            needed = min(needed, self._tail.index(first - packing.reach))
+            needed = min(needed, self._tail.index(first - packer.prefilter_us))
         self._tail.drop(needed)
 
-    def _name(self, log: Log) -> None:
-        """Give those that were confirmed a number, and forget those that have ended."""
-        at = np.nonzero(log.confirmed & (log.before >= BORN))
-        serial, first = np.unique(np.asarray(log.before)[at], return_index=True)
+    def _assign_ids(self, log: LifecycleLog) -> None:
+        """Number the targets that were confirmed, and forget those that have ended."""
+        before = np.asarray(log.id_before)
+        at = np.nonzero(log.confirmed & (before >= FIRST_DETECTED_ID))
+        serial, first = np.unique(before[at], return_index=True)
         for row in np.lexsort((serial, at[0][first])):
-            if int(serial[row]) not in self._born:
-                self._born[int(serial[row])] = self._count
-                self._count += 1
-        for one in np.asarray(log.before)[np.nonzero(log.ended)]:
-            self._born.pop(int(one), None)
+            if int(serial[row]) not in self._detected_ids:
+                self._detected_ids[int(serial[row])] = self._n_ids
+                self._n_ids += 1
+        for one in before[np.nonzero(log.end_reason)]:
+            self._detected_ids.pop(int(one), None)
 
     def _read(self, time: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Numbers, means, covariances and seconds without events of those alive at a time."""
-        packing, mark, state = self._opened(), self._mark, self._state
-        packing.stop = max(self._tail.last, time) + 1
+        """Read out the living targets at a time (us): numbers, means, covariances, idle times."""
+        packer, cursor, state = self._require_packer(), self._cursor, self._state
+        packer.stop = max(self._tail.last, time) + 1
         while True:
-            stretch = packing.pack(mark)
-            if stretch.next is None or stretch.next.start > time:
+            segment = packer.pack(cursor)
+            if segment.next is None or segment.next.start > time:
                 break
-            mark, (state, _) = stretch.next, self._runner.follow(state, stretch.features)
-        chunk, done, since = (int(one[0]) for one in stretch.find_steps(np.array([time])))
-        state, _ = self._runner.follow(state, _cut(stretch.features, chunk, done))
-        told = _read(self._filter, self.params, state.slots, np.int32(since))
-        mean, covariance, idle, alive = (np.asarray(part) for part in told)
-        serial = np.asarray(state.slots.id)
-        names = [self._names[k] if 0 <= k < BORN else self._born.get(int(k), -1) for k in serial]
-        told_of = np.flatnonzero(alive & (np.array(names) >= 0))
-        return np.array(names)[told_of], mean[told_of], covariance[told_of], idle[told_of]
+            cursor, (state, _) = segment.next, self._runner.run(state, segment.features)
+        chunk, done, since = (int(one[0]) for one in segment.find_steps(np.array([time])))
+        state, _ = self._runner.run(state, _truncate(segment.features, chunk, done))
+        states = _read_all(self._filter, self.params, state.tracks, np.int32(since))
+        mean, covariance, idle, alive = (np.asarray(part) for part in states)
+        numbers = np.array([
+            self._seed_ids[k] if 0 <= k < FIRST_DETECTED_ID else self._detected_ids.get(int(k), -1)
+            for k in np.asarray(state.tracks.id)
+        ])  # fmt: skip
+        at = np.flatnonzero(alive & (numbers >= 0))
+        return numbers[at], mean[at], covariance[at], idle[at]
 
 
-def _cut(f: Features, chunk: int, done: int) -> Features:
-    """Chunks without what comes after so many steps of one."""
+def _truncate(f: Features, chunk: int, done: int) -> Features:
+    """Remove the events after so many steps of a chunk."""
     valid, elapsed, cycle, seed = (np.array(p) for p in (f.valid, f.elapsed, f.cycle, f.seed))
     valid[chunk, done:], valid[chunk + 1 :] = False, False
     elapsed[chunk + 1 :] = 0

@@ -1,4 +1,4 @@
-"""What trackers are fitted to: the likelihood of events, or positions that are known."""
+"""Losses that trackers are fitted to: the likelihood of events, or known positions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,10 +10,11 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import Features, Packing
+from jaxevent.blob.prepare import ChunkPacker, Features
 from jaxevent.blob.run import run
-from jaxevent.blob.targets import seconds
+from jaxevent.blob.track import to_seconds
 from jaxevent.blob.tracker import Tracker
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -21,21 +22,30 @@ from jaxevent.recording import Recording, Times, microseconds
 def negative_log_likelihood(
     tracker: Tracker, params: TrackerParams, features: Features, events: str = "associated"
 ) -> Float[Array, ""]:
-    """Mean over events of -ln p(xi), each predicted before it is used; px^-2.
+    """Return the mean over events of -ln p(xi), each predicted before it is used.
 
     With "associated", p sums N(xi; p^-, L L^T + P_p) over the gates that hold the event, and only
     events in a gate count: right for process noise, but a smaller gate lowers it. With "all",
     p = (1 - o) mean_i N_i(xi) + o / area, o = `outliers`, for every event and without gates: right
     for gates and for whole recordings too. N is the filter's `log_likelihood`. A loss for
     `jaxevent.tuning.optimise`, with the tracker given: `functools.partial(..., tracker)`.
+
+    Args:
+        tracker: The estimator.
+        params: Its parameters.
+        features: Chunks of events, of `Tracker.prepare`.
+        events: Events that count, "associated" or "all".
+
+    Returns:
+        The loss, p in px^-2.
     """
-    _, told = run(tracker.filter, params, None, features, events)
-    assert told.loss is not None and told.count is not None
-    return told.loss.sum() / jnp.maximum(told.count.sum(), 1)
+    _, info = run(tracker.filter, params, None, features, events)
+    assert info.loss is not None and info.count is not None
+    return info.loss.sum() / jnp.maximum(info.count.sum(), 1)
 
 
-class Positions(eqx.Module):
-    """A batch of `position_error`: prepared events and where the seeds' targets were."""
+class PositionBatch(eqx.Module):
+    """A batch of `position_error`: prepared events, and true positions of the seeds' targets."""
 
     features: Features
     chunk: Int[np.ndarray | Array, " times"]
@@ -46,17 +56,26 @@ class Positions(eqx.Module):
 
 
 def position_error(
-    tracker: Tracker, params: TrackerParams, batch: Positions, scale: float | int = 10
+    tracker: Tracker, params: TrackerParams, batch: PositionBatch, scale: float | int = 10
 ) -> Float[Array, ""]:
-    """Mean of 2 s^2 (sqrt(1 + d^2 / s^2) - 1), d the distance of seeds' tracks from the truth, px.
+    """Return the mean of 2 s^2 (sqrt(1 + d^2 / s^2) - 1), d the distance of tracks from the truth.
 
-    It is d^2 for d well below `scale` = s (px) and grows as d beyond, so that one lost target does
-    not rule. Lost targets go on along their last velocity.
+    It is d^2 for d well below s and grows as d beyond, so that one lost target does not dominate.
+    Lost targets go on along their last velocity.
+
+    Args:
+        tracker: The estimator.
+        params: Its parameters.
+        batch: A batch of `prepare_positions`.
+        scale: s, px.
+
+    Returns:
+        The loss, px^2.
     """
-    _, told = run(tracker.filter, params, None, batch.features, "path")
-    assert told.path is not None
-    p, v, last = (part[batch.chunk, batch.step, : batch.xi.shape[1]] for part in told.path)
-    dt = seconds(batch.time[:, None] - last, p)
+    _, info = run(tracker.filter, params, None, batch.features, "path")
+    assert info.path is not None
+    p, v, last = (part[batch.chunk, batch.step, : batch.xi.shape[1]] for part in info.path)
+    dt = to_seconds(batch.time[:, None] - last, p)
     d2 = ((p + v * dt[..., None] - jnp.where(batch.known[..., None], batch.xi, p)) ** 2).sum(-1)
     error = 2 * scale**2 * (jnp.sqrt(1 + d2 / scale**2) - 1)
     return jnp.where(batch.known, error, 0).sum() / jnp.maximum(batch.known.sum(), 1)
@@ -71,23 +90,26 @@ def prepare_positions(
     *,
     start: int | float | None = None,
     stop: int | float | None = None,
-) -> Positions:
-    """A batch for `position_error`.
+) -> PositionBatch:
+    """Prepare a batch for `position_error`.
 
     Args:
         recording: The events.
-        params: As for `Tracker.prepare`.
+        params: Parameters that act when events are packed, see `Tracker.prepare`.
         seeds: One (x, y, size) or (x, y, size, t) for every target.
         times: Sorted, (times,).
         positions: True x and y at these times, (times, seeds, 2) in px; NaN where not known.
-        start: Tracking begins there, by default at the first event.
-        stop: And ends before this.
+        start: Begin of tracking, by default the first event.
+        stop: End of tracking, by default after the last event.
+
+    Returns:
+        The batch.
 
     Raises:
         InputError: Positions of another shape, times outside the part that is tracked.
     """
-    packing = Packing(recording, params, seeds, start, stop, False)
-    features = packing.whole()
+    packer = ChunkPacker(recording, params, seeds, start, stop, False)
+    features = packer.pack_all()
     us = np.atleast_1d(microseconds(times))
     positions = np.asarray(positions)
     if positions.shape != (len(us), len(seeds), 2):
@@ -95,13 +117,16 @@ def prepare_positions(
             f"{recording.name}: positions have shape {positions.shape}; give x and y of every "
             f"seed at every time: ({len(us)}, {len(seeds)}, 2)"
         )
-    if len(us) and (us.min() < packing.start or us.max() >= packing.stop):
+    if len(us) and (us.min() < packer.start or us.max() >= packer.stop):
         raise InputError(
             f"{recording.name}: positions are given from {us.min()} to {us.max()} us, but events "
-            f"are used from {packing.start} to {packing.stop - 1} us; leave out the others"
+            f"are used from {packer.start} to {packer.stop - 1} us; leave out the others"
         )
-    out = packing.read_out(features, us)
-    truth = positions[:, packing.seeds.given]
+    out = packer.locate_times(features, us)
+    truth = positions[:, packer.seeds.index]
     known = np.asarray(np.isfinite(truth).all(-1))
     xi = np.where(known[..., None], truth, 0).astype(features.xi.dtype)
-    return Positions(features, out.chunk, out.step, out.time, xi, known)
+    return PositionBatch(features, out.chunk, out.step, out.time, xi, known)
+
+
+__getattr__ = renamed_names(__name__)

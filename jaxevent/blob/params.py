@@ -1,4 +1,4 @@
-"""Parameters that all trackers of blobs have; a filter's own `Params` adds its numbers."""
+"""Parameters common to all trackers of blobs; a filter's own `Params` adds others."""
 
 from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterval
 
@@ -6,8 +6,8 @@ from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterva
 class TrackerParams(Parameters):
     """Parameters of blob tracking: noises of the model, gate, association and life cycle.
 
-    The defaults suit blobs of 10 px at 100,000 events/s, the times of the life cycle those of
-    10,000 events/s and more; scale them with the rate (a blob of 100 events/s needs "slow").
+    The defaults suit blobs of 10 px at 100,000 events/s. The times of the life cycle suit 10,000
+    events/s and more; scale them with the rate (a blob of 100 events/s needs "slow").
     """
 
     events_per_step = Count(1, "", "events that share one prediction and one update")
@@ -24,13 +24,15 @@ class TrackerParams(Parameters):
     P0_p = Positive(25.0, "px^2", "variance of the position at the start")
     P0_v = Positive(2.5e5, "px^2/s^2", "variance of the velocity at the start")
     P0_lambda = Positive(
-        25.0, "px^2", "variance of the size lambda0 at the start; of others as their square"
+        25.0,
+        "px^2",
+        "variance of the size at the start if it is lambda0; in proportion to its square",
     )
     P0_theta = Positive(0.5, "rad^2", "variance of the orientation at the start")
     P0_q = Positive(100.0, "rad^2/s^2", "variance of the turn rate at the start")
     P0_d = Positive(50.0, "px^2", "variance of the polarity offset at the start")
     lambda0 = Positive(10.0, "px", "size at the start, about twice the largest expected")
-    lambda_min = Positive(0.5, "px", "least size")
+    lambda_min = Positive(0.5, "px", "smallest size")
     lambda_max = Positive(60.0, "px", "largest size")
     tau_q = Positive(0.0, "s", "time constant of the turn rate's decay; 0: it does not decay")
     P_theta_max = Positive(1.0, "rad^2", "largest variance of the orientation")
@@ -39,50 +41,56 @@ class TrackerParams(Parameters):
     # disc or a ring nothing, which makes them 0.7 % too large (2.6 % at 3 sizes). A circle of 3
     # sizes makes ellipses 1.7 % too short, and in background events of 10 times the blob's rate
     # 12 % too wide; the ellipse 2 %.
-    gate = Positive(3.5, "", "radius of the gate in sizes", gradient=False)
+    gate = Positive(3.5, "", "radius of the gate, in multiples of the size", gradient=False)
     gate_shape = Choice(
-        ("ellipse", "circle"), "the gate's shape; moment and chi2_split correct for an ellipse"
+        ("ellipse", "circle"), "shape of the gate; moment and chi2_split correct for an ellipse"
     )
     gate_decay = Positive(200.0, "1/s", "rate at which the gate follows the size", gradient=False)
-    gate_min = Positive(6.0, "px", "least radius of the gate", gradient=False)
+    gate_min = Positive(6.0, "px", "smallest radius of the gate", gradient=False)
     gate_max = Positive(80.0, "px", "largest radius of the gate", gradient=False)
     gate_position = Positive(
-        3.0, "", "standard deviations of the position added to the gate", gradient=False
+        3.0,
+        "",
+        "multiple of the position's standard deviation that is added to the gate",
+        gradient=False,
     )
 
     association = Choice(
         ("soft", "nearest", "authors"),
-        "an event in several gates: shared by its likelihood (JPDA), or the likeliest target's; "
-        "authors: that of the nearest last position, as in the paper's program, ties included",
+        "association of an event in several gates. soft: divided by its likelihoods (JPDA); "
+        "nearest: to the likeliest target; authors: to the nearest last position, as in the "
+        "published program",
     )
     clutter = Positive(
-        0.0, "1/px^2", "soft: density of stray events inside a gate, per event of the target"
+        0.0, "1/px^2", "soft association: density of clutter inside a gate, per event of the target"
     )
-    outliers = UnitInterval(0.1, "", "likelihood of all events: share of events of no target")
-    max_targets = Count(16, "", "most targets at a time that detection may hold")
+    outliers = UnitInterval(0.1, "", "share of events of no target in the likelihood of all events")
+    max_targets = Count(16, "", "largest number of detected targets at a time")
 
     prefilter = Choice((False, True), "leave out events without recent neighbours")
-    prefilter_neighbours = Count(2, "", "of 8 pixels around, how many must have fired")
-    prefilter_time = Positive(5e-3, "s", "how long ago they may have fired", gradient=False)
+    prefilter_neighbours = Count(2, "", "number of the 8 adjacent pixels that must have fired")
+    prefilter_time = Positive(5e-3, "s", "longest time since they fired", gradient=False)
 
     cycle = Positive(1e-3, "s", "period of births and deaths", gradient=False)
-    cell = Count(8, "px", "cell of the grid of unassociated events, about a blob's lambda")
-    tau_birth = Positive(3e-3, "s", "time constant in which the grid forgets", gradient=False)
+    cell = Count(8, "px", "cell size of the grid of unassociated events, about a blob's lambda")
+    tau_birth = Positive(3e-3, "s", "time constant of the grid's decay", gradient=False)
     n_birth = Positive(
-        30.0, "", "unassociated events in 3x3 cells that begin a track", gradient=False
+        30.0, "", "number of unassociated events in 3x3 cells that begins a track", gradient=False
     )
     surround = Positive(
         1.0,
         "",
-        "radius, in gates, around a track whose events begin no other (jAER: surround)",
+        "radius around a track, in gates, within which no other begins (jAER: surround)",
         gradient=False,
     )
-    n_confirm = Positive(100.0, "", "events after which a track is confirmed", gradient=False)
-    t_confirm = Positive(2e-3, "s", "least age of a confirmed track", gradient=False)
+    n_confirm = Positive(
+        100.0, "", "number of events after which a track is confirmed", gradient=False
+    )
+    t_confirm = Positive(2e-3, "s", "least age at which a track is confirmed", gradient=False)
     t_tentative = Positive(
         10e-3,
         "s",
-        "tentative tracks end after this time without events, and after twice this time",
+        "tentative tracks end after this time without events, and at twice this age",
         gradient=False,
     )
     t_coast = Positive(
@@ -91,7 +99,7 @@ class TrackerParams(Parameters):
     t_still = Positive(
         0.0,
         "s",
-        "a target without events for this time stands still, for events need motion; 0: it goes on",
+        "a target without events for this time is taken to stand still; 0: it never is",
         gradient=False,
     )
     t_merge = Positive(
@@ -100,8 +108,10 @@ class TrackerParams(Parameters):
         "the younger of two confirmed tracks ends after this time within one lambda of the older",
         gradient=False,
     )
-    aspect_max = Positive(10.0, "", "tracks end when lambda1 / lambda2 is larger", gradient=False)
-    sigma_max = Positive(50.0, "px", "tracks end when the position is less certain", gradient=False)
+    aspect_max = Positive(10.0, "", "largest lambda1 / lambda2; tracks end beyond", gradient=False)
+    sigma_max = Positive(
+        50.0, "px", "largest standard deviation of the position; tracks end beyond", gradient=False
+    )
 
     presets = {
         # Stars: 50 events per second each, a few px per second.

@@ -1,4 +1,4 @@
-"""What tracks say of distance: inverse time to contact and range, with variances.
+"""Distance from tracks: inverse time to contact and range, with variances.
 
 Inverse time to contact (1/s) is positive while approaching; unlike its inverse it is defined at
 rest. A mean is (..., 8) in the order (px, py, vx, vy, lambda1, lambda2, theta, q), in px, s and
@@ -30,11 +30,20 @@ def inverse_ttc(
     mean_b: Float[Array, "*n 8"],
     covariance_b: Float[Array, "*n 8 8"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """1 / TTC (1/s) and its variance from two blobs at the same depth, whichever is first.
+    """Compute 1 / TTC from two blobs at equal depth, in either order.
 
     (v_a - v_b) . (p_a - p_b) / |p_a - p_b|^2, which holds while the line between them keeps its
     direction in space. The errors of the two tracks are taken as independent. Where the positions
     coincide the value is 0 and the variance infinite. (Event blob tracking, eq. 27.)
+
+    Args:
+        mean_a: States of one blob (..., 8).
+        covariance_a: Their covariances (..., 8, 8).
+        mean_b: States of the other blob (..., 8).
+        covariance_b: Their covariances (..., 8, 8).
+
+    Returns:
+        Inverse time to contact (...), 1/s, and its variance, 1/s^2.
     """
     joint = (covariance_a + covariance_b)[..., :4, :4]
     difference = (mean_a - mean_b)[..., :4]
@@ -44,8 +53,8 @@ def inverse_ttc(
     squared = jnp.where(apart, squared, 1)
     value = jnp.sum(d * w, -1) / squared
     # d value / d d = (w - 2 value d) / |d|^2 and d value / d w = d / |d|^2.
-    slope = jnp.concatenate([w - 2 * value[..., None] * d, d], -1) / squared[..., None]
-    variance = jnp.einsum("...i,...ij,...j->...", slope, joint, slope)
+    gradient = jnp.concatenate([w - 2 * value[..., None] * d, d], -1) / squared[..., None]
+    variance = jnp.einsum("...i,...ij,...j->...", gradient, joint, gradient)
     return jnp.where(apart, value, 0), jnp.where(apart, variance, jnp.inf)
 
 
@@ -53,9 +62,17 @@ def inverse_ttc(
 def log_size(
     mean: Float[Array, "*n 8"], covariance: Float[Array, "*n 8 8"]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """log sqrt(lambda1 lambda2) and its variance; it is the same whichever axis is longer."""
-    share = 0.5 / mean[..., 4:6]
-    variance = jnp.einsum("...i,...ij,...j->...", share, covariance[..., 4:6, 4:6], share)
+    """Compute log sqrt(lambda1 lambda2), which does not depend on the order of the axes.
+
+    Args:
+        mean: States (..., 8).
+        covariance: Their covariances (..., 8, 8).
+
+    Returns:
+        Logarithm of the size in px (...), and its variance.
+    """
+    gradient = 0.5 / mean[..., 4:6]
+    variance = jnp.einsum("...i,...ij,...j->...", gradient, covariance[..., 4:6, 4:6], gradient)
     return jnp.sum(jnp.log(mean[..., 4:6]), -1) / 2, variance
 
 
@@ -71,18 +88,28 @@ def growth(
     Q_lambda: Number | None = None,
     smooth: bool = True,
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
-    """1 / TTC (1/s) and its variance from the growth of one blob, at sorted times (s).
+    """Compute 1 / TTC from the growth of one blob.
 
     The scale w = 1 / sqrt(lambda1 lambda2) is proportional to depth, so that at constant speed it
     is a line in time and 1 / TTC = -w' / w: a Kalman filter of (w, w'), exactly linear, whose
-    measurements are the track's sizes. `Q` (1/s^3) is the density of the speed's changes relative
-    to the depth, 0 for constant speed: the least squares line. With `smooth` all times are used
-    for each (Rauch-Tung-Striebel), otherwise those up to it. `valid` says which rows are
-    measurements; the others, which may hold anything, are predicted.
+    measurements are the track's sizes. Before the second measurement the variance is that of the
+    prior, about 100 1/s^2.
 
-    A track's errors at close times are alike. Given the filter's own Q_lambda (px^2/s), its sizes
-    count for as much as the events behind them; None stands for independent errors. Before the
-    second measurement the variance is that of the prior, about 100 1/s^2.
+    Args:
+        times: Sorted times (times,), s.
+        mean: States (times, 8).
+        covariance: Their covariances (times, 8, 8).
+        valid: Rows that are measurements (times,); the others, of any value, are predicted. None:
+            all.
+        Q: Spectral density of the speed's changes relative to the depth, 1/s^3. 0 is constant
+            speed: the least squares line.
+        Q_lambda: The filter's own `Q_lambda`, px^2/s. A track's errors at close times are
+            correlated; given it, sizes weigh as much as the events behind them. None: independent
+            errors.
+        smooth: Whether all times are used for each (Rauch-Tung-Striebel), or those up to it.
+
+    Returns:
+        Inverse time to contact (times,), 1/s, and its variance, 1/s^2.
     """
     valid = jnp.ones(times.shape, bool) if valid is None else valid
     mean = jnp.where(valid[:, None], mean, 1.0)
@@ -102,43 +129,43 @@ def growth(
         dt, w, R, valid = row
         F = jnp.array([[1.0, dt], [0.0, 1.0]])
         noise = Q * m[0] ** 2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        ahead = jnp.sum(F * m, 1), product(product(F, P), F.T) + noise
-        m, P = ahead
+        predicted = jnp.sum(F * m, 1), product(product(F, P), F.T) + noise
+        m, P = predicted
         gain = jnp.where(valid, P[:, 0] / (P[0, 0] + R), 0)
         m = m + gain * (w - m[0])
         keep = jnp.eye(2, dtype=w.dtype).at[:, 0].add(-gain)
         fresh = gain[:, None] * gain * jnp.where(valid, R, 0)
         P = product(product(keep, P), keep.T) + fresh
-        return (m, P), ((m, P), ahead, F)
+        return (m, P), ((m, P), predicted, F)
 
     def backward(later, row):
-        (m, P), (m_ahead, P_ahead), F = row
-        (a, b), (_, d) = P_ahead
+        (m, P), (m_predicted, P_predicted), F = row
+        (a, b), (_, d) = P_predicted
         adjugate = jnp.array([[d, -b], [-b, a]])
         determinant = jnp.maximum(a * d - b * b, 8 * jnp.finfo(a.dtype).eps * a * d)
         gain = product(product(P, F.T), adjugate) / determinant
-        m = m + jnp.sum(gain * (later[0] - m_ahead), 1)
-        P = P + product(product(gain, later[1] - P_ahead), gain.T)
+        m = m + jnp.sum(gain * (later[0] - m_predicted), 1)
+        P = P + product(product(gain, later[1] - P_predicted), gain.T)
         return (m, P), (m, P)
 
     first = w[jnp.argmax(valid)]
     prior = jnp.array([1.0, 0.0]) * first, 100 * first**2 * jnp.eye(2, dtype=w.dtype)
-    end, (state, ahead, F) = lax.scan(forward, prior, (dt, w, R, valid))
+    end, (state, predicted, F) = lax.scan(forward, prior, (dt, w, R, valid))
     if smooth:
         # A last step of dt = 0 leads from the end to itself.
         F = jnp.concatenate([F[1:], F[:1]])
-        ahead = jax.tree.map(lambda x, e: jnp.concatenate([x[1:], e[None]]), ahead, end)
-        _, state = lax.scan(backward, end, (state, ahead, F), reverse=True)
+        predicted = jax.tree.map(lambda x, e: jnp.concatenate([x[1:], e[None]]), predicted, end)
+        _, state = lax.scan(backward, end, (state, predicted, F), reverse=True)
     m, P = state
     value = -m[:, 1] / m[:, 0]
-    slope = -jnp.stack([value, jnp.ones_like(value)], -1) / m[:, :1]
-    return value, jnp.einsum("ti,tij,tj->t", slope, P, slope)
+    gradient = -jnp.stack([value, jnp.ones_like(value)], -1) / m[:, :1]
+    return value, jnp.einsum("ti,tij,tj->t", gradient, P, gradient)
 
 
 def _relative_noise(
     times: Array, relative: Array, covariance: Array, valid: Array, Q_lambda: Number | None
 ) -> Float[Array, " times"]:
-    """The variances of log sizes, as of errors that are independent; see `growth`."""
+    """Return the variances of log sizes for independent errors; see `growth`."""
     # Sizes known exactly would make the covariances singular.
     R = jnp.maximum(relative, 1e-10)
     if Q_lambda is None:
@@ -163,11 +190,21 @@ def size_range(
     size_factor: Number = SIZE_FACTORS["ring"],
     size_factor_variance: Number = 0.0,
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Range (m) and its variance (m^2) of a target whose `extent` (m) is known.
+    """Compute the range of a target of known extent: size_factor extent focal / lambda1.
 
-    size_factor extent focal / max(lambda1, lambda2), the focal length in px. `size_factor` is
-    lambda over the diameter that the target has in the image: one of `SIZE_FACTORS`, or that of
-    `calibrate_size_factor`. (Event blob tracking, eq. 28, whose lambda is not a diameter.)
+    (Event blob tracking, eq. 28, whose lambda is not a diameter.)
+
+    Args:
+        mean: States (..., 8).
+        covariance: Their covariances (..., 8, 8).
+        extent: Diameter of the target, m.
+        focal: Focal length, px.
+        size_factor: lambda1 over the target's diameter in the image: one of `SIZE_FACTORS`, or that
+            of `calibrate_size_factor`.
+        size_factor_variance: Its variance.
+
+    Returns:
+        Range (...), m, and its variance, m^2.
     """
     first = mean[..., 4] >= mean[..., 5]
     size = jnp.where(first, mean[..., 4], mean[..., 5])
@@ -184,10 +221,19 @@ def calibrate_size_factor(
     focal: Number,
     variance: Float[Array, " n"] | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The size factor, and its variance, from sizes lambda (px) at known ranges (m), n >= 2.
+    """Calibrate the size factor by least squares in size = factor extent focal / range.
 
-    Least squares in size = factor extent focal / range, weighted by 1 / `variance` (px^2) where
-    given. The variance is scaled by the residuals, so that those weights need only be relative.
+    The variance is scaled by the residuals, so that weights need only be relative.
+
+    Args:
+        size: Sizes lambda1 (n,), px, n >= 2.
+        known_range: Ranges (n,), m.
+        extent: Diameter of the target, m.
+        focal: Focal length, px.
+        variance: Variances of the sizes (n,), px^2; None: equal ones.
+
+    Returns:
+        The size factor and its variance.
     """
     diameter = extent * focal / known_range
     weight = jnp.ones_like(size) if variance is None else 1 / variance

@@ -14,26 +14,26 @@ from scipy.optimize import linear_sum_assignment
 
 from jaxevent.errors import InputError
 
-ALPHAS = np.arange(1, 20) / 20  # similarities from which HOTA takes a pair as one
-HALF = 0.5  # share of its time that a target is followed, or a track follows nothing
+ALPHAS = np.arange(1, 20) / 20  # least similarities of a pair, over which HOTA is a mean
+MIN_TIME_SHARE = 0.5  # of its time that a found target has a track, or a true track a target
 
 
 @dataclasses.dataclass(frozen=True)
 class TrackScores:
-    """How tracks and targets fit.
+    """Scores of tracks against targets.
 
     Attributes:
-        match: (times, targets), the track that is taken for each target; -1: none.
-        targets: How many targets there are.
-        tracks: How many tracks there are.
-        found: Targets that one track follows for half of their time or more.
+        match: (times, targets), the track matched to each target; -1: none.
+        targets: Number of targets.
+        tracks: Number of tracks.
+        found: Targets near which one track is for half of their time or more.
         missed: The other targets.
         false: Tracks that are near no target for half of their time or more.
-        switches: Times at which a target's track is another one than before.
-        covered: Share of the targets' time at which they have a track.
+        switches: Number of changes of a target's track.
+        covered: Share of the targets' time in which they have a track.
         rms: Distance of matched pairs, root of the mean square, px; NaN: there is none.
         mota: 1 - (misses + false positives + switches) / truth; negative where errors are more.
-        idf1: Share of what is seen and told for which one pairing of whole tracks holds.
+        idf1: F1 score of positions under the best one-to-one pairing of whole tracks and targets.
         hota: Geometric mean of detection and association, over thresholds of distance.
         deta: Its detection.
         assa: Its association.
@@ -66,9 +66,12 @@ def score_tracks(
     Args:
         truth: True positions (times, targets, 2) in px; NaN where a target is not.
         tracks: Positions of tracks (times, tracks, 2); NaN where a track is not.
-        reach: Distance in px up to which a track may be a target; one, or (times, targets).
-        hidden: Where a target cannot be seen (times, targets): there a track near it is no error,
-            and none is none.
+        reach: Largest distance of a matched pair, px; one, or (times, targets).
+        hidden: Whether a target cannot be seen (times, targets): there neither a track near it nor
+            a missing one is an error.
+
+    Returns:
+        The scores.
 
     Raises:
         InputError: The arrays do not fit each other.
@@ -90,7 +93,7 @@ def score_tracks(
         waits = (near & hidden[..., None]).any(1)
     alive = np.asarray(np.isfinite(tracks).all(2) & ~waits)
     pairs = near & there[..., None] & alive[:, None]
-    wanted, told = there.any(0), np.isfinite(tracks).all(2).any(0)
+    real, tracked = there.any(0), np.isfinite(tracks).all(2).any(0)
 
     match, switches = _match(pairs, distance)
     matched = match >= 0
@@ -101,17 +104,17 @@ def score_tracks(
     i, j = linear_sum_assignment(shared, maximize=True)
     total = number + int(alive.sum())
     most = shared.max(1, initial=0)
-    found = int((most[wanted] >= HALF * there.sum(0)[wanted]).sum())
+    found = int((most[real] >= MIN_TIME_SHARE * there.sum(0)[real]).sum())
     lives = np.isfinite(tracks).all(2).sum(0)
     follows = (pairs.any(1) | waits).sum(0)
     deta, assa, hota = _hota(np.where(there[..., None], distance, np.inf), reach, there, alive)
     return TrackScores(
         match=match,
-        targets=int(wanted.sum()),
-        tracks=int(told.sum()),
+        targets=int(real.sum()),
+        tracks=int(tracked.sum()),
         found=found,
-        missed=int(wanted.sum()) - found,
-        false=int((told & (follows < HALF * lives)).sum()),
+        missed=int(real.sum()) - found,
+        false=int((tracked & (follows < MIN_TIME_SHARE * lives)).sum()),
         switches=switches,
         covered=float(matched.sum() / max(number, 1)),
         rms=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
@@ -126,9 +129,9 @@ def score_tracks(
 def _match(
     pairs: NDArray[np.bool_], distance: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], int]:
-    """The track of each target at each time, and how often it changes: CLEAR.
+    """Match tracks to targets at each time by the rules of CLEAR; count changes.
 
-    A pair that was matched stays so while it may; what is left is matched at the least distance.
+    A matched pair stays matched while it may; the others are matched at the least distance.
     """
     times, targets, tracks = pairs.shape
     match, last, switches = np.full((times, targets), -1), np.full(targets, -1), 0
@@ -158,19 +161,19 @@ def _hota(
     there: NDArray[np.bool_],
     alive: NDArray[np.bool_],
 ) -> tuple[float, float, float]:
-    """Detection, association and both, means over `ALPHAS`."""
+    """Compute detection, association and HOTA, means over `ALPHAS`."""
     similar = np.maximum(1 - np.where(alive[:, None], distance, np.inf) / (2 * reach), 0)
     if not there.any() and not alive.any():
         return 1.0, 1.0, 1.0
     all_pairs = similar.sum(1, keepdims=True) + similar.sum(2, keepdims=True) - similar
     possible = (similar / np.maximum(all_pairs, 1e-12)).sum(0)
-    seen, told = there.sum(0)[:, None], alive.sum(0)
-    alignment = possible / np.maximum(seen + told - possible, 1e-12)
+    n_true, n_tracked = there.sum(0)[:, None], alive.sum(0)
+    alignment = possible / np.maximum(n_true + n_tracked - possible, 1e-12)
     count = np.zeros((len(ALPHAS), *possible.shape))
     for now in similar:
         i, j = linear_sum_assignment(alignment * now, maximize=True)
         count[:, i, j] += now[i, j] >= ALPHAS[:, None] - 1e-12
     true = count.sum((1, 2))
     deta = true / (there.sum() + alive.sum() - true)
-    assa = (count**2 / np.maximum(seen + told - count, 1)).sum((1, 2)) / np.maximum(true, 1)
+    assa = (count**2 / np.maximum(n_true + n_tracked - count, 1)).sum((1, 2)) / np.maximum(true, 1)
     return float(deta.mean()), float(assa.mean()), float(np.sqrt(deta * assa).mean())

@@ -1,4 +1,4 @@
-"""Where the user says that targets are, and from when to when they are tracked."""
+"""Seeds of tracks given by the user, and the span of time that is tracked."""
 
 import dataclasses
 import math
@@ -14,22 +14,32 @@ from jaxevent.recording import Recording, microseconds
 
 @dataclasses.dataclass(frozen=True)
 class Seeds:
-    """Tracks given by the user, sorted by time: t (n,) us, xi (n, 2) and size (n,) in px.
+    """Tracks given by the user, sorted by time."""
 
-    `given` is the place of each among those that the user gave.
-    """
-
-    t: NDArray[np.int64]
-    xi: NDArray[np.float64]
-    size: NDArray[np.float64]
-    given: NDArray[np.int64]
+    t: NDArray[np.int64]  # (n,) us
+    xi: NDArray[np.float64]  # (n, 2) px
+    size: NDArray[np.float64]  # (n,) px
+    index: NDArray[np.int64]  # (n,) index of each in the user's order
 
 
 def read_seeds(
     recording: Recording, seeds: Sequence[Any] | np.ndarray | None, start: int, stop: int
 ) -> Seeds:
-    """The user's seeds, sorted by time; raises `InputError` saying which one cannot be used."""
-    times, places, sizes = [], [], []
+    """Read the user's seeds, and sort them by time.
+
+    Args:
+        recording: Recording with the sensor's size.
+        seeds: One (x, y, size) or (x, y, size, t) for each, in px and us or s; None: none.
+        start: Start of tracking, us.
+        stop: Its end, us.
+
+    Returns:
+        The seeds.
+
+    Raises:
+        InputError: A seed has another form, or is outside the sensor or the time.
+    """
+    times, positions, sizes = [], [], []
     for number, seed in enumerate([] if seeds is None else seeds):
         name = f"{recording.name}: seed {number}"
         try:
@@ -54,19 +64,31 @@ def read_seeds(
                 "integers are microseconds, floats seconds, both on the recording's clock"
             )
         times.append(at)
-        places.append((x, y))
+        positions.append((x, y))
         sizes.append(size)
-    given = np.argsort(times, kind="stable").astype(np.int64)
-    xi = np.array(places, np.float64).reshape(-1, 2)
+    index = np.argsort(times, kind="stable").astype(np.int64)
+    xi = np.array(positions, np.float64).reshape(-1, 2)
     return Seeds(
-        np.array(times, np.int64)[given], xi[given], np.array(sizes, np.float64)[given], given
+        np.array(times, np.int64)[index], xi[index], np.array(sizes, np.float64)[index], index
     )
 
 
-def span_of(
+def tracking_span(
     recording: Recording, start: int | float | None, stop: int | float | None
 ) -> tuple[int, int]:
-    """From when to when events are used (us)."""
+    """Return the span [begin, end) in us in which events are used.
+
+    Args:
+        recording: The recording; without events its frames set the default.
+        start: Begin, int us or float s; None: the first event.
+        stop: End, int us or float s; None: after the last event.
+
+    Returns:
+        Begin and end, us.
+
+    Raises:
+        InputError: The span is empty.
+    """
     if not len(recording.events):
         first, last = 0, 1
         if recording.frames is not None:

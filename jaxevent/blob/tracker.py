@@ -1,4 +1,4 @@
-"""The one estimator of blobs: a filter of one target, and what all trackers share."""
+"""The estimator of blobs: a filter of one target, and what all trackers share."""
 
 import dataclasses
 import functools
@@ -11,17 +11,22 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.lifecycle import State, shift
+from jaxevent.blob.engine.runner import KernelRunner
+from jaxevent.blob.filter import Filter
+from jaxevent.blob.lifecycle import TrackerState, shift_state
 from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import Features, Packing, ReadOut
-from jaxevent.blob.run import run
+from jaxevent.blob.prepare import ChunkPacker, Features, ReadoutTimes
+from jaxevent.blob.run import XlaRunner, run
 from jaxevent.blob.search import TargetSearchResult, find
-from jaxevent.blob.smoother import Smoothed, at_end, look_back, nothing_later, tell_smoothed
-from jaxevent.blob.states import TrackStates, is_alive, tell
-from jaxevent.blob.steps import Filter
-from jaxevent.blob.targets import Slots
+from jaxevent.blob.smoother import (
+    SmoothedTracks,
+    backward_pass,
+    propagate_to_chunk_end,
+    readout_smoothed,
+    terminal_info,
+)
+from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.blob.tracks import Tracks
 from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.errors import InputError
@@ -35,7 +40,7 @@ P = TypeVar("P", bound=TrackerParams)
 class Tracker(Estimator[P]):
     """Tracking of any number of blobs, each by a `Filter`.
 
-    One of your own needs a class of parameters, derived from `TrackerParams`, and a filter:
+    A tracker of your own needs a class of parameters, derived from `TrackerParams`, and a filter:
 
         mine = Tracker("mine", Params, dataclasses.replace(moment.filter, update=update))
     """
@@ -63,80 +68,126 @@ class Tracker(Estimator[P]):
         detect: bool | None = None,
         found: TargetSearchResult | None = None,
         extrapolate: bool = False,
-    ) -> tuple[Features, ReadOut]:
-        """All events of a recording, or of a part of it, for `run`, and `times` for `read`.
+    ) -> tuple[Features, ReadoutTimes]:
+        """Prepare all events of a recording, or of a part of it, for `run`.
 
         Of the parameters `events_per_step`, `cycle`, `cell` and those of the prefilter act here.
-        Options and errors as those of `estimate`; also raises `InputError` for times outside the
-        recording, unless told to `extrapolate`: then the estimate is not valid there.
+
+        Args:
+            recording: The events.
+            times: Times for `read`, integers (us) or floats (s).
+            params: See `Params`; None: the defaults.
+            seeds: See `estimate`.
+            start: See `estimate`.
+            stop: See `estimate`.
+            detect: See `estimate`; by default only without seeds.
+            found: See `estimate`.
+            extrapolate: Whether times outside the recording are allowed; estimates are not valid
+                there.
+
+        Returns:
+            Chunks of events for `run`, and the location of the times in them for `read`.
+
+        Raises:
+            InputError: See `estimate`; also times outside the recording.
         """
         self.check(recording)
         self.check_options(seeds=seeds, start=start, stop=stop, detect=detect, found=found)
         params = self.Params() if params is None else params
-        packing = Packing(recording, params, seeds, start, stop, detect, found=found)
+        packer = ChunkPacker(recording, params, seeds, start, stop, detect, found=found)
         us = np.atleast_1d(microseconds(times))
         if not extrapolate:
-            packing.check_times(us)
-        features = packing.whole()
-        return features, packing.read_out(features, us)
+            packer.check_times(us)
+        features = packer.pack_all()
+        return features, packer.locate_times(features, us)
 
-    def run(self, params: P, features: Features, state: State | None = None) -> tuple[Slots, State]:
-        """Track: all targets at every chunk's start and after each of its steps, and at the end.
+    def run(
+        self, params: P, features: Features, state: TrackerState | None = None
+    ) -> tuple[TrackBuffer, TrackerState]:
+        """Track through chunks of events; pure.
 
-        The trajectory's arrays begin with (chunks, steps + 1, targets). `state` is what the run
-        before returned, of features that end where these start; omitted, the recording starts here.
-        `smooth` adds what later events say. For losses, which need less memory, see
-        `jaxevent.blob.losses`.
+        Losses need less memory, see `jaxevent.blob.losses`.
+
+        Args:
+            params: See `Params`.
+            features: Chunks of `prepare`.
+            state: State that the run before returned, of features that end where these begin;
+                None: the recording starts here.
+
+        Returns:
+            All tracks at every chunk's start and after each of its steps, whose arrays begin with
+            (chunks, steps + 1, targets), and the state at the end. `smooth` makes them rest on
+            later events too.
         """
-        state, told = run(self.filter, params, state, features, "states")
-        assert told.slots is not None
+        state, info = run(self.filter, params, state, features, "states")
+        assert info.tracks is not None
         last = jnp.max(jnp.where(features.cycle, jnp.arange(len(features.cycle)), 0))
-        return told.slots, shift(state, jnp.asarray(features.stop)[last])
+        return info.tracks, shift_state(state, jnp.asarray(features.stop)[last])
 
-    def smooth(self, params: P, features: Features, trajectory: Slots) -> Smoothed:
-        """A trajectory of `run`, to be read with all events of the features; pure.
+    def smooth(self, params: P, features: Features, trajectory: TrackBuffer) -> SmoothedTracks:
+        """Smooth a trajectory of `run` with all events of the features; pure.
 
-        Raises `InputError` where the filter's states cannot be smoothed.
+        Args:
+            params: See `Params`.
+            features: Chunks of `prepare`.
+            trajectory: Tracks that `run` returned.
+
+        Returns:
+            The trajectory for `read`, with the information of later events.
+
+        Raises:
+            InputError: The filter's states cannot be smoothed.
         """
         self._check_smoothing()
         elapsed = jnp.asarray(features.elapsed)
 
-        def one(carry: Any, chunk: Array) -> Any:
+        def smooth_chunk(carry: Any, chunk: Array) -> Any:
             path = jax.tree.map(lambda a: a[chunk], trajectory)
-            later = at_end(carry[0], jax.tree.map(lambda a: a[-1], path), carry[1])
-            later = look_back(self.filter, params, path, later)
-            return (jax.tree.map(lambda a: a[0], later), elapsed[chunk]), later
+            end = jax.tree.map(lambda a: a[-1], path)
+            info = propagate_to_chunk_end(carry[0], end, carry[1])
+            info = backward_pass(self.filter, params, path, info)
+            return (jax.tree.map(lambda a: a[0], info), elapsed[chunk]), info
 
-        after = nothing_later(jax.tree.map(lambda a: a[-1, -1], trajectory))
+        after = terminal_info(jax.tree.map(lambda a: a[-1, -1], trajectory))
         chunks = jnp.arange(len(elapsed), dtype=jnp.int32)
-        _, later = lax.scan(one, (after, jnp.zeros_like(elapsed[0])), chunks, reverse=True)
-        return Smoothed(trajectory, later)
+        carry = after, jnp.zeros_like(elapsed[0])
+        _, info = lax.scan(smooth_chunk, carry, chunks, reverse=True)
+        return SmoothedTracks(trajectory, info)
 
-    def read(self, params: P, trajectory: Slots | Smoothed, out: ReadOut) -> TrackStates:
-        """The targets at the times prepared: first the seeds' in the order given.
+    def read(
+        self, params: P, trajectory: TrackBuffer | SmoothedTracks, out: ReadoutTimes
+    ) -> TrackStates:
+        """Read out the tracks at the prepared times; pure.
 
-        Those found follow, as many as may be held at a time. States rest on the events up to each
-        time, those of what `smooth` returned on all. Valid are confirmed targets; unlike `Tracks`,
-        which knows what follows, this leaves out the time before they were confirmed.
+        Args:
+            params: See `Params`.
+            trajectory: Tracks of `run`, whose states rest on the events up to each time, or of
+                `smooth`, whose states rest on all events.
+            out: Location of the times, of `prepare`.
+
+        Returns:
+            States of the seeds' targets in the user's order, then of the detected ones, as many as
+            may be held at a time. Confirmed targets are valid. `Tracks` includes the time before
+            the confirmation too, for it knows what follows.
         """
         now = jax.tree.map(lambda a: a[out.chunk, out.step], trajectory)
         time = jnp.asarray(out.time)
-        if isinstance(now, Smoothed):
-            slots, of_one = now.slots, functools.partial(tell_smoothed, self.filter, params)
-            told = jax.vmap(jax.vmap(of_one, (0, 0, None)))(slots, now.later, time)
+        if isinstance(now, SmoothedTracks):
+            tracks, read = now.tracks, functools.partial(readout_smoothed, self.filter, params)
+            states = jax.vmap(jax.vmap(read, (0, 0, None)))(tracks, now.info, time)
         else:
-            slots, of_one = now, functools.partial(tell, self.filter, params)
-            told = jax.vmap(jax.vmap(of_one, (0, None)))(slots, time)
-        mean, covariance, idle = told
-        valid = jax.vmap(is_alive, (None, 0, 0))(params, slots, time)
+            tracks, read = now, functools.partial(readout, self.filter, params)
+            states = jax.vmap(jax.vmap(read, (0, None)))(tracks, time)
+        mean, covariance, idle = states
+        valid = jax.vmap(is_alive, (None, 0, 0))(params, tracks, time)
         valid &= jnp.asarray(out.inside)[:, None]
-        seeds = len(out.given)
+        seeds = len(out.seed_index)
         valid = valid.at[:, :seeds].set(valid[:, :seeds] & ~jnp.asarray(out.ended))
-        id = slots.id
+        id = tracks.id
         if seeds:
-            given = jnp.asarray(out.given)
-            id = jnp.where((id >= 0) & (id < seeds), given[jnp.clip(id, 0, seeds - 1)], id)
-            order = jnp.concatenate([jnp.argsort(given), jnp.arange(seeds, id.shape[1])])
+            index = jnp.asarray(out.seed_index)
+            id = jnp.where((id >= 0) & (id < seeds), index[jnp.clip(id, 0, seeds - 1)], id)
+            order = jnp.concatenate([jnp.argsort(index), jnp.arange(seeds, id.shape[1])])
             mean, covariance, idle, valid, id = (
                 part[:, order] for part in (mean, covariance, idle, valid, id)
             )
@@ -164,31 +215,33 @@ class Tracker(Estimator[P]):
     ) -> Tracks:
         """Track the blobs of a recording.
 
-        Without parameters and seeds the targets and what suits them are found first, see `find`.
+        Without parameters and seeds the targets and their parameters are found first, see `find`.
 
         Args:
             recording: Events; frames are not needed.
-            params: See `Params`; None: those of what is found, or the defaults.
-            seeds: Where targets are, one (x, y, size) or (x, y, size, t) for each: the pixel, about
-                twice the standard deviation of its events in px, and when the track begins (int us
-                or float s on the recording's clock; by default at `start`). They are confirmed at
-                once.
-            start: Tracking begins there, by default at the first event.
-            stop: And ends before this, by default after the last event.
-            detect: Whether tracks are born where events belong to none; by default only with
-                parameters and without seeds.
-            found: Targets found before, by `find`. Tracks begin and end with them, and take events
-                that are near them only.
+            params: See `Params`; None: those of the found targets, or the defaults.
+            seeds: Targets as (x, y, size) or (x, y, size, t): pixel, about twice the standard
+                deviation of the events in px, and begin of the track (int us or float s on the
+                recording's clock; by default `start`). They are confirmed at once.
+            start: Begin of tracking, by default the first event.
+            stop: End of tracking, by default after the last event.
+            detect: Whether tracks are born of unassociated events; by default only with parameters
+                and without seeds.
+            found: Targets that `find` found. Tracks begin and end with them, and use events near
+                them only.
             smooth: Whether states rest on all events, those after a time included. False: on those
-                up to it, as they are known while events come. None: on all, where the filter can.
-            compiler: "numba" follows and reads targets by kernels made of the filter's own
-                functions, "xla" by the `run` that is differentiated; both to rounding the same.
-                None: numba, where it has a kernel.
-            progress: Whether a bar is shown; None: where somebody looks on.
+                up to it. None: on all, where the filter can.
+            compiler: "numba" tracks by kernels made of the filter's own functions, "xla" by the
+                `run` that is differentiated; they agree to rounding. None: numba, where it has a
+                kernel.
+            progress: Whether to show a progress bar; None: on a terminal.
+
+        Returns:
+            The tracks, a function of time.
 
         Raises:
             InputError: A seed is outside the sensor or the time, there is no time to track, the
-                filter's states cannot be smoothed, or numba is asked for and has no kernel.
+                filter's states cannot be smoothed, or numba is requested and has no kernel.
         """
         self.check(recording)
         self.check_options(
@@ -202,11 +255,13 @@ class Tracker(Estimator[P]):
             found = find(recording, start, stop, progress=progress)
         if params is None:
             params = self.Params(**found.settings()) if found is not None else self.Params()
-        packing = Packing(recording, params, seeds, start, stop, detect, found=found)
-        fused = self._fused(params, compiler, packing)
-        if fused is not None:
-            packing.lengthen()
-        return Tracks(self.filter, packing, params, progress, smooth, fused)
+        births = seeds is None and found is None if detect is None else detect
+        runner = self._make_runner(params, compiler, births, found)
+        packer = ChunkPacker(
+            recording, params, seeds, start, stop, detect, found=found,
+            events_per_segment=runner.events_per_segment,
+        )  # fmt: skip
+        return Tracks(runner, packer, smooth, progress)
 
     def live(
         self,
@@ -218,30 +273,31 @@ class Tracker(Estimator[P]):
         detect: bool | None = None,
         compiler: str | None = None,
     ) -> LiveTracks:
-        """Targets of events that are still to come; see `LiveTracks`.
+        """Track the targets of events that are still to come; see `LiveTracks`.
 
-        Nothing is found beforehand, as `find` needs the whole recording, and nothing is smoothed.
+        Targets are not searched for beforehand, as `find` needs the whole recording, and states are
+        not smoothed.
 
         Args:
             size: (width, height) of the sensor, px.
             params: See `Params`; None: the defaults.
-            seeds: Where targets are, as `estimate` takes them.
-            start: Tracking begins there, and earlier events are left out; by default at the first
-                event.
-            detect: Whether tracks are born where events belong to none; by default only without
-                seeds.
-            compiler: As of `estimate`; what is read is compiled by XLA.
+            seeds: Targets, see `estimate`.
+            start: Begin of tracking; earlier events are left out. By default the first event.
+            detect: Whether tracks are born of unassociated events; by default only without seeds.
+            compiler: See `estimate`; the readout is always compiled by XLA.
+
+        Returns:
+            The tracks, to which events are added.
 
         Raises:
-            InputError: A seed is outside the sensor, or numba is asked for and has no kernel.
+            InputError: A seed is outside the sensor, or numba is requested and has no kernel.
         """
         choose_backend(compiler, True)
         self.check_options(seeds=seeds, start=start, detect=detect)
         params = self.Params() if params is None else params
-        kernel = functools.partial(self._fused, params, compiler)
-        return LiveTracks(
-            self.filter, params, size, seeds=seeds, start=start, detect=detect, kernel=kernel
-        )
+        detect = seeds is None if detect is None else detect
+        runner = self._make_runner(params, compiler, detect)
+        return LiveTracks(self.filter, runner, size, seeds=seeds, start=start, detect=detect)
 
     def _check_smoothing(self) -> None:
         if self.filter.transition is None:
@@ -250,7 +306,14 @@ class Tracker(Estimator[P]):
                 "`transition`; leave out smooth"
             )
 
-    def _fused(self, params: P, compiler: str | None, packing: Packing) -> FusedRun | None:
-        """The kernel that follows targets; None where XLA does."""
-        make = functools.partial(FusedRun, self.filter, params, packing)
-        return make_kernel(self.name, compiler, True, make)
+    def _make_runner(
+        self, params: P, compiler: str | None, detect: bool, found: TargetSearchResult | None = None
+    ) -> KernelRunner | XlaRunner:
+        """Make the runner of segments: by numba where it has a kernel, else by XLA."""
+        overrides = tuple(found.per_target_values(params)) if found else ()
+        make = functools.partial(
+            KernelRunner, self.filter, params,
+            detect=detect, overrides=overrides, has_owners=bool(found),
+        )  # fmt: skip
+        kernel = make_kernel(self.name, compiler, True, make)
+        return XlaRunner(self.filter, params) if kernel is None else kernel

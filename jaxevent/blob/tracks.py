@@ -1,7 +1,8 @@
-"""Tracks of many blobs in one stream of events, as a function of time."""
+"""Tracks of many blobs in one stream of events, as a function of time, and their tables."""
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,14 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.lifecycle import ENDS, Log
-from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.prepare import Mark, Packing, Stretch
-from jaxevent.blob.scan import ScanRun, numbers_in
-from jaxevent.blob.states import TrackStates
-from jaxevent.blob.steps import Filter
-from jaxevent.blob.tables import TABLE_RATE, TABLE_UNITS, evenly, table_columns
+from jaxevent.blob.lifecycle import END_REASONS, LifecycleLog
+from jaxevent.blob.prepare import ChunkPacker, PackingCursor, Segment
+from jaxevent.blob.run import count_numbers
+from jaxevent.blob.track import TrackStates
+from jaxevent.deprecated import renamed_names
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
 from jaxevent.locks import TurnLock
@@ -27,13 +25,86 @@ from jaxevent.recording import Times, microseconds
 if TYPE_CHECKING:
     import pandas
 
-BEGINS = 32  # stretches from which tracking can be taken up again
-TOGETHER = 2**12  # states that are told of at once
-KEPT = 2**24  # numbers of what later events say that are kept between readings
+MAX_CHECKPOINTS = 32  # states from which tracking can be taken up again
+STATES_PER_READOUT = 2**12  # states that are read out at once
+MAX_KEPT_NUMBERS = 2**24  # numbers of the backward pass that are kept between readings
+
+COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
+UNITS = ("px", "px", "px/s", "px/s", "px", "px", "rad", "rad/s")
+TABLE_UNITS = {
+    "t": "s",
+    "id": "1",
+    **dict(zip(COLUMNS, UNITS, strict=True)),
+    **{f"sigma_{name}": unit for name, unit in zip(COLUMNS, UNITS, strict=True)},
+}
+TABLE_RATE = 1000.0  # times per second of a table
 
 
-def _joined(parts: Sequence[TrackStates]) -> TrackStates:
-    """States of the same tracks, at the times of all."""
+def table_columns(
+    t: NDArray[np.int64],
+    id: NDArray[np.integer],
+    mean: NDArray[np.floating],
+    covariance: NDArray[np.floating],
+) -> dict[str, NDArray]:
+    """Arrange tracks as the columns of a table, one row for each track and time.
+
+    Args:
+        t: Times (rows,), us.
+        id: Numbers of the tracks (rows,).
+        mean: States (rows, 8), in `UNITS`.
+        covariance: Their covariances (rows, 8, 8).
+
+    Returns:
+        Arrays (rows,) by the names of `TABLE_UNITS`, in those units. A sigma is the square root of
+        a variance.
+    """
+    deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
+    columns = [t / 1e6, id, *mean.T, *deviation.T]
+    return dict(zip(TABLE_UNITS, columns, strict=True))
+
+
+def evenly_spaced_times(start: int, stop: int, rate: float) -> NDArray[np.int64]:
+    """Return times (us) at a rate (1/s), from `start` to before `stop` (us)."""
+    count = math.ceil((stop - start) * rate / 1e6)
+    times = start + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
+    return np.unique(times[times < stop])
+
+
+class AssociatedEvents(NamedTuple):
+    """Events of a segment of the recording with their likeliest tracks, one entry for each."""
+
+    row: NDArray[np.int64]  # in `recording.events`
+    t: NDArray[np.int64]  # us
+    id: NDArray[np.int64]  # the likeliest track that holds it in its gate; -1: none
+    weight: NDArray[np.floating]  # of the event for this track
+
+
+@dataclasses.dataclass
+class _History:
+    """Births, confirmations and deaths (us, with the reason) by serial number."""
+
+    birth: dict[int, int]
+    confirmed: dict[int, int]
+    death: dict[int, tuple[int, int]] = dataclasses.field(default_factory=dict)
+
+    def add(self, segment: Segment, log: LifecycleLog) -> None:
+        """Add the changes of a segment."""
+        log = jax.tree.map(np.asarray, log)
+        end = segment.start + segment.features.stop
+        at = np.nonzero(log.confirmed & (log.id_before >= 0))
+        for one, first in zip(*np.unique(log.id_before[at], return_index=True), strict=True):
+            self.confirmed.setdefault(int(one), int(end[at[0][first]]))
+        for chunk, entry in zip(*np.nonzero(log.end_reason), strict=True):
+            when = int(segment.start[chunk]) + int(log.death[chunk, entry])
+            reason = int(log.end_reason[chunk, entry])
+            self.death[int(log.id_before[chunk, entry])] = when, reason
+        new = (log.id_after >= 0) & (log.id_after != log.id_before)
+        for chunk, entry in zip(*np.nonzero(new), strict=True):
+            self.birth.setdefault(int(log.id_after[chunk, entry]), int(end[chunk]))
+
+
+def _concatenate_states(parts: Sequence[TrackStates]) -> TrackStates:
+    """Concatenate states of equal tracks along time."""
     mean, covariance, valid, idle = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("mean", "covariance", "valid", "idle")
@@ -41,84 +112,52 @@ def _joined(parts: Sequence[TrackStates]) -> TrackStates:
     return TrackStates(mean, covariance, valid, idle, parts[0].id)
 
 
-class Events(NamedTuple):
-    """Whose events are, one entry for each event of a stretch of the recording."""
-
-    row: NDArray[np.int64]  # in `recording.events`
-    t: NDArray[np.int64]  # us
-    id: NDArray[np.int64]  # the likeliest track that holds it in its gate; -1: none
-    weight: NDArray[np.floating]  # how much of the event is this track's
-
-
-@dataclasses.dataclass
-class _History:
-    """Births, confirmations and deaths (us) by serial number; of deaths also why, see ENDS."""
-
-    birth: dict[int, int]
-    confirmed: dict[int, int]
-    death: dict[int, tuple[int, int]] = dataclasses.field(default_factory=dict)
-
-    def add(self, stretch: Stretch, told: Log) -> None:
-        """Enter those of a stretch."""
-        log = jax.tree.map(np.asarray, told)
-        end = stretch.start + stretch.features.stop
-        at = np.nonzero(log.confirmed & (log.before >= 0))
-        for one, first in zip(*np.unique(log.before[at], return_index=True), strict=True):
-            self.confirmed.setdefault(int(one), int(end[at[0][first]]))
-        for chunk, slot in zip(*np.nonzero(log.ended), strict=True):
-            when = int(stretch.start[chunk]) + int(log.death[chunk, slot])
-            self.death[int(log.before[chunk, slot])] = when, int(log.ended[chunk, slot])
-        new = (log.after >= 0) & (log.after != log.before)
-        for chunk, slot in zip(*np.nonzero(new), strict=True):
-            self.birth.setdefault(int(log.after[chunk, slot]), int(end[chunk]))
-
-
 class Tracks(HtmlRepr):
     """Tracks of a recording: `mean, covariance, valid = tracks(times)`.
 
-    Times, arrays of shape (tracks,): `birth`, `death` (the first moment when it is no more; for a
-    track that lives to the end, that of the last event + 1) and `confirmed`, int64 us. `id` are
-    whole numbers that are never used again, the seeds' first and in the order given; tracks that
-    were never confirmed are left out. `ended` says why: "end" of the events, "idle", "left" the
-    image, "size" beyond limits, "uncertain" position, "merged" with an older one, "not finite".
+    Times, arrays of shape (tracks,): `birth`, `death` (the first moment without the track; for one
+    that lives to the end, that of the last event + 1) and `confirmed`, int64 us. `id` are whole
+    numbers that are never used again, the seeds' first and in the order given; tracks that were
+    never confirmed are left out. `ended` gives the reason of the end: "end" of the events, "idle",
+    "left" the image, "size" beyond limits, "uncertain" position, "merged" with an older one, "not
+    finite".
 
-    `smooth` says whether states rest on all events of the recording, those after the time
-    included, as `jaxevent.blob.smoother` finds them; `filtered` are the same tracks with states
-    that rest on the events up to the time. Births, deaths and whose an event is are the filter's.
+    With `smooth` states rest on all events of the recording, those after the time included, see
+    `jaxevent.blob.smoother`; `filtered` are these tracks with states that rest on the events up to
+    the time. Births, deaths and the association of events are always the filter's.
 
-    Only the targets at the start of some stretches are kept, and what later events say of them.
-    Reading tracks the stretches again that hold the times asked for, so that memory hardly grows
-    with the recording's length. Threads may share tracks, and tracks can be pickled and copied.
+    Only the state at the start of some segments and the result of the backward pass are kept.
+    Reading runs the segments with the requested times again, so that memory hardly grows with the
+    recording's length. Threads may share tracks, and tracks can be pickled and copied.
     """
 
     def __init__(
         self,
-        filter: Filter,
-        packing: Packing,
-        params: TrackerParams,
-        progress: bool | None = None,
+        runner: Any,
+        packer: ChunkPacker,
         smooth: bool = False,
-        fused: FusedRun | None = None,
+        progress: bool | None = None,
     ):
-        self.recording, self.params, self.smooth = packing.recording, params, smooth
-        self._runner: Any = ScanRun(filter, params) if fused is None else fused
-        self.start, self.stop = packing.start, packing.stop
-        self._packing, self._progress = packing, progress
-        self._turns = TurnLock(f"tracks of {packing.recording.name}")
-        self._begins: list[tuple[Mark, int, Any]] = []
-        self._following: dict[Mark, Any] = {}  # of the last stretches, up to `KEPT`
-        self._number(self._follow())
+        self.recording, self.params, self.smooth = packer.recording, runner.params, smooth
+        self.start, self.stop = packer.start, packer.stop
+        self._runner, self._packer, self._progress = runner, packer, progress
+        self._turns = TurnLock(f"tracks of {packer.recording.name}")
+        self._checkpoints: list[tuple[PackingCursor, int, Any]] = []
+        # The result of the backward pass in the last segments, up to `MAX_KEPT_NUMBERS`.
+        self._kept_infos: dict[PackingCursor, Any] = {}
+        self._assign_ids(self._run_all())
 
     def __len__(self) -> int:
         return len(self.id)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what is found again where it is asked for."""
-        return {**{k: v for k, v in vars(self).items() if k != "_later"}, "_following": {}}
+        """Return everything but what is computed again on request."""
+        state = {k: v for k, v in vars(self).items() if k != "_segment_infos"}
+        return {**state, "_kept_infos": {}}
 
     @property
     def filtered(self) -> "Tracks":
-        """The same tracks with states that rest on the events up to each time."""
+        """These tracks with states that rest on the events up to each time."""
         other = object.__new__(Tracks)
         vars(other).update(vars(self), smooth=False)
         return other
@@ -133,25 +172,32 @@ class Tracks(HtmlRepr):
         *,
         extrapolate: bool = False,
     ) -> TrackStates:
-        """States at `times`: integers (us) or floats (s), in any order.
+        """Read out states at some times.
 
-        Filtered, what is told of a time is the prediction from the last step at or before it; with
-        `events_per_step` above 1, a step has the time of its last event. `ids` chooses tracks, by
-        default all. Raises `InputError` for times that are not finite or, unless told to
-        `extrapolate`, outside the recording (where no track is valid), and for ids that do not
-        exist.
+        A filtered state is the prediction from the last step at or before the time; with
+        `events_per_step` above 1, a step has the time of its last event.
+
+        Args:
+            times: Integers (us) or floats (s), in any order.
+            ids: Tracks to read out; None: all.
+            extrapolate: Whether times outside the recording, where no track is valid, are allowed.
+
+        Returns:
+            States (times, tracks).
+
+        Raises:
+            InputError: A time is not finite or outside the recording, or there is no such track.
         """
         times = np.atleast_1d(microseconds(times))
         order = np.argsort(times, kind="stable")
-        found = self.batches(times[order], ids, extrapolate=extrapolate)
-        parts = [states for _, states in found]
-        chosen = self._chosen(ids)
+        parts = [states for _, states in self.batches(times[order], ids, extrapolate=extrapolate)]
+        chosen = self._indices_of(ids)
         if not parts:
-            return self._nothing(times, chosen)
-        told = _joined(parts)
+            return self._invalid_states(times, chosen)
+        states = _concatenate_states(parts)
         back = np.argsort(order, kind="stable")
-        told = (value[back] for value in (told.mean, told.covariance, told.valid, told.idle))
-        return TrackStates(*told, self.id[chosen])
+        fields = (value[back] for value in (*states, states.idle))
+        return TrackStates(*fields, self.id[chosen])
 
     def batches(
         self,
@@ -160,15 +206,31 @@ class Tracks(HtmlRepr):
         *,
         extrapolate: bool = False,
     ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
-        """The same, some of the sorted times after others: `times, states`."""
+        """Read out states at sorted times, some after others, in bounded memory.
+
+        Args:
+            times: Sorted integers (us) or floats (s).
+            ids: Tracks to read out; None: all.
+            extrapolate: Whether times outside the recording are allowed.
+
+        Yields:
+            Times (us) and the states at these.
+
+        Raises:
+            InputError: See the call; also times that are not sorted.
+        """
         held: list[tuple[NDArray[np.int64], TrackStates]] = []
-        for piece in self._pieces(times, ids, extrapolate):
+
+        def join_held() -> tuple[NDArray[np.int64], TrackStates]:
+            return np.concatenate([t for t, _ in held]), _concatenate_states([s for _, s in held])
+
+        for piece in self._read_by_segment(times, ids, extrapolate):
             held.append(piece)
-            if sum(states.valid.size for _, states in held) >= TOGETHER:
-                yield np.concatenate([t for t, _ in held]), _joined([now for _, now in held])
-                held = []
+            if sum(states.valid.size for _, states in held) >= STATES_PER_READOUT:
+                yield join_held()
+                held.clear()
         if held:
-            yield np.concatenate([t for t, _ in held]), _joined([now for _, now in held])
+            yield join_held()
 
     def to_dataframe(
         self,
@@ -192,81 +254,87 @@ class Tracks(HtmlRepr):
         import pandas
 
         if times is None:
-            times = evenly(self.start, self.stop, TABLE_RATE)
+            times = evenly_spaced_times(self.start, self.stop, TABLE_RATE)
         times = np.sort(np.atleast_1d(microseconds(times)))
+        nothing = self._invalid_states(np.zeros(0, np.int64), self._indices_of(ids))
         parts: list[list[NDArray]] = []
-        for t, states in self.batches(times, ids):
+        for t, states in [(times[:0], nothing), *self.batches(times, ids)]:
             row, place = np.nonzero(states.valid)
             own = states.mean[row, place], states.covariance[row, place]
             parts.append([t[row], states.id[place], *own])
-        if not parts:
-            states = self._nothing(np.zeros(0, np.int64), self._chosen(ids))
-            flat = states.mean.reshape(0, 8), states.covariance.reshape(0, 8, 8)
-            parts.append([np.zeros(0, np.int64), np.zeros(0, np.int64), *flat])
         joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
         table = pandas.DataFrame(table_columns(*joined))
         table.attrs["units"] = dict(TABLE_UNITS)
         return table
 
-    def _pieces(
+    def _read_by_segment(
         self, times: Times, ids: Sequence[int] | NDArray[np.integer] | None, extrapolate: bool
     ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
-        """The same, in pieces of one stretch each."""
+        """Read out states at sorted times, in pieces of one segment each; see `batches`."""
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
         if not extrapolate:
-            self._packing.check_times(times)
-        chosen = self._chosen(ids)
+            self._packer.check_times(times)
+        chosen = self._indices_of(ids)
         first, end = (int(i) for i in np.searchsorted(times, [self.start, self.stop]))
         if first:
-            yield times[:first], self._nothing(times[:first], chosen)
+            yield times[:first], self._invalid_states(times[:first], chosen)
         if not len(self) and end > first:
-            yield times[first:end], self._nothing(times[first:end], chosen)
+            yield times[first:end], self._invalid_states(times[first:end], chosen)
             first = end
-        at_once = max(TOGETHER // max(len(chosen), 1), 1)
-        for stretch, begins, following in self._again(times[first:end]):
+        at_once = max(STATES_PER_READOUT // max(len(chosen), 1), 1)
+        for segment, record, infos in self._replay(times[first:end]):
             upto = end
-            if stretch.next is not None:
-                upto = int(np.searchsorted(times[:end], stretch.next.start))
+            if segment.next is not None:
+                upto = int(np.searchsorted(times[:end], segment.next.start))
             while first < upto:
                 batch = times[first : min(first + at_once, upto)]
-                yield batch, self._in_stretch(stretch, begins, following, batch, chosen)
+                yield batch, self._readout_segment(segment, record, infos, batch, chosen)
                 first += len(batch)
         if first < len(times):
-            yield times[first:], self._nothing(times[first:], chosen)
+            yield times[first:], self._invalid_states(times[first:], chosen)
 
     def events(
         self, start: int | float | None = None, stop: int | float | None = None
-    ) -> Iterator[Events]:
-        """Whose each event is, one stretch after another; events outside the tracking are left out.
+    ) -> Iterator[AssociatedEvents]:
+        """Iterate over the events with their likeliest tracks, one segment after another.
 
-        Events that the prefilter drops are not told of. Raises `InputError` for times that are not
-        finite.
+        Events outside the tracking and those that the prefilter drops are left out.
+
+        Args:
+            start: Begin, int us or float s; None: begin of tracking.
+            stop: End, which is left out; None: end of tracking.
+
+        Yields:
+            Events of a segment.
+
+        Raises:
+            InputError: A time is not finite.
         """
         t0 = self.start if start is None else int(microseconds(start, "the start"))
         t1 = self.stop if stop is None else int(microseconds(stop, "the stop"))
         t0, t1 = max(t0, self.start), min(t1, self.stop)
-        if t0 >= t1 or not self._begins:
+        if t0 >= t1 or not self._checkpoints:
             return
-        mark, state = self._begin_of(t0)
-        while mark is not None and mark.start < t1:
-            stretch = self._packing.pack(mark)
-            mark = stretch.next
-            if mark is not None and mark.start <= t0:
-                state, _ = self._runner.follow(state, stretch.features)
+        cursor, state = self._checkpoint_before(t0)
+        while cursor is not None and cursor.start < t1:
+            segment = self._packer.pack(cursor)
+            cursor = segment.next
+            if cursor is not None and cursor.start <= t0:
+                state, _ = self._runner.run(state, segment.features)
                 continue
-            state, serial, weight = self._runner.owners(state, stretch.features)
-            valid = np.asarray(stretch.features.valid)
-            t = (stretch.start[:, None, None] + stretch.features.t)[valid]
+            state, serial, weight = self._runner.associate(state, segment.features)
+            valid = np.asarray(segment.features.valid)
+            t = (segment.start[:, None, None] + segment.features.t)[valid]
             now = (t >= t0) & (t < t1)
-            yield Events(
-                stretch.row[valid][now], t[now], self._id_of[serial[valid][now]],
+            yield AssociatedEvents(
+                segment.row[valid][now], t[now], self._id_of[serial[valid][now]],
                 weight[valid][now],
             )  # fmt: skip
 
-    def _chosen(self, ids: Sequence[int] | NDArray[np.integer] | None) -> NDArray[np.int64]:
-        """Places of tracks in the arrays."""
+    def _indices_of(self, ids: Sequence[int] | NDArray[np.integer] | None) -> NDArray[np.int64]:
+        """Return the indices of tracks in the arrays."""
         if ids is None:
             return np.arange(len(self))
         for one in ids:
@@ -277,7 +345,7 @@ class Tracks(HtmlRepr):
                 )
         return np.array([int(np.flatnonzero(self.id == one)[0]) for one in ids], np.int64)
 
-    def _nothing(self, times: NDArray[np.int64], chosen: NDArray[np.int64]) -> TrackStates:
+    def _invalid_states(self, times: NDArray[np.int64], chosen: NDArray[np.int64]) -> TrackStates:
         shape, real = (len(times), len(chosen)), np.dtype(jnp.result_type(float))
         return TrackStates(
             np.full((*shape, 8), np.nan, real),
@@ -287,165 +355,175 @@ class Tracks(HtmlRepr):
             self.id[chosen],
         )
 
-    def _in_stretch(
+    def _readout_segment(
         self,
-        stretch: Stretch,
-        begins: Any,
-        following: Any,
+        segment: Segment,
+        record: Any,
+        infos: Any,
         times: NDArray[np.int64],
         chosen: NDArray[np.int64],
     ) -> TrackStates:
-        states = self._nothing(times, chosen)
+        """Read out some tracks at times of a segment, from its record and backward pass."""
+        states = self._invalid_states(times, chosen)
         alive = (self.birth[chosen] <= times[:, None]) & (times[:, None] < self.death[chosen])
         some = np.flatnonzero(alive.any(0))
         if len(some):
-            serial, wanted = self._serial[chosen[some]], alive[:, some]
-            told = self._runner.read(stretch, begins, following, times, serial, wanted)
+            serial, requested = self._serial[chosen[some]], alive[:, some]
+            values = self._runner.readout(segment, record, infos, times, serial, requested)
             outs = states.mean, states.covariance, states.idle
-            for out, value in zip(outs, told, strict=True):
+            for out, value in zip(outs, values, strict=True):
                 out[:, some] = value
         states.valid[:] = alive
         return states
 
-    def _again(self, times: NDArray[np.int64]) -> Iterator[tuple[Stretch, Any, Any]]:
-        """The stretches that hold some of the sorted times, with the targets at chunks' starts.
+    def _replay(self, times: NDArray[np.int64]) -> Iterator[tuple[Segment, Any, Any]]:
+        """Run the segments with some of the sorted times again: their records.
 
-        Smoothed, also what later events say after each chunk.
+        With `smooth` also the result of the backward pass, else None.
         """
         if not len(times):
             return
-        mark, state = self._begin_of(int(times[0]))
+        cursor, state = self._checkpoint_before(int(times[0]))
         done = 0
         while done < len(times):
-            assert mark is not None
-            now, stretch = mark, self._packing.pack(mark)
-            mark = stretch.next
-            upto = len(times) if mark is None else int(np.searchsorted(times, mark.start))
+            assert cursor is not None
+            now, segment = cursor, self._packer.pack(cursor)
+            cursor = segment.next
+            upto = len(times) if cursor is None else int(np.searchsorted(times, cursor.start))
             if upto == done:  # none of the times
-                state, _ = self._runner.follow(state, stretch.features)
+                state, _ = self._runner.run(state, segment.features)
             else:
-                state, begins = self._runner.play(state, stretch.features)
-                following = None
+                state, record = self._runner.record(state, segment.features)
+                infos = None
                 if self.smooth:
                     with self._turns:
-                        later = self._later  # fills what is kept
-                    following = self._following.get(now)
-                    if following is None:
-                        following, _ = self._look_back(stretch, begins, later)
-                yield stretch, begins, following
+                        segment_infos = self._segment_infos  # also fills `_kept_infos`
+                    infos = self._kept_infos.get(now)
+                    if infos is None:
+                        infos, _ = self._backward_pass(segment, record, segment_infos)
+                yield segment, record, infos
             done = upto
-            if done < len(times) and mark is not None:
-                later, known = self._begin_of(int(times[done]))
-                if later is not None and later.start > mark.start:
-                    mark, state = later, known
+            if done < len(times) and cursor is not None:
+                later, known = self._checkpoint_before(int(times[done]))
+                if later is not None and later.start > cursor.start:
+                    cursor, state = later, known
 
-    def _begin_of(self, time: int) -> tuple[Mark | None, Any]:
-        known = [(mark, state) for mark, _, state in self._begins if mark.start <= time]
+    def _checkpoint_before(self, time: int) -> tuple[PackingCursor | None, Any]:
+        known = [(cursor, state) for cursor, _, state in self._checkpoints if cursor.start <= time]
         return known[-1]
 
-    def _look_back(
-        self, stretch: Stretch, begins: Any, known: Mapping[Mark, Any], room: int = 0
+    def _backward_pass(
+        self,
+        segment: Segment,
+        record: Any,
+        known: Mapping[PackingCursor, Any],
+        max_numbers: int = 0,
     ) -> tuple[Any, Any]:
-        """What later events say after each chunk of a stretch, and at the stretch's start.
+        """Run the backward pass over a segment.
 
-        `known` is what they say at the start of the next one. Smoothed chunks are kept if all are
-        at most `room` numbers.
+        Args:
+            segment: The segment.
+            record: Its record.
+            known: Backward information at the start of the next segment.
+            max_numbers: Smoothed chunks are kept if they hold at most so many numbers.
+
+        Returns:
+            The result for the readout, and the information at the segment's start.
         """
-        later, elapsed = None, 0
-        if stretch.next is not None:
-            later, elapsed = known[stretch.next], stretch.next.start - stretch.next.previous
-        return self._runner.look_back(stretch, begins, later, elapsed, room)
+        info, elapsed = None, 0
+        if segment.next is not None:
+            info, elapsed = known[segment.next], segment.next.start - segment.next.previous
+        return self._runner.backward_pass(segment, record, info, elapsed, max_numbers)
 
     @functools.cached_property
-    def _later(self) -> dict[Mark, Any]:
-        """What later events say at the starts of all stretches, found from the last one on."""
-        found: dict[Mark, Any] = {}
-        room = KEPT
-        rows = self._packing.rows
-        with bar(
-            total=rows[1] - rows[0], unit="event", unit_scale=True, desc="smooth",
-            progress=self._progress,
-        ) as shown:  # fmt: skip
-            for mark, state, packed in self._backwards():
-                stretch = self._packing.pack(mark) if packed is None else packed
-                _, begins = self._runner.play(state, stretch.features)
-                following, found[mark] = self._look_back(stretch, begins, found, room)
-                room -= numbers_in(following)
-                if room >= 0:
-                    self._following[mark] = following
-                shown.update(int(np.count_nonzero(stretch.features.valid)))
+    def _segment_infos(self) -> dict[PackingCursor, Any]:
+        """Backward information at the starts of all segments, from the last one on."""
+        found: dict[PackingCursor, Any] = {}
+        left = MAX_KEPT_NUMBERS
+        with self._bar("smooth") as progress:
+            for cursor, state, packed in self._segments_backwards():
+                segment = self._packer.pack(cursor) if packed is None else packed
+                _, record = self._runner.record(state, segment.features)
+                infos, found[cursor] = self._backward_pass(segment, record, found, left)
+                left -= count_numbers(infos)
+                if left >= 0:
+                    self._kept_infos[cursor] = infos
+                progress.update(int(np.count_nonzero(segment.features.valid)))
         return found
 
-    def _backwards(self) -> Iterator[tuple[Mark, Any, Stretch | None]]:
-        """All stretches, from the last to the first, with the targets at their starts.
+    def _segments_backwards(self) -> Iterator[tuple[PackingCursor, Any, Segment | None]]:
+        """Iterate over all segments from the last to the first, with the states at their starts.
 
-        A stretch that is packed is given too.
+        A segment that happens to be packed is given too.
         """
         end = None
-        for first, _, state in reversed(self._begins):
-            mark, starts, stretch = first, [], None
-            while mark is not None and mark != end:
-                starts.append((mark, state))
-                stretch = self._packing.pack(mark)
-                mark = stretch.next
-                if mark is not None and mark != end:
-                    state, _ = self._runner.follow(state, stretch.features)
-            for mark, state in reversed(starts):
-                yield mark, state, stretch
-                stretch = None
+        for first, _, state in reversed(self._checkpoints):
+            cursor, starts, segment = first, [], None
+            while cursor is not None and cursor != end:
+                starts.append((cursor, state))
+                segment = self._packer.pack(cursor)
+                cursor = segment.next
+                if cursor is not None and cursor != end:
+                    state, _ = self._runner.run(state, segment.features)
+            for cursor, state in reversed(starts):
+                yield cursor, state, segment
+                segment = None
             end = first
 
-    def _follow(self) -> _History:
-        """The first pass: all births and deaths, and some targets on the way."""
-        born = {k: int(t) for k, t in enumerate(self._packing.seeds.t)}
+    def _bar(self, title: str) -> Any:
+        begin, end = self._packer.rows
+        return bar(
+            total=end - begin, desc=title, unit="event", unit_scale=True, progress=self._progress
+        )
+
+    def _run_all(self) -> _History:
+        """Run all segments: all births and deaths, and checkpoints on the way."""
+        born = {k: int(t) for k, t in enumerate(self._packer.seeds.t)}
         history = _History(dict(born), dict(born))
-        rows = self._packing.rows
+        rows = self._packer.rows
         nothing = rows[0] == rows[1] and not born
-        mark: Mark | None = None if nothing else self._packing.first
+        cursor: PackingCursor | None = None if nothing else self._packer.first
         state, number, every = None, 0, 1
-        logs: list[tuple[Stretch, Log]] = []
-        with bar(
-            total=rows[1] - rows[0],
-            desc="follow targets",
-            unit="event",
-            unit_scale=True,
-            progress=self._progress,
-        ) as shown:
-            while mark is not None:
-                stretch = self._packing.pack(mark)
+        logs: list[tuple[Segment, LifecycleLog]] = []
+        with self._bar("follow targets") as progress:
+            while cursor is not None:
+                segment = self._packer.pack(cursor)
                 if state is None:
-                    state = self._runner.begin(stretch.features)
+                    state = self._runner.init(segment.features)
                 if number % every == 0:
-                    self._begins.append((mark, number, state))
-                    if len(self._begins) > BEGINS:
+                    self._checkpoints.append((cursor, number, state))
+                    if len(self._checkpoints) > MAX_CHECKPOINTS:
                         every *= 2
-                        self._begins = [one for one in self._begins if one[1] % every == 0]
-                state, told = self._runner.follow(state, stretch.features)
-                logs.append((stretch, told))
-                if len(logs) > 1:  # while this stretch is on the device
+                        self._checkpoints = [c for c in self._checkpoints if c[1] % every == 0]
+                state, log = self._runner.run(state, segment.features)
+                logs.append((segment, log))
+                if len(logs) > 1:  # while this segment is on the device
                     history.add(*logs.pop(0))
-                shown.update(int(np.count_nonzero(stretch.features.valid)))
-                mark, number = stretch.next, number + 1
+                progress.update(int(np.count_nonzero(segment.features.valid)))
+                cursor, number = segment.next, number + 1
             for one in logs:
                 history.add(*one)
         return history
 
-    def _number(self, history: _History) -> None:
-        """Give tracks that were confirmed their numbers."""
+    def _assign_ids(self, history: _History) -> None:
+        """Give the confirmed tracks their numbers."""
         serial = np.array(sorted(history.confirmed), np.int64)
-        given = self._packing.seeds.given
+        index = self._packer.seeds.index
         public = np.arange(len(serial))
-        public[: len(given)] = given
+        public[: len(index)] = index
         order = np.argsort(public, kind="stable")
         self._serial = serial[order]
         self.id = public[order].astype(np.int64)
         self.birth = np.array([history.birth[k] for k in self._serial], np.int64)
         self.confirmed = np.array([history.confirmed[k] for k in self._serial], np.int64)
         ends = [history.death.get(int(k), (self.stop, 0)) for k in self._serial]
-        if self._packing.ends is not None:
-            found = [(int(end), 1) for end in self._packing.ends]
+        if self._packer.found_ends is not None:
+            found = [(int(end), 1) for end in self._packer.found_ends]
             ends = [min(e, f) if f[0] < self.stop else e for e, f in zip(ends, found, strict=True)]
         self.death = np.array([when for when, _ in ends], np.int64)
-        self.ended = tuple(ENDS[why] for _, why in ends)
+        self.ended = tuple(END_REASONS[reason] for _, reason in ends)
         self._id_of = np.full(max([-1, *history.birth]) + 2, -1)  # its last serves the serial -1
         self._id_of[self._serial] = self.id
+
+
+__getattr__ = renamed_names(__name__)

@@ -72,7 +72,7 @@ def run(
 ) -> None:
     from jaxevent.errors import install_command
     from jaxevent.runs.evaluate import evaluate
-    from jaxevent.show.report import markdown_table
+    from jaxevent.show.tables import markdown_table
 
     rows = evaluate(
         config,

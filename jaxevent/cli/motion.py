@@ -186,7 +186,8 @@ def run(
         print(warning)
     seconds = time.perf_counter() - clock
     about = {"seed": seed, "smooth": smooth, "gyro": imu, "centred": centred}
-    written = output.write(recording, told, about, true, show_progress(), estimator.name, values)
+    made = {"method": estimator.name, "params": values}
+    written = output.write(recording, told, about, true, progress=show_progress(), **made)
     hint = _truth_there(whole, kind) if truth is None else []
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)

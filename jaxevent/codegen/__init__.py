@@ -1,4 +1,7 @@
-"""How loops over events are compiled for the host."""
+"""Compiled loops of the host: numba's decorators, threads over rows, and scratch.
+
+The other modules of the package compile functions that JAX traces (docs/codegen.md).
+"""
 
 import functools
 import inspect
@@ -28,37 +31,43 @@ _LOOSE: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reas
 
 
 def njit(function: Callable) -> Any:
-    """Compile with numba, without the argument checks that tests wrap around functions."""
+    """Compile a function with numba, without the checks of arguments that tests add."""
     return cache.njit_cached(inspect.unwrap(function), **_USUAL)
 
 
 def njit_inlined(function: Callable) -> Any:
-    """The same for what compiled functions alone call: they are kept, with it inside."""
+    """Compile a function that only other compiled functions call.
+
+    It has no cache entry of its own: its machine code is stored with each caller.
+    """
     return _inside(function, error_model="numpy", **_USUAL)
 
 
 def njit_noalloc(function: Callable) -> Any:
-    """Compile as `compiled` does, in less time, what makes no arrays of its own."""
+    """Compile a function that makes no arrays of its own, in less time than `njit`."""
     return cache.njit_cached(inspect.unwrap(function), **_USUAL, **_LEAN)
 
 
 def njit_noalloc_inlined(function: Callable) -> Any:
-    """Compile so what such functions alone call; not for calls from Python."""
+    """Compile a function that only `njit_noalloc` ones call; Python cannot call it."""
     return _lean_inside(function, error_model="numpy", nogil=True, **_LEAN)
 
 
 def njit_fastmath(function: Callable) -> Any:
-    """Compile as `lean` does, sums in whatever order is fastest: the same one every time."""
+    """Compile a function as `njit_noalloc` does, with sums in the fastest order."""
     return cache.njit_cached(inspect.unwrap(function), **_USUAL, **_LEAN, **_LOOSE)
 
 
 def njit_fastmath_inlined(function: Callable) -> Any:
-    """Compile so what such functions alone call; not for calls from Python."""
+    """Compile a function that only `njit_fastmath` ones call; Python cannot call it."""
     return _lean_inside(function, nogil=True, **_LEAN, **_LOOSE)
 
 
 def _inside(function: Callable, **options: Any) -> Any:
-    """`numba.njit`, not kept; the function itself where there is no numba."""
+    """Compile a function with `numba.njit`, without a cache.
+
+    Return it as it is where there is no numba.
+    """
     plain = inspect.unwrap(function)
     return support.numba.njit(**options)(plain) if support.HAS_NUMBA else plain
 
@@ -77,7 +86,7 @@ class ZeroedScratch:
         self.dtype, self._threads = dtype, threading.local()
 
     def __call__(self, *shape: int) -> NDArray:
-        """The array of a shape."""
+        """Return the array of a shape."""
         if not hasattr(self._threads, "known"):
             self._threads.known = {}
         known: dict[tuple[int, ...], NDArray] = self._threads.known
@@ -90,7 +99,7 @@ THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 
 
 
 def row_scratch(rows: int, *shape: int) -> NDArray[np.float32]:
-    """Room for kernels of `run_over_rows`, (rows, ...): who begins with a row has that of this row.
+    """Return scratch (rows, ...) for kernels of `run_over_rows`: parts use that of their first row.
 
     Memory is taken by what is written alone.
     """

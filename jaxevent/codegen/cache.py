@@ -1,4 +1,4 @@
-"""Functions that numba compiles, kept in files for later processes.
+"""Machine code of functions that numba compiles, in files for later processes.
 
 numba keeps the signatures of a function in an index, and numbers the files that it names. Two
 processes that compile different signatures at the same time read the same index, take the same
@@ -33,7 +33,10 @@ _HASH = 32  # bytes at the beginning of a file
 
 
 def njit_cached(function: Callable, **options: Any) -> Any:
-    """`numba.njit` with these options, kept; the function itself where there is no numba."""
+    """Compile by `numba.njit` with these options, cached in files.
+
+    Do nothing where there is no numba.
+    """
     if not support.HAS_NUMBA:
         return function
     made: Any = numba.njit(**options)(function)
@@ -42,7 +45,7 @@ def njit_cached(function: Callable, **options: Any) -> Any:
 
 
 def cfunc(signature: Any, **options: Any) -> Callable[[Callable], Any]:
-    """`numba.cfunc` with these options, kept."""
+    """Compile by `numba.cfunc` with these options, cached in files."""
 
     def compile_one(function: Callable) -> Any:
         files = _files_of(function)
@@ -54,13 +57,13 @@ def cfunc(signature: Any, **options: Any) -> Callable[[Callable], Any]:
 
 
 def _files_of(function: Callable) -> "SignatureFiles | None":
-    """The files of a function's signatures; None where nothing is kept."""
+    """Return the files of a function's signatures, or None where nothing is cached."""
     folder = cache.folder_for_compiled() if support.HAS_INTERNALS else None
     return None if folder is None else SignatureFiles(folder, function)
 
 
 def hash_source(function: Callable) -> str:
-    """A hash of all that a function is compiled from: files, and numbers of other files."""
+    """Hash all that a function is compiled from: files, and numbers of other files."""
     parts: dict[str, list[str]] = {}
     waiting: list[Any] = [function]
     while waiting:
@@ -92,7 +95,7 @@ def _content(path: str) -> str:
 
 
 class SignatureFiles:
-    """The files of one function's signatures, in a folder of the user's own.
+    """Files of one function's signatures, in a folder of the user's own.
 
     Their names hold the function's and those of its file and of Python's version, so that
     installations beside each other do not replace each other's.
@@ -115,7 +118,7 @@ class SignatureFiles:
             path.unlink(missing_ok=True)
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep what was compiled for a key, where it can be written."""
+        """Save the machine code of a key, where it can be written."""
         path = self._path(key)
         if path is None or cache.secret_key(self.folder) is None:
             return
@@ -131,7 +134,7 @@ class SignatureFiles:
                 raise
 
     def load(self, key: Any) -> Any:
-        """What was compiled for a key; None where there is none."""
+        """Load the machine code of a key; return None where there is none."""
         path = self._path(key)
         if path is None or cache.secret_key(self.folder) is None:
             return None
@@ -144,7 +147,10 @@ class SignatureFiles:
         return pickle.loads(payload) if own else None
 
     def _path(self, key: Any) -> Path | None:
-        """The file of a key; None for one that holds addresses, which other processes share."""
+        """Return the file of a key.
+
+        None for one that holds addresses, which other processes share.
+        """
         text = repr(key)
         if " at 0x" in text:
             return None

@@ -1,17 +1,106 @@
-"""Derivatives along several directions at once: linear programs transposed, and sums of vectors.
+"""Forward derivatives along several directions in the parameters, side by side.
 
 JAX's forward mode makes a function of a function that is linear in the changes of the arguments.
 The factor of each change in a result is found by going through the expressions backwards, once for
-all directions. What is left for each direction is a sum of products, for all of them side by side.
+all directions. What is left for each direction is a sum of products, for all of them at once: the
+change of a state is a sum of changes of the state before, of what the frames say, and of numbers,
+each times a factor that is the same for all directions.
 """
 
 import dataclasses
 import functools
-from typing import Any
+import re
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxevent.codegen.functions import make_intrinsic
 from jaxevent.codegen.graph import Graph, Node, TranslationError, constant_value, dependencies
 from jaxevent.codegen.support import ir, types
+
+
+class Directions(NamedTuple):
+    """Numbers of the parameters by which derivatives are taken, and outputs that have them."""
+
+    numbers: tuple[tuple[int, int], ...] = ()  # leaf of the parameters, number in it
+    of: tuple[str, ...] = ("mean", "variance")
+
+    @property
+    def lanes(self) -> int:
+        """Numbers of a vector of derivatives: as many as processors take at once."""
+        count = len(self.numbers)
+        return -(-count // 8) * 8 if count > 4 else 4
+
+    def seeds(self, params: Any) -> Any:
+        """Return the directions in the parameters, each leaf with an axis of them in front."""
+        leaves, tree = jax.tree.flatten(params)
+        count = len(self.numbers)
+        seeds = [np.zeros((count, *np.shape(leaf)), np.asarray(leaf).dtype) for leaf in leaves]
+        for d, (leaf, number) in enumerate(self.numbers):
+            seeds[leaf].reshape(count, -1)[d, number] = 1
+        return jax.tree.unflatten(tree, seeds)
+
+    def inputs(self, params: Any, fixed: Any) -> tuple[Any, ...]:
+        """Return the numbers that a traced program begins with: the first argument of its steps."""
+        return (params, fixed, self.seeds(params)) if self.numbers else (params, fixed)
+
+    def shapes(self, tree: Any) -> Any:
+        """Return the shapes of the derivatives of a tree of shapes, along all directions."""
+        real, count = eqx.filter(tree, _is_real), len(self.numbers)
+        return jax.tree.map(lambda v: jax.ShapeDtypeStruct((count, *v.shape), v.dtype), real)
+
+
+def _is_real(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.inexact)
+
+
+def with_derivatives(
+    function: Callable[..., dict[str, Any]], outputs: Callable[[dict[str, Any]], dict[str, Any]]
+) -> Callable[..., dict[str, Any]]:
+    """Extend a function by the derivatives of its results along directions in the parameters.
+
+    Args:
+        function: A function of `(params, fixed)` and of named trees.
+        outputs: Selects what has derivatives of the dict that the function returns.
+
+    Returns:
+        A function of `(params, fixed, seeds)`, of the named trees, and of `sensitivities`: the
+        derivatives of some of them, by name. Seeds and derivatives have an axis of directions in
+        front. The dict that the function returns has `sensitivities` beside the results.
+    """
+
+    def both(known: Any, sensitivities: dict[str, Any], **given: Any) -> dict[str, Any]:
+        params, fixed, seeds = known
+        moving = {name: given[name] for name in sensitivities}
+        real, rest = eqx.partition(moving, _is_real)
+
+        def compute(params: Any, real: Any) -> tuple[Any, Any]:
+            made = function((params, fixed), **{**given, **eqx.combine(real, rest)})
+            return eqx.filter(outputs(made), _is_real), made
+
+        def push(seeds: Any, sensitivities: Any) -> Any:
+            return jax.jvp(compute, (params, real), (seeds, sensitivities), has_aux=True)[1:]
+
+        changes, made = jax.vmap(push, out_axes=(0, None))(seeds, sensitivities)
+        return made | {"sensitivities": changes}
+
+    return both
+
+
+def derivative_name(name: str, direction: int) -> str:
+    """Return the name of a single number's derivative: "sensitivities['a'].b.2" for "a.b.0"."""
+    tree, rest = re.split(r"\b", name.removesuffix(".0"), maxsplit=2)[1:]
+    return f"sensitivities['{tree}']{rest}.{direction}"
+
+
+def parse_derivative(name: str) -> tuple[str, int] | None:
+    """Return the number and the direction of a derivative's name; None for other names."""
+    found = re.fullmatch(r"sensitivities\['(\w+)'\](.*)\.(\d+)", name)
+    return None if found is None else (f"{found[1]}{found[2]}.0", int(found[3]))
 
 
 def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node, Node]:
@@ -41,7 +130,7 @@ def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node,
 
 
 def _passed(node: Node, at: Node, moving: set[Node], graph: Graph) -> list[tuple[Node, Node]]:
-    """The factors of a node's arguments, of its own."""
+    """Return the factors of a node's arguments, from the node's own."""
     apply, args = graph.apply, node.args
     minus = apply("neg", (at,), "f")
     if node.op in ("add", "sub"):
@@ -72,13 +161,19 @@ Sum = tuple[int, tuple[Term, ...]]  # where it is written to, and what is added 
 
 
 def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
-    """A function for kernels: sums of products of numbers and vectors of `lanes` numbers.
+    """Make a function for kernels: sums of products of numbers and vectors of `lanes` numbers.
 
     `function(out, to, cells, at, numbers, factors)` writes the sums behind the place `to` of `out`.
     Vectors lie in `cells` behind the place `at`, or in `numbers`. All are read before any is
     written.
+
+    Args:
+        lanes: Numbers of a vector.
+        sums: For each sum where it goes, and its terms: which factor, whether the vector is of
+            `numbers`, and where it begins.
     """
 
+    # numba's typing context comes first of the arguments.
     @make_intrinsic
     def function(context: Any, out: Any, to: Any, cells: Any, at: Any, numbers: Any, factors: Any):
         def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -103,7 +198,7 @@ def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
 
 
 class _Vectors:
-    """Operations on vectors, in the compiler's language."""
+    """Instructions of LLVM on vectors."""
 
     def __init__(self, builder: Any, real: Any, lanes: int):
         self.builder, self.lanes = builder, lanes
@@ -134,50 +229,54 @@ class _Vectors:
         return self.builder.fadd(one, other, flags=("contract",))
 
 
-Table = list[Node]
-
-
 @dataclasses.dataclass(frozen=True)
-class Change:
-    """A vector of changes, nothing along directions that are not named."""
+class ChangeVector:
+    """Vector of changes, 0 along directions that are not named."""
 
     kind: str  # of a "state", of a "table" (what frames say), or of a "number"
-    state: int  # which
+    state: str  # its name
     nodes: dict[int, list[Node]]  # numbers to add up; or what the table holds in each variant
 
 
 @dataclasses.dataclass(frozen=True)
-class Slopes:
-    """How changes of results are made of others."""
+class Derivatives:
+    """Derivatives of results, as sums of factors times vectors of changes."""
 
-    changes: list[Change]
+    changes: list[ChangeVector]
     factors: dict[str, list[tuple[Node, int]]]  # by the result's name: factor, place in `changes`
 
     def factors_of(self, *names: str) -> list[Node]:
-        """The factors of some results, each once."""
+        """Return the factors of some results, each once."""
         return list(dict.fromkeys(node for name in names for node, _ in self.factors[name]))
 
 
-def slopes_of(
+def collect_derivatives(
     outs: dict[str, list[Node]],
-    tables: list[Table],
+    tables: list[list[Node]],
     excess: list[Node],
     moving: set[Node],
     graph: Graph,
-) -> Slopes:
-    """The derivatives of results, by direction; raises `TranslationError`.
+) -> Derivatives:
+    """Collect the derivatives of results.
 
-    `moving` are the changes of numbers of the parameters.
+    Args:
+        outs: Derivatives of each result, by direction.
+        tables: What the slots hold, for each variant.
+        excess: What a segment adds to the sums "total.0", ...
+        moving: Changes of numbers of the parameters.
+        graph: Graph of the nodes.
+
+    Raises:
+        TranslationError: They are no such sums.
     """
-    sums = {f"_{k}" for k, node in enumerate(excess) if moving & set(dependencies([node]))}
+    sums = {f"total.{k}." for k, node in enumerate(excess) if moving & set(dependencies([node]))}
 
     def changes(node: Node) -> bool:
-        name = str(node.args[0]) if node.op == "input" else ""
         if node.op == "slot":
             below = dependencies([table[node.args[0]] for table in tables])
             return any(changes(n) for n in below)
-        ours = name.startswith("slope") or (name.startswith("total") and name[6:] in sums)
-        return ours or node in moving
+        name = str(node.args[0]) if node.op == "input" else ""
+        return name.startswith(("sensitivities[", *sums)) or node in moving
 
     every = dependencies([node for nodes in outs.values() for node in nodes])
     known = {node for node in every if changes(node)}
@@ -200,11 +299,11 @@ def slopes_of(
             alike[key] = by_name
         vectors.setdefault(key, {}).setdefault(direction, []).append(change)
     order = sorted(vectors, key=lambda key: ("state", "table", "number").index(key[0]))
-    made: list[Change] = []
+    made: list[ChangeVector] = []
     terms: dict[str, dict[int, Node]] = {name: {} for name in outs}
     for key in order:
         kind, state = key[:2]
-        change = Change(kind, state, _contents(kind, vectors[key], tables, graph))
+        change = ChangeVector(kind, state, _contents(kind, vectors[key], tables, graph))
         if change not in made:
             made.append(change)
         place = made.index(change)
@@ -215,11 +314,11 @@ def slopes_of(
         name: [(factor, place) for place, factor in by_place.items() if constant_value(factor) != 0]
         for name, by_place in terms.items()
     }
-    return Slopes(made, sums)
+    return Derivatives(made, sums)
 
 
 def _contents(
-    kind: str, changes: dict[int, list[Node]], tables: list[Table], graph: Graph
+    kind: str, changes: dict[int, list[Node]], tables: list[list[Node]], graph: Graph
 ) -> dict[int, list[Node]]:
     def total(nodes: list[Node]) -> Node:
         return functools.reduce(lambda a, b: graph.apply("add", (a, b), "f"), nodes)
@@ -234,9 +333,10 @@ def _contents(
     }
 
 
-def _kind(change: Node) -> tuple[Any, ...]:
-    if change.op == "input" and str(change.args[0]).startswith("slope"):
-        return "state", int(change.args[0].removeprefix("slope").partition("_")[0])
+def _kind(change: Node) -> tuple[str, str]:
+    found = parse_derivative(change.args[0]) if change.op == "input" else None
+    if found is not None:
+        return "state", found[0]
     if change.op not in ("number", "slot"):
         raise TranslationError(f"the derivative of {change.op!r} at a point")
-    return "number" if change.op == "number" else "table", -1
+    return "number" if change.op == "number" else "table", ""

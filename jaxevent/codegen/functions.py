@@ -26,14 +26,17 @@ def compile_function(function: Callable) -> Any:
 
 
 def make_intrinsic(function: Callable) -> Any:
-    """An operation of the compiler's own."""
+    """Make an operation of the compiler's own.
+
+    Return the function as it is where there is no numba.
+    """
     plain = inspect.unwrap(function)
     return plain if intrinsic is None else intrinsic(plain)
 
 
 @make_intrinsic
 def _as_real(context: Any, x: Any):
-    """The float32 with the bits of an int32."""
+    """Return the float32 with the bits of an int32."""
 
     def make(context, builder, signature, arguments):
         return builder.bitcast(arguments[0], context.get_value_type(types.float32))
@@ -43,7 +46,7 @@ def _as_real(context: Any, x: Any):
 
 @make_intrinsic
 def _as_bits(context: Any, x: Any):
-    """The bits of a float32 as an int32."""
+    """Return the bits of a float32 as an int32."""
 
     def make(context, builder, signature, arguments):
         return builder.bitcast(arguments[0], context.get_value_type(types.int32))
@@ -53,7 +56,10 @@ def _as_bits(context: Any, x: Any):
 
 @make_intrinsic
 def _choose(context: Any, truth: Any, one: Any, other: Any):
-    """One number or another, without a branch: of those, a wait at each costs more than both."""
+    """Select one number or another, without a branch.
+
+    A wait at each costs more than both numbers.
+    """
 
     def make(context, builder, signature, arguments):
         truth = builder.trunc(arguments[0], ir.IntType(1))
@@ -120,7 +126,7 @@ def logistic32(x):
 
 @compile_function
 def _reduced(x):
-    """x less whole quarter turns, and their number."""
+    """Return x less whole quarter turns, and their number."""
     n = np.floor(x * F(0.636619772) + F(0.5))
     r = x - n * F(1.5703125) - n * F(4.837512969e-4) - n * F(7.549790126e-8)
     return r, np.int32(n)

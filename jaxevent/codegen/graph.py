@@ -1,7 +1,10 @@
-"""Scalar expressions: what a traced function computes for one pixel, as a graph of numbers.
+"""Scalar expressions of a traced function, as a graph of numbers, and their evaluation by NumPy.
 
 A `Node` is one number. Equal nodes are the same object, so what is computed twice is computed once,
 and what does not reach a result is never written. Constants are folded as they appear.
+
+What depends on parameters alone is computed by NumPy, and again for others: XLA would compile a few
+hundred operations on single numbers longer than they take.
 """
 
 import dataclasses
@@ -15,7 +18,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from numpy.typing import NDArray
 
-# What a primitive computes, by its name: of any arrays, element by element.
+# Primitives that act element by element, by name.
 ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "add_any": np.add,
@@ -61,7 +64,7 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "copy": lambda x: x,
     "copy_p": lambda x: x,
 }
-# Of what is made of constants alone.
+# Operations that are folded where all operands are constants.
 FOLDABLE: dict[str, Callable[..., Any]] = {
     **ELEMENTWISE,
     "div": lambda a, b: np.float64(a) / b,
@@ -74,11 +77,11 @@ COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
 
 
 class TranslationError(Exception):
-    """A function uses what there is no translation for; the scan serves it."""
+    """A function uses something that has no translation; XLA compiles it instead."""
 
 
 class Level(enum.IntEnum):
-    """When a number is known: the later, the more often it is computed."""
+    """Time at which a number is known: the later, the more often it is computed."""
 
     CONSTANT = 0  # when the program is written
     HOST = 1  # with the parameters
@@ -100,21 +103,24 @@ class Node:
 
 
 class Graph:
-    """Makes nodes."""
+    """Maker of nodes."""
 
     def __init__(self):
         self._known: dict[Any, Node] = {}
 
     def node(self, op: str, args: tuple[Any, ...], kind: str, level: Level) -> Node:
+        """Return the node of an operation, always the same object."""
         key = (op, kind, level, *(a.number if isinstance(a, Node) else ("", a) for a in args))
         if key not in self._known:
             self._known[key] = Node(op, args, kind, level, len(self._known))
         return self._known[key]
 
     def input(self, name: str, kind: str, level: Level) -> Node:
+        """Return the node of an input."""
         return self.node("input", (name,), kind, level)
 
     def constant(self, value: Any) -> Node:
+        """Return the node of a constant."""
         value = np.asarray(value)
         kind = {"f": "f", "i": "i", "u": "i", "b": "b"}.get(value.dtype.kind)
         if kind is None:
@@ -123,7 +129,7 @@ class Graph:
         return self.node("constant", (repr(text),), kind, Level.CONSTANT)
 
     def apply(self, op: str, args: tuple[Any, ...], kind: str) -> Node:
-        """An operation on nodes; further arguments are plain values."""
+        """Apply an operation to nodes and simplify it; further arguments are plain values."""
         simple = self._folded(op, args)
         if simple is not None:
             return simple
@@ -131,7 +137,10 @@ class Graph:
         return self.node(op, args, kind, level)
 
     def _folded(self, op: str, args: tuple[Any, ...]) -> Node | None:
-        """The same in simpler form. Tables and parameters are taken to be finite."""
+        """Return an operation in simpler form, or None.
+
+        Tables and parameters are taken to be finite.
+        """
         value = [constant_value(a) for a in args]
         if op in FOLDABLE and all(v is not None for v in value):
             with np.errstate(all="ignore"):
@@ -166,7 +175,7 @@ class Graph:
         return None
 
     def _selected(self, which: Node, no: Node, yes: Node) -> Node | None:
-        """`select_n` in simpler form: a truth value as a number is known where it chooses."""
+        """Simplify `select_n`: a truth value as a number is known where it chooses."""
         number = self._number_of(which)
         if number is not None and number in (no, yes):
             no = self.constant(0.0) if no is number else no
@@ -177,7 +186,7 @@ class Graph:
         return no if no is yes else None
 
     def _compared(self, op: str, args: tuple[Any, ...], bound: Any) -> Node | None:
-        """A truth value as a number, compared with a constant: itself, or a constant."""
+        """Simplify the comparison of a truth value as a number with a constant."""
         number = args[0]
         if bound is None or number.op != "to_f" or number.args[0].kind != "b":
             return None
@@ -187,11 +196,11 @@ class Graph:
         return number.args[0] if yes else self.apply("not", (number.args[0],), "b")
 
     def _number_of(self, truth: Node) -> Node | None:
-        """The node that makes a number of a truth value, if there is one."""
+        """Return the node that makes a number of a truth value, if there is one."""
         return self._known.get(("to_f", "f", truth.level, truth.number))
 
     def suppose(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
-        """The results where a truth value is known."""
+        """Return the results where a truth value is known."""
         found = {truth: self.constant(value)}
         for node in dependencies([*results.values()], {truth}):
             if node not in found:
@@ -201,7 +210,7 @@ class Graph:
 
 
 def constant_value(node: Any) -> Any:
-    """The value of a constant, None of all others."""
+    """Return the value of a constant, or None for all other nodes."""
     if not isinstance(node, Node) or node.op != "constant":
         return None
     if node.kind == "f":
@@ -210,7 +219,10 @@ def constant_value(node: Any) -> Any:
 
 
 def dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
-    """The nodes that the results rest on, in order; `stop`: known, not looked behind."""
+    """Return the nodes that results depend on, in order of creation.
+
+    `stop` ones are followed no further.
+    """
     found: dict[int, Node] = {}
     waiting = list(results)
     while waiting:
@@ -223,7 +235,7 @@ def dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Nod
     return [found[number] for number in sorted(found)]
 
 
-# The state at the start is found once, for all pixels, by the same operations of NumPy.
+# Operations on arrays in place of numbers.
 ARRAYS: dict[str, Callable[..., Any]] = {
     **ELEMENTWISE,
     "div": np.divide,
@@ -234,10 +246,20 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 }
 
 
-def evaluate_arrays(
+def evaluate_nodes(
     nodes: list[Node], known: Callable[[str], Any], values: list[Any], dtype: np.dtype
 ) -> list[Any]:
-    """Expressions for arrays in place of numbers; `known(name)` gives inputs."""
+    """Evaluate expressions for arrays in place of numbers.
+
+    Args:
+        nodes: The expressions.
+        known: Returns the array of an input by its name.
+        values: Values of the `ParameterProgram`.
+        dtype: Kind of real numbers.
+
+    Returns:
+        An array for each expression.
+    """
     found: dict[Node, Any] = {}
     with np.errstate(all="ignore"):
         for node in dependencies(nodes):
@@ -260,7 +282,7 @@ CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
 def called_jaxpr(eqn: Any) -> Any | None:
-    """The closed jaxpr that an equation only calls; None where it does more."""
+    """Return the closed jaxpr that an equation only calls; None where it does more."""
     if eqn.primitive.name in ("scan", "while", "cond"):
         return None
     for name in CALLS:
@@ -271,7 +293,7 @@ def called_jaxpr(eqn: Any) -> Any | None:
 
 
 def move_elements(eqn: Any, values: list[Any]) -> NDArray | None:
-    """What a primitive makes that only moves elements, of any kind; None for other primitives.
+    """Evaluate a primitive that only moves elements, of any kind; return None for other primitives.
 
     Indices are known numbers.
     """
@@ -343,7 +365,7 @@ def _reduce(eqn: Any, x: NDArray, indices: NDArray) -> NDArray:
 
 
 def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
-    """What an equation makes of numbers."""
+    """Evaluate an equation of a jaxpr for arrays."""
     name = eqn.primitive.name
     called = called_jaxpr(eqn)
     if called is not None:
@@ -371,7 +393,7 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
 
 
 def evaluate_jaxpr(closed: Any, values: list[NDArray]) -> list[NDArray]:
-    """What a closed jaxpr makes of numbers."""
+    """Evaluate a closed jaxpr for arrays."""
     known: dict[Any, NDArray] = dict(zip(closed.jaxpr.invars, values, strict=True))
     known |= dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
 
@@ -385,7 +407,7 @@ def evaluate_jaxpr(closed: Any, values: list[NDArray]) -> list[NDArray]:
 
 
 def evaluate_function(function: Callable[..., Any], *arrays: NDArray) -> NDArray:
-    """What a function makes of arrays, one array; traced by JAX, and not compiled."""
+    """Evaluate a function of arrays that returns one array; JAX traces it, and compiles nothing."""
     closed = jax.make_jaxpr(function)(*arrays)
     given = [np.asarray(a, v.aval.dtype) for a, v in zip(arrays, closed.jaxpr.invars, strict=True)]
     (made,) = evaluate_jaxpr(closed, given)
@@ -393,7 +415,10 @@ def evaluate_function(function: Callable[..., Any], *arrays: NDArray) -> NDArray
 
 
 def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:
-    """A scan step by step; by JAX where the steps take slices, or their results are stacked."""
+    """Evaluate a scan step by step.
+
+    By JAX where the steps take slices, or their results are stacked.
+    """
     p = eqn.params
     body = p["jaxpr"].jaxpr
     ends = zip([*eqn.invars, *eqn.outvars], [*body.invars, *body.outvars], strict=True)
@@ -412,20 +437,24 @@ class ParameterProgram:
     """Numbers known with the parameters: inputs, and the equations that make others of them."""
 
     values: list[NDArray] = dataclasses.field(default_factory=list)
-    inputs: int = 0
+    n_inputs: int = 0
     steps: list[tuple[Any, list[Any], list[int]]] = dataclasses.field(default_factory=list)
-    decided: list[int] = dataclasses.field(default_factory=list)  # truth values that chose a way
+    conditions: list[int] = dataclasses.field(default_factory=list)  # truth values that chose a way
     zeros: dict[int, NDArray] = dataclasses.field(default_factory=dict)  # where values must be 0
     _known: dict[Any, list[int]] = dataclasses.field(default_factory=dict)
 
     def add_input(self, value: NDArray) -> int:
+        """Add an input, and return its number among the values."""
         assert not self.steps
         self.values.append(np.asarray(value))
-        self.inputs += 1
+        self.n_inputs += 1
         return len(self.values) - 1
 
     def add(self, eqn: Any, arguments: list[Any]) -> list[int]:
-        """Arguments are numbers of values (int), or arrays. The same again gives the same."""
+        """Add an equation, and return the numbers of its results; an equal one is not added again.
+
+        Arguments are numbers of values (int), or arrays.
+        """
         what = eqn.primitive.name, str(eqn.params)
         key = (what, *(a if isinstance(a, int) else (a.tobytes(), a.shape) for a in arguments))
         if key in self._known:
@@ -441,12 +470,12 @@ class ParameterProgram:
         return numbers
 
     def evaluate(self, inputs: list[NDArray]) -> list[NDArray] | None:
-        """All values for other inputs; None where one that chose a way is another."""
+        """Compute all values for other inputs; return None where a condition is another."""
         values: list[NDArray] = [*inputs]
         for eqn, arguments, _ in self.steps:
             values += evaluate_equation(
                 eqn, [values[a] if isinstance(a, int) else a for a in arguments]
             )
-        same = all(np.array_equal(values[n], self.values[n]) for n in self.decided)
+        same = all(np.array_equal(values[n], self.values[n]) for n in self.conditions)
         same = same and all(np.array_equal(values[n] == 0, z) for n, z in self.zeros.items())
         return values if same else None

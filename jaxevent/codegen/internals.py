@@ -1,4 +1,4 @@
-"""The private interfaces of numba that kernels use; `support` says with which releases.
+"""Private interfaces of numba that kernels use, with the releases that `support` names.
 
 numba makes machine code of every function, and of what calls it once more, with the function
 inside. For a part, which compiled functions alone call, the first is left out: a fifth to a quarter
@@ -66,9 +66,9 @@ class _Compiler(Compiler):
 
 
 def njit_linked(function: Callable, **options: Any) -> Any:
-    """`numba.njit` with these options; called from Python it raises `TypeError`.
+    """Compile by `numba.njit` with these options; called from Python it raises `TypeError`.
 
-    It may neither make arrays nor print, nor raise with anything but constants.
+    The function may neither make arrays nor print, nor raise with anything but constants.
     """
     bare = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _Compiler}
     made: Any = numba.njit(**bare, **options)(inspect.unwrap(function))  # ty: ignore[no-matching-overload]
@@ -77,7 +77,7 @@ def njit_linked(function: Callable, **options: Any) -> Any:
 
 
 def _ignore(*_: Any) -> None:
-    """Do not note for Python what was compiled: it would call nothing, and the process end."""
+    """Do not tell Python what was compiled: a call would call nothing, and end the process."""
 
 
 def _refuse(*_: Any, **named: Any) -> None:
@@ -131,13 +131,13 @@ class SignatureCache:
 
 
 def use_signature_cache(dispatcher: Any, files: Any) -> Any:
-    """Have what `numba.njit` made keep its signatures in `files`; returns it."""
+    """Make a dispatcher of `numba.njit` cache its signatures in files, and return it."""
     dispatcher._cache = SignatureCache(dispatcher.py_func, files)
     return dispatcher
 
 
 def cached_cfunc(function: Callable, signature: Any, options: dict[str, Any], files: Any) -> CFunc:
-    """`numba.cfunc` of a signature with these options, kept in `files`."""
+    """Compile by `numba.cfunc` of a signature with these options, cached in files."""
     made: Any = CFunc(function, sigutils.normalize_signature(signature), {}, options)
     made._cache = SignatureCache(function, files)
     made.compile()

@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -80,15 +81,17 @@ class KernelCache:
         """Find the program for some parameters, and translate it if there is none yet.
 
         Args:
-            key: All that `translate` depends on beside the numbers of `params`.
+            key: All that `translate` depends on beside `params`.
             params: Pytree of the numbers that the program's `host` begins with.
             translate: Makes the program; raises `TranslationError`.
 
         Returns:
             The program, its modules, and the values of its `host` for these parameters.
         """
-        inputs = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
-        programs = get_or_make(self._programs, key, list)
+        leaves, tree = jax.tree.flatten(params)
+        inputs = [np.asarray(leaf) for leaf in leaves]
+        shapes = tuple(array.shape for array in inputs)
+        programs = get_or_make(self._programs, (key, tree, shapes), list)
         found = _match(programs, inputs)
         if found is None:
             with _lock:
@@ -105,7 +108,7 @@ class KernelCache:
         """Compile the program for some parameters, if it is not yet; see `find_program`.
 
         Args:
-            key: All that `translate` depends on beside the numbers of `params`.
+            key: All that `translate` depends on beside `params`.
             params: Pytree of the numbers that the program's `host` begins with.
             translate: Makes the program; raises `TranslationError`.
             layout: Further arguments of `write`.
@@ -191,7 +194,7 @@ def make_module(text: str) -> ModuleType:
     """Make a module from its text, in a file with its compiled functions beside it (`cache`).
 
     Raises:
-        TranslationError: numba cannot be imported.
+        TranslationError: numba cannot be imported, or does not compile the module.
     """
     if numba is None:
         raise TranslationError("numba cannot be imported")
@@ -207,7 +210,13 @@ def make_module(text: str) -> ModuleType:
     module.__file__ = str(path)
     sys.modules[name] = module
     # Not by an import: Python keeps bytecode beside a file, and a part of that ends the process.
-    exec(compile(text, path, "exec"), module.__dict__)
+    try:
+        exec(compile(text, path, "exec"), module.__dict__)
+    except Exception as error:  # a release of numba may fail in any way
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        about = f"numba {numba.__version__} does not compile it: {reason}"
+        warnings.warn(f"a kernel is left to XLA, which is slower, as {about}", stacklevel=2)
+        raise TranslationError(about) from error
     return module
 
 

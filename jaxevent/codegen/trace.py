@@ -46,7 +46,10 @@ KINDS = {"f": "f", "i": "i", "u": "i", "b": "b"}
 
 @dataclasses.dataclass(frozen=True)
 class Constant:
-    """An array known when the program is written; `at_point`: it tells where a point lies."""
+    """Array that is known when the program is written.
+
+    `at_point`: it depends on where a point lies, which differs between variants of a program.
+    """
 
     value: NDArray
     at_point: bool = False
@@ -54,9 +57,9 @@ class Constant:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterValue:
-    """An array known with the parameters: a value of the `ParameterProgram`.
+    """Array that is known with the parameters: a value of the `ParameterProgram`.
 
-    Kernels leave out what is 0 in `sparse` ones. `change`: it is a derivative.
+    Kernels leave out elements of `sparse` ones that are 0. `change`: it is a derivative.
     """
 
     number: int
@@ -68,21 +71,25 @@ Value = Constant | ParameterValue | NDArray  # an array of nodes
 
 
 class Translation:
-    """Translator of jaxprs into one graph; families override `translate_special` and others."""
+    """Translator of jaxprs into one graph.
+
+    Families override `translate_special` and `translate_lookup`.
+    """
 
     def __init__(self, graph: Graph, host: ParameterProgram):
         self.graph, self.host = graph, host
         self.changes: set[Node] = set()  # numbers that are derivatives
 
     def translate_special(self, eqn: Any, values: list[Value]) -> NDArray | None:
-        """What an equation of a family's own makes; None for all others."""
+        """Translate an equation in a family's own way; return None to translate it as usual."""
         return None
 
     def translate_lookup(self, found: NDArray, kind: str) -> NDArray:
-        """What is looked up where points lie (`Constant.at_point`)."""
+        """Translate elements that were looked up by a `Constant` at a point."""
         raise TranslationError("a look-up at a place")
 
     def run(self, closed: Any, values: list[Value]) -> list[Value]:
+        """Translate a closed jaxpr for values of its arguments."""
         jaxpr = closed.jaxpr
         known: dict[Any, Value] = dict(zip(jaxpr.invars, values, strict=True))
         for var, const in zip(jaxpr.constvars, closed.consts, strict=True):
@@ -97,7 +104,7 @@ class Translation:
         return [of(a) for a in jaxpr.outvars]
 
     def nodes(self, value: Value) -> NDArray:
-        """The value as an array of nodes."""
+        """Return a value as an array of nodes."""
         if isinstance(value, np.ndarray):
             return value
         number = value.number if isinstance(value, ParameterValue) else None
@@ -136,7 +143,7 @@ class Translation:
         return [self._symbolic(eqn, values)]
 
     def split_array(self, eqn: Any, value: Value) -> list[Value]:
-        """What an array is taken apart into, along an axis."""
+        """Split an array along an axis."""
         sizes = eqn.params.get("sizes", [1] * len(eqn.outvars))
         parts = np.split(self.nodes(value), np.cumsum(sizes)[:-1], eqn.params["axis"])
         return [part.reshape(var.aval.shape) for part, var in zip(parts, eqn.outvars, strict=True)]
@@ -149,7 +156,7 @@ class Translation:
         out: list[Value] = []
         for number in numbers:
             if self.host.values[number].dtype == bool:
-                self.host.decided.append(number)
+                self.host.conditions.append(number)
                 out.append(Constant(self.host.values[number]))
             else:
                 real = self.host.values[number].dtype.kind == "f"  # places have no derivatives
@@ -216,7 +223,7 @@ class Translation:
         return power
 
     def reduce_axes(self, op: str, array: NDArray, axes: list[int]) -> NDArray:
-        """An array folded by an operation, along axes."""
+        """Reduce axes of an array by an operation on two nodes."""
         for axis in sorted(axes, reverse=True):
             parts = np.moveaxis(array, axis, 0)
             total = parts[0]
@@ -228,7 +235,7 @@ class Translation:
         return array
 
     def _argmax(self, array: NDArray, axis: int) -> NDArray:
-        """The place of the largest along an axis, the first of equal ones."""
+        """Return the index of the largest element along an axis, the first of equal ones."""
         apply, parts = self.graph.apply, np.moveaxis(array, axis, 0)
         out = np.empty(parts.shape[1:], object)
         for place in np.ndindex(*out.shape):
@@ -255,7 +262,7 @@ class Translation:
         return out
 
     def _dot(self, eqn: Any, left: NDArray, right: NDArray) -> NDArray:
-        """Products summed over the axes that both arrays share."""
+        """Multiply two arrays, and sum over the axes that both share."""
         ((of_left, of_right), (batch_left, batch_right)) = eqn.params["dimension_numbers"]
         if batch_left or batch_right:
             raise TranslationError("a product of batches of matrices")
@@ -273,7 +280,7 @@ class Translation:
         return self.reduce_axes("add", out, list(range(len(shared))))
 
     def _set(self, eqn: Any, values: list[Value]) -> NDArray:
-        """An array with single elements replaced, at known places."""
+        """Replace single elements of an array, at known places."""
         numbers, places = eqn.params["dimension_numbers"], values[1]
         if not isinstance(places, Constant) or numbers.update_window_dims or places.at_point:
             raise TranslationError("elements set at places of data")
@@ -308,7 +315,7 @@ class Translation:
         raise TranslationError("a look-up with an index of data")
 
     def _table_entries(self, table: ParameterValue, index: NDArray, kind: str) -> NDArray:
-        """What stands at places of data in a table of one axis."""
+        """Look up entries of a table of one axis by an index of data."""
         out, array = np.empty(index.shape, object), self.host.values[table.number]
         if table.sparse or table.change:
             self.host.zeros[table.number] = array == 0
@@ -323,7 +330,7 @@ class Translation:
         return out
 
     def _table_row(self, table: ParameterValue, row: int, size: int) -> ParameterValue:
-        """A row of a table."""
+        """Return a row of a table."""
         out = [types.SimpleNamespace(aval=self.host.values[table.number])]
         cut = {"start_indices": (row, 0), "limit_indices": (row + 1, size), "strides": None}
         number = table.number
@@ -335,7 +342,7 @@ class Translation:
 
 
 class ElementTranslation(Translation):
-    """Translates functions with one axis of elements; with `single`, of one element only."""
+    """Translator of functions with one axis of elements; with `single`, of one element only."""
 
     def __init__(self, graph: Graph, host: ParameterProgram, single: bool):
         super().__init__(graph, host)
@@ -353,7 +360,7 @@ class ElementTranslation(Translation):
         return super()._equation(_with_one_element(eqn) if any(marked) else eqn, values)
 
     def _element_numbers(self, eqn: Any) -> NDArray:
-        """The elements' own numbers, from 0 on."""
+        """Return the elements' own numbers, from 0 on."""
         shape, along = eqn.params["shape"], eqn.params["dimension"]
         if shape[along] != ELEMENTS:
             raise TranslationError("a table of elements")
@@ -384,7 +391,7 @@ class ElementTranslation(Translation):
         return array.squeeze(tuple(along))
 
     def _reduce_product(self, eqn: Any, values: list[Value]) -> NDArray:
-        """A matrix product that sums over elements."""
+        """Translate a matrix product that sums over elements."""
         product = self._dot(eqn, *(self.nodes(v) for v in values))
         if self.single:
             return product
@@ -394,7 +401,7 @@ class ElementTranslation(Translation):
         return out
 
     def _reduce(self, name: str, node: Node) -> Node:
-        """A node that says something of all elements."""
+        """Return a node for a reduction over all elements."""
         apply = self.graph.apply
         if name in ("reduce_max", "reduce_min") and node.level < Level.ELEMENT:
             return node
@@ -422,7 +429,7 @@ class ElementTranslation(Translation):
         return self.graph.node(op, (node,), kind, Level.POINT)
 
     def _split_factors(self, node: Node) -> tuple[Node | None, Node | None]:
-        """A product as that of its scalar factors and that of the others, which are summed."""
+        """Split a product into its scalar factors and the others, which are summed."""
         apply = self.graph.apply
         if node.level < Level.ELEMENT:
             return node, None
@@ -481,12 +488,12 @@ def _with_one_element(eqn: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class TracedFunction:
-    """A function as expressions: its results by name."""
+    """Expressions of a function: its results by name."""
 
     results: dict[str, Node]
 
     def phases(self) -> dict[Node, int]:
-        """After how many loops each node is known."""
+        """Return the number of loops after which each node is known."""
         found: dict[Node, int] = {}
         for node in dependencies([*self.results.values()]):
             arguments = [found[a] for a in node.args if isinstance(a, Node)]
@@ -496,7 +503,7 @@ class TracedFunction:
 
 @dataclasses.dataclass(frozen=True)
 class TracedProgram:
-    """The functions of a family: expressions, and what their numbers are."""
+    """Expressions of the functions of a family, and the places of their numbers."""
 
     functions: dict[str, TracedFunction]
     host: ParameterProgram
@@ -505,15 +512,57 @@ class TracedProgram:
 
 
 def name_leaves(name: str, tree: Any) -> dict[str, Any]:
-    """The leaves of a tree of arrays or shapes, by the names that kernels know them by."""
+    """Return the leaves of a tree of arrays or shapes, by their names in kernels."""
     found = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {name + jax.tree_util.keystr(path): leaf for path, leaf in found}
 
 
 def name_numbers(name: str, leaf: Any, elements: bool = True) -> list[str]:
-    """The names of a leaf's single numbers; an axis of elements counts once."""
+    """Return the names of a leaf's single numbers; an axis of elements counts once."""
     shape = [1 if size == ELEMENTS and elements else size for size in np.shape(leaf)]
     return [f"{name}.{k}" for k in range(int(np.prod(shape)))]
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """Jaxpr of a function of parameters and named inputs."""
+
+    jaxpr: Any
+    inputs: dict[str, jax.ShapeDtypeStruct]  # beside the parameters
+    outputs: dict[str, jax.ShapeDtypeStruct]
+
+    def translate(self, translation: Translation, values: list[Value]) -> dict[str, Node]:
+        """Translate the function for values of its parameters and inputs: results by name."""
+        made = iter(translation.run(self.jaxpr, values))
+        results: dict[str, Node] = {}
+        for name, leaf in self.outputs.items():
+            nodes = np.ravel(translation.nodes(next(made)))
+            results |= dict(zip(name_numbers(name, leaf), nodes, strict=True))
+        return results
+
+
+def trace_function(function: Callable, params: Any, given: Mapping[str, Any]) -> Trace:
+    """Trace `function(params, **given)`, which returns a dict.
+
+    Args:
+        function: A function of pytrees.
+        params: Its parameters.
+        given: Trees of shapes, by the names of the other arguments.
+
+    Raises:
+        TranslationError: The function fails, whatever it raises.
+    """
+    try:
+        call = lambda p, v: function(p, **v)  # noqa: E731
+        closed, shapes = jax.make_jaxpr(call, return_shape=True)(params, dict(given))
+    except Exception as error:
+        about = f"its functions fail for one pixel or target: {error}"
+        raise TranslationError(about.partition("\n")[0]) from error
+    inputs, outputs = (
+        {leaf: v for name in sorted(trees) for leaf, v in name_leaves(name, trees[name]).items()}
+        for trees in (given, shapes)
+    )
+    return Trace(closed, inputs, outputs)
 
 
 def translate_function(
@@ -522,35 +571,31 @@ def translate_function(
     given: Mapping[str, Any],
     graph: Graph,
     host: ParameterProgram,
+    *,
     single: bool = False,
     seeds: int = 0,
     zeros: Collection[str] = (),
 ) -> TracedFunction:
-    """`function(params, **given)`, which returns a dict; raises `TranslationError`.
+    """Translate `function(params, **given)`, which returns a dict.
 
-    `given` are trees of shapes by name. Arrays with an axis of `ELEMENTS` are elements. `host` has
-    the leaves of the parameters as its inputs; the last `seeds` are derivatives, mostly 0.
-    `zeros` are names of single numbers that are always 0.
+    Args:
+        function: A function of pytrees.
+        params: Its parameters.
+        given: Trees of shapes, by the names of the other arguments; an axis of `ELEMENTS` has
+            elements.
+        graph: Graph to which the expressions are added.
+        host: Program whose inputs are the leaves of the parameters.
+        single: Whether there is one element only.
+        seeds: Number of the last leaves of the parameters that are derivatives, mostly 0.
+        zeros: Names of single numbers that are always 0.
+
+    Raises:
+        TranslationError: There is no translation.
     """
-    try:
-        call = lambda p, v: function(p, **v)  # noqa: E731
-        closed, shape = jax.make_jaxpr(call, return_shape=True)(params, dict(given))
-    except Exception as error:  # whatever a function raises
-        about = f"its functions fail in a trace: {error}"
-        raise TranslationError(about.partition("\n")[0]) from error
-    known = len(jax.tree.leaves(params))
+    trace, known = trace_function(function, params, given), len(jax.tree.leaves(params))
     values: list[Value] = [ParameterValue(k, k >= known - seeds) for k in range(known)]
-    for name in sorted(given):
-        for leaf_name, leaf in name_leaves(name, given[name]).items():
-            values.append(_inputs(graph, leaf_name, leaf, single, zeros))
-    translation = ElementTranslation(graph, host, single)
-    made = iter(translation.run(closed, values))
-    results: dict[str, Node] = {}
-    for name in sorted(shape):
-        for leaf_name, leaf in name_leaves(name, shape[name]).items():
-            nodes = np.ravel(translation.nodes(next(made)))
-            results |= dict(zip(name_numbers(leaf_name, leaf), nodes, strict=True))
-    return TracedFunction(results)
+    values += [_inputs(graph, n, leaf, single, zeros) for n, leaf in trace.inputs.items()]
+    return TracedFunction(trace.translate(ElementTranslation(graph, host, single), values))
 
 
 def _inputs(graph: Graph, name: str, leaf: Any, single: bool, zeros: Collection[str]) -> Value:

@@ -92,7 +92,7 @@ class ModuleText(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ElementLoop:
-    """How a loop over elements is written."""
+    """Text of a loop over elements."""
 
     index: str
     count: str

@@ -343,6 +343,16 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
         _remove(partial)
 
 
+def check_writable(path: Path, directory: bool = False) -> None:
+    """Raise `InputError` where `complete` could not write, before the work begins."""
+
+    class Withdrawn(Exception):
+        pass
+
+    with contextlib.suppress(Withdrawn), complete(path, directory):
+        raise Withdrawn
+
+
 def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)

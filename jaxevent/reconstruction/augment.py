@@ -1,9 +1,9 @@
-"""What the frames say at any time: deblurring, integration of events, interpolation.
+"""Models of the log intensity at any time, from frames: deblurring, integration, interpolation.
 
 Equation numbers are those of Wang et al., "An Asynchronous Kalman Filter for Hybrid Event Cameras",
 ICCV 2021. Letters: L log intensity ln(I + I0), c contrast threshold, T exposure, tau mid-exposure.
-Each model makes its tables, [rows, pixels], once per window; called with points (where they lie
-among the frames, `features.Points`) it looks them up.
+Each model makes its tables, [rows, pixels], once per window. Called with points (their positions
+among the frames, `features.Points`) it looks the tables up.
 """
 
 import functools
@@ -45,7 +45,7 @@ class FrameParams(Parameters):
 
 
 class CertaintyParams(FrameParams):
-    """... and of the certainty of frames (4), as far as the camera's response does not tell it."""
+    """Parameters of the certainty of frames (4), as far as the response leaves it open."""
 
     w_min = Positive(
         0.09, "1", "least certainty w of frames, of dark and saturated pixels", least=1e-9
@@ -57,7 +57,7 @@ class CertaintyParams(FrameParams):
 
 
 class AugmentParams(CertaintyParams):
-    """... and of the augmented frame: calibration of contrasts (10), weights of two frames."""
+    """Parameters of the augmented frame: calibrated contrasts (10), weights of two frames."""
 
     calibrate = Choice((True, False), "whether each pixel's threshold is fitted between frames")
     ratio_min = Positive(
@@ -75,14 +75,31 @@ class AugmentParams(CertaintyParams):
 
 
 def integrate_counts(params: FrameParams, on: Array, off: Array) -> Array:
-    """Change of log intensity that events report: the sum of s c over them."""
+    """Return the change of log intensity that event counts report: the sum of s c.
+
+    Args:
+        params: Thresholds `c_on` and `c_off`, ln I.
+        on: Number of ON events, of any shape.
+        off: Number of OFF events, of the same shape.
+
+    Returns:
+        The change, ln I.
+    """
     return params.c_on * on - params.c_off * off
 
 
 def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
-    """Change of log intensity that one event reports, `since` seconds after its pixel's last.
+    """Return the change of log intensity that one event reports.
 
     With a dead time rho an event stands for dt / (dt - rho) events, at most 3 (`Timing`).
+
+    Args:
+        params: Thresholds, ln I, and dead time `rho_ref`, s.
+        polarity: +1, -1, or 0 for no event.
+        since: Time since the pixel's last event, s.
+
+    Returns:
+        The change, ln I.
     """
     rho = params.rho_ref
     near = since <= 1.5 * rho
@@ -92,23 +109,33 @@ def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
 
 @runtime_checkable
 class GreyFrames(Protocol):
-    """Frames as the camera gave them, as `FrameFeatures` has them."""
+    """Frames as the camera gave them, a part of `FrameFeatures`."""
 
     @property
-    def grey(self) -> Any: ...
+    def grey(self) -> Any:
+        """Grey values (frames, pixels), 0 to 1."""
 
     @property
-    def response(self) -> Any: ...
+    def response(self) -> Any:
+        """Intensities (256,) of evenly spaced grey values."""
 
     @property
-    def gain(self) -> Any: ...
+    def gain(self) -> Any:
+        """Exposures (frames,) relative to the common one."""
 
 
 def unclipped_weight(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
-    """1 where a grey value says what the intensity was, 0 where it is black or white.
+    """Return 1 where a grey value shows the intensity, 0 where it is black or white.
 
-    A clipped pixel with noise reads a few grey values from the end; the edge at `margin` is soft, a
-    tenth of a grey value wide, so that the margin can be tuned by gradient.
+    A clipped pixel with noise reads a few grey values from the end. The edge at `margin` is soft, a
+    tenth of a grey value wide, so that the margin can be fitted by gradient.
+
+    Args:
+        params: `margin`, grey / 255.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), 0 to 1.
     """
     grey = jnp.asarray(frames.grey)
     distance = 255 * jnp.minimum(grey, 1 - grey)
@@ -118,7 +145,15 @@ def unclipped_weight(params: CertaintyParams, frames: GreyFrames) -> Float[Array
 
 @full_precision
 def certainty(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
-    """w of every frame and pixel without regard to clipping, at least `w_min`."""
+    """Return the certainty w of every frame and pixel, whether it is clipped or not.
+
+    Args:
+        params: Factors `certainty` on w and its least value `w_min`.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), at least `w_min`.
+    """
     w = frames.certainty
     knots = params.certainty
     if len(knots) == 1:
@@ -135,18 +170,42 @@ def certainty(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "f
 def effective_certainty(
     params: CertaintyParams, frames: FrameFeatures
 ) -> Float[Array, "frames pixels"]:
-    """w of every frame and pixel, at least `w_min`, which is that of clipped ones."""
+    """Return the certainty w of each frame and pixel, with clipped pixels at `params.w_min`.
+
+    Args:
+        params: Parameters of the certainty.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), at least `w_min`.
+    """
     clear = unclipped_weight(params, frames)
     return clear * certainty(params, frames) + (1 - clear) * params.w_min
 
 
 def clipped_side(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
-    """+1 where a frame is clipped at white, -1 where at black, 0 where it is not."""
+    """Return +1 where a frame is clipped at white, -1 where at black, 0 where it is not.
+
+    Args:
+        params: `margin`, grey / 255.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels); between 0 and 1 in size within the soft edge.
+    """
     return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped_weight(params, frames))
 
 
 def clipping_bound(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
-    """The log intensity at which pixels begin to clip: that of a grey `margin` from the end."""
+    """Return the log intensity at which pixels begin to clip, that of a grey `margin` from the end.
+
+    Args:
+        params: `margin`, grey / 255, and `I0`.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), ln I, of the end that is nearer to the grey value.
+    """
     greys, response = jnp.arange(256), jnp.asarray(frames.response)
     margin = jnp.clip(params.margin, 0, 127)
     gain = jnp.asarray(frames.gain)[:, None]
@@ -162,7 +221,7 @@ SPLINE_POINTS = 256
 
 @functools.lru_cache
 def _spline_matrix(knots: int) -> NDArray[np.floating]:
-    """The natural cubic spline through evenly spaced knots, at SPLINE places: a matrix."""
+    """Return the natural cubic spline through evenly spaced knots as a matrix (points, knots)."""
     from scipy.interpolate import CubicSpline
 
     if knots < 3:
@@ -172,17 +231,44 @@ def _spline_matrix(knots: int) -> NDArray[np.floating]:
 
 
 def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
-    """Seconds by which the frames' clock differs from the one prepared for; 0 in a `Video`."""
+    """Return the seconds by which the frames' clock differs from the prepared one; 0 in a `Video`.
+
+    Args:
+        params: `clock_offset`, s.
+        frames: Features that were prepared for some clock offset.
+
+    Returns:
+        (), s.
+    """
     return params.clock_offset - frames.clock_offset
 
 
 def segment_excess(params: FrameParams, share: Array, on: Array, off: Array) -> Array:
-    """What a segment of an exposure adds to m - 1, see `deblur_frames`."""
+    """Return the part that a segment of an exposure adds to m - 1, see `deblur_frames`.
+
+    Args:
+        params: Thresholds.
+        share: Fraction of the exposure that the segment fills.
+        on: ON events from mid-exposure to the segment, negative before.
+        off: OFF events, likewise.
+
+    Returns:
+        The part, of the shape of `share`.
+    """
     return share * jnp.expm1(integrate_counts(params, on, off))
 
 
 def deblur_level(params: FrameParams, level: Array, total: Array) -> Array:
-    """Log intensity at mid-exposure from the mean's, with the `total` of `segment_excess`."""
+    """Return the log intensity at mid-exposure, from that of the exposure's mean.
+
+    Args:
+        params: `deblur`.
+        level: Log intensity of the mean, ln I.
+        total: Sum of `segment_excess` over the exposure.
+
+    Returns:
+        The log intensity, ln I.
+    """
     return level - jnp.log1p(total) * params.deblur
 
 
@@ -191,11 +277,19 @@ def deblur_frames(
     frames: FrameFeatures,
     shift: Float[Array, "frames pixels"] | float = 0.0,
 ) -> tuple[Float[Array, "frames pixels"], Float[Array, "frames pixels"]]:
-    """Log intensity at the left and right edge of each exposure (event double integral).
+    """Return the log intensity at both edges of each exposure (event double integral).
 
     The exposure averages exp(E(t)), E the events' change since mid-exposure. E is piecewise
     constant, so the mean is exact: m = 1 + sum over segments of share (exp(E) - 1), and
-    l(D) = ln((I + I0) / m). `shift` is added to ln(I + I0).
+    l(D) = ln((I + I0) / m).
+
+    Args:
+        params: Thresholds, `I0` and `deblur`.
+        frames: The frames.
+        shift: Added to ln(I + I0), ln I.
+
+    Returns:
+        Log intensity at the left and at the right edge, each (frames, pixels), ln I.
     """
     level = jnp.log(frames.intensity + params.I0) + shift
     if frames.segments is None or frames.head is None or frames.tail is None:
@@ -211,7 +305,18 @@ def deblur_frames(
 
 
 def _shift_endpoints(lag: Array, here: Array, there: Array) -> tuple[Array, Array]:
-    """Ends whose blend with weight w is that of `here` and `there` with weight w - lag."""
+    """Shift the end points of a linear interpolation.
+
+    The blend with weight w becomes what the blend with weight w - lag was.
+
+    Args:
+        lag: Shift of the weight.
+        here: Values for weight 0.
+        there: Values for weight 1.
+
+    Returns:
+        The values for weight 0 and 1.
+    """
     drift = lag * (here - there)
     return here + drift, there + drift
 
@@ -219,12 +324,20 @@ def _shift_endpoints(lag: Array, here: Array, there: Array) -> tuple[Array, Arra
 def frame_information(
     params: AugmentParams, frames: FrameFeatures
 ) -> Float[Array, "frames pixels"]:
-    """w (I + I0)^2: how well each frame tells the log intensity, in units of kappa."""
+    """Return w (I + I0)^2, the information rate of each frame on log intensity.
+
+    Args:
+        params: Parameters of the certainty, and `I0`.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), in units of `kappa`.
+    """
     return effective_certainty(params, frames) * (frames.intensity + params.I0) ** 2
 
 
 class LogIntensityModel(eqx.Module):
-    """A model of the log intensity at any time, from what the frames say."""
+    """A model of the log intensity at any time, made of a window's frames."""
 
     Params: ClassVar[type[FrameParams]] = FrameParams
 
@@ -265,9 +378,9 @@ class AugmentedFrame(LogIntensityModel):
     Each piece blends two lines base + ratio S, S the nominal integral of events since the left edge
     of the piece's exposure. The calibrated threshold is `ratio` times the nominal one (10).
 
-    Weighted by certainty, the lines of a gap count by (1 - u) / R_k and u / R_{k+1} instead of
-    1 - u and u, R = 1 / (w (I + I0)^2), so that a clipped frame does not speak against a good one;
-    `tilt` is R_k / R_{k+1}. At the ends of the gap the estimate is the same.
+    Weighted by certainty, the lines of a gap count by (1 - u) / R_k and u / R_{k+1} instead of 1 -
+    u and u, R = 1 / (w (I + I0)^2). So a clipped frame does not act against a good one. `tilt` is
+    R_k / R_{k+1}. At the ends of the gap the estimate is the same.
     """
 
     Params = AugmentParams
@@ -343,7 +456,7 @@ class AugmentedFrame(LogIntensityModel):
 
 
 class EventIntegral(LogIntensityModel):
-    """EDI alone: the latest deblurred frame plus the events since, thresholds nominal."""
+    """The latest deblurred frame plus the events since, with nominal thresholds (EDI)."""
 
     params: FrameParams
     base: Float[Array, "pieces pixels"]
@@ -360,7 +473,7 @@ class EventIntegral(LogIntensityModel):
 
 
 class ZeroOrderHold(LogIntensityModel):
-    """The last frame whose mid-exposure has passed (zero-order hold); before, the first one."""
+    """The last frame whose mid-exposure has passed; before it, the first one."""
 
     level: Float[Array, "frames pixels"]
 
@@ -386,7 +499,7 @@ class LinearBlend(LogIntensityModel):
 
 
 class NoFrames(LogIntensityModel):
-    """No frames at all: log intensity 0."""
+    """Log intensity 0 at all times, for methods that take no frames."""
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
         pass

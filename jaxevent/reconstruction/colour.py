@@ -30,9 +30,10 @@ _SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
 
 
 def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
-    """Luminance (...) of linear colours (..., 3), Rec. 709: white (1, 1, 1) has 1.
+    """Return the luminance (...) of linear colours (..., 3), Rec. 709: white (1, 1, 1) has 1.
 
-    Raises `InputError` for arrays that are not floats of three channels.
+    Raises:
+        InputError: Colours are not floats of three channels.
     """
     colours = _check_colours(rgb)
     return np.asarray(colours @ np.asarray(REC709, colours.dtype))
@@ -41,12 +42,22 @@ def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
 def chrominance(
     rgb: ArrayLike, *, black: float | int = 0.0, white: float | int = 1.0
 ) -> NDArray[np.floating]:
-    """Colours (..., 3) divided by their luminance: what is left has luminance 1; grey is (1, 1, 1).
+    """Divide colours by their luminance, so that the result has luminance 1; grey is (1, 1, 1).
 
     A channel that reads `white` is clipped and the ratio means nothing: over the last 2 % below
-    white the colour fades to grey; `white=np.inf` for colours that are nowhere clipped. So it does
-    where the brightest channel is between `black` and 0 and noise makes the ratio; luminance 0 is
-    grey in any case. Raises `InputError` for arrays that are not floats of three channels.
+    white the colour fades to grey. It also fades where the brightest channel is between `black` and
+    0 and noise makes the ratio. Luminance 0 is grey in any case.
+
+    Args:
+        rgb: (..., 3) linear colours.
+        black: Intensity below which colours fade.
+        white: Intensity at which channels clip; `np.inf` for colours that are nowhere clipped.
+
+    Returns:
+        (..., 3).
+
+    Raises:
+        InputError: Colours are not floats of three channels.
     """
     colours = _check_colours(rgb)
     y = luminance(colours)[..., None]
@@ -60,10 +71,19 @@ def chrominance(
 
 
 def apply_chrominance(luminance: ArrayLike, chroma: ArrayLike) -> NDArray[np.floating]:
-    """Linear colours (..., 3) of a luminance (...), of any range, and a chrominance (..., 3).
+    """Return linear colours of a luminance and a chrominance.
 
-    Hue and saturation are those of the chrominance at every luminance. Raises `InputError` for
-    shapes that do not fit together.
+    Hue and saturation are those of the chrominance at every luminance.
+
+    Args:
+        luminance: (...), of any range.
+        chroma: (..., 3).
+
+    Returns:
+        (..., 3).
+
+    Raises:
+        InputError: The shapes do not fit together.
     """
     y, ratio = np.asarray(luminance), _check_colours(chroma)
     try:
@@ -76,7 +96,7 @@ def apply_chrominance(luminance: ArrayLike, chroma: ArrayLike) -> NDArray[np.flo
 
 
 def _check_colours(rgb: ArrayLike) -> NDArray[np.floating]:
-    """The colours as an array; `InputError` unless they are floats of three channels."""
+    """Return colours as an array; raise `InputError` unless they are floats of three channels."""
     colours = np.asarray(rgb)
     if colours.dtype.kind != "f" or colours.shape[-1:] != (3,):
         raise InputError(
@@ -89,15 +109,23 @@ def _check_colours(rgb: ArrayLike) -> NDArray[np.floating]:
 def colour_video(
     video: ImageSequence[Any], recording: Recording
 ) -> Callable[..., NDArray[np.floating]]:
-    """A reconstruction in the colours of `recording.extra["rgb"]`: `colour_video(...)(times)`.
+    """Make a reconstruction in the colours of `recording.extra["rgb"]`: `colour_video(...)(times)`.
 
-    `extra["rgb"]`, (frames, H, W, 3) uint8, holds the colours of every one of `recording.frames`,
-    on the same camera response. Returns a function that gives linear colours (T, H, W, 3) at times
-    as `video` takes them: its image as luminance, with the chrominance of the frames before and
-    after, linear between them and constant outside. Where the video knows how points move (`mc`),
-    chrominance is that of the points, and a frame that does not show a point does not count. Raises
-    `InputError` for a recording without colour frames and for frames of another number, size or
-    type.
+    The video's image is the luminance. The chrominance is that of the frames before and after,
+    linear between them and constant outside. Where the video knows how points move (`mc`),
+    chrominance is that of the points, and a frame that does not show a point does not count.
+
+    Args:
+        video: Images of the recording.
+        recording: The recording with `extra["rgb"]`, (frames, H, W, 3) uint8: the colours of each
+            of
+            its frames, on the same camera response.
+
+    Returns:
+        A function of times, as `video` takes them, that returns linear colours (T, H, W, 3).
+
+    Raises:
+        InputError: There are no colour frames, or their number, size or type differs.
     """
     name, frames, rgb = recording.name, recording.frames, recording.extra.get("rgb")
     if frames is None or rgb is None:
@@ -151,13 +179,21 @@ def colour_video(
 
 
 def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Recording]:
-    """The recordings R, G1, G2 and B of the sites of a Bayer pattern, each of half the size.
+    """Split a recording into the recordings R, G1, G2 and B of a Bayer pattern.
 
-    `pattern` names the colours of the upper left 2 x 2 pixels, row by row. Events and frames of a
-    channel are those of its sites; its pinhole camera has half the focal lengths and its centre at
-    the sites. Arrays of `extra` whose last two axes are the sensor's are subsampled as frames are,
-    `rgb` is left out, others are kept. Raises `InputError` for other patterns and for a sensor of
-    odd width or height.
+    Each is of half the size. Events and frames of a channel are those of its sites. Its pinhole
+    camera has half the focal lengths and its centre at the sites. Arrays of `extra` whose last two
+    axes are the sensor's are subsampled as frames are, `rgb` is left out, others are kept.
+
+    Args:
+        recording: The recording.
+        pattern: Colours of the upper left 2 x 2 pixels, row by row.
+
+    Returns:
+        The recordings by name of the channel.
+
+    Raises:
+        InputError: The pattern is unknown, or the width or height is odd.
     """
     places = bayer_sites(pattern)
     if recording.width % 2 or recording.height % 2:
@@ -207,11 +243,20 @@ def _channel(recording: Recording, events: Events, name: str, row: int, column: 
 
 
 def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArray[np.floating]:
-    """Colour images (T, 2 h, 2 w, 3) of the channels R, G1, G2 and B, each (T, h, w).
+    """Join images of the channels R, G1, G2 and B to colour images.
 
-    Bilinear demosaicing: a channel keeps its values at its sites; elsewhere it is the mean of its
-    2 or 4 nearest sites, at the border of those there are. Raises `InputError` for other patterns,
-    missing channels and shapes that differ.
+    Bilinear demosaicing: a channel keeps its values at its sites. Elsewhere it is the mean of its 2
+    or 4 nearest sites, at the border of fewer.
+
+    Args:
+        images: (T, h, w) images by name of the channel.
+        pattern: Colours of the upper left 2 x 2 pixels, row by row.
+
+    Returns:
+        (T, 2 h, 2 w, 3).
+
+    Raises:
+        InputError: The pattern is unknown, a channel is missing, or shapes differ.
     """
     places = bayer_sites(pattern)
     missing = [name for name in places if name not in images]

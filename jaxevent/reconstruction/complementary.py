@@ -1,8 +1,8 @@
 """Complementary and high-pass filters (Scheerlinck et al., ACCV 2018): a constant gain.
 
-Their state is log intensity; no variance is estimated. What pulls it is the last frame (the
-original), the augmented frame ("CF with augmentation", AKF supplement section 2), or nothing (the
-high-pass filter: events only, so its images have no absolute brightness).
+Their state is log intensity; no variance is estimated. It is pulled by the last frame (the
+original), by the augmented frame ("CF with augmentation", AKF supplement section 2), or by zero
+(the high-pass filter: events only, so its images have no absolute brightness).
 """
 
 from typing import Any
@@ -45,7 +45,7 @@ class AugmentedParams(AugmentParams):
 
 
 class ConstantRateModel(FrameModel):
-    """A model of the log intensity, believed at the rate alpha."""
+    """A model of the log intensity that pulls the state at the rate alpha."""
 
     level: LogIntensityModel
     alpha: Float[Array, ""]
@@ -56,19 +56,40 @@ class ConstantRateModel(FrameModel):
 
 
 def predict(params: FrameParams, state: PixelState, dt: Array, frame: Observation) -> PixelState:
-    """L <- L e^(-alpha dt) + u (1 - e^(-alpha dt))."""
+    """Decay towards the frames: L <- L e^(-alpha dt) + u (1 - e^(-alpha dt)).
+
+    Args:
+        params: Parameters; not used.
+        state: State of a pixel.
+        dt: Time without events, s.
+        frame: Log intensity u and rate alpha, 1/s.
+
+    Returns:
+        The state dt later.
+    """
     decay = jnp.exp(-frame.rate * dt)
     return PixelState(state.L * decay + frame.level * (1 - decay), state.P)
 
 
 def event_update(params: FrameParams, state: PixelState, event: Event) -> PixelState:
-    """L <- L + s c."""
+    """Add an event: L <- L + s c.
+
+    Args:
+        params: Thresholds.
+        state: State just before the event.
+        event: The event.
+
+    Returns:
+        The state after the event.
+    """
     return PixelState(state.L + event_change(params, event.polarity, event.since), state.P)
 
 
 def _filter(
     name: str, model: type[LogIntensityModel], params: type[FrameParams], about: str, **more: Any
 ) -> Filter:
+    """Make a filter of a model of the log intensity that pulls."""
+
     def frame_model(values: Any, frames: FrameFeatures) -> ConstantRateModel:
         return ConstantRateModel(model(values, frames), values.alpha)
 

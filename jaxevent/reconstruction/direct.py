@@ -1,4 +1,4 @@
-"""Methods that keep no state: what the frames (and the events between them) say, read directly."""
+"""Methods without a state: the log intensity of a model of frames, and perhaps of events, alone."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ from jaxevent.reconstruction.filtering import (
 
 
 class DirectFrameModel(FrameModel):
-    """A model of the log intensity, believed at once."""
+    """A model of the log intensity that is taken at once."""
 
     level: LogIntensityModel
 
@@ -35,10 +35,23 @@ class DirectFrameModel(FrameModel):
 
 
 def predict(params: FrameParams, state: PixelState, dt: Array, frame: Observation) -> PixelState:
+    """Take the log intensity of the frames.
+
+    Args:
+        params: Parameters; not used.
+        state: State of a pixel, of which the variance is kept.
+        dt: Time, s; not used.
+        frame: Log intensity of the frames.
+
+    Returns:
+        The state.
+    """
     return PixelState(frame.level, jnp.broadcast_to(state.P, frame.level.shape))
 
 
 def _direct(name: str, model: type[LogIntensityModel], about: str, **more: Any) -> Filter:
+    """Make a method of a model of the log intensity."""
+
     def frame_model(values: Any, frames: FrameFeatures) -> DirectFrameModel:
         return DirectFrameModel(model(values, frames))
 

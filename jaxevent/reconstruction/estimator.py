@@ -12,6 +12,7 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
+from jaxevent.reconstruction.engine.images import images_from_kernel, video_from_kernel
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.frames import Timing, time_span
 from jaxevent.reconstruction.live import LiveVideo
@@ -28,15 +29,15 @@ class PreparedImages(Protocol):
     """
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
-        """The images; without `variance` there is none, and no derivatives of it."""
+        """Return the images; without `variance` there is none, nor derivatives of it."""
         ...
 
     def take(self, rows: NDArray) -> "PreparedImages":
-        """Those at some of the times, in that order."""
+        """Choose the images at some of the times, in the order of `rows`."""
         ...
 
     def over(self, devices: Sequence[Any]) -> "PreparedImages":
-        """The same on several devices, pixels shared out."""
+        """Put the images on several devices, pixels sharded."""
         ...
 
 
@@ -52,9 +53,11 @@ class ScannedImages(eqx.Module):
         return self.method.read(params, trajectory, self.out)
 
     def take(self, rows: NDArray) -> "ScannedImages":
+        """Choose some of the images; see `PreparedImages.take`."""
         return ScannedImages(self.features, self.out.take(rows), self.method)
 
     def over(self, devices: Sequence[Any]) -> "ScannedImages":
+        """Put the images on several devices; see `PreparedImages.over`."""
         return ScannedImages(self.features.over(devices), self.out.over(devices), self.method)
 
 
@@ -85,7 +88,16 @@ class ImageEstimator(Estimator[P]):
         )
 
     def check_span(self, recording: Recording, times: Times, params: P) -> None:
-        """Raise `InputError` for times outside the recording, its frames on either clock."""
+        """Check that times lie within the recording, its frames on either clock.
+
+        Args:
+            recording: Events and frames.
+            times: Times of images, us or s.
+            params: Parameters, of which `clock_offset` is used.
+
+        Raises:
+            InputError: A time lies outside.
+        """
         check_times(times, *time_span(recording, params.clock_offset), recording.name)
 
     def check(self, recording: Recording) -> None:
@@ -94,9 +106,14 @@ class ImageEstimator(Estimator[P]):
         recording.refuse_empty()
 
     def check_clocks(self, recording: Recording, params: P) -> None:
-        """Raise `InputError` or warn if frames and events that it combines cannot be on one clock.
+        """Check that frames and events that are combined can be on one clock (`events.clocks`).
 
-        See `jaxevent.events.clocks`.
+        Args:
+            recording: Events and frames.
+            params: Parameters, of which `clock_offset` is used.
+
+        Raises:
+            InputError: They cannot; where it is but doubtful there is a warning.
         """
         if self.fuses:
             check_clocks(recording, params.clock_offset)
@@ -105,9 +122,18 @@ class ImageEstimator(Estimator[P]):
     def estimate(
         self, recording: Recording, params: P | None = None, **options: Any
     ) -> ImageSequence[P]:
-        """Images of a recording: `image, variance, valid = estimate(recording, params)(times)`.
+        """Make images of a recording: `mean, variance, valid = estimate(recording, params)(times)`.
 
-        Raises `InputError` if the recording lacks what the method needs.
+        Args:
+            recording: Events and frames.
+            params: Parameters; the defaults if None.
+            **options: Options of the method.
+
+        Returns:
+            Images as a function of time.
+
+        Raises:
+            InputError: The recording lacks what the method needs.
         """
 
     def prepare_images(
@@ -118,14 +144,24 @@ class ImageEstimator(Estimator[P]):
         *,
         extrapolate: bool = False,
     ) -> PreparedImages:
-        """The images at sorted `times` as a function of parameters, for losses.
+        """Prepare the images at sorted times as a function of parameters, for losses.
 
             images = akf.prepare_images(recording, times)
             loss = lambda params: ((images(params).mean - truth) ** 2).mean()
-            value, slope = jax.jit(jax.value_and_grad(loss))(akf.Params())
+            value, gradient = jax.jit(jax.value_and_grad(loss))(akf.Params())
 
-        Prepared for those of the `params` that act through comparisons with event times, see
-        `prepare`. Raises `InputError` as `prepare` does.
+        Args:
+            recording: Events and frames.
+            times: Sorted times, integers in us or floats in s.
+            params: Parameters that act through comparisons with event times, see `prepare`; the
+                defaults if None.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            The images as a function of parameters.
+
+        Raises:
+            InputError: As `prepare`.
         """
         features, out = self.prepare(recording, times, params, extrapolate=extrapolate)
         return ScannedImages(features, out, self)
@@ -134,7 +170,7 @@ class ImageEstimator(Estimator[P]):
 @renamed_methods(filters="is_event_driven", looks_ahead="needs_future", start="init_state")
 @dataclasses.dataclass(frozen=True, repr=False)
 class PixelEstimator(ImageEstimator[P]):
-    """A reconstruction method to which every pixel is one of its own, in windows of events."""
+    """A reconstruction method that takes each pixel on its own, in windows of events."""
 
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "devices"}), kw_only=True
@@ -143,16 +179,24 @@ class PixelEstimator(ImageEstimator[P]):
     @property
     @abc.abstractmethod
     def is_event_driven(self) -> bool:
-        """Whether it passes over single events."""
+        """True if the method passes over single events."""
 
     @property
     def needs_future(self) -> bool:
-        """Whether `run` needs what later windows say."""
+        """True if `run` needs the message of later windows."""
         return False
 
     @abc.abstractmethod
     def init_state(self, params: P, features: Features) -> Any:
-        """The state at the recording's start, from the features of its first window."""
+        """Return the state at the recording's start.
+
+        Args:
+            params: Parameters.
+            features: The first window.
+
+        Returns:
+            A pytree of arrays (pixels,).
+        """
 
     @abc.abstractmethod
     def run(
@@ -160,14 +204,28 @@ class PixelEstimator(ImageEstimator[P]):
     ) -> tuple[Any, Any]:
         """Estimate a window; pure, so it jits, vmaps over `params` and differentiates.
 
-        `state` is what the window before returned; omitted, the recording starts here. `future` is
-        what later windows say, for estimators that look ahead; omitted, there are none. Returns
-        the trajectory, to `read` images from, and the state for the next window.
+        Args:
+            params: Parameters.
+            features: The window.
+            state: State that the window before returned; None: the recording starts here.
+            future: Message of later windows, for methods that need it; None: there are none.
+
+        Returns:
+            The trajectory, to `read` images from, and the state for the next window.
         """
 
     @abc.abstractmethod
     def read(self, params: P, trajectory: Any, out: ReadOut) -> Estimate:
-        """The images prepared in `out`, each array (times, pixels); pure, as `run`."""
+        """Read images of a window; pure, as `run`.
+
+        Args:
+            params: Parameters.
+            trajectory: Trajectory that `run` returned.
+            out: Prepared times of images.
+
+        Returns:
+            The images, each array (times, pixels).
+        """
 
     def prepare(
         self,
@@ -177,11 +235,21 @@ class PixelEstimator(ImageEstimator[P]):
         *,
         extrapolate: bool = False,
     ) -> tuple[Features, ReadOut]:
-        """A whole recording for `run`, and points of images at sorted `times` for `read`.
+        """Prepare a recording for `run`, and images for `read`; see `windows.prepare`.
 
-        See `windows.prepare`; prepared for those of the `params` that act through comparisons with
-        event times. Raises `InputError` if the recording lacks what the method needs, and for times
-        that are not sorted or, unless told to `extrapolate`, outside the recording.
+        Args:
+            recording: Events and frames.
+            times: Sorted times, integers in us or floats in s.
+            params: Parameters that act through comparisons with event times; the defaults if None.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            The features of the recording, and the read-out of the images.
+
+        Raises:
+            InputError: The recording lacks what the method needs, or times are not sorted or
+                outside
+                the recording.
         """
         self.check(recording)
         params = self.Params() if params is None else params
@@ -193,10 +261,18 @@ class PixelEstimator(ImageEstimator[P]):
     def estimate(
         self, recording: Recording, params: P | None = None, **options: Any
     ) -> ImageSequence[P]:
-        """Video of a recording: `image, variance, valid = estimate(recording, params)(times)`.
+        """Make images of a recording: `mean, variance, valid = estimate(recording, params)(times)`.
 
-        `options` are those of `Video`. Raises `InputError` if the recording lacks what the method
-        needs.
+        Args:
+            recording: Events and frames.
+            params: Parameters; the defaults if None.
+            **options: Options of `Video`.
+
+        Returns:
+            Images as a function of time.
+
+        Raises:
+            InputError: The recording lacks what the method needs.
         """
         self.check_options(**options)
         return Video(self, recording, self.Params() if params is None else params, **options)
@@ -204,14 +280,109 @@ class PixelEstimator(ImageEstimator[P]):
     def live(
         self, size: tuple[int, int], params: P | None = None, *, frames: bool, **options: Any
     ) -> LiveVideo:
-        """Images of events, and with `frames` of frames, that are still to come; see `LiveVideo`.
+        """Make images of events, and perhaps frames, that are still to come; see `LiveVideo`.
 
-        `size` is (width, height). Options: `window_events`, which are filtered together; `extra`,
-        a recording's further arrays, for a camera response. Raises `InputError` for a method that
-        looks ahead.
+        Args:
+            size: Width and height of the sensor, px.
+            params: Parameters; the defaults if None.
+            frames: Whether frames will come.
+            **options: `window_events`, which are filtered together; `extra`, a recording's further
+                arrays, for a camera response.
+
+        Returns:
+            The images, to which events are added.
+
+        Raises:
+            InputError: The method needs later events.
         """
         if self.needs_future:
             raise InputError(f"the method {self.name!r} needs what comes later; use akf")
         self.check_options(**options)
         params = self.Params() if params is None else params
         return LiveVideo(self, size, params, frames=frames, **options)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class KernelEstimator(PixelEstimator[P]):
+    """A per-pixel method of which numba makes kernels for the CPU, from its own functions."""
+
+    kernel_video: ClassVar[Any]  # class of its images, see `engine.images`
+    kernel_images: ClassVar[Any]  # class of its kernels for prepared images
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
+    )
+
+    def estimate(
+        self,
+        recording: Recording,
+        params: P | None = None,
+        *,
+        compiler: str | None = None,
+        **options: Any,
+    ) -> ImageSequence[P]:
+        """Make images of a recording: `mean, variance, valid = estimate(recording, params)(times)`.
+
+        In single precision they come from a kernel that numba compiles from the method's own
+        functions (`engine`) for the CPU. `run` and `read`, compiled by XLA, serve where a function
+        has no translation, in double precision and on several devices.
+
+        Args:
+            recording: Events and frames.
+            params: Parameters; the defaults if None.
+            compiler: "numba" or "xla", to demand one of the two.
+            **options: Options of `Video`; those of `aks` include `factors`.
+
+        Returns:
+            Images as a function of time.
+
+        Raises:
+            InputError: The recording lacks what the method needs, or no kernel can do what is
+                demanded.
+        """
+        self.check_options(**options)
+        params = self.Params() if params is None else params
+        fused = video_from_kernel(self.kernel_video, self, recording, params, compiler, options)
+        return Video(self, recording, params, **options) if fused is None else fused
+
+    def prepare_images(
+        self,
+        recording: Recording,
+        times: Times,
+        params: P | None = None,
+        *,
+        extrapolate: bool = False,
+        compiler: str | None = None,
+    ) -> PreparedImages:
+        """Prepare the images at sorted times as a function of parameters, for losses.
+
+        On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
+        in one pass over the events. `run` and `read` serve where a function has no translation, in
+        double precision, on other devices and on several, for derivatives by the dead time
+        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.dispatch`).
+
+        Args:
+            recording: Events and frames.
+            times: Sorted times, integers in us or floats in s.
+            params: Parameters that act in preparation; the defaults if None.
+            extrapolate: Allow times outside the recording.
+            compiler: "numba" or "xla", to demand the kernel or to do without it.
+
+        Returns:
+            The images as a function of parameters.
+
+        Raises:
+            InputError: As `estimate`, and for times that are not sorted or outside the recording.
+        """
+        params = self.Params() if params is None else params
+        fused = images_from_kernel(
+            self.kernel_images,
+            self,
+            recording,
+            times,
+            params,
+            extrapolate=extrapolate,
+            compiler=compiler,
+        )
+        if fused is not None:
+            return fused
+        return super().prepare_images(recording, times, params, extrapolate=extrapolate)

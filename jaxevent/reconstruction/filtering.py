@@ -1,15 +1,15 @@
-"""The one driver of all per-pixel filters: filter events tile by tile, read at any time.
+"""The driver of all per-pixel filters: filter events tile by tile, read images at any time.
 
-A `Filter` is a handful of pure functions of one pixel, written in scalars beside the paper's
-equations; this module supplies what all share: `run` scans the ranks of a window's tiles and maps
-the step over their lanes, `read` evaluates images.
+A `Filter` consists of a few pure functions of one pixel, written in scalars beside the paper's
+equations. This module has what all filters share: `run` scans the ranks of a window's tiles and
+maps the step over their lanes, `read` makes images.
 """
 
 import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,9 +22,8 @@ from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.devices import loop_unroll
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
-from jaxevent.reconstruction.engine.images import DividedEvents, prepared_by_kernel
-from jaxevent.reconstruction.engine.video import FusedVideo, video_by_kernel
-from jaxevent.reconstruction.estimator import P, PixelEstimator, PreparedImages
+from jaxevent.reconstruction.engine.images import FilterImages, FilterVideo
+from jaxevent.reconstruction.estimator import KernelEstimator, P
 from jaxevent.reconstruction.features import (
     SHAPES,
     SLOTS,
@@ -35,16 +34,14 @@ from jaxevent.reconstruction.features import (
     ReadOut,
     Tiles,
 )
-from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.recording import Recording, Times
 
-UNROLLED = 8  # ranks of a tile that a GPU passes over at once
+UNROLLED_RANKS = 8  # of a tile, that a GPU passes over at once
 
 
 class PixelState(eqx.Module):
     """Log intensity L = ln(I + I0) of a pixel and its variance P (NaN if not estimated).
 
-    The usual state of a `Filter`, whose own may be any pytree of numbers per pixel.
+    The state of most filters; a filter's own may be any pytree of numbers per pixel.
     """
 
     L: Float[Numeric, "*pixels"]
@@ -52,22 +49,30 @@ class PixelState(eqx.Module):
 
 
 def init_without_variance(params: FrameParams, level: Array) -> PixelState:
-    """The initial state of methods that estimate no variance."""
+    """Return the initial state of methods that estimate no variance.
+
+    Args:
+        params: Parameters; not used.
+        level: Log intensity, ln I.
+
+    Returns:
+        The state, of variance NaN.
+    """
     return PixelState(level, jnp.full_like(level, jnp.nan))
 
 
 class Observation(eqx.Module):
-    """What the frames say at a point: log intensity, and the rate (1/s) at which to believe it."""
+    """Evidence of the frames at a point: log intensity and its information rate, 1/s."""
 
     level: Float[Numeric, "*points"]
     rate: Float[Numeric, "*points"]
-    # A bound and the rate at which to pull states below it (positive) or above it (negative) there.
+    # A bound and the rate (1/s) that pulls to it states below (positive) or above it (negative).
     bound: Float[Numeric, "*points"] | None = None
     push: Float[Numeric, "*points"] | None = None
 
 
 class Event(eqx.Module):
-    """One event as a filter's step sees it."""
+    """One event of a pixel, with the observation just before it."""
 
     since: Float[Numeric, "*points"]  # s since the pixel's previous event
     near: Float[Numeric, "*points"]  # s since the 3x3 neighbourhood's previous event
@@ -76,7 +81,7 @@ class Event(eqx.Module):
 
 
 class LaneBlock(eqx.Module):
-    """Which lanes tiles serve, and in which shape (`features.Tiles`)."""
+    """Kind and first lane of tiles (`features.Tiles`)."""
 
     kind: Int[Array, " tiles"]
     lane: Int[Array, " tiles"]
@@ -84,13 +89,14 @@ class LaneBlock(eqx.Module):
 
 @renamed_methods(outset="initial_level")
 class FrameModel(eqx.Module):
-    """What the frames say anywhere in a window: tables made once, looked up at points."""
+    """A model of the frames of a window: tables made once, looked up at points."""
 
     @abc.abstractmethod
-    def __call__(self, points: Points) -> Observation: ...
+    def __call__(self, points: Points) -> Observation:
+        """Return the observation at points."""
 
     def initial_level(self, points: Points) -> Float[Array, "..."]:
-        """The log intensity from which a filter starts."""
+        """Return the log intensity from which a filter starts."""
         return self(points).level
 
 
@@ -102,27 +108,37 @@ class Trajectory(ShortRepr):
     path: Any  # state (slots,), after every event, in the order of the features' slots; or None
 
     def at(self, slot: Int[Array, "*images pixels"]) -> Any:
-        """The states after each pixel's event in a slot, or at the window's start for slot -1."""
+        """Gather each pixel's state after the event in a given slot; -1: at the window's start."""
         if self.path is None:
             return self.start
 
-        def look(start: Array, path: Array) -> Array:
+        def gather(start: Array, path: Array) -> Array:
             return jnp.where(slot < 0, start, path.at[slot].get(mode="clip"))
 
-        return jax.tree.map(look, self.start, self.path)
+        return jax.tree.map(gather, self.start, self.path)
 
 
 def readout_log_intensity(params: FrameParams, state: Any) -> tuple[Array, Array]:
-    """Log intensity and its variance of a pixel whose state is a `PixelState`."""
+    """Return log intensity and variance of a pixel whose state is a `PixelState`.
+
+    Args:
+        params: Parameters; not used.
+        state: The state.
+
+    Returns:
+        L, ln I, and P, (ln I)^2.
+    """
     return state.L, state.P
 
 
-@renamed_methods(at_pixel="step_and_readout", initial_state="init_from_frames")
+@renamed_methods(
+    at_pixel="step_and_readout", image="predict_image", initial_state="init_from_frames"
+)
 @renamed_fields(
     observe="frame_model", initial="init", advance="predict", jump="event_update", tell="readout"
 )
 @dataclasses.dataclass(frozen=True, repr=False)
-class Filter(PixelEstimator[P]):
+class Filter(KernelEstimator[P]):
     """A causal method, made of pure functions of one pixel.
 
     Attributes:
@@ -141,70 +157,43 @@ class Filter(PixelEstimator[P]):
     predict: Callable[[P, Any, Array, Observation], Any]
     event_update: Callable[[P, Any, Event], Any] | None = None
     readout: Callable[[P, Any], tuple[Array, Array]] = readout_log_intensity
-    options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
-    )
+    kernel_video: ClassVar[Any] = FilterVideo
+    kernel_images: ClassVar[Any] = FilterImages
 
     @property
     def is_event_driven(self) -> bool:
         return self.event_update is not None
 
-    def estimate(
-        self,
-        recording: Recording,
-        params: P | None = None,
-        *,
-        compiler: str | None = None,
-        **options: Any,
-    ) -> ImageSequence[P]:
-        """Images of a recording: `image, variance, valid = estimate(recording, params)(times)`.
-
-        In single precision they come from a kernel that numba compiles from the method's own
-        functions (`fused`), which the CPU runs, several times faster than the `run` and `read` that
-        XLA compiles, and than a GPU runs these. They serve where a function has no translation, in
-        double precision and on several devices. `compiler` asks for one of the two: "numba" or
-        "xla". Further options are those of `Video`. Raises `InputError` if the recording lacks what
-        the method needs, and where numba is asked for what it cannot do.
-        """
-        self.check_options(**options)
-        params = self.Params() if params is None else params
-        fused = video_by_kernel(FusedVideo, self, recording, params, compiler, options)
-        return Video(self, recording, params, **options) if fused is None else fused
-
-    def prepare_images(
-        self,
-        recording: Recording,
-        times: Times,
-        params: P | None = None,
-        *,
-        extrapolate: bool = False,
-        compiler: str | None = None,
-    ) -> PreparedImages:
-        """As `ImageEstimator.prepare_images`.
-
-        On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
-        in one pass over the events. `run` and `read` serve where a function has no translation, in
-        double precision, on other devices and on several, for derivatives by the dead time
-        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.dispatch`).
-        `compiler` is as in `estimate`.
-        """
-        params = self.Params() if params is None else params
-        fused = prepared_by_kernel(
-            DividedEvents, self, recording, times, params, extrapolate, compiler
-        )
-        if fused is not None:
-            return fused
-        return super().prepare_images(recording, times, params, extrapolate=extrapolate)
-
     def step(self, params: P, state: Any, event: Event) -> Any:
-        """The state of a pixel after an event: advance to it, then jump."""
+        """Return the state of a pixel after an event: predict to it, then add it.
+
+        Args:
+            params: Parameters.
+            state: State after the pixel's event before.
+            event: The event.
+
+        Returns:
+            The state.
+        """
         assert self.event_update is not None
         return self.event_update(
             params, self.predict(params, state, event.since, event.frame), event
         )
 
-    def image(self, params: P, state: Any, since: Array, frame: Observation) -> tuple[Array, Array]:
-        """Intensity and variance of a pixel `since` seconds after its last event."""
+    def predict_image(
+        self, params: P, state: Any, since: Array, frame: Observation
+    ) -> tuple[Array, Array]:
+        """Return intensity and variance of a pixel some time after its last event.
+
+        Args:
+            params: Parameters.
+            state: State after the pixel's last event.
+            since: Time since then, s.
+            frame: Observation at the time.
+
+        Returns:
+            Intensity, and variance of log intensity.
+        """
         L, P = self.readout(params, self.predict(params, state, since, frame))
         return jnp.exp(L) - params.I0, P
 
@@ -217,14 +206,35 @@ class Filter(PixelEstimator[P]):
         near: Array,
         polarity: Array,
     ) -> tuple[Any, Array, Array]:
-        """The state after an event; intensity and variance at its time without it."""
+        """Return the state after an event, and the image at its time without it.
+
+        Args:
+            params: Parameters.
+            frame: Observation just before the event.
+            state: State after the pixel's event before.
+            since: Time since then, s.
+            near: Time since the event before in the 3x3 neighbourhood, s.
+            polarity: +1, -1, or 0 for no event.
+
+        Returns:
+            The state, intensity, and variance of log intensity.
+        """
         after = state
         if self.event_update is not None:
             after = self.step(params, state, Event(since, near, polarity, frame))
-        return after, *self.image(params, state, since, frame)
+        return after, *self.predict_image(params, state, since, frame)
 
     def init_from_frames(self, params: P, frame_model: FrameModel, points: Points) -> Any:
-        """The state of the pixels at the recording's start."""
+        """Return the state of the pixels at the recording's start.
+
+        Args:
+            params: Parameters.
+            frame_model: Model of the first window's frames.
+            points: The recording's start.
+
+        Returns:
+            The state (pixels,).
+        """
         level = frame_model.initial_level(points)[0]
         return jax.vmap(functools.partial(self.init, params))(level)
 
@@ -235,7 +245,17 @@ class Filter(PixelEstimator[P]):
     def run(
         self, params: P, features: Features, state: Any = None, future: None = None
     ) -> tuple[Trajectory, Any]:
-        """As `PixelEstimator.run`; the state is (pixels,), after each pixel's last event."""
+        """Filter a window; see `PixelEstimator.run`.
+
+        Args:
+            params: Parameters.
+            features: The window.
+            state: (pixels,) state after each pixel's last event before the window.
+            future: Not used.
+
+        Returns:
+            The trajectory, and the state (pixels,) after each pixel's last event.
+        """
         features = features.at_dead_time(params.rho_ref)
         frame_model = self.frame_model(params, features.frames)
         if state is None:
@@ -247,19 +267,29 @@ class Filter(PixelEstimator[P]):
         return trajectory, trajectory.at(jnp.asarray(features.last))
 
     def scan(self, params: P, frame_model: FrameModel, tiles: Tiles, state: Any) -> Any:
-        """The states after every event, (slots,)."""
+        """Filter the events of tiles.
+
+        Args:
+            params: Parameters.
+            frame_model: Model of the window's frames.
+            tiles: The events.
+            state: (pixels,) state before the window.
+
+        Returns:
+            The states after every event, (slots,).
+        """
         path = tiles.map_shards(self._scan, params, frame_model, state)
         return jax.tree.map(jnp.ravel, path)
 
     def _scan(self, tiles: Tiles, params: P, frame_model: FrameModel, state: Any) -> Any:
-        """The states after every event, (tiles, slots)."""
+        """Return the states after every event of one device's tiles, (tiles, slots)."""
         frame = frame_model(tiles.points)
         events = Event(
             jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity), frame
         )
-        place = LaneBlock(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
+        block = LaneBlock(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
-        return _path(self, params, events, lanes, place)
+        return _filter_lanes(self, params, events, lanes, block)
 
     def read(self, params: P, trajectory: Trajectory, out: ReadOut) -> Estimate:
         out = out.at_dead_time(params.rho_ref)
@@ -267,17 +297,17 @@ class Filter(PixelEstimator[P]):
         since, frame = jnp.asarray(out.since), trajectory.frame_model(out.points)
 
         frame = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, since.shape), frame)
-        one = functools.partial(self.image, params)
+        one = functools.partial(self.predict_image, params)
         over_images = jax.vmap(jax.vmap(one), (0 if trajectory.path is not None else None, 0, 0))
         image, P = over_images(before, since, frame)
         return Estimate(image, P, jnp.isfinite(image))
 
 
-def _over_tiles(step: Callable, lanes: Any, place: LaneBlock, slots: Any) -> Any:
+def _scan_tiles(step: Callable, lanes: Any, block: LaneBlock, slots: Any) -> Any:
     """Scan the tiles in order, and in each its ranks: `step(lanes, slots) -> lanes, output`.
 
-    `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots). Of
-    tiles shared out among devices each has an equal share of the lanes of every block of `LANES`.
+    `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots). On
+    several devices each has an equal part of the lanes of every block of `LANES`.
     """
     share = SLOTS // jax.tree.leaves(slots)[0].shape[1]
     shapes = [(ranks, width // share) for ranks, width in SHAPES]
@@ -286,7 +316,7 @@ def _over_tiles(step: Callable, lanes: Any, place: LaneBlock, slots: Any) -> Any
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:
         tile = jax.tree.map(lambda v: v.reshape(ranks, width), tile)
         mine = jax.tree.map(lambda s: s[:width], lanes)
-        end, out = lax.scan(step, mine, tile, unroll=loop_unroll(UNROLLED))
+        end, out = lax.scan(step, mine, tile, unroll=loop_unroll(UNROLLED_RANKS))
         lanes = jax.tree.map(lambda s, e: jnp.concatenate([e, s[width:]]), lanes, end)
         return lanes, jax.tree.map(jnp.ravel, out)
 
@@ -306,22 +336,22 @@ def _over_tiles(step: Callable, lanes: Any, place: LaneBlock, slots: Any) -> Any
         lanes = jax.tree.map(lambda s, e: lax.dynamic_update_slice(s, e, (lane,)), lanes, end)
         return lanes, out
 
-    return lax.scan(body, lanes, (place, slots))[1]
+    return lax.scan(body, lanes, (block, slots))[1]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _path(method: Filter, params: Any, events: Event, lanes: Any, place: LaneBlock) -> Any:
-    """The states after every event, (tiles, slots), from those of lanes, (lanes,)."""
+def _filter_lanes(method: Filter, params: Any, events: Event, lanes: Any, block: LaneBlock) -> Any:
+    """Return the states after every event, (tiles, slots), from those of lanes, (lanes,)."""
 
     def step(at: Any, event: Event) -> tuple[Any, Any]:
-        at = _each(method, params, at, event)
+        at = _step_all(method, params, at, event)
         return at, at
 
-    return _over_tiles(step, lanes, place, events)
+    return _scan_tiles(step, lanes, block, events)
 
 
-def _each(method: Filter, params: Any, at: Any, event: Event) -> Any:
-    """The filter's step, mapped over all axes of states and events."""
+def _step_all(method: Filter, params: Any, at: Any, event: Event) -> Any:
+    """Map the filter's step over all axes of states and events."""
     step = functools.partial(method.step, params)
     for _ in range(event.since.ndim):
         step = jax.vmap(step)
@@ -334,26 +364,26 @@ def _each(method: Filter, params: Any, at: Any, event: Event) -> Any:
 # this linear recursion is left to be scanned; it transposes to the adjoint one. Derivatives of the
 # scan itself keep and move what each step computed: reverse mode took 1.2 s where this takes 0.6 s
 # for 5 M events (two cores), next to 0.05 s for the states.
-@_path.defjvp
-def _path_jvp(method: Filter, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-    params, events, lanes, place = primals
+@_filter_lanes.defjvp
+def _filter_lanes_jvp(method: Filter, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    params, events, lanes, block = primals
     d_params, d_events, d_lanes, _ = tangents
 
     def step(at: Any, event: Event) -> tuple[Any, tuple[Any, Any]]:
-        after = _each(method, params, at, event)
+        after = _step_all(method, params, at, event)
         return after, (at, after)
 
-    before, path = _over_tiles(step, lanes, place, events)
+    before, path = _scan_tiles(step, lanes, block, events)
     # Counters and flags of a state have no derivative: only its real leaves are followed.
     real, rest = eqx.partition(before, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(real)
 
     def by_state(*leaves: Array) -> list[Array]:
         at = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
-        return _real(_each(method, params, at, events))
+        return _real(_step_all(method, params, at, events))
 
     def by_rest(params: Any, frame: Observation) -> list[Array]:
-        return _real(_each(method, params, before, dataclasses.replace(events, frame=frame)))
+        return _real(_step_all(method, params, before, dataclasses.replace(events, frame=frame)))
 
     zero, one = (tuple(full(leaf) for leaf in leaves) for full in (jnp.zeros_like, jnp.ones_like))
     columns = [
@@ -371,7 +401,7 @@ def _path_jvp(method: Filter, primals: tuple, tangents: tuple) -> tuple[Any, Any
         return after, after
 
     def recursion(d_lanes: list[Array], pushed: list[Array]) -> list[Array]:
-        return _over_tiles(linear, d_lanes, place, (columns, pushed))
+        return _scan_tiles(linear, d_lanes, block, (columns, pushed))
 
     return path, _as_tangent(path, _linear(recursion, _real_tangents(lanes, d_lanes), pushed))
 
@@ -388,18 +418,18 @@ def _linear(function: Callable, *arguments: Any) -> Any:
 
 
 def _real(state: Any) -> list[Array]:
-    """The leaves of a state that have derivatives."""
+    """Return the leaves of a state that have derivatives."""
     return jax.tree.leaves(eqx.filter(state, eqx.is_inexact_array))
 
 
 def _real_tangents(state: Any, tangent: Any) -> list[Array]:
-    """The tangents of those leaves."""
+    """Return the tangents of the leaves of a state that have derivatives."""
     pairs = zip(jax.tree.leaves(state), jax.tree.leaves(tangent), strict=True)
     return [d for leaf, d in pairs if eqx.is_inexact_array(leaf)]
 
 
 def _as_tangent(state: Any, real: list[Array]) -> Any:
-    """A tangent of a state from those of its real leaves; the others have none (float0)."""
+    """Make a tangent of a state from those of its real leaves; others have none (float0)."""
     leaves, tree = jax.tree.flatten(state)
     following = iter(real)
     return jax.tree.unflatten(

@@ -308,7 +308,7 @@ def make_segments(
     for row, edges in enumerate(np.stack(clock.edges(used), axis=1)):
         i, middle, j = (int(np.searchsorted(stream.t, edge)) for edge in edges)
         if i < j:
-            part = stream.part(i, j)._replace(t=stream.t[i:j] - clock.origin)
+            part = stream.section(i, j)._replace(t=stream.t[i:j] - clock.origin)
             count = np.zeros_like(counts.base.start)
             parts.append(_cut_exposure(part, weight[i:j], middle - i, row, exact[row], count))
     total = sum(len(part[0]) for part in parts)

@@ -1,7 +1,7 @@
 """The asynchronous Kalman filter (Wang et al., ICCV 2021), equations corrected.
 
-Per pixel: the state is the log intensity L with variance P. Events move L by their threshold and
-add noise Q; between events the augmented frame L^A, believed with variance density R, pulls L.
+The state of a pixel is the log intensity L with variance P. Events move L by their threshold and
+add noise Q. Between events the augmented frame L^A, of variance density R, pulls L.
 """
 
 import jax
@@ -80,11 +80,18 @@ MAX_LOG_BIAS = 0.5  # ln I; the expansion holds for small noise
 
 
 def noise_bias(params: Params, frames: FrameFeatures) -> Float[Array, "frames pixels"]:
-    """What is added to the log intensity of frames: `log_bias` Rbar / (2 (I + I0)^2), (6).
+    """Return the correction of the log intensity of frames for noise, (6).
 
-    Of a noisy I with the variance V the log is too low by V / (2 (I + I0)^2) on average, to second
-    order; V is the density Rbar times the frame rate. (6) subtracts Rbar / (2 (I + I0)^2) "to
-    compensate", which doubles what it means to undo. At most `MAX_LOG_BIAS` is added.
+    It is `log_bias` Rbar / (2 (I + I0)^2). Of a noisy I with the variance V the log is too low by
+    V / (2 (I + I0)^2) on average, to second order; V is the density Rbar times the frame rate. (6)
+    subtracts Rbar / (2 (I + I0)^2) "to compensate", which doubles what it means to undo.
+
+    Args:
+        params: `log_bias`, Hz, `kappa` and the parameters of the certainty.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), ln I, at most `MAX_LOG_BIAS` in size.
     """
     Rbar = 1 / (params.kappa * effective_certainty(params, frames))
     bias = params.log_bias * Rbar / (2 * (jnp.asarray(frames.intensity) + params.I0) ** 2)
@@ -92,7 +99,7 @@ def noise_bias(params: Params, frames: FrameFeatures) -> Float[Array, "frames pi
 
 
 class AugmentedFrameModel(FrameModel):
-    """L^A, and 1/R with R = Rbar / (I + I0)^2, Rbar and I linear between frames (4), (5), (7).
+    """L^A with 1/R, R = Rbar / (I + I0)^2, Rbar and I linear between frames (4), (5), (7).
 
     Paper (4) writes sigma_im^2 = 7e5 as a multiplier; it is the reciprocal of the density.
     Paper (7) prints a factor 2 in the denominator; Var ln(I + I0) = Var I / (I + I0)^2.
@@ -150,14 +157,32 @@ class AugmentedFrameModel(FrameModel):
 
 
 def init(params: Params, level: Array) -> PixelState:
+    """Return the state at the recording's start.
+
+    Args:
+        params: Variance `P0`, (ln I)^2.
+        level: Log intensity of the frames, ln I.
+
+    Returns:
+        The state.
+    """
     return PixelState(level, jnp.broadcast_to(params.P0, level.shape))
 
 
 def predict(params: Params, state: PixelState, dt: Array, frame: Observation) -> PixelState:
-    """Towards the augmented frame over dt: (18) and (16).
+    """Pull the state towards the augmented frame over a time without events: (18) and (16).
 
     The line before (17) of the paper must read P' = -P^2 / R + Q. One-sided evidence of clipped
     frames acts like a frame at the bound while the state lies on its wrong side.
+
+    Args:
+        params: Parameters; not used.
+        state: State of a pixel.
+        dt: Time, s.
+        frame: Log intensity and 1/R of the augmented frame, held over `dt`.
+
+    Returns:
+        The state dt later.
     """
     rate, u = frame.rate, frame.level
     if frame.push is not None:
@@ -171,17 +196,32 @@ def predict(params: Params, state: PixelState, dt: Array, frame: Observation) ->
 
 
 def process_noise(params: Params, event: Event) -> Array:
-    """Q of an event (2): process, isolated-pixel and refractory-period noise."""
+    """Return Q of an event (2): process, isolated-pixel and refractory-period noise.
+
+    Args:
+        params: Standard deviations of the three.
+        event: The event.
+
+    Returns:
+        Q, (ln I)^2.
+    """
     Q_proc = params.sigma_proc**2 * event.since
     Q_iso = params.sigma_iso**2 * event.near
     return Q_proc + Q_iso + params.sigma_ref**2 * refractory_indicator(params, event.since)
 
 
 def refractory_indicator(params: Params, since: Array) -> Array:
-    """1 within the bound rho on the refractory period, 0 after it.
+    """Return 1 within the bound rho on the refractory period, 0 after it.
 
-    The comparison has no derivative by rho; with a width the step is relaxed to
-    1 / (1 + (dt / rho)^(1 / width)), which has.
+    The comparison has no derivative by rho. With a width the step is relaxed to
+    1 / (1 + (dt / rho)^(1 / width)), which has one.
+
+    Args:
+        params: `rho`, s, and `rho_width`, of ln time.
+        since: Time since the pixel's last event, s.
+
+    Returns:
+        The indicator, 0 to 1.
     """
     sharp = params.rho_width == 0
     steepness = 1 / jnp.where(sharp, 1, params.rho_width)
@@ -192,7 +232,16 @@ def refractory_indicator(params: Params, since: Array) -> Array:
 
 
 def event_update(params: Params, state: PixelState, event: Event) -> PixelState:
-    """At an event: L moves by the nominal threshold (14), P grows by Q (19)."""
+    """Add an event: L moves by the nominal threshold (14), P grows by Q (19).
+
+    Args:
+        params: Thresholds and noises.
+        state: State just before the event.
+        event: The event; with polarity 0 the state stays.
+
+    Returns:
+        The state after the event.
+    """
     L = state.L + event_change(params, event.polarity, event.since)
     return PixelState(L, state.P + jnp.where(event.polarity == 0, 0, process_noise(params, event)))
 

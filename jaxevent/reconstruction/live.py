@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.tail import Tail
@@ -23,10 +24,12 @@ from jaxevent.reconstruction.video import PixelMethod, Video
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
 WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
+MAX_HELD_FRAMES = 32  # before what is settled is dropped
 
 
+@renamed_methods(dropping="drop_before", grown="append")
 class TailImages:
-    """An `ImageSource` of which only the last images are held."""
+    """An `ImageSource` that holds the last images only."""
 
     def __init__(self, images: NDArray, dropped: int = 0):
         self.images, self.dropped = images, dropped
@@ -42,20 +45,29 @@ class TailImages:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         raise IndexError("frames that are gone cannot be read")
 
-    def grown(self, image: NDArray) -> "TailImages":
+    def append(self, image: NDArray) -> "TailImages":
+        """Return the images with one more at the end."""
         return TailImages(np.concatenate([self.images, image[None]]), self.dropped)
 
-    def dropping(self, row: int) -> "TailImages":
+    def drop_before(self, row: int) -> "TailImages":
+        """Return the images without those before a row."""
         return TailImages(self.images[max(row - self.dropped, 0) :].copy(), row)
 
 
 class LiveVideo:
     """Images of all that has been added so far: `image, variance, valid = live(times)`.
 
-    `add` takes events and `add_frame` frames, each in order of time. With `frames` a moment is
-    settled when the second frame after it, and the events of its exposure, have come: until then
-    images between frames may change, as those of a recording that ends there do. One thread may add
-    what another reads.
+    With frames a moment is settled when the second frame after it, and the events of its exposure,
+    have come. Until then images between frames may change, as those of a recording that ends there
+    do. One thread may add while another reads.
+
+    Args:
+        estimator: The method.
+        size: Width and height of the sensor, px.
+        params: Its parameters.
+        frames: Whether frames will come.
+        window_events: Events that are filtered together.
+        extra: Further arrays of a recording, for a camera response.
     """
 
     def __init__(
@@ -73,7 +85,7 @@ class LiveVideo:
         self._turns = TurnLock("live images")
         self._recording = Recording("live", *size, Tail(*size), extra=extra or {})
         self._video: Video | None = None
-        self._grown = False
+        self._changed = False
 
     @property
     def _events(self) -> Tail:
@@ -90,7 +102,7 @@ class LiveVideo:
     @property
     @synchronized
     def start(self) -> int:
-        """The first time (us) of which images can still be had."""
+        """First time (us) of which images can still be read."""
         self._check()
         settled = None if self._video is None else self._video.settled
         return self._recording.start if settled is None else settled
@@ -98,7 +110,7 @@ class LiveVideo:
     @property
     @synchronized
     def stop(self) -> int:
-        """The time (us) of the last event or frame."""
+        """Time (us) of the last event or frame."""
         self._check()
         return self._recording.stop
 
@@ -106,12 +118,21 @@ class LiveVideo:
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
         self._events.add(events)
-        self._grown = True
+        self._changed = True
         self._settle()
 
     @synchronized
     def add_frame(self, time: Times, image: NDArray, exposure: int | float = 0) -> None:
-        """Add a frame (H, W): mid-exposure time and length of the exposure, us or s."""
+        """Add a frame.
+
+        Args:
+            time: Mid-exposure, integer us or float s, after the frame before.
+            image: (H, W), whole numbers or floats in [0, 1].
+            exposure: Length of the exposure, integer us or float s; 0 if unknown.
+
+        Raises:
+            InputError: No frames were expected, or the frame is not valid or not later.
+        """
         if not self._expects_frames:
             raise InputError("frames were not expected; make the live video with frames=True")
         r, t = self._recording, int(microseconds(time))
@@ -131,16 +152,16 @@ class LiveVideo:
             assert isinstance(known.images, TailImages)
             frames = Frames(
                 np.append(known.t, t),
-                known.images.grown(np.asarray(image)),
+                known.images.append(np.asarray(image)),
                 np.append(known.exposure, one.exposure),
             )
         self._recording = dataclasses.replace(r, frames=frames)
-        self._grown = True
+        self._changed = True
         self._settle()
 
     @synchronized
     def __call__(self, times: Times) -> Estimate:
-        """Images at `times`, from `start` to `stop`, as `Video` gives them."""
+        """Return the images at `times`, from `start` to `stop`, as `Video` does."""
         us = np.atleast_1d(microseconds(times))
         start, stop = self.start, self.stop
         if len(us) and not start <= us.min() <= us.max() <= stop:
@@ -148,43 +169,43 @@ class LiveVideo:
                 f"images from {us.min()} to {us.max()} us were asked for; those from {start} to "
                 f"{stop} us can be had, earlier ones are forgotten and later ones not known"
             )
-        return self._following()(us)
+        return self._updated_video()(us)
 
     def _check(self) -> None:
         if not len(self._events) and self._recording.frames is None:
             raise InputError("nothing has been added yet; add events or a frame first")
 
-    def _following(self) -> Video:
-        """The video of all that has been added."""
+    def _updated_video(self) -> Video:
+        """Return the video of all that has been added."""
         if self._video is None:
             self._video = Video(
                 self.estimator, self._recording, self.params,
                 window_events=self.window_events, progress=False,
             )  # fmt: skip
-        elif self._grown:
-            self._video.grow(self._recording)
-        self._grown = False
+        elif self._changed:
+            self._video.extend(self._recording)
+        self._changed = False
         return self._video
 
     def _settle(self) -> None:
-        """Filter what can no longer change, once it is a window's worth, and forget it."""
+        """Filter events that no addition changes, once they are a window's worth, and drop them."""
         tail, frames = self._events, self._recording.frames
         waiting = tail.count - tail.dropped
-        pictures = 0
+        held_frames = 0
         if frames is not None and isinstance(frames.images, TailImages):
-            pictures = len(frames.images.images)
-        if waiting < 2 * self.window_events and pictures < 32:
+            held_frames = len(frames.images.images)
+        if waiting < 2 * self.window_events and held_frames < MAX_HELD_FRAMES:
             return
         if self._expects_frames and (frames is None or len(frames) < 3):
             return
-        video = self._following()
+        video = self._updated_video()
         row, first_frame = video.settle(self._expects_frames)
         if row > tail.dropped:
             tail.drop(row)
         if frames is not None and isinstance(frames.images, TailImages):
             if first_frame > frames.images.dropped:
-                images = frames.images.dropping(first_frame)
+                images = frames.images.drop_before(first_frame)
                 self._recording = dataclasses.replace(
                     self._recording, frames=dataclasses.replace(frames, images=images)
                 )
-                self._grown = True
+                self._changed = True

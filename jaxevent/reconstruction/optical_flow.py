@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import Response
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
@@ -23,16 +24,16 @@ from jaxevent.reconstruction.frames import Clock, FrameImages, Timing
 from jaxevent.reconstruction.video import BATCH, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 
-SMALLEST = 12  # pixels that OpenCV's search needs in width or height
-OUTLIERS = 1e-3  # of the greys of two frames, at either end, that do not set the range
+MIN_SIDE_PX = 12  # pixels that OpenCV's search needs in width or height
+OUTLIER_FRACTION = 1e-3  # of the greys of two frames, at either end, that do not set the range
 
 
 class Params(FrameParams):
-    """Parameters of `flow`; of them only `clock_offset` acts."""
+    """Parameters of `flow`, of which `clock_offset` alone acts."""
 
 
 class FrameSeries(ShortRepr):
-    """Frames in time: what `run` is given."""
+    """Frames in time, the features that `run` takes."""
 
     mid: NDArray[np.floating]  # (frames,), mid-exposures, us from the recording's start
     grey: NDArray[np.floating]  # (frames, H, W), in [0, 1]
@@ -41,36 +42,36 @@ class FrameSeries(ShortRepr):
     response: Response
 
 
-class Moments(NamedTuple):
-    """What `read` is given: the frames before times, and how far these are to the next."""
+class ImageTimes(NamedTuple):
+    """Times of images among the frames, prepared for `read`."""
 
     frame: NDArray[np.int64]
     share: NDArray[np.floating]
 
 
-class Pair(NamedTuple):
-    """Two frames that follow each other (H, W), and the flows (H, W, 2) there and back, pixels."""
+class FramePair(NamedTuple):
+    """Two successive frames (H, W), and the flows (H, W, 2) from each to the other, px."""
 
     before: NDArray[np.floating]
     after: NDArray[np.floating]
-    there: NDArray[np.float32]
-    back: NDArray[np.float32]
+    forward: NDArray[np.float32]
+    backward: NDArray[np.float32]
 
     def at(self, share: float | int) -> NDArray[np.floating]:
-        """The image at that share of the time from one to the other."""
+        """Return the image at a fraction `share` of the time from one frame to the other."""
         s = float(share)
         if s == 0:
             return self.before
-        moved = _warp(self.before, s * self.there), _warp(self.after, (1 - s) * self.back)
+        moved = _warp(self.before, s * self.forward), _warp(self.after, (1 - s) * self.backward)
         return (1 - s) * moved[0] + s * moved[1]
 
     def flow(self, share: float | int) -> NDArray[np.floating]:
-        """The flow (H, W, 2) at that time, pixels from the one frame to the other."""
-        return (1 - share) * self.there - share * self.back
+        """Return the flow (H, W, 2) at a fraction of the time, px from frame to frame."""
+        return (1 - share) * self.forward - share * self.backward
 
 
 def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.floating]:
-    """The image with every pixel fetched from where the flow at it comes from."""
+    """Sample an image at the source of the flow of every pixel."""
     cv2 = require("cv2", "vision")
     y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
     return cv2.remap(
@@ -78,52 +79,51 @@ def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.
     )
 
 
-def make_pair(frames: FrameSeries, first: int) -> Pair:
-    """The frames `first` and `first + 1`, and the flows between them."""
+def make_pair(frames: FrameSeries, first: int) -> FramePair:
+    """Find the flows between a frame and the next.
+
+    Args:
+        frames: Frames in time.
+        first: Index of the first of the two.
+
+    Returns:
+        The two frames with the flows.
+    """
     cv2 = require("cv2", "vision")
     two = slice(first, first + 2)
     one, other = _levels(frames.grey[two], frames.intensity[two], frames.gain[two], frames.response)
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     there, back = search.calc(one, other, None), search.calc(other, one, None)
-    return Pair(frames.intensity[first], frames.intensity[first + 1], there, back)
+    return FramePair(frames.intensity[first], frames.intensity[first + 1], there, back)
 
 
 def _levels(
     grey: NDArray, intensity: NDArray, gain: NDArray, response: Response
 ) -> NDArray[np.uint8]:
-    """Two frames in the 256 levels that the search takes.
+    """Scale two frames to the 256 levels that the search takes.
 
     The search weighs gradients against thresholds and a smoothness that are made for levels of a
-    well exposed picture, and 256 levels of which frames use a few tell no motion below a pixel. So
-    the range of the two frames, but for a few outliers such as hot pixels, is spread over all
-    levels; the same for both, since flow follows points of one brightness. The range of the whole
-    recording would be that of its brightest moment, and known only at its end. Frames of different
-    gain are brought to the lower one, at which neither clips anew. Levels are grey values rather
-    than intensities: these would leave few for what is dark.
+    well exposed picture. Frames that use a few of 256 levels show no motion below a pixel. So the
+    range of the two frames, but for a few outliers such as hot pixels, is spread over all levels.
+    The range is common to both, as flow follows points of one brightness. Frames of different gain
+    are brought to the lower one, at which neither clips anew. Levels are grey values rather than
+    intensities, which would leave few levels for dark parts.
     """
     if gain[0] != gain[1]:
         grey = np.asarray(response.grey(jnp.asarray(intensity * gain.min())))
-    low, high = np.quantile(grey, [OUTLIERS, 1 - OUTLIERS])
+    low, high = np.quantile(grey, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION])
     spread = 255 / (high - low) if high > low else 0.0
     return np.rint(((grey - low) * spread).clip(0, 255)).astype(np.uint8)
 
 
-class _Frames:
-    """A recording's frames, read a few at a time."""
-
-    def __init__(self, recording: Recording, clock: Clock):
-        self.recording, self.mid = recording, clock.mid
-        self._images = FrameImages(recording, np.dtype(jnp.result_type(float)))
-
-    def read(self, used: slice) -> FrameSeries:
-        """Frames `used` as a series."""
-        number = used.stop - used.start
-        shape = (number, self.recording.height, self.recording.width)
-        grey, intensity, _, gain = self._images.read(used, number)
-        response = self.recording.response
-        return FrameSeries(
-            self.mid[used], grey.reshape(shape), intensity.reshape(shape), gain, response
-        )
+def _read_frames(images: FrameImages, clock: Clock, used: slice) -> FrameSeries:
+    """Read a range of frames as a series."""
+    recording, n = images.recording, used.stop - used.start
+    shape = (n, recording.height, recording.width)
+    grey, intensity, _, gain = images.read(used, n)
+    return FrameSeries(
+        clock.mid[used], grey.reshape(shape), intensity.reshape(shape), gain, recording.response
+    )
 
 
 class FlowVideo(ImageSequence[Params]):
@@ -143,80 +143,89 @@ class FlowVideo(ImageSequence[Params]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._clock = Clock.of(recording, Timing.of(params))
-        self._frames = _Frames(recording, self._clock)
         self._dtype = np.dtype(jnp.result_type(float))
-        self._pair: tuple[int, Pair] | None = None  # with the number of its first frame
+        self._images = FrameImages(recording, self._dtype)
+        self._pair: tuple[int, FramePair] | None = None  # with the number of its first frame
 
     @property
     def dtype(self) -> np.dtype:
         return self._dtype
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
-        moments = _moments(self._clock, times)
+        located = _locate(self._clock, times)
         for first in range(0, len(times), BATCH):
             batch = slice(first, first + BATCH)
-            places = zip(moments.frame[batch], moments.share[batch], strict=True)
+            places = zip(located.frame[batch], located.share[batch], strict=True)
             images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)
 
     @synchronized
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
-        """The flow (T, H, W, 2) in px/s, x before y, at times as images are asked for; any order.
+        """Return the flow at times, along which images are made.
 
-        It is that along which images are made. Outside the frames nothing is known to move: NaN.
+        Args:
+            times: Integers (us) or floats (s), in any order.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            (T, H, W, 2) px/s, x before y; NaN outside the frames.
+
+        Raises:
+            InputError: A time is not finite, or outside the recording.
         """
         times = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.estimator.check_span(self.recording, times, self.params)
-        moments = _moments(self._clock, times)
+        located = _locate(self._clock, times)
         shape = (len(times), self.recording.height, self.recording.width, 2)
         flows = np.full(shape, np.nan, self._dtype)
         since = times - self._clock.origin
         for row in np.argsort(times, kind="stable"):
-            frame = int(moments.frame[row])
+            frame = int(located.frame[row])
             if self._clock.mid[0] <= since[row] and frame + 1 < len(self._clock):
                 seconds = float(self._clock.mid[frame + 1] - self._clock.mid[frame]) * 1e-6
-                flows[row] = self._between(frame).flow(float(moments.share[row])) / seconds
+                flows[row] = self._between(frame).flow(float(located.share[row])) / seconds
         return flows
 
     def _image(self, frame: int, share: float) -> NDArray[np.floating]:
         if share == 0:
-            return self._frames.read(slice(frame, frame + 1)).intensity[0]
+            return _read_frames(self._images, self._clock, slice(frame, frame + 1)).intensity[0]
         return self._between(frame).at(share)
 
-    def _between(self, frame: int) -> Pair:
+    def _between(self, frame: int) -> FramePair:
         if self._pair is None or self._pair[0] != frame:
-            self._pair = frame, make_pair(self._frames.read(slice(frame, frame + 2)), 0)
+            two = _read_frames(self._images, self._clock, slice(frame, frame + 2))
+            self._pair = frame, make_pair(two, 0)
         return self._pair[1]
 
 
-def _moments(clock: Clock, times: NDArray[np.int64]) -> Moments:
+def _locate(clock: Clock, times: NDArray[np.int64]) -> ImageTimes:
     _, frame, _, share = clock.locate(times - clock.origin)
-    return Moments(frame, share)
+    return ImageTimes(frame, share)
 
 
 def _estimate(images: NDArray[np.floating]) -> Estimate:
     return Estimate(images, np.full_like(images, np.nan), np.isfinite(images))
 
 
-class Flows(ShortRepr):
-    """The trajectory: frames, and the flows (H, W, 2) from each to the next and back, pixels."""
+class FlowTrajectory(ShortRepr):
+    """Frames, and the flows (H, W, 2) from each to the next and back, px: the trajectory."""
 
     frames: FrameSeries
-    pairs: list[Pair]
+    pairs: list[FramePair]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Flow(ImageEstimator[Params]):
-    """The estimator of this module."""
+    """Interpolation along the optical flow of the frames."""
 
     def check(self, recording: Recording) -> None:
-        """Raise `InputError` without frames, for tiny ones and where the extra is missing."""
+        """Raise `InputError` without frames, for tiny ones and without the extra `vision`."""
         super().check(recording)
-        if max(recording.width, recording.height) < SMALLEST:
+        if max(recording.width, recording.height) < MIN_SIDE_PX:
             raise InputError(
                 f"{recording.name}: {recording.width}x{recording.height} pixels are too few for "
-                f"optical flow; {SMALLEST} in one direction are needed, or the method 'blend'"
+                f"optical flow; {MIN_SIDE_PX} in one direction are needed, or the method 'blend'"
             )
         require("cv2", "vision")
 
@@ -227,27 +236,57 @@ class Flow(ImageEstimator[Params]):
         params: Params | None = None,
         *,
         extrapolate: bool = False,
-    ) -> tuple[FrameSeries, Moments]:
-        """All frames of a recording, and where sorted `times` lie among them.
+    ) -> tuple[FrameSeries, ImageTimes]:
+        """Read all frames of a recording, and find times among them.
 
-        Raises `InputError` as `check`, and for times outside the recording unless told to
-        `extrapolate`.
+        Args:
+            recording: The recording.
+            times: Sorted times, integers in us or floats in s.
+            params: Parameters; the defaults if None.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            The frames, and the times among them.
+
+        Raises:
+            InputError: As `check`, and for times outside the recording.
         """
         self.check(recording)
         params = self.Params() if params is None else params
         if not extrapolate:
             self.check_span(recording, times, params)
         clock = Clock.of(recording, Timing.of(params))
-        frames = _Frames(recording, clock).read(slice(0, len(clock)))
-        return frames, _moments(clock, np.atleast_1d(microseconds(times)))
+        images = FrameImages(recording, np.dtype(jnp.result_type(float)))
+        frames = _read_frames(images, clock, slice(0, len(clock)))
+        return frames, _locate(clock, np.atleast_1d(microseconds(times)))
 
-    def run(self, params: Params, features: FrameSeries, state: None = None) -> tuple[Flows, None]:
-        """Find the flows between all frames; on the host. Nothing passes from run to run."""
+    def run(
+        self, params: Params, features: FrameSeries, state: None = None
+    ) -> tuple[FlowTrajectory, None]:
+        """Find the flows between all frames, on the host.
+
+        Args:
+            params: Parameters; not used.
+            features: The frames.
+            state: Not used.
+
+        Returns:
+            The trajectory, and None: nothing passes from run to run.
+        """
         pairs = [make_pair(features, first) for first in range(len(features.mid) - 1)]
-        return Flows(features, pairs), None
+        return FlowTrajectory(features, pairs), None
 
-    def read(self, params: Params, trajectory: Flows, out: Moments) -> Estimate:
-        """The images prepared in `out`, each array (times, pixels); on the host."""
+    def read(self, params: Params, trajectory: FlowTrajectory, out: ImageTimes) -> Estimate:
+        """Read images, on the host.
+
+        Args:
+            params: Parameters; not used.
+            trajectory: Frames and flows.
+            out: Times among the frames.
+
+        Returns:
+            The images, each array (times, pixels).
+        """
         images = [
             trajectory.frames.intensity[frame]
             if share == 0
@@ -264,9 +303,19 @@ class Flow(ImageEstimator[Params]):
         progress: bool | None = None,
         **options: Any,
     ) -> FlowVideo:
-        """Images along the frames' flow: `image, variance, valid = estimate(recording)(times)`.
+        """Make images along the frames' flow: `mean, variance, valid = estimate(recording)(times)`.
 
-        Takes the option `progress`. Raises `InputError` as `check`.
+        Args:
+            recording: The recording.
+            params: Parameters; the defaults if None.
+            progress: Show a progress bar; None: if it takes long.
+            **options: None; others raise.
+
+        Returns:
+            Images as a function of time.
+
+        Raises:
+            InputError: As `check`.
         """
         self.refuse_unknown(options)
         chosen = self.Params() if params is None else params
@@ -283,3 +332,5 @@ flow = Flow(
     about="The frames before and after, each moved along the optical flow between them (dense "
     "inverse search), blended by time; no events. Needs the extra `vision`.",
 )
+
+__getattr__ = renamed_names(__name__)

@@ -1,20 +1,19 @@
-"""The smoother: what all frames and events of a recording say about a pixel, before and after.
+"""The asynchronous Kalman smoother: a pixel's log intensity from all frames and events.
 
 A pixel's log intensity L is a random walk with known steps: an event moves it by s c and adds the
 variance (sigma_event c)^2, time adds sigma_bg^2 per second. Each frame measures it, deblurred, at
-mid-exposure, with variance r = (sigma_frame / w)^2 / (I + I0)^2 + sigma_floor^2. A clipped pixel of
-a frame is no measurement; it says only that L lies beyond the clip (one-sided evidence, a truncated
-Gaussian whose first two moments are kept).
+mid-exposure, with variance r = (sigma_frame / w)^2 / (I + I0)^2 + sigma_floor^2. A clipped pixel is
+a censored measurement: L lies beyond the clip (a truncated Gaussian, whose first two moments are
+kept).
 
 Between two of its events a pixel's intensity moves by less than a threshold, unseen. Events around
-it tell of that: of every event the part `share` belongs to the eight neighbours (on slider_depth
-the changes between frames have a quarter less error so, and hidden frames too).
+it are evidence of that: the fraction `share` of every event belongs to the eight neighbours.
 
 Between frames nothing but sums over events matters, so the recursions pass over frames, not events.
-Forward (Kalman filter) it carries mean and variance (m, P); backward (information filter) what
-later frames say, h and J: exp(h L - J L^2 / 2). Both together give mean and variance at any time,
-and the innovations of the forward pass the exact marginal likelihood of the frames, which needs no
-reference: all parameters can be fitted with it.
+Forward (Kalman filter) they carry mean and variance (m, P). Backward (information filter) they
+carry the message of later frames, h and J: exp(h L - J L^2 / 2). Both together give mean and
+variance at any time. The innovations of the forward pass give the exact marginal likelihood of the
+frames, which needs no reference: all parameters can be fitted with it.
 """
 
 import dataclasses
@@ -46,11 +45,8 @@ from jaxevent.reconstruction.augment import (
     segment_excess,
     unclipped_weight,
 )
-from jaxevent.reconstruction.engine.images import prepared_by_kernel
-from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
-from jaxevent.reconstruction.engine.smoothed_images import DividedFrames
-from jaxevent.reconstruction.engine.video import video_by_kernel
-from jaxevent.reconstruction.estimator import PixelEstimator, PreparedImages
+from jaxevent.reconstruction.engine.images import SmootherImages, SmootherVideo
+from jaxevent.reconstruction.estimator import KernelEstimator
 from jaxevent.reconstruction.features import (
     Features,
     FrameFeatures,
@@ -58,8 +54,6 @@ from jaxevent.reconstruction.features import (
     Numeric,
     ReadOut,
 )
-from jaxevent.reconstruction.video import ImageSequence, Video
-from jaxevent.recording import Recording, Times
 
 
 class Params(CertaintyParams):
@@ -103,13 +97,21 @@ class Gaussian(eqx.Module):
 
 
 class Message(eqx.Module):
-    """What later frames say about the log intensity L of pixels: exp(h L - J L^2 / 2)."""
+    """Likelihood exp(h L - J L^2 / 2) of later frames, given the log intensity L of pixels."""
 
     h: Float[Numeric, "*pixels"]
     J: Float[Numeric, "*pixels"]
 
     def propagate_back(self, S: Array, q: Array) -> "Message":
-        """The same about L before it moved by S with variance q."""
+        """Return the message about L before it moved.
+
+        Args:
+            S: Move, ln I.
+            q: Variance of the move, (ln I)^2.
+
+        Returns:
+            The message.
+        """
         fade = 1 / (1 + q * self.J)
         return Message((self.h - self.J * S) * fade, self.J * fade)
 
@@ -119,9 +121,11 @@ class Message(eqx.Module):
 
 @renamed_methods(before="apply", then="compose")
 class MessageMap(eqx.Module):
-    """How a message after several frames becomes one before them (Sarkka & Garcia-Fernandez 2021).
+    """Map from the message after several frames to the one before them (Sarkka & Garcia-Fernandez
+    2021).
 
     h' = h + A (h_later - J_later b) / (1 + C J_later), J' = J + A^2 J_later / (1 + C J_later).
+    Maps compose; they are elements of an associative scan.
     """
 
     A: Float[Numeric, "*pixels"]
@@ -131,7 +135,7 @@ class MessageMap(eqx.Module):
     J: Float[Numeric, "*pixels"]
 
     def compose(self, after: "MessageMap") -> "MessageMap":
-        """Both links in one, this one being the earlier."""
+        """Compose this map with that of the frames after its own."""
         D = 1 + self.C * after.J
         return MessageMap(
             self.A * after.A / D,
@@ -142,6 +146,7 @@ class MessageMap(eqx.Module):
         )
 
     def apply(self, later: Message) -> Message:
+        """Return the message before the frames, from the one after them."""
         D = 1 + self.C * later.J
         return Message(
             self.h + self.A * (later.h - later.J * self.b) / D, self.J + self.A**2 * later.J / D
@@ -149,7 +154,7 @@ class MessageMap(eqx.Module):
 
 
 class FrameMeasurements(eqx.Module):
-    """What frames measure."""
+    """Measurements of the log intensity by frames, some of them censored."""
 
     z: Float[Array, "*frames pixels"]  # deblurred log intensity
     r: Float[Array, "*frames pixels"]  # its variance
@@ -160,7 +165,7 @@ class FrameMeasurements(eqx.Module):
 
 
 class FrameSteps(eqx.Module):
-    """The frames of a window as measurements, and the steps from each to the next."""
+    """The frames of a window as measurements, with the steps from each to the next."""
 
     measured: FrameMeasurements
     S: Float[Array, "frames pixels"]  # sum of s c until the next frame
@@ -169,13 +174,15 @@ class FrameSteps(eqx.Module):
 
 @runtime_checkable
 class CensoredPixels(Protocol):
-    """Clipped pixels, as `FrameSteps` has them."""
+    """Clipped pixels, a part of `FrameMeasurements`."""
 
     @property
-    def side(self) -> Any: ...
+    def side(self) -> Any:
+        """+1, -1: L lies above, below the bound; 0: nothing is known."""
 
     @property
-    def bound(self) -> Any: ...
+    def bound(self) -> Any:
+        """Log intensity at which pixels clip, ln I."""
 
 
 class SmoothedWindow(ShortRepr):
@@ -195,7 +202,17 @@ class SmoothedWindow(ShortRepr):
 def measure_frames(
     params: Params, frames: FrameFeatures, z: Array, exists: Array
 ) -> FrameMeasurements:
-    """Frames as measurements; `z` is the deblurred log intensity."""
+    """Make measurements of frames.
+
+    Args:
+        params: Noise and certainty of frames.
+        frames: The frames.
+        z: (frames, pixels) deblurred log intensity, ln I.
+        exists: (frames, 1) whether a row is a frame rather than spare.
+
+    Returns:
+        The measurements.
+    """
     noise = params.sigma_frame / certainty(params, frames) / (frames.intensity + params.I0)
     clear = unclipped_weight(params, frames)
     side = clipped_side(params, frames) * params.one_sided
@@ -210,14 +227,33 @@ def measure_frames(
 
 
 def change_between(params: Params, on: Array, off: Array, seconds: Array) -> tuple[Array, Array]:
-    """The sum of s c over events, and the variance that they and time add."""
+    """Return the sum of s c over events, and the variance that they and time add.
+
+    Args:
+        params: Thresholds, `sigma_event` and `sigma_bg`.
+        on: Number of ON events.
+        off: Number of OFF events.
+        seconds: Time, s.
+
+    Returns:
+        The change, ln I, and its variance, (ln I)^2.
+    """
     return integrate_counts(params, on, off), added_variance(params, on, off, seconds)
 
 
 def make_frame_steps(
     params: Params, frames: FrameFeatures
 ) -> tuple[FrameSteps, Float[Array, "2 frames pixels"]]:
-    """Measurements and steps; and the counts of ON and OFF events between mid-exposures."""
+    """Make measurements of a window's frames, and the steps between them.
+
+    Args:
+        params: Parameters.
+        frames: The frames.
+
+    Returns:
+        Measurements and steps, and the counts (2, frames, pixels) of ON and OFF events from each
+        mid-exposure to the next.
+    """
     z, counts = jnp.log(frames.intensity + params.I0), frames.span
     if frames.head is not None and frames.tail is not None:
         left, _ = deblur_frames(params, frames)
@@ -235,14 +271,22 @@ def make_frame_steps(
 
 
 def redistribute_images(params: Params, frames: FrameFeatures, counts: Array) -> Array:
-    """Event counts [..., pixels] of which each pixel gives the part `share` to its neighbours.
+    """Give a fraction of every pixel's events to its eight neighbours.
 
     Between two events of a pixel its intensity moves by less than a threshold, unseen; events
-    around it tell of that. At the border the missing neighbours' part stays with the pixel.
+    around it are evidence of that. At the border the missing neighbours' part stays with the pixel.
+
+    Args:
+        params: `share`, the fraction.
+        frames: Frames of the sensor.
+        counts: (..., pixels) event counts.
+
+    Returns:
+        (..., pixels).
     """
     image = counts.reshape(*counts.shape[:-1], -1, frames.width)
 
-    def three(values: Array, axis: int) -> Array:
+    def sum_three(values: Array, axis: int) -> Array:
         rest = [(0, 0)] * values.ndim
         rest[axis] = (1, 1)
         padded = jnp.pad(values, rest)
@@ -250,37 +294,62 @@ def redistribute_images(params: Params, frames: FrameFeatures, counts: Array) ->
         left, middle, right = (lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(3))
         return left + middle + right
 
-    def around(values: Array) -> Array:
-        return three(three(values, values.ndim - 1), values.ndim - 2) - values
+    def neighbours(values: Array) -> Array:
+        return sum_three(sum_three(values, values.ndim - 1), values.ndim - 2) - values
 
-    given = around(jnp.ones(image.shape[-2:], image.dtype)) / 8
-    return redistribute_events(params, image, around(image), given).reshape(counts.shape)
+    given = neighbours(jnp.ones(image.shape[-2:], image.dtype)) / 8
+    return redistribute_events(params, image, neighbours(image), given).reshape(counts.shape)
 
 
 def redistribute_events(params: Params, own: Array, around: Array, given: Array) -> Array:
-    """Events of a pixel of which the part `given` of the neighbours get their share.
+    """Redistribute a pixel's event count: it gives the fraction `params.share` to its neighbours.
 
-    `around` are those of its neighbours.
+    Args:
+        params: `share`.
+        own: Events of the pixel.
+        around: Events of its eight neighbours, summed.
+        given: Fraction of the eight neighbours that lie on the sensor.
+
+    Returns:
+        The count.
     """
     return own + params.share * (around / 8 - given * own)
 
 
 def added_variance(params: Params, on: Array, off: Array, seconds: Array) -> Array:
-    """Variance that a stretch of time adds."""
+    """Return the variance that events and time add.
+
+    Args:
+        params: Thresholds, `sigma_event` and `sigma_bg`.
+        on: Number of ON events.
+        off: Number of OFF events.
+        seconds: Time, s.
+
+    Returns:
+        The variance, (ln I)^2.
+    """
     events = params.c_on**2 * on + params.c_off**2 * off
     return params.sigma_event**2 * events + params.sigma_bg**2 * seconds
 
 
 def one_sided_message(state: Gaussian, row: CensoredPixels, floor: Array) -> tuple[Message, Array]:
-    """One-sided evidence as the message that keeps the first two moments; its log likelihood.
+    """Approximate one-sided evidence by the message that keeps the first two moments.
 
     L is above the bound (side 1) with probability Phi(d), d = (m - bound) / sqrt(P + floor). The
     moments of the truncated Gaussian are m + P lam / s and P - P^2 lam (lam + d) / s^2,
     lam = phi(d) / Phi(d), s^2 = P + floor.
 
     A Gaussian grows back the tail that a truncation took. A pixel that stays clipped would be
-    truncated again at every frame and drift away from the bound without end; so the evidence counts
+    truncated again at every frame and drift away from the bound without end. So the evidence counts
     by the sigmoid of -2 d: fully where the state contradicts it, not where it is known.
+
+    Args:
+        state: State before the frame.
+        row: The frame's censored pixels.
+        floor: Variance of the bound, (ln I)^2.
+
+    Returns:
+        The message, and its log likelihood.
     """
     sign = jnp.sign(row.side)
     s2 = state.P + floor
@@ -298,7 +367,16 @@ def one_sided_message(state: Gaussian, row: CensoredPixels, floor: Array) -> tup
 def frame_update(
     params: Params, state: Gaussian, row: FrameMeasurements
 ) -> tuple[Gaussian, Message, Array]:
-    """The state after a frame, what the frame says, and the log likelihood of that."""
+    """Update the state with a frame's measurement.
+
+    Args:
+        params: `sigma_floor`, ln I.
+        state: State before the frame.
+        row: The frame's measurements.
+
+    Returns:
+        The state after the frame, the frame's message, and the log likelihood of its intensity.
+    """
     # A half clear pixel counts half: its variance is doubled.
     J = row.clear / row.r
     s2 = state.P + row.r
@@ -314,18 +392,27 @@ def frame_update(
 
 
 def init(params: Params) -> Gaussian:
-    """The state before the first frame."""
+    """Return the state before the first frame."""
     mean = jnp.log(params.start + params.I0)
     return Gaussian(mean, jnp.broadcast_to(params.P_start, mean.shape))
 
 
 def state_to_message(state: Gaussian) -> Message:
-    """A state as a message."""
+    """Return a state as a message."""
     return Message(state.m / state.P, 1 / state.P)
 
 
 def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> FrameFeatures:
-    """One frame of one pixel: grey value, intensity and certainty."""
+    """Make one frame of one pixel.
+
+    Args:
+        gain: (1,) exposure relative to the common one.
+        fixed: Further fields of `FrameFeatures`, equal for all frames.
+        **image: Grey value, intensity and certainty, each (1, 1).
+
+    Returns:
+        The frame, without events.
+    """
     none = jnp.zeros((2, 1, 1), gain.dtype)
     return FrameFeatures(
         **image,
@@ -345,15 +432,30 @@ def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> Fr
 
 
 def combine(m: Array, precision: Array, later: Message) -> Gaussian:
-    """What is known from before, with its precision 1 / P, and from later."""
+    """Combine a Gaussian from the past with the message of later frames.
+
+    Args:
+        m: Mean from the past, ln I.
+        precision: Its precision 1 / P.
+        later: Message.
+
+    Returns:
+        The smoothed state.
+    """
     P = 1 / (precision + later.J)
     return Gaussian(m + P * (later.h - later.J * m), P)
 
 
 def filter_forward(params: Params, rows: FrameSteps, state: Gaussian) -> tuple[Any, ...]:
-    """Kalman filter over frames, arrays [frames, pixels].
+    """Run the Kalman filter over frames.
 
-    Returns the states before and after each frame, what each says, and its log likelihood.
+    Args:
+        params: Parameters.
+        rows: Frames, arrays [frames, pixels].
+        state: State before the first frame.
+
+    Returns:
+        The states before and after each frame, its message, and its log likelihood.
     """
 
     def step(at: Gaussian, row: FrameSteps) -> tuple[Gaussian, Any]:
@@ -366,9 +468,16 @@ def filter_forward(params: Params, rows: FrameSteps, state: Gaussian) -> tuple[A
 def filter_backward(
     rows: FrameSteps, said: Message, last: Message, number: Any
 ) -> tuple[Message, Message]:
-    """Information filter over frames: what is said before the first frame, and after each.
+    """Run the information filter backwards over frames.
 
-    `last` is what the last of the `number` frames and all later ones say.
+    Args:
+        rows: Frames, arrays [frames, pixels].
+        said: Messages of the frames.
+        last: Message of the last of the `number` frames and all later ones.
+        number: Number of frames.
+
+    Returns:
+        The message before the first frame, and after each frame.
     """
 
     def step(later: Message, row: Any) -> tuple[Message, Message]:
@@ -382,7 +491,17 @@ def filter_backward(
 
 
 def compose_message_maps(rows: FrameSteps, said: Message, anchor: Any, number: Any) -> MessageMap:
-    """The link from the last of the `number` frames to the frame `anchor`."""
+    """Compose the maps from the last of the `number` frames to the frame `anchor`.
+
+    Args:
+        rows: Frames, arrays [frames, pixels].
+        said: Messages of the frames.
+        anchor: Row of the frame at which the map ends.
+        number: Number of frames.
+
+    Returns:
+        The map.
+    """
 
     def step(link: MessageMap, row: Any) -> tuple[MessageMap, None]:
         i, own, S, q = row
@@ -396,19 +515,28 @@ def compose_message_maps(rows: FrameSteps, said: Message, anchor: Any, number: A
 
 
 def adjacent_counts(
-    params: Params, passage: "SmoothedWindow", points: ImagePoints
+    params: Params, window: "SmoothedWindow", points: ImagePoints
 ) -> tuple[Array, Array, Array, Array]:
-    """ON and OFF events [2, times, pixels] since the frame before and until the frame after.
+    """Count the events since the frame before and until the frame after, at times of images.
 
     Known are those since the left edge of the piece's exposure, or, before the first one, since
-    the window's start. Also the seconds (times, 1) of both stretches.
+    the window's start.
+
+    Args:
+        params: `clock_offset` and `share`.
+        window: The window.
+        points: The images.
+
+    Returns:
+        ON and OFF events since the frame before and until the frame after, each (2, times,
+        pixels), and the seconds (times, 1) of both intervals.
     """
-    frames, f = passage.frames, jnp.asarray(points.frame)
+    frames, f = window.frames, jnp.asarray(points.frame)
     rate = jnp.asarray(frames.blend_rate)[f][:, None]
     elapsed = jnp.asarray(points.elapsed)[:, None] - clock_lag(params, frames)
     behind = jnp.asarray(points.elapsed)[:, None] < 0  # before the first frame
     since = jnp.stack([points.on, points.off])
-    between = jnp.take(passage.events, f, axis=1)
+    between = jnp.take(window.events, f, axis=1)
     before = jnp.asarray(frames.before)[:, None]
     if frames.head is None or frames.tail is None:
         until = jnp.where(behind, before - since, between - since)
@@ -431,10 +559,12 @@ def adjacent_counts(
 
 @renamed_methods(keep="frame_info", tell="readout")
 @dataclasses.dataclass(frozen=True, repr=False)
-class Smoother(PixelEstimator[Params]):
-    """The estimator of this module."""
+class Smoother(KernelEstimator[Params]):
+    """The asynchronous Kalman smoother."""
 
     has_likelihood: ClassVar[bool] = True
+    kernel_video: ClassVar[Any] = SmootherVideo
+    kernel_images: ClassVar[Any] = SmootherImages
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "devices", "compiler", "factors"}), kw_only=True
     )
@@ -450,14 +580,31 @@ class Smoother(PixelEstimator[Params]):
     def frame_info(
         self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
     ) -> Any:
-        """What images need to know of frames beside the messages: arrays [frames, pixels].
+        """Return what images need of frames beside the messages; here nothing.
 
-        `events` [frames, pixels] lie within exposures; None where no exposure is known.
+        Args:
+            params: Parameters.
+            frames: The frames.
+            measured: Their measurements.
+            events: (frames, pixels) events within exposures; None where no exposure is known.
+
+        Returns:
+            A pytree of arrays (frames, pixels).
         """
         return ()
 
     def readout(self, params: Params, state: Gaussian, kept: Any, here: Array) -> Estimate:
-        """Images of smoothed states; `here`: at the middle of the exposure of the frame before."""
+        """Make images of smoothed states.
+
+        Args:
+            params: Parameters.
+            state: Smoothed states (times, pixels).
+            kept: `frame_info` of the frames before.
+            here: Whether the time is the middle of the exposure of the frame before.
+
+        Returns:
+            The images.
+        """
         image = jnp.exp(state.m) - params.I0
         return Estimate(image, state.P, jnp.isfinite(image))
 
@@ -472,7 +619,17 @@ class Smoother(PixelEstimator[Params]):
         state: Gaussian | None = None,
         future: Message | None = None,
     ) -> tuple[SmoothedWindow, Gaussian]:
-        """As `PixelEstimator.run`; the state is (pixels,), before the next window's first frame."""
+        """Smooth a window; see `PixelEstimator.run`.
+
+        Args:
+            params: Parameters.
+            features: The window.
+            state: (pixels,) state before the window's first frame.
+            future: Message of later windows.
+
+        Returns:
+            The smoothed window, and the state (pixels,) before the next window's first frame.
+        """
         frames = features.at_dead_time(params.rho_ref).frames
         rows, counts = make_frame_steps(params, frames)
         state = self.init_state(params, features) if state is None else state
@@ -486,10 +643,10 @@ class Smoother(PixelEstimator[Params]):
         if frames.head is not None and frames.tail is not None:
             events = (jnp.asarray(frames.head) + frames.tail).sum(0)
         kept = self.frame_info(params, frames, rows.measured, events)
-        passage = SmoothedWindow(
+        window = SmoothedWindow(
             past, later, first, counts, frames, kept, link, last, likelihood.sum(1)
         )
-        return passage, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
+        return window, jax.tree.map(lambda v: v.at[onward].get(mode="clip"), ahead)
 
     def read(self, params: Params, trajectory: SmoothedWindow, out: ReadOut) -> Estimate:
         points = out.at_dead_time(params.rho_ref).points
@@ -509,19 +666,28 @@ class Smoother(PixelEstimator[Params]):
         return self.readout(params, combine(m, precision, later), kept, here)
 
     def pixel_state_spec(self, number: Array) -> dict[str, Any]:
-        """The trees of numbers that `pixel_functions` speaks of, all as the one given."""
+        """Return the pytrees that `pixel_functions` refer to, every leaf the given number."""
         state, said = Gaussian(number, number), Message(number, number)
         return {"state": state, "said": said, "link": MessageMap(*[number] * 5)}
 
     def apply_message_map(self, link: NDArray, later: NDArray) -> NDArray:
-        """Numbers of the message before several frames, from those of their link and the later."""
+        """Return the message before several frames, as numbers for kernels.
+
+        Args:
+            link: (5, ...) fields of their `MessageMap`.
+            later: (2, ...) h and J of the message after them.
+
+        Returns:
+            (2, ...) h and J.
+        """
         message = MessageMap(*link).apply(Message(*later))
         return np.stack([message.h, message.J])
 
     def pixel_functions(self, exposed: bool) -> dict[str, Callable[..., dict[str, Any]]]:
-        """What `run` and `read` do at one pixel, for kernels (`engine.smoothing`).
+        """Return the steps of `run` and `read` at one pixel, for kernels.
 
-        Functions of parameters, what is known with them, and numbers that kernels keep by name.
+        See `engine.smoother_program`. They are functions of parameters, of quantities that depend on
+        parameters alone, and of numbers by name.
         """
 
         def lag(known):
@@ -532,7 +698,7 @@ class Smoother(PixelEstimator[Params]):
                 params, off, around_off, given
             )
 
-        def frame(known, clipped, exists, gain, total, inside, state, **image):
+        def frame(known, clipped, *, exists, gain, total, inside, state, **image):
             params, fixed = known
             frames = single_pixel_frame(gain, fixed, **image)
             z = jnp.log(frames.intensity + params.I0)
@@ -560,7 +726,7 @@ class Smoother(PixelEstimator[Params]):
             )
             return {"said": later, "later": here}
 
-        def show(known, past, said, moved_on, moved_off, kept, elapsed, seconds, here, **counts):
+        def show(known, past, said, *, moved_on, moved_off, kept, elapsed, seconds, here, **counts):
             on, off = counted(known[0], **counts)
             rest = jnp.where(seconds > 0, seconds + lag(known), 0)
             left = change_between(known[0], moved_on - on, moved_off - off, rest)
@@ -593,44 +759,16 @@ class Smoother(PixelEstimator[Params]):
             "excess": excess,
         }
 
-    def estimate(
-        self,
-        recording: Recording,
-        params: Params | None = None,
-        *,
-        compiler: str | None = None,
-        **options: Any,
-    ) -> ImageSequence[Params]:
-        """As `Filter.estimate`: by a kernel on CPUs, in single precision.
-
-        `run` and `read` serve in double precision, on other devices and on several. `factors` (2,
-        pixels) are those of ON and OFF thresholds of single pixels. Raises `InputError`.
-        """
-        self.check_options(**options)
-        params = self.Params() if params is None else params
-        fused = video_by_kernel(SmoothedVideo, self, recording, params, compiler, options)
-        return Video(self, recording, params, **options) if fused is None else fused
-
-    def prepare_images(
-        self,
-        recording: Recording,
-        times: Times,
-        params: Params | None = None,
-        *,
-        extrapolate: bool = False,
-        compiler: str | None = None,
-    ) -> PreparedImages:
-        """As `Filter.prepare_images`."""
-        params = self.Params() if params is None else params
-        fused = prepared_by_kernel(
-            DividedFrames, self, recording, times, params, extrapolate, compiler
-        )
-        if fused is not None:
-            return fused
-        return super().prepare_images(recording, times, params, extrapolate=extrapolate)
-
     def log_likelihood(self, params: Params, features: Features) -> Float[Array, ""]:
-        """Of all frames of a prepared recording, given its events: a sum over frames and pixels."""
+        """Return the log likelihood of all frames of a prepared recording, given its events.
+
+        Args:
+            params: Parameters.
+            features: The whole recording.
+
+        Returns:
+            (), a sum over frames and pixels.
+        """
         return self.run(params, features)[0].log_likelihood.sum()
 
 

@@ -27,7 +27,7 @@ class Stream(NamedTuple):
     def of(cls, events: Events, width: int) -> "Stream":
         return cls(events.t, events.x, events.y, events.p, width)
 
-    def part(self, begin: int, end: int) -> "Stream":
+    def section(self, begin: int, end: int) -> "Stream":
         """Return the events of the rows [begin, end)."""
         rows = slice(begin, end)
         return Stream(self.t[rows], self.x[rows], self.y[rows], self.p[rows], self.width)

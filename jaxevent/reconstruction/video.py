@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
+from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.devices import has_accelerator
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
@@ -35,45 +36,93 @@ from jaxevent.recording import Recording, Times, microseconds
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
 
-BEGINS = 32  # windows from which filtering can be taken up again
+MAX_STARTS = 32  # windows from which filtering can be taken up again
 BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
 DEVICE_BATCH = 32  # on a GPU, where each call costs as much as several images
 
 
 @runtime_checkable
 class ImageMethod(Protocol):
-    """What a sequence of images needs of its estimator; see `estimator.ImageEstimator`."""
+    """Members of an estimator that a sequence of images needs; see `estimator.ImageEstimator`."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the method."""
 
     @property
-    def fuses(self) -> bool: ...
+    def fuses(self) -> bool:
+        """True if images rest on events and frames together."""
 
-    def check(self, recording: Recording) -> None: ...
+    def check(self, recording: Recording) -> None:
+        """Raise `InputError` for a recording without what the method needs."""
 
-    def check_clocks(self, recording: Recording, params: Any) -> None: ...
+    def check_clocks(self, recording: Recording, params: Any) -> None:
+        """Check that frames and events can be on one clock.
 
-    def check_span(self, recording: Recording, times: Times, params: Any) -> None: ...
+        Args:
+            recording: Events and frames.
+            params: Parameters.
+        """
+
+    def check_span(self, recording: Recording, times: Times, params: Any) -> None:
+        """Check that times lie within the recording.
+
+        Args:
+            recording: Events and frames.
+            times: Times of images.
+            params: Parameters.
+        """
 
 
 @runtime_checkable
 class PixelMethod(ImageMethod, Protocol):
-    """What a video needs of its estimator; see `estimator.PixelEstimator`."""
+    """Members of an estimator that a video needs; see `estimator.PixelEstimator`."""
 
     @property
-    def is_event_driven(self) -> bool: ...
+    def is_event_driven(self) -> bool:
+        """True if the method passes over single events."""
 
     @property
-    def needs_future(self) -> bool: ...
+    def needs_future(self) -> bool:
+        """True if `run` needs the message of later windows."""
 
-    def init_state(self, params: Any, features: Features) -> Any: ...
+    def init_state(self, params: Any, features: Features) -> Any:
+        """Return the state at the recording's start.
+
+        Args:
+            params: Parameters.
+            features: The first window.
+
+        Returns:
+            The state.
+        """
 
     def run(
         self, params: Any, features: Features, state: Any = None, future: Any = None
-    ) -> tuple[Any, Any]: ...
+    ) -> tuple[Any, Any]:
+        """Estimate a window.
 
-    def read(self, params: Any, trajectory: Any, out: ReadOut) -> Estimate: ...
+        Args:
+            params: Parameters.
+            features: The window.
+            state: State before it.
+            future: Message of later windows.
+
+        Returns:
+            The trajectory, and the state for the next window.
+        """
+
+    def read(self, params: Any, trajectory: Any, out: ReadOut) -> Estimate:
+        """Read images of a window.
+
+        Args:
+            params: Parameters.
+            trajectory: Trajectory that `run` returned.
+            out: Prepared times of images.
+
+        Returns:
+            The images.
+        """
 
 
 # jax.jit returns before the result is there; eqx.filter_jit waits for it.
@@ -92,8 +141,8 @@ def _read(estimator: PixelMethod, params, trajectory, out: ReadOut):
     return estimator.read(params, trajectory, out)
 
 
-class Begin(NamedTuple):
-    """What filtering from a window's start needs; no state: the recording's beginning."""
+class WindowStart(NamedTuple):
+    """Start of a window with the state there, from which filtering can be taken up again."""
 
     start: int | None
     before: StreamState
@@ -101,6 +150,7 @@ class Begin(NamedTuple):
 
     @property
     def time(self) -> float:
+        """Start of the window, us; minus infinity for the first."""
         return -math.inf if self.start is None else float(self.start)
 
 
@@ -112,6 +162,7 @@ class FilteredWindow(NamedTuple):
     trajectory: Any
 
     def contains(self, time: int) -> bool:
+        """Return whether a time (us) lies in the window."""
         start, stop = self.window.start, self.window.stop
         return (start is None or start <= time) and (stop is None or time < stop)
 
@@ -119,11 +170,11 @@ class FilteredWindow(NamedTuple):
 class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
-    A subclass reads images in `_read`. Images do not depend on which others were asked for. Threads
-    may share a sequence: they take turns, in calls as a whole, else image by image. A pickle or
-    copy holds what the sequence was made of, and is made anew of that. Raises `InputError` if the
-    recording lacks what the estimator needs. The first reading warns where events contradict frames
-    at the given thresholds, see `consistency`.
+    A subclass reads images in `_read`. Images do not depend on which others were read. Threads may
+    share a sequence: they take turns, in calls as a whole, else image by image. A pickle or copy
+    holds the arguments of the sequence, and is made anew of these. Raises `InputError` if the
+    recording lacks what the estimator needs. The first reading warns if events contradict frames at
+    the given thresholds, see `consistency`.
     """
 
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
@@ -155,14 +206,14 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     @property
     @abc.abstractmethod
     def dtype(self) -> np.dtype:
-        """The type of images and variances."""
+        """Type of images and variances."""
 
     @abc.abstractmethod
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Read a few images after another at sorted times (us): the times and their `Estimate`.
 
-        Its arrays have a row of all pixels, in whichever shape, for each of the times, and may have
-        spare rows behind these.
+        Its arrays have a row of all pixels, of any shape, for each of the times, and may have spare
+        rows after these.
         """
 
     def __repr__(self) -> str:
@@ -172,13 +223,23 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         return f"{kind}({self.estimator.name} of {r.name}, {r.width}x{r.height}, {span})"
 
     def __call__(self, times: Times, extrapolate: bool = False) -> Estimate:
-        """Images at `times`, integers (us) or floats (s) on the recording's clock, in any order.
+        """Return the images at times.
 
-        Each array has the shape (T, H, W): `mean` is intensity, 0 black and 1 the frames' white,
-        and goes beyond; `covariance` is the variance of log intensity ln(I + I0), NaN of methods
-        that estimate none; `valid` is false outside the recording and where the intensity is not a
-        finite number. Raises `InputError` for times that are not finite, and for those outside the
-        recording unless told to `extrapolate`: before its start images show the initial state.
+        Args:
+            times: Integers (us) or floats (s) on the recording's clock, in any order.
+            extrapolate: Allow times outside the recording; before its start images show the initial
+                state.
+
+        Returns:
+            `mean`, `covariance` and `valid`, each (T, H, W). `mean` is intensity, 0 black and 1 the
+            frames' white, and goes beyond. `covariance` is the variance of log intensity ln(I +
+                I0), NaN
+            of methods that estimate none. `valid` is false outside the recording and where the
+                intensity
+            is not a finite number.
+
+        Raises:
+            InputError: A time is not finite, or outside the recording.
         """
         times = np.atleast_1d(microseconds(times))
         order = np.argsort(times, kind="stable")
@@ -197,15 +258,24 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     def carry(
         self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Images (n, H, W, channels) taken `at` (us), as they are seen at the time `to` (us).
+        """Move images to another time along the motion of points, if the sequence knows it.
 
-        And how far each shows the points visible then, (n, H, W), 0 to 1. A sequence that does not
-        know how points move leaves them in place.
+        Here points stay in place.
+
+        Args:
+            images: (n, H, W, channels).
+            at: (n,) times at which they were taken, us.
+            to: Time to which they are moved, us.
+
+        Returns:
+            The images (n, H, W, channels), and the degree (n, H, W), 0 to 1, to which each shows
+                the
+            points visible at the time `to`.
         """
         return images, np.ones(images.shape[:3], images.dtype)
 
     def to_xarray(self, times: Times) -> Any:
-        """The images at `times` as an `xarray.Dataset`, for labelled axes, netCDF and Dask.
+        """Return the images at `times` as an `xarray.Dataset`, for labelled axes, netCDF and Dask.
 
         It has image, variance and valid over t (us), y and x (px). Raises `InputError` as calling
         does, and without the extra "xarray".
@@ -226,7 +296,18 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     def batches(
         self, times: Times, extrapolate: bool = False
     ) -> Iterator[tuple[NDArray[np.int64], Estimate]]:
-        """The same, a few images after another for sorted times: `times, estimate`."""
+        """Yield the images a few after another.
+
+        Args:
+            times: Sorted times, integers (us) or floats (s).
+            extrapolate: Allow times outside the recording.
+
+        Yields:
+            Times (us), and their images as a call returns them.
+
+        Raises:
+            InputError: Times are not sorted, or outside the recording.
+        """
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
@@ -252,15 +333,24 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
                 shown.update(len(batch))
 
 
+@renamed_methods(grow="extend")
 class Video(ImageSequence[P]):
     """Images of a reconstruction: `image, variance, valid = video(times)`.
 
-    The recording is filtered in time windows of at most `window_events` events when images in them
-    are asked for; windows before them are filtered first. One window is kept, and the state at
-    every window's start, so memory does not grow with the recording's length. Images do not depend
-    on which other images were asked for, nor on the windows. Given several `devices`, of this
-    process, they share out the pixels. `factors` (2, pixels) are those of ON and OFF thresholds of
-    single pixels, for estimators that do not filter.
+    The recording is filtered in time windows when images in them are read; windows before them are
+    filtered first. One window is held, and the state at the start of some, so memory does not grow
+    with the recording's length. Images do not depend on which other images were read, nor on the
+    windows.
+
+    Args:
+        estimator: The method.
+        recording: Events and frames.
+        params: Its parameters.
+        window_events: Greatest number of events of a window.
+        progress: Show a progress bar; None: if it takes long.
+        devices: Devices of this process over which pixels are sharded.
+        factors: (2, pixels) factors on the ON and OFF thresholds of single pixels, for methods that
+            do not pass over single events.
     """
 
     estimator: PixelMethod
@@ -287,9 +377,12 @@ class Video(ImageSequence[P]):
             events=window_events,
             reuse=True,
         )
-        self._begins = [Begin(None, self._windows.initial(), None)]
-        self._open: FilteredWindow | None = None
-        self._coming: tuple[object, Any] = (None, None)  # the last images, and who asked for them
+        self._starts = [WindowStart(None, self._windows.initial(), None)]
+        self._current: FilteredWindow | None = None
+        self._pending: tuple[object, Any] = (
+            None,
+            None,
+        )  # the last reading and its images
         self._future: dict[int | None, Any] | None = None  # by the start of the window
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -310,7 +403,7 @@ class Video(ImageSequence[P]):
             ahead = following
 
     def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
-        """Batches of images on their way on the device."""
+        """Yield batches of images that are being computed on the device."""
         dispatch.check_threads()
         done, mine = 0, object()
         while done < len(times):
@@ -319,70 +412,73 @@ class Video(ImageSequence[P]):
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, self._batch):
                 batch = times[first : min(first + self._batch, end)]
-                asker, coming = self._coming
-                if asker is not mine:  # two readings of this one fit into the reader
-                    jax.block_until_ready(coming)
-                out = self._place(reader(batch))
+                reading, images_before = self._pending
+                if reading is not mine:  # two readings of this one fit into the reader
+                    jax.block_until_ready(images_before)
+                out = self._put(reader(batch))
                 images = _read(self.estimator, self.params, trajectory, out)
-                self._coming = mine, images
+                self._pending = mine, images
                 for leaf in images:
                     leaf.copy_to_host_async()
                 yield batch, images
             done = end
 
-    def _place(self, part: Any) -> Any:
-        """Weight features or a read-out, and put them on the devices."""
+    def _put(self, part: Any) -> Any:
+        """Scale the counts of features or a read-out, and put them on the devices."""
         part = part if self._factors is None else part.scale_counts(self._factors)
         return part if self._mesh is None else part.over(self._devices)
 
-    def _share_out(self, state: Any) -> Any:
-        """Put a state or message on the devices; else every change of where it lies is compiled."""
+    def _put_state(self, state: Any) -> Any:
+        """Put a state or message on the devices; else every change of place is compiled."""
         return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
 
     def _window_of(self, time: int) -> FilteredWindow:
-        """The filtered window that contains `time`; windows on the way are filtered in order."""
+        """Return the filtered window that contains `time`; those before it are filtered first."""
         if self.estimator.needs_future and self._future is None:
-            self._look_ahead()
-        if self._open is not None and self._open.contains(time):
-            return self._open
-        begin = [b for b in self._begins if b.time <= time][-1]
+            self._run_backward_pass()
+        if self._current is not None and self._current.contains(time):
+            return self._current
+        begin = [b for b in self._starts if b.time <= time][-1]
         while True:
-            self._open = None  # so that two windows are never held at once
-            self._open, begin = self._filter(begin)
-            stop = self._open.window.stop
+            self._current = None  # so that two windows are never held at once
+            self._current, begin = self._filter(begin)
+            stop = self._current.window.stop
             if stop is None or time < stop:
-                return self._open
+                return self._current
 
     @property
     def settled(self) -> int | None:
-        """The time (us) before which images can no longer be read; None: all can."""
-        return self._begins[0].start
+        """Time (us) before which images can no longer be read; None: all can."""
+        return self._starts[0].start
 
-    def grow(self, recording: Recording) -> None:
-        """Go on with the same recording of which more is known, after its end."""
+    def extend(self, recording: Recording) -> None:
+        """Go on with the same recording after events or frames were added to its end."""
         self.recording = recording
         self._windows.extend(recording)
-        self._open, self._begins = None, self._begins[:1]
+        self._current, self._starts = None, self._starts[:1]
 
     def settle(self, frames: bool) -> tuple[int, int]:
-        """Filter up to where nothing that is added can change the past, and keep that state only.
+        """Filter up to the time before which additions change nothing, and keep that state only.
 
-        Returns the first row of the events and the first frame that are needed from then on. With
-        `frames` more of these will come, else only events.
+        Args:
+            frames: Whether more frames will come, else events alone.
+
+        Returns:
+            The first row of the events and the first frame that are needed from then on.
         """
-        begin, final = self._begins[0], self._windows.final_time(frames)
+        begin, final = self._starts[0], self._windows.final_time(frames)
         while True:
-            self._open = None
+            self._current = None
             _, following = self._filter(begin)
             if following.start is None or following.start > final:
                 break
             begin = following
-        self._begins = [begin]
+        self._starts = [begin]
         return self._windows.first_needed(begin.start, begin.before)
 
-    def _look_ahead(self) -> None:
-        """Pass over all windows once, to know at each what later ones say."""
-        begin, starts, links = self._begins[0], [], []
+    def _run_backward_pass(self) -> None:
+        """Pass over all windows once, for the message of later windows at each."""
+        begin, starts, links = self._starts[0], [], []
         total = len(self.recording.events)
         with bar(
             total=total, desc="look ahead", unit="event", unit_scale=True, progress=self.progress
@@ -399,23 +495,26 @@ class Video(ImageSequence[P]):
             message = links[place][0].apply(message)
             future[starts[place - 1]] = message
         self._future = future
-        self._open = filtered  # the last window has nothing later to know of
+        self._current = filtered  # no window is later than the last
 
-    def _filter(self, begin: Begin) -> tuple[FilteredWindow, Begin]:
-        """Prepare and filter the window that begins there; and where the next one begins."""
+    def _filter(self, begin: WindowStart) -> tuple[FilteredWindow, WindowStart]:
+        """Prepare and filter the window that begins there; return it and the start of the next."""
         dispatch.check_threads()
         window, features = self._windows.prepare(begin.start, begin.before)
-        features = self._place(features)
+        features = self._put(features)
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
         future = None if self._future is None else self._future[begin.start]
-        state, future = self._share_out((state, future))
+        state, future = self._put_state((state, future))
         trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
-        following = Begin(window.stop, window.after, end)
-        if window.stop is not None and all(b.start != window.stop for b in self._begins):
-            self._begins = sorted([*self._begins, following], key=lambda b: b.time)
-            if len(self._begins) > BEGINS:  # the first one, the last one, and half of the others
-                self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
+        following = WindowStart(window.stop, window.after, end)
+        if window.stop is not None and all(b.start != window.stop for b in self._starts):
+            self._starts = sorted([*self._starts, following], key=lambda b: b.time)
+            if len(self._starts) > MAX_STARTS:  # first, last, half of the others
+                self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
         return FilteredWindow(window, window.reader(self._batch), trajectory), following
+
+
+__getattr__ = renamed_names(__name__)

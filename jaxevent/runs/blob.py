@@ -9,7 +9,7 @@ Settings of trackers in a configuration of `jaxevent.runs.fit`:
                                         # of the positions, or without any, tracks are born
     positions = "*.csv"                 # beside each recording, * being its name without suffix
 
-A method may have its own loss and events. Positions are as in `jaxevent.runs.blob_positions`.
+A method may have its own loss and events. PositionBatch are as in `jaxevent.runs.blob_positions`.
 
 A recording is cut into windows of `window` seconds. If neither validation nor test is given, they
 are shared out: with `split` = [2, 1, 1], of every 4 windows in turn 2 are to fit, 1 to validate and
@@ -41,7 +41,7 @@ from jaxevent.blob import (
     position_error,
     prepare_positions,
 )
-from jaxevent.blob.losses import Positions
+from jaxevent.blob.losses import PositionBatch
 from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
@@ -57,7 +57,7 @@ from jaxevent.runs.blob_positions import (
 from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
-from jaxevent.show.report import aligned, legend
+from jaxevent.show.tables import legend, results_table
 from jaxevent.splits import SPLITS, windows
 from jaxevent.tuning import Batches
 
@@ -68,7 +68,7 @@ EVENTS = ("all", "associated")
 class Batch(eqx.Module):
     """A window: packed events, with positions if the loss needs them."""
 
-    features: Features | Positions
+    features: Features | PositionBatch
     weight: Float[np.ndarray | Array, ""]  # number of events or positions
 
 
@@ -86,7 +86,7 @@ class TrackLoss:
         return self.name == "likelihood"
 
     def __call__(self, params: TrackerParams, batch: Batch) -> Float[Array, ""]:
-        if isinstance(batch.features, Positions):
+        if isinstance(batch.features, PositionBatch):
             return position_error(self.tracker, params, batch.features)
         return negative_log_likelihood(self.tracker, params, batch.features, self.events)
 
@@ -185,7 +185,7 @@ class TrackGoal(Goal):
         if any("rmse" in row for row in rows):
             columns[1:1] = [("RMSE px", "rmse", 1, 3), ("median px", "median", 1, 3)]
             columns[3:3] = [("covered", "covered", 1, 3)]
-        return aligned(rows, columns) + legend(columns)
+        return results_table(rows, columns) + legend(columns)
 
     def _windows(
         self, sources: Sources, split: Shares, window: float | int | None
@@ -304,7 +304,7 @@ def _cut_window(
     return TrackWindow(recording, start, stop, chosen, known, split)
 
 
-def _filled(batch: Features | Positions, f: Features, used: Sequence[int]) -> Any:
+def _filled(batch: Features | PositionBatch, f: Features, used: Sequence[int]) -> Any:
     """Pad a batch with chunks, steps, seeds and times that do not count."""
     chunks, steps, seeds, times = used
 
@@ -324,7 +324,7 @@ def _filled(batch: Features | Positions, f: Features, used: Sequence[int]) -> An
         return features
     one = {name: fill(getattr(batch, name), times) for name in ("chunk", "step", "time")}
     two = {name: fill(getattr(batch, name), times, seeds) for name in ("xi", "known")}
-    return Positions(features, **one, **two)
+    return PositionBatch(features, **one, **two)
 
 
 _likelihood = jax.jit(

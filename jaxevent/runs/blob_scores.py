@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from jaxevent.blob import Tracker, TrackerParams, find
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.blob.scores import score_tracks
-from jaxevent.blob.states import THETA_RATIO
+from jaxevent.blob.track import THETA_RATIO
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording

@@ -13,8 +13,9 @@ from jaxevent.recording import Recording
 from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.results import check_folder, open_results, write_rows
 from jaxevent.runs.scores import score
-from jaxevent.show.export import evenly, shown
-from jaxevent.show.report import Kind, comparison_figure, markdown_table, video_writer
+from jaxevent.show.export import display_images, evenly
+from jaxevent.show.images import Kind, comparison_figure, video_writer
+from jaxevent.show.tables import markdown_table
 
 RECORDING = resources.files("jaxevent") / "data/slider_depth_crop.h5"
 # The thresholds of the demo's sensor, and the lag of its frames' clock, set by hand.
@@ -111,6 +112,6 @@ def _video(recording: Recording, params: Any, path: Path, progress: bool | None)
     video = find("akf").estimate(recording, params, progress=progress)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
-        for _, image in shown(video, evenly(recording, rate)[:longest], "linear"):
+        for _, image in display_images(video, evenly(recording, rate)[:longest], "linear"):
             write(np.kron(image, np.ones((zoom, zoom), np.uint8)))
     return rate / fps

@@ -59,7 +59,7 @@ from jaxevent.recording import Recording
 from jaxevent.runs import egomotion_scores as scores
 from jaxevent.runs.config import NATURAL
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
-from jaxevent.show.report import aligned, legend
+from jaxevent.show.tables import legend, results_table
 from jaxevent.splits import SPLITS, windows
 from jaxevent.tuning import Batches
 
@@ -181,7 +181,7 @@ class MotionGoal(Goal):
         for part in self.kind.parts:
             if part.direction and any(part.name in row for row in rows):
                 columns.insert(1, (f"{part.name} deg", part.name, 1, 2))
-        return aligned(rows, columns) + legend(columns)
+        return results_table(rows, columns) + legend(columns)
 
     def known(self, recording: Recording) -> KnownMotion:
         """Return the true motion of a recording, whose name is its path."""

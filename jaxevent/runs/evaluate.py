@@ -103,7 +103,7 @@ from jaxevent.runs.family import Protocol, Source, family_of, find_protocol
 from jaxevent.runs.own import MethodFunction, Metric, find_method, import_path, module_hash
 from jaxevent.runs.results import Evaluation, check_folder, open_results, write_rows
 from jaxevent.runs.tasks import ComputeResources, Outcome, Task, run
-from jaxevent.show.report import write_parquet
+from jaxevent.show.tables import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.

@@ -22,7 +22,7 @@ from typing import Any
 from jaxevent.errors import InputError
 from jaxevent.runs.config import check, check_choice, is_number, is_texts
 from jaxevent.runs.family import Source
-from jaxevent.show.report import COLUMNS
+from jaxevent.show.tables import COLUMNS
 
 PLACES = [place for _, place, _, _ in COLUMNS if "." not in place]
 

@@ -31,7 +31,7 @@ from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, check_choice, is_
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
 from jaxevent.runs.protocols import A_GAP, GAP, PROTOCOLS, Reference, divide, frame_times, is_gap
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
-from jaxevent.show.report import markdown_table
+from jaxevent.show.tables import markdown_table
 from jaxevent.splits import SPLITS, interleave
 from jaxevent.tuning import Batches
 

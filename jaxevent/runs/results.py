@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jaxevent.errors import InputError
 from jaxevent.io.output import check_outputs, complete, locked
 from jaxevent.parameters import Parameters
-from jaxevent.show.report import flatten, markdown_table, means
+from jaxevent.show.tables import flatten, markdown_table, means
 
 if TYPE_CHECKING:
     import pandas
@@ -25,7 +25,7 @@ import numpy as np
 from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
 from jaxevent.runs.fit_config import Plan, Task
-from jaxevent.show.report import lay_out
+from jaxevent.show.tables import lay_out
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Batches, FitResult, Run, begin
 

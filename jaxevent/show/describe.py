@@ -1,4 +1,4 @@
-"""A recording in a few lines: sensor, events, frames, clocks, and what else it holds."""
+"""Description of a recording in a few lines: sensor, events, frames, clocks, and the rest."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,18 +11,36 @@ from jaxevent.events.clocks import compare_clocks
 from jaxevent.progress import bar
 from jaxevent.recording import EventSource, ImageSource, Recording, Triggers
 
-BLOCK = 1 << 20  # events looked at together: 13 MB
-BIN = 10_000  # us over which the peak rate is taken
+BLOCK_EVENTS = 1 << 20  # events read together: 13 MB
+BIN_US = 10_000  # us over which the peak rate is taken
 PARTS = 10  # of a recording, whose rates show how the rate changes
-GAP = 100_000  # us without an event that may be a jump of the clock
-_TRUTH = ("omega", "rvec", "tvec", "HDR_mat", "hdr", "motion", "tracks", "depth", "mask", "flow")
+GAP_US = 100_000  # us without an event that may be a jump of the clock
+_TRUTH_NAMES = (
+    "omega",
+    "rvec",
+    "tvec",
+    "HDR_mat",
+    "hdr",
+    "motion",
+    "tracks",
+    "depth",
+    "mask",
+    "flow",
+)
 
 
 def describe(recording: Recording, progress: bool | None = None) -> list[tuple[str, str]]:
-    """What a user wants to know first of a recording, as (name, text); reads events in blocks.
+    """Describe a recording; events are read in blocks.
 
     Hot pixels are those of `jaxevent.events.find_hot_pixels`. A gap is 0.1 s and more without
-    an event, an interval between frames or samples counts as one where it exceeds 1.5 medians.
+    an event, or an interval between frames or samples over 1.5 medians.
+
+    Args:
+        recording: The recording.
+        progress: Whether a bar is shown; None: in a terminal or notebook.
+
+    Returns:
+        Lines (name, text).
     """
     lines = [
         ("name", recording.name),
@@ -73,7 +91,7 @@ def _value(values: Any) -> str:
 
 def _truth(recording: Recording, extra: Mapping[str, NDArray]) -> str:
     known = ["poses"] if recording.poses is not None and len(recording.poses) else []
-    known += [name for name in extra if name.startswith(_TRUTH)]
+    known += [name for name in extra if name.startswith(_TRUTH_NAMES)]
     return ", ".join(known) or "none"
 
 
@@ -95,7 +113,7 @@ def _about_triggers(triggers: Triggers) -> str:
 
 
 def _about_clocks(recording: Recording) -> list[str]:
-    """Intervals of frames and samples that are too long, and clocks that do not overlap."""
+    """Describe intervals of frames and samples that are too long, and clocks without overlap."""
     texts = []
     events = recording.events
     parts = [("frames", recording.frames), ("poses", recording.poses), ("IMU", recording.imu)]
@@ -135,18 +153,18 @@ def _about_events(
     first, last = int(events[:1].t[0]), int(events[count - 1 :].t[0])
     in_part = np.zeros(PARTS, np.int64)
     longest, longest_after, before = 0, first, first
-    blocks = range(0, count, BLOCK)
+    blocks = range(0, count, BLOCK_EVENTS)
     for row in bar(blocks, desc="look at events", unit="M events", progress=progress):
-        block = events[row : row + BLOCK]
+        block = events[row : row + BLOCK_EVENTS]
         on += int(block.p.sum())
         at_pixel += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=len(at_pixel))
         # Sorted, so that only the first bin of a block can have begun in the one before it.
-        bins, counts = np.unique((block.t - first) // BIN, return_counts=True)
+        bins, counts = np.unique((block.t - first) // BIN_US, return_counts=True)
         if last_bin == bins[0]:
             counts[0] += carried
         peak, last_bin, carried = max(peak, int(counts.max())), bins[-1], int(counts[-1])
         steps = np.diff(block.t, prepend=before)
-        gaps += int(np.count_nonzero(steps >= GAP))
+        gaps += int(np.count_nonzero(steps >= GAP_US))
         if (widest := int(np.argmax(steps))) >= 0 and steps[widest] > longest:
             longest = int(steps[widest])
             longest_after = int(block.t[widest]) - longest
@@ -159,23 +177,22 @@ def _about_events(
     ]
     # The last bin is rarely full, so a recording shorter than a bin has no rate.
     seconds = (last - first) / 1e6
-    if last - first >= BIN:
+    if last - first >= BIN_US:
         part = seconds / PARTS
         rates = ", ".join(_short(n / part) for n in in_part)
         lines += [
             (
                 "event rate",
-                f"mean {count / seconds:,.0f} per s, peak {peak / BIN * 1e6:,.0f} per s in "
-                f"{BIN // 1000} ms",
+                f"mean {count / seconds:,.0f} per s, peak {peak / BIN_US * 1e6:,.0f} per s in "
+                f"{BIN_US // 1000} ms",
             ),
             ("rate over time", f"{rates} per s, in tenths of {part:.3g} s"),
         ]
     if longest:
         text = f"longest {longest / 1000:.3f} ms, after {longest_after / 1e6:.6f} s"
         if gaps:
-            text += (
-                f"; {gaps} of {GAP // 1000} ms and more, each a jump of the clock or a standstill"
-            )
+            text += f"; {gaps} of {GAP_US // 1000} ms and more, "
+            text += "each a jump of the clock or a standstill"
         lines.append(("gaps", text))
     hot = np.flatnonzero(is_hot(at_pixel.reshape(height, width)))
     share = 100 * at_pixel[hot].sum() / count
@@ -186,14 +203,14 @@ def _about_events(
     shown = []
     for pixel in hottest[at_pixel[hottest] > 0]:
         n = int(at_pixel[pixel])
-        rate = f", {n / seconds:,.0f} per s" if last - first >= BIN else ""
+        rate = f", {n / seconds:,.0f} per s" if last - first >= BIN_US else ""
         shown.append(f"({pixel % width}, {pixel // width}) {n:,} events{rate}")
     lines.append(("hottest pixels", "; ".join(shown)))
     return lines
 
 
 def _short(rate: float) -> str:
-    """Three digits with k or M: 12.3k."""
+    """Format a rate with three digits and k or M: 12.3k."""
     for unit, name in ((1e6, "M"), (1e3, "k")):
         if rate >= unit:
             return f"{rate / unit:.3g}{name}" if rate < 999.5 * unit else f"{rate / unit:.0f}{name}"

@@ -1,4 +1,4 @@
-"""A reconstruction written to files: HDF5 of exact values, a video, or a folder of images."""
+"""Files of a reconstruction: HDF5 of exact values, a video, or a folder of images."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -16,13 +16,25 @@ from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import BATCH, ImageSequence
 from jaxevent.recording import Recording, microseconds
-from jaxevent.show.report import display_limits, tone_map, video_writer, write_png
+from jaxevent.show.images import display_limits, tone_map, video_writer, write_png
 
 
 def evenly(
     recording: Recording, rate: float | int, start: float | int | None = None
 ) -> NDArray[np.int64]:
-    """Times (us) at a rate (1/s) from `start` (s), or the recording's start, to its stop."""
+    """Return evenly spaced times of a recording.
+
+    Args:
+        recording: The recording.
+        rate: Times per second.
+        start: First time, s; None for the recording's start.
+
+    Returns:
+        (T,) us, up to the recording's stop.
+
+    Raises:
+        InputError: The rate is not possible.
+    """
     if not 0 < rate <= 1e6:
         raise InputError(
             f"{recording.name}: cannot be read at --rate {rate:g}; give a number of images per "
@@ -38,9 +50,16 @@ def evenly(
 def within(
     times: NDArray[np.int64], start: float | int | None, stop: float | int | None, name: str
 ) -> NDArray[np.int64]:
-    """Those of the times (us) with start <= t < stop (s); None is no bound.
+    """Choose the times from `start` to before `stop`.
 
-    Raises `InputError`, naming the recording, where there are none.
+    Args:
+        times: (T,) us.
+        start: First time, s; None for no bound.
+        stop: End, s; None for no bound.
+        name: Name of the recording, for the error.
+
+    Raises:
+        InputError: There are none.
     """
     first = -np.inf if start is None else microseconds(float(start), "--start")
     end = np.inf if stop is None else microseconds(float(stop), "--stop")
@@ -48,13 +67,13 @@ def within(
     if not len(chosen):
         span = f"from {times[0] / 1e6:g} to {times[-1] / 1e6:g} s" if len(times) else "none"
         raise InputError(
-            f"{name}: no image is asked for from --start to --stop; its times are {span}, so "
+            f"{name}: there is no image from --start to --stop; its times are {span}, so "
             "choose others"
         )
     return chosen
 
 
-RARE = 1e-3  # of the pixels: fewer do not tell what range images use
+RARE_SHARE = 1e-3  # of the pixels; rarer values do not count for the range that images use
 
 # Chunks of one image, read by every HDF5 library; `deflate_shuffled` writes them faster than h5py.
 _SMALLER = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
@@ -64,12 +83,15 @@ Writer = Callable[[ImageSequence, NDArray, Path, str, str, Colours], str]
 
 
 def writer(out: Path) -> Writer:
-    """How to write a file: `writer(out)(video, times, out, tone, recording_name, colours)`.
+    """Return the function that writes a file of some suffix.
 
-    `times` are sorted, us; `colours` is `colour_video(video, recording)`, or None for grey images.
-    HDF5 holds t, image and variance, exact, or t and image (T, H, W, 3) in colour; videos and PNG
-    images are toned for the display. It returns the end of a sentence about what was written.
-    Raises `InputError` for a suffix other than .h5, .hdf5, .mp4 or none.
+    It is called as `writer(out)(video, times, out, tone, recording_name, colours)`, where `times`
+    are sorted (us) and `colours` is `colour_video(video, recording)`, or None for grey images. It
+    returns the end of a sentence about the file. HDF5 holds t, image and variance, exact, or t and
+    image (T, H, W, 3) in colour. Videos and PNG images are toned for the display.
+
+    Raises:
+        InputError: The suffix is not .h5, .hdf5, .mp4 or none.
     """
     if not out.name:
         raise InputError(f"{out}: is a folder in use; give the name of a new file or folder")
@@ -130,7 +152,7 @@ def write_hdf5(
 
 
 def _store(compressed: list[tuple[h5py.Dataset, int, Future[bytes]]]) -> None:
-    """Write images as they are compressed: their dataset, their row, and what they become."""
+    """Write compressed images to their rows of datasets."""
     for stored, row, job in compressed:
         stored.id.write_direct_chunk((row, *[0] * (len(stored.shape) - 1)), job.result())
 
@@ -140,9 +162,9 @@ def _write_video(
 ) -> str:
     rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
     fps = min(rate, 60.0)
-    range_used = Range(tone)
+    range_used = RangeCounter(tone)
     with video_writer(out, fps) as write:
-        for _, image in shown(video, times, tone, colours):
+        for _, image in display_images(video, times, tone, colours):
             range_used.add(image)
             write(image)
     return f", played at {fps:.4g} per s, {fps / rate:.3g} of real time{range_used}"
@@ -151,10 +173,10 @@ def _write_video(
 def _write_images(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
-    range_used = Range(tone)
+    range_used = RangeCounter(tone)
     with complete(out, directory=True) as partial:
         lines = []
-        for number, (at, image) in enumerate(shown(video, times, tone, colours)):
+        for number, (at, image) in enumerate(display_images(video, times, tone, colours)):
             range_used.add(image)
             file = f"frame_{number:08d}.png"
             write_png(partial / file, image)
@@ -163,10 +185,10 @@ def _write_images(
     return str(range_used)
 
 
-class Range:
-    """What part of the display's range the images of the tone "linear" use; str() says it.
+class RangeCounter:
+    """Part of the display's range that images of the tone "linear" use; `str` describes it.
 
-    That tone shows the frames' black and white as they are, so what is brighter is cut off, and
+    That tone shows the frames' black and white as they are, so brighter values are cut off, and
     images are as dark as the frames.
     """
 
@@ -182,21 +204,27 @@ class Range:
         if self._counts is None:
             return ""
         above = self._counts[::-1].cumsum()[::-1] / max(int(self._counts.sum()), 1)
-        if above[255] > RARE:
+        if above[255] > RARE_SHARE:
             share = 100 * above[255]
             return f", {share:.2g} % of the pixels at white or cut off there (--tone log shows all)"
-        if above[128] < RARE:
-            most = int(np.flatnonzero(above >= RARE)[-1])
+        if above[128] < RARE_SHARE:
+            most = int(np.flatnonzero(above >= RARE_SHARE)[-1])
             return f", as dark as the frames, up to grey {most} of 255 (--tone percentile spreads)"
         return ""
 
 
-def shown(
+def display_images(
     video: ImageSequence, times: NDArray, tone: str, colours: Colours = None
 ) -> Iterator[tuple[int, NDArray]]:
-    """Each time (us) and its image for the display, of limits common to all.
+    """Yield each time (us) and its image for the display, with limits common to all.
 
-    A colour image is its toned luminance with the chrominance it had.
+    A colour image is its toned luminance with its former chrominance.
+
+    Args:
+        video: A reconstruction.
+        times: (T,) sorted times, us.
+        tone: Tone of `tone_map`.
+        colours: Function from times to colour images; None for grey images.
     """
     sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
     if tone == "linear":  # the limits are those of any image
@@ -219,10 +247,10 @@ def shown(
 def _batches(
     video: ImageSequence, times: NDArray, colours: Colours
 ) -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
-    """A few images after another: their times, and what HDF5 holds of them by name."""
+    """Yield times and images in batches, by their names in HDF5."""
     if colours is None:
-        for batch, told in video.batches(times):
-            yield batch, {"image": told.mean, "variance": told.covariance}
+        for batch, estimate in video.batches(times):
+            yield batch, {"image": estimate.mean, "variance": estimate.covariance}
         return
     rows = range(0, len(times), BATCH)
     for row in bar(rows, desc="images", unit="batch", progress=video.progress):

@@ -1,37 +1,56 @@
-"""One figure for each kind of thing, as `matplotlib.figure.Figure`; see `jaxevent.show`."""
+"""Figures of recordings and results, and the HTML that notebooks show of them.
 
+`import jaxevent` hands `as_html` to `jaxevent.display`, so that recordings import no figures.
+"""
+
+import base64
+import functools
+import html
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.tracks import Tracks
+from jaxevent.display import plural
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.events import event_image
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, EventSource, Recording, Times, microseconds
-from jaxevent.show.canvas import new_figure
-from jaxevent.show.motion_pictures import motion_figure
-from jaxevent.show.track_plots import draw_paths
+from jaxevent.show.images import new_figure
+from jaxevent.show.motion_figures import motion_figure
+from jaxevent.show.track_figures import draw_paths
 from jaxevent.tuning import FitResult
 
 ON, OFF = "#c8401e", "#3a78b5"
-WIDE = 7.0  # inches of a figure
-IN_SPACE = 20_000  # events drawn in x, y and t
+WIDTH_INCHES = 7.0
+MAX_EVENTS_3D = 20_000  # events drawn in x, y and t
 PATH_TIMES = 400  # at which a track's path is drawn
+MAX_HTML_EVENTS = 1_000_000  # events that notebooks process for a picture
+MAX_HTML_TRACKS = 12  # lines of a table of tracks
 
 
 def plot_events(
     part: Events | Recording, count: int | None = None, *, size: tuple[int, int] | None = None
 ) -> Any:
-    """Draw the `count` events in the middle, ON red and OFF blue, over the frame then.
+    """Draw the events in the middle, ON red and OFF blue, over the frame of that time.
 
-    By default as many as a quarter of the pixels. Cut the recording for those of other times:
-    `plot_events(recording[1.0:1.02])`. `size` (width, height) is needed for `Events`.
+    Cut the recording for events of other times: `plot_events(recording[1.0:1.02])`.
+
+    Args:
+        part: Events, or a recording.
+        count: Number of events; None for a quarter of the pixels.
+        size: Width and height of the sensor, px; needed for `Events`.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" or the size is missing.
     """
     (width, height), events = _sensor(part, size), _middle(part, count, size)
     figure, axis = _image_figure(width, height)
@@ -50,15 +69,26 @@ def plot_events(
 def plot_events_3d(
     part: Events | Recording, count: int | None = None, *, size: tuple[int, int] | None = None
 ) -> Any:
-    """Draw the `count` events in the middle in x, y and t, ON red and OFF blue.
+    """Draw the events in the middle in x, y and t, ON red and OFF blue.
 
-    By default as many as there are pixels. Of more than 20,000 events every n-th is drawn.
+    Of more than 20,000 events every n-th is drawn.
+
+    Args:
+        part: Events, or a recording.
+        count: Number of events; None for the number of pixels.
+        size: Width and height of the sensor, px; needed for `Events`.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" or the size is missing.
     """
     width, height = _sensor(part, size)
     events = _middle(part, width * height if count is None else count, size)
-    shown = slice(None, None, max(1, math.ceil(len(events) / IN_SPACE)))
+    shown = slice(None, None, max(1, math.ceil(len(events) / MAX_EVENTS_3D)))
     t, x, y, p = (getattr(events, name)[shown] for name in "txyp")
-    figure = new_figure(WIDE, 5.5)
+    figure = new_figure(WIDTH_INCHES, 5.5)
     axis = figure.add_subplot(projection="3d")
     zero = t[0] if len(t) else 0
     for chosen, colour, label in ((p, ON, "ON"), (~p, OFF, "OFF")):
@@ -71,20 +101,30 @@ def plot_events_3d(
 
 
 def plot_image(video: ImageSequence, time: Times) -> Any:
-    """Draw the image of a reconstruction at a time (us or s), and how certain it is.
+    """Draw the image of a reconstruction, and its uncertainty.
 
-    White is the image's brightest 0.5 %; black is the frames'. The uncertainty, where the method
-    tells one, is the standard deviation of ln(intensity + I0).
+    White is the image's brightest 0.5 %; black is the frames'. The uncertainty, if the method
+    estimates it, is the standard deviation of ln(intensity + I0).
+
+    Args:
+        video: A reconstruction.
+        time: Time of the image; an integer is us, a float s.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" is missing.
     """
-    told = video(time)
-    image = np.where(told.valid[0], told.mean[0], np.nan)
-    deviation = np.sqrt(np.where(told.valid[0], told.covariance[0], np.nan))
+    estimate = video(time)
+    image = np.where(estimate.valid[0], estimate.mean[0], np.nan)
+    deviation = np.sqrt(np.where(estimate.valid[0], estimate.covariance[0], np.nan))
     panels = [(image, "intensity", {"cmap": "gray", "vmin": 0.0, "vmax": _bright(image, 1e-6)})]
     if np.isfinite(deviation).any():
         scale = {"cmap": "viridis", "vmin": 0.0, "vmax": _bright(deviation, 1e-6)}
         panels.append((deviation, "standard deviation of ln I", scale))
     height, width = image.shape
-    figure = new_figure(WIDE * len(panels) / 1.4, WIDE / 1.4 * height / width + 0.6)
+    figure = new_figure(WIDTH_INCHES * len(panels) / 1.4, WIDTH_INCHES / 1.4 * height / width + 0.6)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (values, label, scale) in zip(axes, panels, strict=True):
         shown = axis.imshow(values, interpolation="nearest", **scale)
@@ -101,8 +141,18 @@ def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int =
     """Draw the paths of tracks in the image plane over the events of their whole time.
 
     Time is colour; ellipses of two standard deviations stand along a path, and its id at its end.
-    `ids` chooses tracks; by default the `most` that live longest. Behind is how many events each
-    pixel fired, of at most a million in the middle. `jaxevent track` draws the same.
+    Behind is the number of events of each pixel, of at most a million in the middle.
+
+    Args:
+        tracks: Tracks of a recording.
+        ids: Tracks that are drawn; None for those that live longest.
+        most: Number of the tracks that are then drawn.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" is missing.
     """
     recording = tracks.recording
     figure, axis = _image_figure(recording.width, recording.height)
@@ -110,8 +160,8 @@ def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int =
         longest = np.argsort(tracks.birth - tracks.death, kind="stable")[:most]
         ids = sorted(tracks.id[longest].tolist())
     times = np.linspace(tracks.start, tracks.stop - 1, PATH_TIMES).round().astype(np.int64)
-    told = tracks(times, ids)
-    draw_paths(axis, recording, times, list(ids), told.mean, told.valid)
+    states = tracks(times, ids)
+    draw_paths(axis, recording, times, list(ids), (states.mean, states.valid))
     span = f"{tracks.start * 1e-6:.6g} to {tracks.stop * 1e-6:.6g} s"
     axis.set_title(f"{recording.name}: {len(ids)} of {len(tracks)} tracks, {span}", fontsize=10)
     return figure
@@ -126,9 +176,19 @@ def plot_motion(
 ) -> Any:
     """Draw a motion's components over time, with bands of two standard deviations.
 
-    Grey spans are those in which it is lost. `times` are by default spread over the estimates;
-    against a `truth` (`egomotion.known_motion`) errors are drawn too. Raises `InputError` where there is
-    no estimate and no time.
+    Grey spans are those in which the motion is lost.
+
+    Args:
+        motion: A motion.
+        times: Times, us or s; None for times spread over the estimates.
+        truth: The true motion (`egomotion.known_motion`), whose errors are drawn too.
+        centred: Whether estimates count for the middle of the events that they use.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" is missing, or there is no estimate and no time.
     """
     if times is None and not len(motion):
         raise InputError(f"{motion.recording}: the motion has no estimate; nothing to draw")
@@ -140,10 +200,21 @@ def plot_motion(
 
 
 def plot_losses(fitted: FitResult | Sequence[FitResult], names: Sequence[str] = ()) -> Any:
-    """Draw the losses of fits over iterations, a line for each start; `names` are titles."""
+    """Draw the losses of fits over iterations, a line for each start.
+
+    Args:
+        fitted: Results of fits.
+        names: Titles of the panels.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" is missing.
+    """
     several = list(fitted) if isinstance(fitted, Sequence) else [fitted]
     titles = list(names) or [""] * len(several)
-    figure = new_figure(WIDE, 3 * len(several))
+    figure = new_figure(WIDTH_INCHES, 3 * len(several))
     grid = figure.subplots(len(several), squeeze=False)[:, 0]
     for one, title, axis in zip(several, titles, grid, strict=True):
         # Rounds follow each other.
@@ -162,8 +233,97 @@ def plot_losses(fitted: FitResult | Sequence[FitResult], names: Sequence[str] = 
     return figure
 
 
+@functools.singledispatch
+def as_html(thing: Any) -> str:
+    """Return a table about a thing and a picture of it, as HTML.
+
+    Without the extra "plot" the picture is left out.
+    """
+    return f"<pre>{html.escape(repr(thing))}</pre>"
+
+
+@as_html.register
+def _(recording: Recording) -> str:
+    start, stop = recording.start, recording.stop
+    rows = [
+        ("sensor", f"{recording.width} x {recording.height} px"),
+        ("time", f"{start / 1e6:.6g} to {stop / 1e6:.6g} s"),
+        ("events", f"{len(recording.events):,}"),
+        ("frames", f"{0 if recording.frames is None else len(recording.frames):,}"),
+    ]
+    also = [name for name in ("camera", "poses", "imu") if getattr(recording, name) is not None]
+    rows.append(("also", ", ".join([*also, *recording.extra]) or "-"))
+    return _block(recording.name, rows, lambda: plot_events(recording))
+
+
+@as_html.register
+def _(video: ImageSequence) -> str:
+    recording = video.recording
+    middle = (recording.start + recording.stop) // 2
+    if recording.events.index(middle) > MAX_HTML_EVENTS:
+        middle = int(recording.events[MAX_HTML_EVENTS : MAX_HTML_EVENTS + 1].t[0])
+    rows = [
+        ("method", video.estimator.name),
+        ("images", f"{recording.width} x {recording.height} px, at any time"),
+        ("time", f"{recording.start / 1e6:.6g} to {recording.stop / 1e6:.6g} s"),
+    ]
+    return _block(recording.name, rows, lambda: plot_image(video, middle))
+
+
+@as_html.register
+def _(tracks: Tracks) -> str:
+    order = sorted(
+        np.argsort(tracks.birth - tracks.death, kind="stable")[:MAX_HTML_TRACKS].tolist()
+    )
+    rows = [
+        (
+            f"track {tracks.id[i]}",
+            f"{tracks.birth[i] / 1e6:.6g} to {tracks.death[i] / 1e6:.6g} s, {tracks.ended[i]}",
+        )
+        for i in order
+    ]
+    if len(tracks) > len(order):
+        rows.append(("", f"and {len(tracks) - len(order)} shorter ones"))
+    picture = (
+        (lambda: plot_tracks(tracks)) if len(tracks.recording.events) <= MAX_HTML_EVENTS else None
+    )
+    title = f"{len(tracks)} {plural('track', len(tracks))} of {tracks.recording.name}"
+    return _block(title, rows, picture)
+
+
+@as_html.register
+def _(motion: MotionEstimate) -> str:
+    lost = int((~motion.valid).sum())
+    rows = [
+        ("motion", motion.model.title),
+        ("estimates", f"{len(motion):,}, {lost:,} of them lost"),
+    ]
+    for i, (name, unit) in enumerate(zip(motion.model.components, motion.model.units, strict=True)):
+        if motion.valid.any():
+            mean = motion.mean[motion.valid, i].mean()
+            rows.append((name, f"{mean:.4g}{'' if unit == '1' else f' {unit}'} on average"))
+    return _block(motion.recording, rows, lambda: plot_motion(motion))
+
+
+def _block(title: str, rows: Sequence[tuple[str, str]], picture: Callable[[], Any] | None) -> str:
+    cells = "".join(
+        f"<tr><th>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
+        for name, text in rows
+    )
+    image = ""
+    if picture is not None:
+        try:
+            png = base64.b64encode(picture()._repr_png_()).decode()
+            image = f"<img alt='' style='max-width:100%' src='data:image/png;base64,{png}'>"
+        except InputError as error:  # no matplotlib, or nothing to draw
+            image = f"<p>{html.escape(str(error))}</p>"
+    return f"<div><b>{html.escape(title)}</b><table>{cells}</table>{image}</div>"
+
+
 def _image_figure(width: int, height: int) -> tuple[Any, Any]:
-    figure = new_figure(WIDE, min(max(WIDE * height / width, 2), 2 * WIDE) + 0.3)
+    figure = new_figure(
+        WIDTH_INCHES, min(max(WIDTH_INCHES * height / width, 2), 2 * WIDTH_INCHES) + 0.3
+    )
     axis = figure.subplots()
     axis.set(xlabel="x (px)", ylabel="y (px)")
     return figure, axis
@@ -173,7 +333,9 @@ def _sensor(part: Events | Recording, size: tuple[int, int] | None) -> tuple[int
     if isinstance(part, Recording):
         return part.width, part.height
     if size is None:
-        raise InputError("events alone do not tell the sensor; give size=(width, height)")
+        raise InputError(
+            "the size of the sensor is not known from events; give size=(width, height)"
+        )
     return size
 
 
@@ -188,7 +350,7 @@ def _middle(
 
 
 def _frame_at(part: Events | Recording, events: Events) -> NDArray[np.float32] | None:
-    """The frame nearest to the middle of the events, faint, so that they are seen on it."""
+    """Return the frame nearest to the middle of the events, faint, so that they are seen on it."""
     if not isinstance(part, Recording) or part.frames is None:
         return None
     middle = (events.t[0] + events.t[-1]) // 2 if len(events) else part.frames.t[0]

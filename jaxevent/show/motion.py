@@ -1,6 +1,5 @@
-"""A motion written to files: tables, and with `motion_pictures` plots and images."""
+"""Files of a motion: tables, HDF5, and the figures of `motion_figures`."""
 
-import contextlib
 import dataclasses
 import json
 import math
@@ -27,28 +26,36 @@ from jaxevent.egomotion.truth import (
 )
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
-from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
 from jaxevent.metrics import MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
-from jaxevent.show.motion_pictures import (
+from jaxevent.show.images import save_figure
+from jaxevent.show.motion_figures import (
     flow_of,
+    motion_figure,
     plot_flow,
-    plot_motion,
     plot_warped,
     span_of,
     window_of,
 )
+from jaxevent.show.tables import align_cells
 
 
 def write_motion_table(
-    path: str | Path, model: str | type[Model], times: NDArray[np.int64], told: Estimate
+    path: str | Path, model: str | type[Model], times: NDArray[np.int64], estimated: Estimate
 ) -> None:
-    """Write motion at times (us) as CSV: t (s), the components, sigma_<component>, lost (0 or 1).
+    """Write a motion as CSV: t (s), the components, sigma_<component>, lost (0 or 1).
 
     A sigma is the square root of its component's variance. Where the motion is lost both are empty.
+
+    Args:
+        path: File that is written.
+        model: Motion model, or its name.
+        times: (T,) us.
+        estimated: The motion at these times.
     """
-    _write_csv(path, table_columns(model, times, told))
+    _write_csv(path, table_columns(model, times, estimated))
 
 
 def write_known(
@@ -57,7 +64,14 @@ def write_known(
     times: NDArray[np.int64],
     values: NDArray[np.floating],
 ) -> None:
-    """Write a known motion (times, components) at times (us) as CSV: t (s) and the components."""
+    """Write a known motion as CSV: t (s) and the components.
+
+    Args:
+        path: File that is written.
+        model: Motion model, or its name.
+        times: (T,) us.
+        values: (T, components).
+    """
     columns = dict(zip(find_model(model).components, values.T, strict=True))
     _write_csv(path, {"t": times / 1e6, **columns})
 
@@ -74,11 +88,16 @@ def write_motion(
     method: str | None = None,
     params: Parameters | None = None,
 ) -> None:
-    """Write the estimates as HDF5: t (us), mean, covariance, lost, lag (s), contrast, evidence, and
-    what else the motion has.
+    """Write the estimates as HDF5: t (us), mean, covariance, lost, lag (s), contrast and others.
 
-    The attributes are recording, model, components, units, what `about` holds, of numbers and
-    texts, and what `jaxevent.io.output` lists.
+    The attributes are recording, model, components, units, and those of `jaxevent.io.output`.
+
+    Args:
+        path: File that is written.
+        motion: A motion.
+        about: Further attributes, numbers and texts.
+        method: Name of the method that estimated the motion.
+        params: Parameters of the method.
     """
     units = {
         "t": CLOCK_UNIT, "mean": "units", "covariance": "units[i] units[j]", "lost": "1",
@@ -108,16 +127,16 @@ def write_motion(
                 file[name].attrs["units"] = motion.model.units
 
 
-def write_errors(folder: Path, found: MotionScores) -> None:
+def write_errors(folder: Path, errors: MotionScores) -> None:
     """Write errors.csv (figure, value, unit) and errors.json into a folder."""
-    rows = found.rows()
+    rows = errors.rows()
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
     table = {
         name: {"value": _plain(value), "unit": unit, "meaning": MEANINGS[name]}
         for name, value, unit in rows
     }
-    about = {"times": found.count, "truth": found.truth}
+    about = {"times": errors.count, "truth": errors.truth}
     with complete(folder / "errors.json") as partial:
         partial.write_text(json.dumps({"figures": table, **about}, indent=2) + "\n")
 
@@ -129,16 +148,24 @@ def _plain(value: float) -> float | None:
 def fitted_velocity(
     recording: Recording, motion: MotionEstimate, span: float | int = 0.02
 ) -> KnownMotion:
-    """Return the motion from poses at the one depth that fits `motion` best.
+    """Return the motion from poses at the one depth that fits an estimate.
 
-    Poses do not tell the depth, so that of an image velocity only directions, and changes of the
-    speed, are compared with a truth. Raises `InputError` without poses or calibration.
+    The depth is not observable from poses. So only directions of an image velocity, and changes of
+    its speed, are compared with a truth. See `Model.from_twists_at_fitted_depth`.
+
+    Args:
+        recording: Recording with poses and calibration.
+        motion: The estimate.
+        span: Time over which poses are differentiated, s.
+
+    Raises:
+        InputError: There are no poses or no calibration.
     """
     model = motion.model
     if recording.poses is None or recording.camera is None:
         raise InputError(
             f"{recording.name}: holds no {'poses' if recording.poses is None else 'calibration'}, "
-            f"which tell an {model.parts[0].name}"
+            f"which determine an {model.parts[0].name}"
             f"{recording.describe_left_out('poses') or recording.describe_left_out('camera')}; "
             f"give --truth a table with the columns {', '.join(('t', *model.components))}"
         )
@@ -150,7 +177,7 @@ def fitted_velocity(
 
 
 class Truth(NamedTuple):
-    """A known motion, what it is in words, and further lines about it."""
+    """A known motion, its source in words, and further lines about it."""
 
     known: KnownMotion
     words: str
@@ -160,17 +187,23 @@ class Truth(NamedTuple):
 def measured_rotation(
     truth: KnownMotion, motion: MotionEstimate, unbiased: bool, turned: bool
 ) -> Truth:
-    """The truth of a gyro, as it is compared with an estimate.
+    """Prepare the angular velocity of a gyro for the comparison with an estimate.
 
-    Where nothing has told its bias (`unbiased`) the constant that fits the estimate is taken off.
-    Where nothing has told its axes (`turned`) and others fit far better, a note says so.
+    Without a known bias the constant that fits the estimate is subtracted. Without a known rotation
+    a note names other axes that fit far better.
+
+    Args:
+        truth: Angular velocity of the gyro.
+        motion: The estimate.
+        unbiased: Whether the bias is known and subtracted.
+        turned: Whether the rotation to the camera is known and applied.
     """
-    told = motion(truth.t, centred=True, extrapolate=True)
-    rows = told.valid & np.isfinite(told.mean).all(1)
+    estimated = motion(truth.t, centred=True, extrapolate=True)
+    rows = estimated.valid & np.isfinite(estimated.mean).all(1)
     words, notes = "the gyro", []
     if not rows.any():
         return Truth(truth, words)
-    estimate, measured = told.mean[rows], truth.values[rows]
+    estimate, measured = estimated.mean[rows], truth.values[rows]
     axes = None if turned else find_imu_axes(estimate, measured)
     if axes is not None:
         notes.append(
@@ -190,23 +223,22 @@ def measured_rotation(
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """What is written of a motion: `output.write(recording, motion, ...)`.
+    """Destination of a motion: `output.write(recording, motion, ...)`.
 
     `path` is a folder for
 
     - motion.csv: a row for each of `rate` times per second, see `write_motion_table`;
     - motion.h5: the estimates as they were made, see `write_motion`;
-    - motion.png: the components over time, with bands of two standard deviations, particles where
-      the motion has a cloud of them, and, with a truth, the truth and the errors;
-    - warped.png: the events of a short window as they fell and moved back along the motion;
-    - errors.csv and errors.json, with a truth: see `Comparison`;
+    - motion.png: the components over time, see `motion_figure`;
+    - warped.png: the events of a short window before and after warping along the motion;
+    - errors.csv and errors.json, with a truth: see `MotionScores`;
     - flow.h5 and flow.png, if `flow` is set: t (us), u, v (px/s) and valid of each event, and the
       window's events in colours of their flow.
 
     `truth` is "auto" (the recording's poses, else its gyro), the path of a table with the columns
-    of motion.csv, or None. `centred` estimates count for the time that what they saw shows. Without
-    the extra "plot" the pictures are left out. Raises `InputError` for settings that are not
-    possible and a place that cannot be written.
+    of motion.csv, or None. `centred` estimates count for the middle of the events that they use.
+    Without the extra "plot" the figures are left out. `InputError` is raised for settings that are
+    not possible and a place that cannot be written.
     """
 
     path: Path
@@ -222,9 +254,7 @@ class Output:
             )
         if not 0 < self.rate <= 1e6:
             raise InputError(f"--rate {self.rate:g} is not possible; give times per s, up to 1e6")
-        # A place that cannot be written is told before the work.
-        with contextlib.suppress(_Tried), complete(self.path, directory=True):
-            raise _Tried
+        check_writable(self.path, directory=True)
 
     def known(
         self,
@@ -234,11 +264,19 @@ class Output:
         rotation: NDArray[np.float64] | None = None,
         depth: float | int | None = None,
     ) -> Callable[[MotionEstimate], Truth] | None:
-        """The truth, given the motion; None where none is asked for.
+        """Return a function from the estimated motion to its truth; None without a truth.
 
-        Of a gyro, which is looked at where there are no poses, `bias` (rad/s) is taken off and
-        `rotation` takes its axes to the camera's; see `measured_rotation` for what is done without
-        them. `depth` (m) is the scene's. Raises `InputError` for a truth that is not there.
+        A gyro is used if there are no poses, see `measured_rotation`.
+
+        Args:
+            recording: Recording of the motion.
+            model: Motion model, or its name.
+            bias: (3,) rad/s, bias of the gyro; None if it is not known.
+            rotation: (3, 3) from the gyro's axes to the camera's; None if it is not known.
+            depth: Depth of the scene, m.
+
+        Raises:
+            InputError: The recording does not hold the truth.
         """
         if self.truth is None:
             return None
@@ -268,30 +306,41 @@ class Output:
         motion: MotionEstimate,
         about: Mapping[str, Any] = MappingProxyType({}),
         truth: Callable[[MotionEstimate], Truth] | None = None,
+        *,
         progress: bool | None = None,
         method: str | None = None,
         params: Parameters | None = None,
-    ) -> "Written":
-        """Write everything, complete or not at all; motion.h5 says `about`, `method`, `params`."""
+    ) -> "WrittenMotion":
+        """Write everything, complete or not at all.
+
+        Args:
+            recording: Recording of the motion.
+            motion: A motion.
+            about: Further attributes of motion.h5.
+            truth: Function that `known` returned.
+            progress: Whether a bar is shown; None: in a terminal or notebook.
+            method: Name of the method that estimated the motion.
+            params: Parameters of the method.
+        """
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
         start, stop = span_of(recording)
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
-        told = motion(times, centred=self.centred)
+        estimated = motion(times, centred=self.centred)
         true = None if truth is None else truth(motion)
-        found = None
+        errors = None
         if true is not None:
-            found = score_motion(
+            errors = score_motion(
                 motion, true.known, times, start=start, centred=self.centred, description=true.words
             )
-            found = dataclasses.replace(found, notes=true.notes)
+            errors = dataclasses.replace(errors, notes=true.notes)
         outliers = None
         with complete(self.path, directory=True) as folder:
-            write_motion_table(folder / "motion.csv", motion.model, times, told)
+            write_motion_table(folder / "motion.csv", motion.model, times, estimated)
             write_motion(folder / "motion.h5", motion, about, method, params)
-            if found is not None:
-                write_errors(folder, found)
+            if errors is not None:
+                write_errors(folder, errors)
             if self.flow:
                 outliers = _write_flow(folder / "flow.h5", recording, motion, progress)
             left_out = None
@@ -301,13 +350,14 @@ class Output:
                 left_out = str(missing)
             else:
                 shown = None if true is None else true.known
-                plot_motion(folder / "motion.png", motion, times, shown, centred=self.centred)
+                figure = motion_figure(motion, times, shown, centred=self.centred)
+                save_figure(figure, folder / "motion.png", dpi=130)
                 self._draw_window(folder, recording, motion)
             files = sorted(path.name for path in folder.iterdir())
-        return Written(files, times, told, motion, found, outliers, left_out)
+        return WrittenMotion(files, times, estimated, motion, errors, outliers, left_out)
 
     def _draw_window(self, folder: Path, recording: Recording, motion: MotionEstimate) -> None:
-        """The events of a short window as they fell, moved back, and in colours of their flow."""
+        """Draw the events of a short window before and after warping, and in colours of flow."""
         part = window_of(recording, motion)
         flows = None
         if self.flow or motion.model.half_line:
@@ -318,31 +368,31 @@ class Output:
 
 
 @dataclasses.dataclass(frozen=True)
-class Written:
-    """What `Output.write` has written: names of files, the rows of motion.csv, errors."""
+class WrittenMotion:
+    """Result of `Output.write`: names of files, the rows of motion.csv, errors."""
 
     files: list[str]
     times: NDArray[np.int64]
-    told: Estimate
+    estimated: Estimate
     motion: MotionEstimate
     errors: MotionScores | None
     outliers: float | None  # percentage of events, where flow was asked for
-    left_out: str | None = None  # why there are no pictures
+    left_out: str | None = None  # the reason why there are no figures
 
     def summary(self) -> list[str]:
-        """Lines to print: when it was found, means and spreads, errors, what is left out."""
-        lines = self._found()
+        """Return lines to print: the time found, means and spreads, errors, missing figures."""
+        lines = self._describe_motion()
         if self.left_out is not None:
             lines += ["", f"pictures are left out: {self.left_out}"]
         return lines
 
     def _count(self) -> str:
-        """Of estimates, without those that are held."""
+        """Count the estimates, without those that are held."""
         number = len(self.motion) - self.motion.n_extended
         return f"{number:,} {plural('estimate', number)}"
 
-    def _found(self) -> list[str]:
-        lost = ~self.told.valid
+    def _describe_motion(self) -> list[str]:
+        lost = ~self.estimated.valid
         first = np.flatnonzero(~lost)
         if not len(first):
             lines = [f"{self._count()}: the motion was never found"]
@@ -355,32 +405,28 @@ class Written:
         lines = [
             f"{self._count()}, found after {since:.3f} s, then lost {100 * later:.2f} % of the time"
         ]
-        mean = self.told.mean[first]
-        sigma = np.sqrt(np.diagonal(self.told.covariance[first], axis1=1, axis2=2).clip(0))
+        mean = self.estimated.mean[first]
+        sigma = np.sqrt(np.diagonal(self.estimated.covariance[first], axis1=1, axis2=2).clip(0))
         cells = [["", "mean", "least", "most", "sigma", ""]]
         model = self.motion.model
-        told = is_observable(model, self.told.covariance[first])
+        observable = is_observable(model, self.estimated.covariance[first])
         for i, (name, unit) in enumerate(zip(model.components, model.units, strict=True)):
-            column = mean[told[:, i], i]
+            column = mean[observable[:, i], i]
             numbers = (column.mean(), column.min(), column.max()) if len(column) else ()
-            said = [f"{number:.4g}" for number in numbers] or ["not told", "", ""]
+            texts = [f"{number:.4g}" for number in numbers] or ["unobservable", "", ""]
             usual = f"{np.median(sigma[:, i]):.4g}"
-            cells.append([name, *said, usual, "" if unit == "1" else unit])
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines += [
-            "  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
-            for line in cells
-        ]
+            cells.append([name, *texts, usual, "" if unit == "1" else unit])
+        lines += align_cells(cells)
         lines.append(
             "mean, least and most over the times found; sigma: median of the standard deviations"
         )
         for part in model.parts:
             if part.direction:
-                unknown = ~told[:, part.rows].all(1)
+                unknown = ~observable[:, part.rows].all(1)
                 if unknown.any():
                     lines.append(
                         f"translation is not observable {100 * unknown.mean():.0f} % of the time: "
-                        f"rotation alone explains the events, and the {part.name} is not told"
+                        f"rotation alone explains the events, and the {part.name} is unknown"
                     )
         if self.outliers is not None:
             lines.append(
@@ -391,14 +437,10 @@ class Written:
         return lines
 
 
-class _Tried(Exception):
-    """Only to leave a block without effect."""
-
-
 def _write_flow(
     path: Path, recording: Recording, motion: MotionEstimate, progress: bool | None
 ) -> float:
-    """Write the flow of all events, in stretches; returns the percentage of outliers."""
+    """Write the flow of all events, and return the percentage of outliers."""
     over = known_count = row = 0
     total = len(recording.events)
     params = event_flow.Params.of({})
@@ -415,9 +457,9 @@ def _write_flow(
             for name, column in columns.items():
                 stored[name][row:stop] = column
             check()
-            known_motion = ~np.isnan(part.residual)
-            known_count += int(known_motion.sum())
-            over += int((part.residual[known_motion] > float(params.limit)).sum())
+            known = ~np.isnan(part.residual)
+            known_count += int(known.sum())
+            over += int((part.residual[known] > float(params.limit)).sum())
             row = stop
         units = {"t": CLOCK_UNIT, "u": "px/s, undistorted", "v": "px/s, undistorted", "valid": "1"}
         for name, unit in units.items():

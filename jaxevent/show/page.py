@@ -19,28 +19,30 @@ import jaxevent
 from jaxevent.display import plural
 from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET, MEANINGS
-from jaxevent.show.report import (
+from jaxevent.show.images import display_limits, tone_map
+from jaxevent.show.tables import (
     WORK,
     Column,
     columns_of,
-    display_limits,
+    format_number,
     mean_of,
     means,
-    number,
     short_names,
-    tone_map,
+    value_at,
 )
 
-SIDE = 360  # pixels of the longer side of a picture
-STRIPS = 12  # recordings with pictures and plots over time; more would make the page slow to open
-POINTS = 300  # of a curve over time, means of so many parts of it
+PICTURE_PX = 360  # px of the longer side of a picture
+MAX_STRIPS = (
+    12  # recordings with pictures and plots over time; more would make the page slow to open
+)
+MAX_POINTS = 300  # of a curve over time, means of so many parts of it
 # Standard deviations of log intensity shown black and white; between them by their logarithm.
-UNCERTAIN = 0.001, 0.1
-WIDTH = 4.5  # inches of a plot: 27 rem of the page
-LABEL = 18  # letters of a line of a method's label in a plot
+DEVIATION_LIMITS = 0.001, 0.1
+WIDTH_INCHES = 4.5  # inches of a plot: 27 rem of the page
+LABEL_LETTERS = 18  # letters of a line of a method's label in a plot
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
-FULL = {False: 0.1, True: 1.0}
-HIGHER = {  # of these more is better
+FULL_ERROR = {False: 0.1, True: 1.0}
+HIGHER_IS_BETTER = {  # of these more is better
     "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
     "mota", "idf1", "hota",
 }  # fmt: skip
@@ -66,15 +68,18 @@ def page(
     hosts: Sequence[str],
     title: str,
 ) -> str:
-    """The page, as text.
+    """Render the page.
 
     Args:
-        rows: As `evaluate.evaluate` gives them, those with an error too.
-        pictures: What `picture` gave for each row; None: nothing to show.
-        protocol: What was asked of the methods.
-        config: The text of the configuration.
-        hosts: The names of the machines that computed it.
-        title: Of the page.
+        rows: Rows of `evaluate.evaluate`, those with an error too.
+        pictures: A `picture` of each row, or None.
+        protocol: Name of the protocol of evaluation.
+        config: Text of the configuration.
+        hosts: Names of the machines that computed it.
+        title: Title of the page.
+
+    Returns:
+        The page as HTML.
     """
     import jinja2
 
@@ -94,17 +99,17 @@ def page(
         "means": _means(rows, columns),
         "unequal": len(counts) > 1,
         "strips": _strips(rows, pictures, recordings, names),
-        "full": f"{FULL[hdr]:g}",
+        "full": f"{FULL_ERROR[hdr]:g}",
         "unit": "ln(I + 0.003)" if hdr else "intensity",
-        "certain": UNCERTAIN[0],
-        "uncertain": UNCERTAIN[1],
+        "certain": DEVIATION_LIMITS[0],
+        "uncertain": DEVIATION_LIMITS[1],
         "everything": _table(rows, columns, names),
         "parameters": _parameters(rows, methods),
         "computed": _computed(hosts),
         "config": config,
     }
-    if len(recordings) > STRIPS:
-        values["first_only"] = f"Of {len(recordings)} recordings the first {STRIPS} are shown."
+    if len(recordings) > MAX_STRIPS:
+        values["first_only"] = f"Of {len(recordings)} recordings the first {MAX_STRIPS} are shown."
     if importlib.util.find_spec("matplotlib") is None:
         values["missing_plots"] = install_command("plot")
     else:
@@ -120,10 +125,10 @@ def page(
 
 
 def picture(sample: Any) -> dict[str, Any]:
-    """An image, its error, the truth and more as base64 of PNG, from an `evaluate.Sample`.
+    """Encode an image, its error, the truth and more as base64 of PNG.
 
-    With an HDR reference all are logarithmic, between the truth's limits; else they are linear, and
-    dark ones are brightened alike.
+    With an HDR reference all are logarithmic, between the truth's limits. Otherwise they are
+    linear, and dark ones are brightened alike. `sample` is an `evaluate.Sample`.
     """
     image, truth = (np.asarray(a, np.float64) for a in (sample.image, sample.truth))
     known = np.isfinite(truth) & np.isfinite(image)
@@ -136,7 +141,7 @@ def picture(sample: Any) -> dict[str, Any]:
         bright = float(np.percentile(truth, 99.5))
         tone, limits = "linear", (0.0, bright if 0 < bright < 0.8 else 1.0)
         error = image.clip(0, 1) - truth
-    error = np.where(known, error / FULL[sample.hdr], 0).clip(-1, 1)
+    error = np.where(known, error / FULL_ERROR[sample.hdr], 0).clip(-1, 1)
     shown = {
         "t": sample.t,
         "image": _grey(tone_map(image, tone, limits)),
@@ -144,7 +149,7 @@ def picture(sample: Any) -> dict[str, Any]:
         "error": _diverging(error),
     }
     if sample.deviation is not None:
-        least, most = UNCERTAIN
+        least, most = DEVIATION_LIMITS
         deviation = np.nan_to_num(np.asarray(sample.deviation, np.float64), nan=most)
         share = np.log(np.maximum(deviation, least) / least) / np.log(most / least)
         shown["deviation"] = _grey(np.rint(255 * share.clip(0, 1)).astype(np.uint8))
@@ -155,7 +160,7 @@ def picture(sample: Any) -> dict[str, Any]:
 
 def _size(shape: tuple[int, ...]) -> tuple[int, int]:
     height, width = shape
-    scale = min(1.0, SIDE / max(height, width))
+    scale = min(1.0, PICTURE_PX / max(height, width))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
@@ -167,7 +172,7 @@ def _grey(image: NDArray[np.uint8]) -> str:
 
 
 def _diverging(error: NDArray[np.float64]) -> str:
-    """Errors of -1, 0 and 1 as blue, white and red, in steps, which PNG packs well."""
+    """Encode errors of -1, 0 and 1 as blue, white and red, in steps, which PNG packs well."""
     from PIL import Image
 
     small = Image.fromarray(error.astype(np.float32)).resize(
@@ -205,28 +210,27 @@ def _failures(
 
 
 def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
-    """The means of each method, the best of every measure marked.
+    """Tabulate the means of each method, the best of every measure marked.
 
-    Whether more is better of a metric of the user's own is not known, so none of them is marked.
+    Metrics of the user's own are not marked, as it is not known whether more of them is better.
     """
     found = means(rows)
     measures = [column for column in columns if column[1] in found[0]]
     unmarked = WORK.union(*(row.get("own_metrics", ()) for row in rows))
     most = max(one["recordings"] for one in found)
+    best = {}
+    for _, place, _, _ in measures:
+        values = [one[place] for one in found if one["recordings"] == most]
+        values = [value for value in values if value is not None]
+        if len(values) > 1 and place not in unmarked:
+            best[place] = (max if place in HIGHER_IS_BETTER else min)(values)
     lines = []
     for one in found:
         cells = [Cell(one["method"], "left"), Cell(str(one["recordings"]))]
-        for _, place, factor, digits in measures:
-            value = one[place]
-            others = [
-                other[place]
-                for other in found
-                if other[place] is not None and other["recordings"] == most
-            ]
-            best = others and value == (max if place in HIGHER else min)(others)
-            marked = best and len(others) > 1 and one["recordings"] == most
-            cell = number({"mean": value}, "mean", factor, digits)
-            cells.append(Cell(cell, "best" if marked and place not in unmarked else ""))
+        for column in measures:
+            place, value = column[1], one[column[1]]
+            marked = value is not None and value == best.get(place) and one["recordings"] == most
+            cells.append(Cell(format_number(value, column), "best" if marked else ""))
         lines.append(cells)
     return ["method", "recordings", *(title for title, _, _, _ in measures)], lines, 1
 
@@ -241,7 +245,8 @@ def _table(
         if "error" in row:
             cells.append(Cell(row["error"], "wrap", len(columns)))
         else:
-            cells += [Cell(number(row, *column[1:])) for column in columns]
+            for column in columns:
+                cells.append(Cell(format_number(value_at(row, column[1]), column)))
         lines.append(cells)
     return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 
@@ -277,9 +282,9 @@ def _strips(
     recordings: Sequence[str],
     names: Mapping[str, str],
 ) -> list[dict[str, Any]]:
-    """Of each recording the truth, the frame before, and every method's pictures."""
+    """Collect the truth, the frame before, and every method's pictures of each recording."""
     strips = []
-    for recording in recordings[:STRIPS]:
+    for recording in recordings[:MAX_STRIPS]:
         shown = [
             (row["method"], one)
             for row, one in zip(rows, pictures, strict=True)
@@ -312,7 +317,7 @@ NAMES = {
 
 
 def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
-    """Two measures whose means are plotted, and that which is plotted over time."""
+    """Choose two measures whose means are plotted, and the one plotted over time."""
     pairs = {
         "log_mse": (["log_mse", "log_ssim"], "log_mse"),
         "rmse": (["rmse", "covered"], "distance"),
@@ -329,7 +334,7 @@ def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
 def _points(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
 ) -> list[str]:
-    """Means over recordings, a plot for each measure; errors on a logarithmic scale."""
+    """Plot means over recordings for each measure, errors on a logarithmic scale."""
     plots = []
     for measure in measures:
         figure, axis = _panel(methods)
@@ -340,7 +345,7 @@ def _points(
         colours = [_colour(i) for i in range(len(methods))]
         axis.hlines(range(len(methods)), 0, 1, "0.9", transform=axis.get_yaxis_transform())
         axis.scatter(places, range(len(methods)), c=colours, zorder=2)
-        if measure not in HIGHER and all(place > 0 for place in places if place == place):
+        if measure not in HIGHER_IS_BETTER and all(place > 0 for place in places if place == place):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
         axis.set_xlabel(NAMES[measure])
@@ -349,13 +354,15 @@ def _points(
 
 
 def _panel(methods: Sequence[str]) -> tuple[Any, Any]:
-    """A figure and its axes with a line for each method, from above."""
+    """Make a figure and its axes with a line for each method, from above."""
     from matplotlib.figure import Figure
 
-    lines = sum(len(textwrap.wrap(method, LABEL)) for method in methods)
-    figure = Figure(figsize=(WIDTH, 0.8 + 0.14 * (lines + len(methods))), layout="constrained")
+    lines = sum(len(textwrap.wrap(method, LABEL_LETTERS)) for method in methods)
+    figure = Figure(
+        figsize=(WIDTH_INCHES, 0.8 + 0.14 * (lines + len(methods))), layout="constrained"
+    )
     axis = figure.subplots()
-    labels = [textwrap.fill(method, LABEL) for method in methods]
+    labels = [textwrap.fill(method, LABEL_LETTERS) for method in methods]
     axis.set(yticks=range(len(methods)), yticklabels=labels, ylim=(len(methods) - 0.5, -0.5))
     axis.tick_params(left=False)
     axis.spines[["top", "right", "left"]].set_visible(False)
@@ -363,14 +370,14 @@ def _panel(methods: Sequence[str]) -> tuple[Any, Any]:
 
 
 def _series(row: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a row lists of every image, or of every time; empty of published numbers."""
+    """Return the values of a row by image or time; none of published numbers."""
     return row.get("per_frame") or row.get("per_time") or {}
 
 
 def _boxes(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
 ) -> list[str]:
-    """How the values of all images, or times, of all recordings spread: a plot for each measure.
+    """Plot the distribution of each measure over all images, or times, of all recordings.
 
     A box reaches from the first to the third quartile, the line in it is the median, whiskers
     reach to the last value within 1.5 times the box's length. Further metrics have plots too.
@@ -395,7 +402,7 @@ def _boxes(
         )  # fmt: skip
         for i, box in enumerate(drawn["boxes"]):
             box.set(facecolor=_colour(i), alpha=0.6)
-        if measure not in HIGHER | own and all((one > 0).all() for one in columns):
+        if measure not in HIGHER_IS_BETTER | own and all((one > 0).all() for one in columns):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
         axis.set_xlabel(NAMES.get(measure, measure))
@@ -410,12 +417,12 @@ def _curves(
     measure: str,
     names: Mapping[str, str],
 ) -> list[tuple[str, str]]:
-    """The name of each recording and a plot of the error of every method at every image."""
+    """Plot the error of every method at every image, for each recording by its name."""
     from matplotlib.figure import Figure
 
     parts = []
-    for recording in recordings[:STRIPS]:
-        figure = Figure(figsize=(WIDTH, 2.8), layout="constrained")
+    for recording in recordings[:MAX_STRIPS]:
+        figure = Figure(figsize=(WIDTH_INCHES, 2.8), layout="constrained")
         axis = figure.subplots()
         for row in rows:
             if row["recording"] != recording:
@@ -428,8 +435,8 @@ def _curves(
             pieces = [
                 (float(np.mean(a)), float(np.mean(b)))
                 for a, b in zip(
-                    np.array_split(t, min(POINTS, len(t))),
-                    np.array_split(values, min(POINTS, len(t))),
+                    np.array_split(t, min(MAX_POINTS, len(t))),
+                    np.array_split(values, min(MAX_POINTS, len(t))),
                     strict=True,
                 )
             ]
@@ -460,7 +467,7 @@ def _curves(
 
 
 def _label_plainly(axis: Any) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5 of each decade, as plain numbers."""
+    """Put ticks of a logarithmic axis at 1, 2 and 5 of each decade, as plain numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=12))

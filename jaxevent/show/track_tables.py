@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.blob.tables import COLUMNS, TABLE_UNITS, UNITS, table_columns
+from jaxevent.blob.tracks import COLUMNS, TABLE_UNITS, UNITS, table_columns
 from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.parameters import Parameters
@@ -26,34 +26,29 @@ QUANTITIES = (
 )  # fmt: skip
 
 
-def write_tracks(
-    path: str | Path,
-    times: Times,
-    ids: ArrayLike,
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    valid: ArrayLike | None = None,
-) -> None:
-    """Write tracks to a file that ends in .csv, .h5 or .hdf5, one row per time and valid track.
-
-    A table is written as it is instead where ids are (rows,), mean (rows, 8), covariance (rows, 8,
-    8) and `times` (rows,), say one row per event. CSV has the columns t (s), id, the state x, y,
-    vx, vy, lambda1, lambda2, theta, q and their standard deviations sigma_x ... sigma_q. HDF5 has t
-    (rows,) int64 us, id (rows,), mean (rows, 8) and covariance (rows, 8, 8), with the attributes
-    `columns` and `units`, and says what `jaxevent.io.output` lists. Raises `InputError` for
-    another suffix and shapes that do not fit.
-    """
-    with track_writer(path) as write:
-        write(times, ids, mean, covariance, valid)
-
-
 @contextlib.contextmanager
 def track_writer(
     path: str | Path, method: str | None = None, params: Parameters | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Open a file as of `write_tracks` and give the function that appends to it.
+    """Open a table of tracks, one row per time and valid track, for a function that appends to it.
 
-    The file appears at the end, complete. HDF5 says what `method` and `params` made the tracks.
+    The function takes times, ids, mean, covariance and valid, as above, or the rows of a table: ids
+    (rows,), mean (rows, 8), covariance (rows, 8, 8) and times (rows,). CSV has the columns t (s),
+    id, the state x, y, vx, vy, lambda1, lambda2, theta, q and their standard deviations sigma_x ...
+    sigma_q. HDF5 has t (rows,) int64 us, id (rows,), mean (rows, 8) and covariance (rows, 8, 8),
+    with the attributes `columns` and `units` and those of `jaxevent.io.output`. The file
+    appears at the end, complete.
+
+    Args:
+        path: File that is written, .csv, .h5 or .hdf5.
+        method: Name of the method that made the tracks, for HDF5.
+        params: Parameters of the method, for HDF5.
+
+    Yields:
+        The function that appends.
+
+    Raises:
+        InputError: The suffix is another one, or shapes do not fit.
     """
     path = Path(path)
     hdf5 = functools.partial(_hdf5_writer, method=method, params=params)
@@ -118,10 +113,10 @@ def _hdf5_writer(
 def quantity_writer(
     path: str | Path, method: str | None = None, params: Parameters | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Open an HDF5 file of time to contact and range, and give the function that appends rows.
+    """Open an HDF5 file of time to contact and range for a function that appends rows.
 
     It takes the columns `QUANTITIES`, (rows,) each: t int64 us, id and other (-1: no other track)
-    whole numbers, the others floats, NaN where not asked for.
+    integers, the others floats, NaN where not requested.
     """
     with complete_hdf5(Path(path), method, params) as (file, check):
         file.attrs["format"] = "jaxevent quantities"
@@ -139,7 +134,7 @@ def quantity_writer(
 
 
 def _append_rows(file: h5py.File, columns: Iterable[tuple[str, NDArray]]) -> None:
-    """Append arrays of as many rows each to data sets, which are made where they are not there."""
+    """Append rows of arrays to data sets, which are made if they are missing."""
     for name, array in columns:
         if name not in file:
             file.create_dataset(
@@ -154,7 +149,7 @@ def _append_rows(file: h5py.File, columns: Iterable[tuple[str, NDArray]]) -> Non
 
 
 def no_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Times, ids, means and covariances of no row."""
+    """Return times, ids, means and covariances of no row."""
     none = np.empty(0, np.int64)
     return none, none, np.empty((0, 8), np.float32), np.empty((0, 8, 8), np.float32)
 
@@ -177,7 +172,7 @@ def check_tracks(
     covariance: ArrayLike | None,
     valid: ArrayLike | None,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """The arrays, as arrays whose shapes fit."""
+    """Return the arguments as arrays whose shapes fit; raise `InputError` if they do not."""
     t, ids, mean = np.atleast_1d(microseconds(times)), np.asarray(ids), np.asarray(mean)
     if covariance is None:
         covariance = np.broadcast_to(0.0, (*mean.shape, 8))

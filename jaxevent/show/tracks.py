@@ -1,4 +1,4 @@
-"""Tracks written to files: a table, a video of ellipses and trails, plots over time."""
+"""Files of tracks: tables, a video of ellipses and trails, and plots over time."""
 
 import contextlib
 import dataclasses
@@ -15,37 +15,36 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
-from jaxevent.blob.states import TrackStates
-from jaxevent.blob.tables import TABLE_RATE, evenly
-from jaxevent.blob.tracks import Tracks
+from jaxevent.blob.track import TrackStates
+from jaxevent.blob.tracks import TABLE_RATE, Tracks, evenly_spaced_times
 from jaxevent.errors import InputError, MissingExtra, require
-from jaxevent.io.output import complete
+from jaxevent.io.output import check_writable, complete
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
-from jaxevent.show.report import video_writer
-from jaxevent.show.track_pictures import draw_frames
-from jaxevent.show.track_plots import write_track_plot
+from jaxevent.show.images import video_writer
+from jaxevent.show.tables import align_cells
+from jaxevent.show.track_figures import draw_frames, write_track_plot
 from jaxevent.show.track_tables import QUANTITIES, no_rows, quantity_writer, track_writer
 
 _PLOTS = (".png", ".pdf", ".svg")
 _EXTRAS = {".mp4": ("imageio_ffmpeg", "video")} | {kind: ("matplotlib", "plot") for kind in _PLOTS}
-_COARSE, _PLOTTED = 4096, 64  # most times of the plot and of quantities, most tracks plotted
-_FPS, _PICTURES = 30.0, 150  # of a video: most pictures per second, and least in all
-_STRETCH = 2_000_000  # events of which rows are written at a time
+_MAX_TIMES, _MAX_TRACKS = 4096, 64  # of the plot; times also of quantities
+_MAX_FPS, _MIN_PICTURES = 30.0, 150  # of a video: pictures per second, and in all
+_BATCH_EVENTS = 2_000_000  # events of which rows are written at a time
 
 _ranges = jax.jit(size_range)
 _closing = jax.jit(inverse_ttc)
-_LEAST = 64  # rows that a compiled function takes at least; more come in powers of two
+_MIN_ROWS = 64  # rows that a compiled function takes; more come in powers of two
 
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """What is written of `Tracks`: `output.write(tracks)`.
+    """Destination of tracks: `output.write(tracks)`.
 
     `path` is a folder for tracks.csv, tracks.h5, tracks.mp4, tracks.png and, given pairs or an
     extent, quantities.csv; or one file by its suffix (.csv, .h5, .mp4, .png, .pdf, .svg). Tables
-    hold a row per track and time, `rate` times per second, or with None a row for each event that
-    is in the gate of a track, of its likeliest one. Behind the video are "events" or the
+    hold a row per track and time, `rate` times per second. With None they hold a row for each event
+    in the gate of a track, of its likeliest one. Behind the video are "events" or the
     "high-pass" reconstruction; it plays at 30 pictures per second, slower than real time if that
     would be less than 5 s. quantities.csv and the plot have at most 4096 times, evenly spaced; the
     plot shows the 64 longest tracks. Memory does not grow with the recording's length.
@@ -55,9 +54,9 @@ class Output:
     `quantities`. With a row for each event quantities.h5 has those columns at event rate: 1 / TTC
     of each of the `pairs` at the events of both, and range at those of each track; t in us, other
     -1 where there is none. `extent` (m), `focal` (px) and `size_factor` are those of `size_range`.
-    A folder goes without tracks.mp4 or tracks.png where the extra "video" or "plot" is missing.
-    Raises `InputError` for settings that do not fit each other, a place that cannot be written and
-    a video or plot as the one file without its extra.
+    Without the extra "video" or "plot" a folder has no tracks.mp4 or tracks.png. `InputError` is
+    raised for settings that do not fit each other, a place that cannot be written, and a video or
+    plot as the one file without its extra.
     """
 
     path: Path
@@ -92,7 +91,7 @@ class Output:
         for one, other in self.pairs:
             if one == other:
                 raise InputError(f"--pair {one},{other} is one track; give two")
-        if self._asked and suffix not in ("", *_PLOTS):
+        if self._has_quantities and suffix not in ("", *_PLOTS):
             raise InputError(
                 f"{path}: --pair and --extent are for a folder or a plot; leave them out"
             )
@@ -100,13 +99,11 @@ class Output:
             raise InputError(f"{path}: --background is for a video; leave it out")
         if suffix in _EXTRAS:
             require(*_EXTRAS[suffix])
-        # A place that cannot be written is told before the work.
-        with contextlib.suppress(_Tried), complete(path, directory=not suffix):
-            raise _Tried
+        check_writable(path, directory=not suffix)
 
     @property
-    def _asked(self) -> bool:
-        """Whether time to contact or range are."""
+    def _has_quantities(self) -> bool:
+        """Return whether time to contact or range are written."""
         return bool(len(self.pairs)) or self.extent is not None
 
     def write(
@@ -115,10 +112,17 @@ class Output:
         progress: bool | None = None,
         texts: Mapping[str, str] | None = None,
         method: str | None = None,
-    ) -> "Written":
-        """Write everything, complete or not at all; raises `InputError` for an unknown pair.
+    ) -> "WrittenTracks":
+        """Write everything, complete or not at all.
 
-        `texts` are further files of a folder, by name; `method` made the tracks, as HDF5 says.
+        Args:
+            tracks: The tracks.
+            progress: Whether a bar is shown; None: in a terminal or notebook.
+            texts: Further files of a folder, by name.
+            method: Name of the method that made the tracks.
+
+        Raises:
+            InputError: A pair is not two of the tracks.
         """
         known = tracks.id.tolist()
         for one, other in self.pairs:
@@ -128,7 +132,7 @@ class Output:
                     f"found, {', '.join(map(str, known[:20])) or 'none'}"
                 )
         if self.path.suffix:
-            return self._all(tracks, {self.path.suffix.lower(): self.path}, progress, method)
+            return self._write_all(tracks, {self.path.suffix.lower(): self.path}, progress, method)
         with complete(self.path, directory=True) as folder:
             places = {kind: folder / f"tracks{kind}" for kind in (".csv", ".h5", ".mp4", ".png")}
             left_out = []
@@ -137,35 +141,39 @@ class Output:
                     require(*_EXTRAS[kind])
                 except MissingExtra as missing:
                     left_out.append(f"{places.pop(kind).name} is left out: {missing}")
-            if self._asked:
+            if self._has_quantities:
                 places["quantities"] = folder / "quantities.csv"
                 if self.rate is None:
                     places["per event"] = folder / "quantities.h5"
             for name, text in (texts or {}).items():
                 (folder / name).write_text(text, encoding="utf-8")
-            written = self._all(tracks, places, progress, method)
+            written = self._write_all(tracks, places, progress, method)
             files = [*written.files, *(texts or {})]
             return dataclasses.replace(written, files=files, left_out=sorted(left_out))
 
-    def _all(
+    def _write_all(
         self,
         tracks: Tracks,
         places: Mapping[str, Path],
         progress: bool | None,
         method: str | None,
-    ) -> "Written":
+    ) -> "WrittenTracks":
         duration = (tracks.stop - tracks.start) * 1e-6
         rate = TABLE_RATE if self.rate is None else float(self.rate)
-        coarse = evenly(tracks.start, tracks.stop, min(rate, _COARSE / duration))
-        often = min(max(_FPS, _PICTURES / duration), max(rate, _FPS))
-        pictures = evenly(tracks.start, tracks.stop, often) if ".mp4" in places else coarse[:0]
+        coarse = evenly_spaced_times(tracks.start, tracks.stop, min(rate, _MAX_TIMES / duration))
+        often = min(max(_MAX_FPS, _MIN_PICTURES / duration), max(rate, _MAX_FPS))
+        pictures = (
+            evenly_spaced_times(tracks.start, tracks.stop, often)
+            if ".mp4" in places
+            else coarse[:0]
+        )
         tables = [path for kind, path in places.items() if kind in (".csv", ".h5", ".hdf5")]
         times = (
-            evenly(tracks.start, tracks.stop, rate)
+            evenly_spaced_times(tracks.start, tracks.stop, rate)
             if tables and self.rate is not None
             else coarse[:0]
         )
-        rows = _Rows(coarse, tracks.id)
+        rows = _TrackRows(coarse, tracks.id)
         with contextlib.ExitStack() as stack:
             writers = [
                 stack.enter_context(track_writer(path, method, tracks.params)) for path in tables
@@ -176,7 +184,7 @@ class Output:
                     one(*table)
 
             def states() -> Iterator[tuple[NDArray, NDArray]]:
-                """Of the pictures' times; the tables are written on the way."""
+                """Yield the states at the pictures' times; the tables are written on the way."""
                 everything = np.unique(np.concatenate([coarse, pictures, times]))
                 with bar(
                     total=len(everything), unit="time", desc="read", progress=progress
@@ -194,7 +202,7 @@ class Output:
             if ".mp4" in places:
                 recording = tracks.recording
                 behind = _high_pass(recording, pictures) if self.background != "events" else None
-                fps = min(often, _FPS)
+                fps = min(often, _MAX_FPS)
                 with video_writer(places[".mp4"], fps) as show:
                     for image in draw_frames(recording, pictures, tracks.id, states(), behind):
                         show(image)
@@ -215,19 +223,21 @@ class Output:
         if "quantities" in places:
             self._write_quantities(places["quantities"], rows, tracks)
         for kind in set(places) & set(_PLOTS):
-            chosen = rows.longest(_PLOTTED, [one for pair in self.pairs for one in pair])
+            chosen = rows.longest(_MAX_TRACKS, [one for pair in self.pairs for one in pair])
+            mean, covariance, valid = rows.dense(chosen)
             write_track_plot(
-                places[kind], tracks.recording, coarse, tracks.id[chosen], *rows.dense(chosen),
-                pairs=self.pairs, extent=self.extent, focal=self.focal, size_factor=self._factor(),
-                Q_lambda=float(tracks.params.Q_lambda), total=len(tracks),
+                places[kind], tracks.recording, coarse, tracks.id[chosen], mean, covariance,
+                valid=valid, pairs=self.pairs, extent=self.extent, focal=self.focal,
+                size_factor=self._factor(), total=len(tracks),
+                Q_lambda=float(tracks.params.Q_lambda),
             )  # fmt: skip
-        slow = min(often, _FPS) / often if ".mp4" in places else None
-        return Written(tracks, rows, [path.name for path in places.values()], slow, [])
+        slow = min(often, _MAX_FPS) / often if ".mp4" in places else None
+        return WrittenTracks(tracks, rows, [path.name for path in places.values()], slow, [])
 
     def _factor(self) -> float | int:
         return SIZE_FACTORS["ring"] if self.size_factor is None else self.size_factor
 
-    def _event_quantities(self, now: "_AtEvents") -> Iterator[tuple[NDArray, ...]]:
+    def _event_quantities(self, now: "_EventStates") -> Iterator[tuple[NDArray, ...]]:
         """Columns `QUANTITIES` of the events of some times."""
         states = now.states
 
@@ -237,21 +247,21 @@ class Output:
 
         if self.extent is not None:
             k, i = now.row, now.place
-            told = states.mean[k, i], states.covariance[k, i]
+            arrays = states.mean[k, i], states.covariance[k, i]
             scale = self.extent, self.focal, self._factor()
-            value, deviation = _computed(lambda m, P: _ranges(m, P, *scale), *told)
+            value, deviation = _evaluate(lambda m, P: _ranges(m, P, *scale), *arrays)
             nothing = np.full(len(k), np.nan)
             yield columns(k, states.id[i], -1, nothing, nothing, value, deviation)
         for pair in self.pairs:
             a, b = (int(np.flatnonzero(states.id == one)[0]) for one in pair)
             k = now.row[np.isin(now.place, [a, b])]
             k = k[states.valid[k, a] & states.valid[k, b]]
-            told = (array[k, i] for i in (a, b) for array in (states.mean, states.covariance))
-            value, deviation = _computed(_closing, *told)
+            arrays = (array[k, i] for i in (a, b) for array in (states.mean, states.covariance))
+            value, deviation = _evaluate(_closing, *arrays)
             nothing = np.full(len(k), np.nan)
             yield columns(k, pair[0], pair[1], value, deviation, nothing, nothing)
 
-    def _write_quantities(self, path: Path, rows: "_Rows", tracks: Tracks) -> None:
+    def _write_quantities(self, path: Path, rows: "_TrackRows", tracks: Tracks) -> None:
         tables = []
         since = jnp.asarray((rows.t - rows.t[0]) * 1e-6, jnp.result_type(float))
         Q_lambda = float(tracks.params.Q_lambda)
@@ -286,20 +296,20 @@ class Output:
 
 
 @dataclasses.dataclass(frozen=True)
-class Written:
-    """What `Output.write` has written: the names of the files, and how slowly the video plays.
+class WrittenTracks:
+    """Result of `Output.write`: the names of the files, and the speed of the video.
 
-    `left_out` are sentences that say which files are missing and why.
+    `slow` is that speed over real time; `left_out` are sentences about missing files.
     """
 
     tracks: Tracks
-    rows: "_Rows"
+    rows: "_TrackRows"
     files: list[str]
     slow: float | None
     left_out: list[str]
 
     def summary(self, most: int = 20) -> list[str]:
-        """Lines of a table of the longest tracks: times in s, median speed and size in px.
+        """Return lines of a table of the longest tracks: times in s, median speed and size in px.
 
         Times are from the recording's start, as in the plot.
         """
@@ -314,10 +324,7 @@ class Written:
                 speed, size = f"{median[0]:.4g}", f"{median[1]:.3g}, {median[2]:.3g}"
             birth, death = (f"{(at[i] - zero) * 1e-6:.4f}" for at in (tracks.birth, tracks.death))
             cells.append([str(tracks.id[i]), birth, death, tracks.ended[i], speed, size])
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines = [
-            "  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)) for line in cells
-        ]
+        lines = align_cells(cells)
         if len(tracks) > most:
             lines.append(f"and {len(tracks) - most} shorter ones")
         reasons = dict.fromkeys(tracks.ended[i] for i in order)
@@ -345,8 +352,8 @@ ENDED = {  # of `Tracks.ended`, what it means
 }
 
 
-class _AtEvents(NamedTuple):
-    """States at the times of some events, and whose these are."""
+class _EventStates(NamedTuple):
+    """States at the times of some events, and the tracks of the events."""
 
     t: NDArray[np.int64]  # (times,) us
     states: TrackStates
@@ -360,20 +367,16 @@ class _AtEvents(NamedTuple):
         return self.t[k], self.states.id[i], self.states.mean[k, i], self.states.covariance[k, i]
 
 
-def _computed(quantity: Callable[..., Any], *arrays: NDArray) -> tuple[NDArray, NDArray]:
-    """A quantity of rows and its standard deviation, compiled for few numbers of rows."""
+def _evaluate(quantity: Callable[..., Any], *arrays: NDArray) -> tuple[NDArray, NDArray]:
+    """Evaluate a quantity of rows and its standard deviation, compiled for few lengths."""
     count = len(arrays[0])
-    fill = max(_LEAST, 1 << (count - 1).bit_length()) - count if count else _LEAST
+    fill = max(_MIN_ROWS, 1 << (count - 1).bit_length()) - count if count else _MIN_ROWS
     filled = [np.pad(a, [(0, fill)] + [(0, 0)] * (a.ndim - 1), mode="empty") for a in arrays]
     value, variance = (np.asarray(part, np.float64)[:count] for part in quantity(*filled))
     return value, np.sqrt(np.maximum(variance, 0))
 
 
-class _Tried(Exception):
-    """Only to leave a block without effect."""
-
-
-class _Rows:
+class _TrackRows:
     """States at some times, of valid tracks only."""
 
     def __init__(self, t: NDArray[np.int64], ids: NDArray[np.int64]):
@@ -397,67 +400,64 @@ class _Rows:
         return slice(*np.searchsorted(self._joined[1], [place, place + 1]))
 
     def of(self, place: int) -> NDArray:
-        """Means (rows, 8) of one track."""
+        """Return the means (rows, 8) of one track."""
         return self._joined[2][self._slice(place)]
 
     def longest(self, most: int, also: Sequence[int]) -> list[int]:
-        """The places of the tracks seen at the most times, and of some ids, by rising id."""
+        """Return places of the tracks seen at the most times, and of some ids, by rising id."""
         count = np.bincount(self._joined[1], minlength=len(self.ids))
         order = np.argsort(-count, kind="stable")[:most].tolist()
         return sorted({*order, *(int(np.flatnonzero(self.ids == one)[0]) for one in also)})
 
     def dense(self, places: Sequence[int]) -> tuple[NDArray, NDArray, NDArray]:
-        """Mean (T, n, 8), covariance (T, n, 8, 8) and valid (T, n) of some tracks."""
+        """Return mean (T, n, 8), covariance (T, n, 8, 8) and valid (T, n) of some tracks."""
         at, _, rows, P = self._joined
         shape = len(self.t), len(places)
         mean, valid = np.ones((*shape, 8), rows.dtype), np.zeros(shape, bool)
         covariance = np.broadcast_to(np.eye(8, dtype=rows.dtype), (*shape, 8, 8)).copy()
         for k, place in enumerate(places):
             part = self._slice(place)
-            mean[at[part], k], covariance[at[part], k], valid[at[part], k] = (
-                rows[part],
-                P[part],
-                True,
-            )
+            mean[at[part], k], covariance[at[part], k] = rows[part], P[part]
+            valid[at[part], k] = True
         return mean, covariance, valid
 
 
 def _within(t: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.intp]:
-    """The places in t (sorted) of those times (sorted) that are in its reach; t holds them all."""
+    """Return the places in t (sorted) of the times (sorted) in its range; t holds them all."""
     first, last = np.searchsorted(some, [t[0], t[-1] + 1]) if len(t) else (0, 0)
     return np.searchsorted(t, some[first:last])
 
 
 def _high_pass(recording: Recording, times: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-    """Images of the events alone, grey where nothing happens."""
+    """Yield images from the events alone, grey where nothing happens."""
     from jaxevent.reconstruction import high_pass
-    from jaxevent.show.export import shown
+    from jaxevent.show.export import display_images
 
     video = high_pass.estimate(recording)
-    return (image for _, image in shown(video, times, "percentile"))
+    return (image for _, image in display_images(video, times, "percentile"))
 
 
-def _per_event(tracks: Tracks, progress: bool | None) -> Iterator[_AtEvents]:
-    """The events that tracks hold, with the states at their times."""
+def _per_event(tracks: Tracks, progress: bool | None) -> Iterator[_EventStates]:
+    """Yield the events in the gates of tracks, with the states at their times."""
     events, end = tracks.recording.events, tracks.stop
     row, last = events.index(tracks.start), events.index(end)
     with bar(
         total=last - row, unit="event", unit_scale=True, desc="read", progress=progress
     ) as shown:
         while row < last:
-            # Every stretch reads from one of few windows on, so it must not be short.
-            until = min(row + _STRETCH, last)
+            # Every batch reads from one of few windows on, so it must not be short.
+            until = min(row + _BATCH_EVENTS, last)
             begin = int(events[row : row + 1].t[0])
             stop = end if until == last else max(int(events[until : until + 1].t[0]), begin + 1)
-            told = list(tracks.events(begin, stop))
-            held = [(one.t[one.id >= 0], one.id[one.id >= 0]) for one in told]
+            batches = list(tracks.events(begin, stop))
+            held = [(one.t[one.id >= 0], one.id[one.id >= 0]) for one in batches]
             none = np.empty(0, np.int64)
             t, number = (np.concatenate(x) for x in zip((none, none), *held, strict=True))
             for now, states in tracks.batches(np.unique(t)):
                 a, b = np.searchsorted(t, [now[0], now[-1] + 1])
                 k, i = np.searchsorted(now, t[a:b]), np.searchsorted(tracks.id, number[a:b])
                 seen = states.valid[k, i]
-                yield _AtEvents(now, states, k[seen], i[seen])
+                yield _EventStates(now, states, k[seen], i[seen])
             next_row = events.index(stop)
             shown.update(next_row - row)
             row = next_row

@@ -1,4 +1,4 @@
-"""A recording and what was estimated from it, on one timeline of the Rerun viewer."""
+"""A recording and its results on one timeline of the Rerun viewer."""
 
 import contextlib
 import functools
@@ -20,8 +20,8 @@ from jaxevent.recording import Recording, microseconds
 from jaxevent.show.track_tables import COLUMNS
 
 ON, OFF = (200, 64, 30), (58, 120, 181)
-BLOCK = 1 << 20  # events sent at a time
-STEP = 5_000  # us between states of tracks and of motion
+BLOCK_EVENTS = 1 << 20  # events sent at a time
+STEP_US = 5_000  # us between states of tracks and of motion
 TABLES = "tracks.csv", "motion.csv"  # of the folders that the commands write
 CIRCLE = np.linspace(0, 2 * np.pi, 25)
 
@@ -36,13 +36,20 @@ def view(
 ) -> None:
     """Show events, frames and results in the Rerun viewer, or store them in a file for it.
 
-    A result is a reconstruction (shown at the frames' times), tracks, a motion, or a path: images
-    with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of `jaxevent
-    track` and `jaxevent motion`. Events are shown in windows of `window` s. With `out`, a file
-    .rrd, no viewer is opened. Time begins with the recording. Every sequence of images has a view
-    of its own, with events and tracks over it; motions have one of curves.
+    Time begins with the recording. Every sequence of images has a view of its own, with events and
+    tracks over it; motions have one of curves.
 
-    Raises `MissingExtra` without the extra "view" and `InputError` for a result that is neither.
+    Args:
+        recording: Events and frames.
+        results: Reconstructions (shown at the frames' times), tracks, motions, or paths: images
+            with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of
+            `jaxevent track` and `jaxevent motion`.
+        out: File .rrd that is written; None to open a viewer.
+        window: Length of the windows in which events are shown, s.
+
+    Raises:
+        MissingExtra: The extra "view" is missing.
+        InputError: A result is none of these.
     """
     if not 0 < window < np.inf:
         raise InputError(f"a window of {window:g} s is not possible; give seconds above 0")
@@ -60,7 +67,7 @@ def view(
 
 @contextlib.contextmanager
 def _stream(out: Path | None) -> Iterator[Any]:
-    """A stream to the viewer, or to a file that appears when complete."""
+    """Open a stream to the viewer, or to a file that appears when complete."""
     rerun: Any = require("rerun", "view")
     stream = rerun.RecordingStream("jaxevent")
     if out is None:
@@ -78,7 +85,7 @@ def _stream(out: Path | None) -> Iterator[Any]:
 
 
 class _Sender:
-    """What is sent: each thing under a name, at times in us on the recording's clock."""
+    """Sender of named things to a stream, at times in us on the recording's clock."""
 
     def __init__(self, stream: Any, start: int):
         self._stream, self._start = stream, start
@@ -88,7 +95,7 @@ class _Sender:
         self._white = 0.0
 
     def layout(self, width: int, height: int) -> Any:
-        """A view for each sequence of images, with events and tracks over it, and one of curves."""
+        """Lay out a view for each sequence of images, with events and tracks, and one of curves."""
         plan = self._rerun.blueprint
         bounds = plan.VisualBounds2D(x_range=(0, width), y_range=(0, height))
         over = ["/image/events", "/image/tracks/**", "/image/paths/**"]
@@ -114,10 +121,10 @@ class _Sender:
         return [self._rerun.TimeColumn("time", duration=(t - self._start) * 1e-6)]
 
     def events(self, recording: Recording, window: int) -> None:
-        """Points, ON red and OFF blue, of one window after the other."""
+        """Send events as points, ON red and OFF blue, window by window."""
         source, rerun = recording.events, self._rerun
-        for first in range(0, len(source), BLOCK):
-            events = source[first : first + BLOCK]
+        for first in range(0, len(source), BLOCK_EVENTS):
+            events = source[first : first + BLOCK_EVENTS]
             number = (events.t - self._start) // window
             begin = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
             lengths = np.diff(begin, append=len(events))
@@ -130,10 +137,10 @@ class _Sender:
             self._stream.send_columns("image/events", self._times(times), columns)
 
     def images(self, name: str, t: NDArray[np.int64], image: Callable[[int], NDArray]) -> None:
-        """Grey images of linear intensity.
+        """Send grey images of linear intensity.
 
-        White is the brightest 0.5 % of the first image of all that are sent, so that sequences
-        compare, and of brighter ones that follow.
+        White is the brightest 0.5 % of the first image of all sequences, so that these compare, and
+        of brighter images that follow.
         """
         self._pictures.append(f"/{name}")
         for row, time in enumerate(t.tolist()):
@@ -146,7 +153,7 @@ class _Sender:
             self._stream.log(name, shown)
 
     def tracks(self, table: pd.DataFrame) -> None:
-        """Ellipses of two standard deviations, until the track ends, and paths."""
+        """Send ellipses of two standard deviations, until the track ends, and paths."""
         rerun = self._rerun
         for number, rows in table.groupby("id"):
             x, y, along, across, angle = (
@@ -166,7 +173,7 @@ class _Sender:
             self._stream.log(f"image/paths/{number}", path, static=True)
 
     def curves(self, table: pd.DataFrame) -> None:
-        """One curve for each column but t, those of sigmas aside; gaps where it is lost."""
+        """Send a curve for each column but t and those of sigmas, with gaps where it is lost."""
         self._curves = True
         names = [n for n in table.columns if n not in ("t", "lost") and not n.startswith("sigma_")]
         for name in names:
@@ -181,7 +188,7 @@ _Layer = tuple[str, Callable[[_Sender, str], None]]
 
 
 def _layer(result: Any, recording: Recording) -> _Layer:
-    """The name of a result and how it is sent."""
+    """Return the name of a result and the function that sends it."""
     if isinstance(result, Tracks):
         table = _table_of_tracks(result)
         return "tracks", lambda send, _: send.tracks(table)
@@ -223,7 +230,7 @@ def _layer_of_table(path: Path) -> _Layer:
 def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name: str) -> None:
     if recording.frames is None:
         raise InputError(
-            f"{recording.name}: has no frames, whose times would be shown"
+            f"{recording.name}: has no frames, at whose times images are shown"
             f"{recording.describe_left_out('frames')}; store images"
         )
     t = recording.frames.t
@@ -231,18 +238,18 @@ def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name:
 
 
 def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
-    times = np.arange(tracks.start, tracks.stop, STEP)
-    told = tracks(times)
-    row, column = np.nonzero(told.valid)
-    states = np.asarray(told.mean)[row, column]
+    times = np.arange(tracks.start, tracks.stop, STEP_US)
+    states = tracks(times)
+    row, column = np.nonzero(states.valid)
+    mean = np.asarray(states.mean)[row, column]
     known = {"t": times[row] / 1e6, "id": tracks.id[column]}
-    return pd.DataFrame(known | dict(zip(COLUMNS, states.T, strict=True)))
+    return pd.DataFrame(known | dict(zip(COLUMNS, mean.T, strict=True)))
 
 
 def _table_of_motion(motion: MotionEstimate) -> pd.DataFrame:
-    times = np.arange(motion.t[0], motion.t[-1] + 1, STEP) if len(motion) else motion.t
-    told = motion(times)
-    values = np.where(told.valid[:, None], told.mean, np.nan)
+    times = np.arange(motion.t[0], motion.t[-1] + 1, STEP_US) if len(motion) else motion.t
+    estimated = motion(times)
+    values = np.where(estimated.valid[:, None], estimated.mean, np.nan)
     return pd.DataFrame(
         {"t": times / 1e6} | dict(zip(motion.model.components, values.T, strict=True))
     )

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.association import share
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.lifecycle import begin
-from jaxevent.blob.prepare import Packing
-from jaxevent.blob.run import Told, run_compiled
-from jaxevent.blob.states import tell
+from jaxevent.blob.engine.runner import KernelRunner
+from jaxevent.blob.filter import association_weights
+from jaxevent.blob.lifecycle import init_state
+from jaxevent.blob.prepare import ChunkPacker
+from jaxevent.blob.run import ChunkInfo, run_compiled
+from jaxevent.blob.track import readout
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 
@@ -44,10 +44,7 @@ def crossing(rng, events=2400, seconds=0.03):
 
 CASES = {
     "moment": {"events_per_step": 1},
-    "constant_velocity": {
-        "events_per_step": 6, "association": "nearest", "gate_shape": "circle",
-    },
-    "moving_moments": {"events_per_step": 6},
+    "moving_moments": {"events_per_step": 6, "association": "nearest", "gate_shape": "circle"},
     "options": {
         "events_per_step": 5, "tau_q": 0.01, "t_still": 1e-3, "clutter": 1e-3,
         "polarity_offset": True,
@@ -67,36 +64,36 @@ def test_kernel_equals_run(case):
     params = tracker.Params(**FEW, **values, max_targets=3)
     seeds = [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
     rec = crossing(np.random.default_rng(7))
-    packing = Packing(rec, params, seeds, detect=True, steps=16, chunks=40)
-    state, mark, kernel = None, packing.first, FusedRun(tracker.filter, params, packing)
+    packer = ChunkPacker(rec, params, seeds, detect=True, steps=16, chunks=40)
+    state, cursor, kernel = None, packer.first, KernelRunner(tracker.filter, params, detect=True)
     number = 0
-    while mark is not None:
-        stretch = packing.pack(mark)
-        mark, number = stretch.next, number + 1
+    while cursor is not None:
+        segment = packer.pack(cursor)
+        cursor, number = segment.next, number + 1
         if state is None:
-            state = begin(tracker.filter, params, stretch.features)
-        end, log = kernel.follow(state, stretch.features)
-        got = end, Told(log, kernel.slots(kernel.play(state, stretch.features)[1]))
+            state = init_state(tracker.filter, params, segment.features)
+        end, log = kernel.run(state, segment.features)
+        got = end, ChunkInfo(log, kernel.chunk_starts(kernel.record(state, segment.features)[1]))
         before = state
-        state, told = run_compiled(tracker.filter, params, state, stretch.features)
-        expected = state, dataclasses.replace(told, association=None)
+        state, result = run_compiled(tracker.filter, params, state, segment.features)
+        expected = state, dataclasses.replace(result, association=None)
         paths = jax.tree_util.tree_flatten_with_path(expected)[0]
         for (path, one), other in zip(paths, jax.tree.leaves(got), strict=True):
-            name = f"{jax.tree_util.keystr(path)} of stretch {number}"
+            name = f"{jax.tree_util.keystr(path)} of segment {number}"
             assert other.dtype == one.dtype, name
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9, err_msg=name)
-    # Of the last stretch also what is read, filtered, as the first chunk with a pause begins.
-    _, updates = kernel.play(before, stretch.features)
-    ends = np.asarray(stretch.features.t)[:, 0, -1]  # of the chunks' first steps
-    chunk = int(np.flatnonzero((ends > 1) & (np.asarray(told.slots.id) >= 0).any(1))[0])
-    slots = jax.tree.map(lambda a: a[chunk], told.slots)
-    read = jax.jit(jax.vmap(functools.partial(tell, tracker.filter, params), (0, None)))
-    wanted, id = np.asarray(slots.id)[None] >= 0, np.asarray(slots.id, np.int64)
-    times = stretch.start[[chunk]] + ends[chunk] - 1
-    got = kernel.read(stretch, updates, None, times, id, wanted)
-    for one, other in zip(got, read(slots, ends[chunk] - 1), strict=True):
+    # Of the last segment also the readout, filtered, as the first chunk with a pause begins.
+    _, updates = kernel.record(before, segment.features)
+    ends = np.asarray(segment.features.t)[:, 0, -1]  # of the chunks' first steps
+    chunk = int(np.flatnonzero((ends > 1) & (np.asarray(result.tracks.id) >= 0).any(1))[0])
+    tracks = jax.tree.map(lambda a: a[chunk], result.tracks)
+    read = jax.jit(jax.vmap(functools.partial(readout, tracker.filter, params), (0, None)))
+    wanted, id = np.asarray(tracks.id)[None] >= 0, np.asarray(tracks.id, np.int64)
+    times = segment.start[[chunk]] + ends[chunk] - 1
+    got = kernel.readout(segment, updates, None, times, id, wanted)
+    for one, other in zip(got, read(tracks, ends[chunk] - 1), strict=True):
         np.testing.assert_allclose(one[wanted], other[wanted[0]], rtol=1e-9, atol=1e-9)
-    log = np.asarray(told.log.ended)
+    log = np.asarray(result.log.end_reason)
     assert log.shape == (40, 5) and (np.asarray(state.next_id) > 2)
 
 
@@ -104,7 +101,7 @@ def test_kernel_equals_run(case):
 def test_tracks_of_both_compilers():
     """Smoothed states, with pauses in which targets stand still, and whose the events are."""
     rec, seeds = crossing(np.random.default_rng(7)), [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
-    tracker, options = blob.constant_velocity, {**FEW, **CASES["constant_velocity"]}
+    tracker, options = blob.constant_velocity, {**FEW, **CASES["moving_moments"]}
     params = tracker.Params(**options, t_still=1e-3, max_targets=3)
     fused, scanned = (
         tracker.estimate(rec, params, seeds=seeds, detect=True, compiler=compiler, progress=False)
@@ -112,29 +109,29 @@ def test_tracks_of_both_compilers():
     )
     np.testing.assert_array_equal([fused.birth, fused.death], [scanned.birth, scanned.death])
     times = np.arange(rec.start, rec.stop, 173)
-    told = fused(times)
-    assert told.valid.any(0).all() and not told.valid.all()
-    for one, other in zip(told, scanned(times), strict=True):
+    result = fused(times)
+    assert result.valid.any(0).all() and not result.valid.all()
+    for one, other in zip(result, scanned(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
     for one, other in zip(fused.events(), scanned.events(), strict=True):
         for x, y in zip(one, other, strict=True):
             np.testing.assert_allclose(x, y, rtol=0, atol=1e-9)
 
     # Numbers that do not depend on each other may as well be taken together.
-    fused._runner._reading = fused._runner._reading._replace(blocks=np.array([0, 8]))
-    del fused._later
-    fused._following.clear()
-    np.testing.assert_allclose(fused(times).mean, told.mean, rtol=1e-9, atol=1e-9)
+    fused._runner._readout_kernel = fused._runner._readout_kernel._replace(blocks=np.array([0, 8]))
+    del fused._segment_infos
+    fused._kept_infos.clear()
+    np.testing.assert_allclose(fused(times).mean, result.mean, rtol=1e-9, atol=1e-9)
 
 
 def test_a_filter_without_kernel_is_scanned():
     def strange(params, held, density):
-        return share(params, held, jnp.sort(density))
+        return association_weights(params, held, jnp.sort(density))
 
     mine = dataclasses.replace(
         blob.moment,
         name="strange",
-        filter=dataclasses.replace(blob.moment.filter, share=strange),
+        filter=dataclasses.replace(blob.moment.filter, association_weights=strange),
     )
     rec = crossing(np.random.default_rng(2), 50)
     with pytest.raises(InputError, match="no kernel"):

@@ -9,8 +9,8 @@ import pytest
 
 import jaxevent
 from jaxevent.blob import Tracks, moment
-from jaxevent.blob.prepare import Packing
-from jaxevent.blob.run import run_compiled
+from jaxevent.blob.prepare import ChunkPacker
+from jaxevent.blob.run import XlaRunner, run_compiled
 from jaxevent.recording import Events, Recording
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_real.py"
@@ -34,8 +34,8 @@ def dot(data):
 
 def follow(recording, params, steps, chunks):
     """`estimate` with chunks of a size that suits short slices."""
-    packing = Packing(recording, params, steps=steps, chunks=chunks)
-    return Tracks(moment.filter, packing, params)
+    packer = ChunkPacker(recording, params, steps=steps, chunks=chunks)
+    return Tracks(XlaRunner(moment.filter, params), packer)
 
 
 def test_reference_finds_a_known_path(real):
@@ -80,12 +80,12 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     begun = {}
     for surround in (1.0, 2.0):
         params = moment.Params(preset="fast", **real.DOT_FOUND, surround=surround)
-        packing = Packing(cut, params, steps=64, chunks=128)
-        mark, state = packing.first, None
-        while mark is not None:  # in the program of `follow`
-            stretch = packing.pack(mark)
-            state, _ = run_compiled(moment.filter, params, state, stretch.features)
-            mark = stretch.next
+        packer = ChunkPacker(cut, params, steps=64, chunks=128)
+        cursor, state = packer.first, None
+        while cursor is not None:  # in the program of `follow`
+            segment = packer.pack(cursor)
+            state, _ = run_compiled(moment.filter, params, state, segment.features)
+            cursor = segment.next
         begun[surround] = int(state.next_id)
     assert begun[2.0] == 1 < begun[1.0]
 
@@ -102,16 +102,3 @@ def test_cars_are_found_and_followed(real, data, float32):
     assert row["coverage"] == 1
     assert row["median"] < 4
     assert row["switches"] == row["strays"] == 0
-
-
-@pytest.mark.slow
-def test_dat_events(real, tmp_path):
-    events = np.array([[5, 1279 | 719 << 14 | 1 << 28], [7, 3 | 2 << 14]], "<u4")
-    path = tmp_path / "two.dat"
-    path.write_bytes(b"% Height 720\n% Width 1280\n" + bytes([12, 8]) + events.tobytes())
-    recording = real.read_dat(path)
-    assert (recording.width, recording.height) == (1280, 720)
-    assert recording.events.t.tolist() == [5, 7]
-    assert recording.events.x.tolist() == [1279, 3]
-    assert recording.events.y.tolist() == [719, 2]
-    assert recording.events.p.tolist() == [True, False]

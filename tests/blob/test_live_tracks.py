@@ -7,8 +7,9 @@ import pytest
 from test_blob_tracker import cloud, line, noise, together
 
 from jaxevent import blob
-from jaxevent.blob.live import CHUNKS, STEPS
-from jaxevent.blob.prepare import Packing
+from jaxevent.blob.live import CHUNKS_PER_RUN, STEPS_PER_CHUNK
+from jaxevent.blob.prepare import ChunkPacker
+from jaxevent.blob.run import XlaRunner
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -69,8 +70,10 @@ def test_states_are_those_of_the_whole_however_it_is_divided():
     seeds = [(60.0, 80.0, 8.0), (168.0, 92.0, 8.0, 0.03)]
     start = recording.start
     seeds[1] = (*seeds[1][:3], start + 30_000)
-    packing = Packing(recording, params, seeds, detect=True, steps=STEPS, chunks=CHUNKS)
-    whole = Tracks(tracker.filter, packing, params)
+    packer = ChunkPacker(
+        recording, params, seeds, detect=True, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN
+    )
+    whole = Tracks(XlaRunner(tracker.filter, params), packer)
     assert len(whole) > 2 and (whole.ended[2] == "idle")
     known = by_confirmation(whole, 2)
     for seed in range(2):
@@ -93,8 +96,10 @@ def test_steps_of_several_events_are_those_of_what_was_added():
     for number in (301, 202, 413):
         live.add(recording.events[row : row + number])
         row += number
-        packing = Packing(so_far(recording, row), params, steps=STEPS, chunks=CHUNKS)
-        part = Tracks(tracker.filter, packing, params)
+        packer = ChunkPacker(
+            so_far(recording, row), params, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN
+        )
+        part = Tracks(XlaRunner(tracker.filter, params), packer)
         compare(live(live.stop), part, live.stop, by_confirmation(part, 0))
 
 
@@ -106,8 +111,8 @@ def test_targets_are_added_while_events_come():
     places = [(60, 80, 8), (40, 150, 8), (168, 92, 8), (100, 30, 8), (20, 20, 8)]
     begins = start + 1000 * np.array([0, 10, 30, 60, 95])
     given = [(*place, int(begin)) for place, begin in zip(places, begins, strict=True)]
-    packing = Packing(recording, params, given, steps=STEPS, chunks=CHUNKS)
-    whole = Tracks(tracker.filter, packing, params)
+    packer = ChunkPacker(recording, params, given, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN)
+    whole = Tracks(XlaRunner(tracker.filter, params), packer)
     live = tracker.live(SIZE, params, seeds=given[:1])
     order = [0, 2, 1]
     assert [live.add_target(*given[k]) for k in order[1:]] == [1, 2]
@@ -120,7 +125,7 @@ def test_targets_are_added_while_events_come():
         if len(chunk):
             compare(live(live.stop), whole, live.stop, np.array([0, 2, 1, 3, 4]))
     # The second one ended before the fifth was added, and made room for it.
-    assert whole.death[1] < begins[4] - 10_000 and len(live._packing.seeds.t) == 4
+    assert whole.death[1] < begins[4] - 10_000 and len(live._packer.seeds.t) == 4
     with pytest.raises(InputError, match="is forgotten"):
         live.add_target(10, 10, 5, start + 10)
 
@@ -148,8 +153,8 @@ def test_after_the_last_event_states_are_predicted():
     seeds = [(60.0, 80.0, 8.0)]
     live = blob.constant_velocity.live(SIZE, params, seeds=seeds)
     live.add(recording.events[:600])
-    packing = Packing(recording, params, seeds, steps=STEPS, chunks=CHUNKS)
-    whole = Tracks(blob.constant_velocity.filter, packing, params)
+    packer = ChunkPacker(recording, params, seeds, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN)
+    whole = Tracks(XlaRunner(blob.constant_velocity.filter, params), packer)
     compare(live(live.stop), whole, live.stop, np.arange(1))
     times = live.stop + np.array([0, 5_000, 30_000])
     states = live(times)

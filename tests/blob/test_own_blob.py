@@ -59,8 +59,8 @@ def test_it_obeys_the_contract(folder):
         features, out = student.prepare(recording, times, params, seeds=mine, **span)
         trajectory, state = run(params, features, state)
         states = read(params, trajectory, out)
-        whole = [told[part][:, order] for told in (*expected, expected.idle)]
-        mean, covariance, valid = (np.asarray(told)[part] for told in states)
+        whole = [result[part][:, order] for result in (*expected, expected.idle)]
+        mean, covariance, valid = (np.asarray(result)[part] for result in states)
         assert np.array_equal(valid, whole[2])
         np.testing.assert_allclose(mean, whole[0], rtol=1e-9)
         np.testing.assert_allclose(covariance, whole[1], rtol=1e-9, atol=1e-12)

@@ -17,60 +17,60 @@ def path(x, first=0, last=T):
 
 
 def scored(truth, tracks, reach=4.0, hidden=None):
-    true, told = (np.stack(p, 1) if p else np.zeros((T, 0, 2)) for p in (truth, tracks))
-    return score_tracks(true, told, reach, hidden)
+    true, result = (np.stack(p, 1) if p else np.zeros((T, 0, 2)) for p in (truth, tracks))
+    return score_tracks(true, result, reach, hidden)
 
 
-def counts(told):
+def counts(result):
     names = ("targets", "tracks", "found", "missed", "false", "switches")
-    return tuple(getattr(told, name) for name in names)
+    return tuple(getattr(result, name) for name in names)
 
 
 def test_right_tracks():
-    told = scored([path(0), path(50)], [path(50), path(0)])
-    assert counts(told) == (2, 2, 2, 0, 0, 0)
-    assert (told.covered, told.mota, told.idf1, told.hota, told.rms) == (1, 1, 1, 1, 0)
-    np.testing.assert_array_equal(told.match, np.tile([1, 0], (T, 1)))
+    result = scored([path(0), path(50)], [path(50), path(0)])
+    assert counts(result) == (2, 2, 2, 0, 0, 0)
+    assert (result.covered, result.mota, result.idf1, result.hota, result.rms) == (1, 1, 1, 1, 0)
+    np.testing.assert_array_equal(result.match, np.tile([1, 0], (T, 1)))
 
 
 def test_a_track_that_goes_over_to_another_target():
     """Two tracks that swap after four of ten times."""
     swapped = [np.r_[path(0)[:4], path(50)[4:]], np.r_[path(50)[:4], path(0)[4:]]]
-    told = scored([path(0), path(50)], swapped)
-    assert counts(told) == (2, 2, 2, 0, 0, 2)
-    assert told.covered == 1 and told.mota == pytest.approx(1 - 2 / 20)
-    assert told.idf1 == pytest.approx(2 * 12 / 40)
+    result = scored([path(0), path(50)], swapped)
+    assert counts(result) == (2, 2, 2, 0, 0, 2)
+    assert result.covered == 1 and result.mota == pytest.approx(1 - 2 / 20)
+    assert result.idf1 == pytest.approx(2 * 12 / 40)
     # Each of 4 and 6 true positives of a pair: 4 / (10 + 10 - 4) and 6 / (10 + 10 - 6).
-    assert told.deta == pytest.approx(1)
-    assert told.assa == pytest.approx((8 * 4 / 16 + 12 * 6 / 14) / 20)
-    assert told.hota == pytest.approx(np.sqrt(told.assa))
+    assert result.deta == pytest.approx(1)
+    assert result.assa == pytest.approx((8 * 4 / 16 + 12 * 6 / 14) / 20)
+    assert result.hota == pytest.approx(np.sqrt(result.assa))
 
 
 def test_missed_false_and_late():
     """One target without a track, one found late, and a track of nothing for six times."""
-    told = scored([path(0), path(50)], [path(50, 3), path(99, 0, 6)])
-    assert counts(told) == (2, 2, 1, 1, 1, 0)
-    assert told.covered == 7 / 20
-    assert told.mota == pytest.approx(1 - (13 + 6) / 20)
-    assert told.idf1 == pytest.approx(2 * 7 / (20 + 13))
-    assert told.deta == pytest.approx(7 / (20 + 13 - 7)) and told.assa == pytest.approx(0.7)
+    result = scored([path(0), path(50)], [path(50, 3), path(99, 0, 6)])
+    assert counts(result) == (2, 2, 1, 1, 1, 0)
+    assert result.covered == 7 / 20
+    assert result.mota == pytest.approx(1 - (13 + 6) / 20)
+    assert result.idf1 == pytest.approx(2 * 7 / (20 + 13))
+    assert result.deta == pytest.approx(7 / (20 + 13 - 7)) and result.assa == pytest.approx(0.7)
 
 
 def test_distance():
     """2 px off at a reach of 4 px: a similarity of 3/4, which 15 of 19 thresholds allow."""
-    told = scored([path(0)], [path(2)])
-    assert told.rms == 2 and told.mota == told.idf1 == 1
+    result = scored([path(0)], [path(2)])
+    assert result.rms == 2 and result.mota == result.idf1 == 1
     share = (ALPHAS <= 0.75).mean()
     assert share == 15 / 19
-    assert told.deta == told.assa == told.hota == pytest.approx(share)
+    assert result.deta == result.assa == result.hota == pytest.approx(share)
     assert scored([path(0)], [path(4.1)]).covered == 0
 
 
 def test_a_match_stays_while_it_may():
     """Another track that comes nearer for some times does not take the target over."""
-    told = scored([path(0)], [path(2), path(1, 3, 7)])
-    np.testing.assert_array_equal(told.match[:, 0], 0)
-    assert told.switches == 0 and told.mota == pytest.approx(1 - 4 / 10)
+    result = scored([path(0)], [path(2), path(1, 3, 7)])
+    np.testing.assert_array_equal(result.match[:, 0], 0)
+    assert result.switches == 0 and result.mota == pytest.approx(1 - 4 / 10)
     # Two that may follow one of two targets each are both matched, though one is further away.
     both = scored([path(0), path(3)], [path(2.5), path(6)], reach=3.0)
     assert both.covered == 1
@@ -78,9 +78,9 @@ def test_a_match_stays_while_it_may():
 
 def test_fragments():
     """A target whose track ends and begins anew: one switch, identity for six of ten times."""
-    told = scored([path(0)], [path(0, 0, 4), path(0, 4)])
-    assert counts(told) == (1, 2, 1, 0, 0, 1)
-    assert told.idf1 == pytest.approx(2 * 6 / 20)
+    result = scored([path(0)], [path(0, 0, 4), path(0, 4)])
+    assert counts(result) == (1, 2, 1, 0, 0, 1)
+    assert result.idf1 == pytest.approx(2 * 6 / 20)
 
 
 def test_hidden_targets():
@@ -94,9 +94,9 @@ def test_hidden_targets():
 
 
 def test_nothing():
-    told = scored([], [])
-    assert counts(told) == (0,) * 6
-    assert told.idf1 == told.hota == told.mota == 1 and np.isnan(told.rms)
+    result = scored([], [])
+    assert counts(result) == (0,) * 6
+    assert result.idf1 == result.hota == result.mota == 1 and np.isnan(result.rms)
     assert scored([], [path(0)]).false == 1 and scored([path(0)], []).missed == 1
     assert scored([path(0)], []).hota == scored([], [path(0)]).hota == 0
     with pytest.raises(InputError, match="do not fit"):

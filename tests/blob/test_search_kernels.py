@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from jaxevent.blob import moment
-from jaxevent.blob.prepare import Packing
+from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.blob.search import stream as stream_module
 from jaxevent.blob.search.background import (
     CELL_PX,
@@ -297,7 +297,7 @@ def test_where_events_of_one_polarity_lag_the_other_tells_the_place():
     np.testing.assert_allclose(told.p[:, 0], 20 + 40e-6 * path.t, atol=0.8)
     np.testing.assert_allclose(told.C[0], np.diag([1.5**2 + 1 / 6] * 2), atol=0.4)
     found = TargetSearchResult((told,), (), 0, 0.0, recording)
-    kept = Packing(recording, moment.Params(), found=found).whole()
+    kept = ChunkPacker(recording, moment.Params(), found=found).pack_all()
     assert (kept.polarity[kept.valid] > 0).all() and kept.valid.sum() > 1500
     # No events of hot pixels, and no change where both are alike.
     assert prefer_sharper([path], recording, ~cold)[0] is path

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.engine.tracking import FusedRun
-from jaxevent.blob.prepare import Packing
+from jaxevent.blob.engine.runner import KernelRunner
+from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -38,9 +38,9 @@ def walk():
 
 
 def follow(recording, params, seeds, tracker, steps=64, chunks=32, **options):
-    packing = Packing(recording, params, seeds, steps=steps, chunks=chunks, **options)
-    kernel = FusedRun(tracker.filter, params, packing)
-    return Tracks(tracker.filter, packing, params, smooth=True, fused=kernel)
+    packer = ChunkPacker(recording, params, seeds, steps=steps, chunks=chunks, **options)
+    runner = KernelRunner(tracker.filter, params, detect=packer.detect)
+    return Tracks(runner, packer, smooth=True)
 
 
 def all_at_once(recording, M, size, start, times):
@@ -51,9 +51,9 @@ def all_at_once(recording, M, size, start, times):
     """
     e = recording.events
     steps = [np.arange(i, min(i + M, len(e))) for i in range(0, len(e), M)]
-    told = [(int(e.t[rows[-1]]), rows) for rows in steps] + [(int(t), []) for t in times]
-    order = sorted(range(len(told)), key=lambda k: (told[k][0], k))
-    nodes = [(int(e.t[0]), []), *(told[k] for k in order)]
+    result = [(int(e.t[rows[-1]]), rows) for rows in steps] + [(int(t), []) for t in times]
+    order = sorted(range(len(result)), key=lambda k: (result[k][0], k))
+    nodes = [(int(e.t[0]), []), *(result[k] for k in order)]
     d = 4 * len(nodes)
     A, b = [], []
 
@@ -66,15 +66,15 @@ def all_at_once(recording, M, size, start, times):
         return np.eye(d)[4 * k : 4 * k + 4]
 
     add(place(0), np.r_[start, 0, 0], np.diag([P0_P, P0_P, P0_V, P0_V]))
-    heard, eye = nodes[0][0], np.eye(2)
+    last_event, eye = nodes[0][0], np.eye(2)
     for k in range(1, len(nodes)):
         later = [t for t, rows in nodes[k:] if len(rows)]
         dt = (nodes[k][0] - nodes[k - 1][0]) * 1e-6
-        gap = ((later[0] if later else nodes[k][0]) - heard) * 1e-6
+        gap = ((later[0] if later else nodes[k][0]) - last_event) * 1e-6
         F = np.block([[eye, dt * eye], [0 * eye, eye]])
         a, h, c = Q_P * dt + Q_V * dt**3 / 3, Q_V * dt**2 / 2, Q_V * dt
         if gap > STILL:
-            since = (nodes[k - 1][0] - heard) * 1e-6, (nodes[k][0] - heard) * 1e-6
+            since = (nodes[k - 1][0] - last_event) * 1e-6, (nodes[k][0] - last_event) * 1e-6
             F[:, 2:], h = 0, 0
             # The filter's noise of the whole silence, as far as it has gone.
             a, c = Q_P * dt + Q_V * (since[1] ** 3 - since[0] ** 3) / 3, P0_V
@@ -86,7 +86,7 @@ def all_at_once(recording, M, size, start, times):
             H = np.concatenate([eye, -age * eye], 1)
             xi = np.r_[e.x[rows].mean(), e.y[rows].mean()]
             add(H @ place(k), xi, size**2 / len(rows) * eye)
-        heard = t if len(rows) else heard
+        last_event = t if len(rows) else last_event
     A, b = np.concatenate(A), np.concatenate(b)
     Q, R = np.linalg.qr(A)
     R = np.linalg.inv(R)
@@ -106,15 +106,17 @@ def test_equals_least_squares_of_all_states(walk):
     times = np.array(
         [int(walk.events.t[0]), 7001, 39_000, 41_000, 60_000, 89_000, 101_234, 139_000]
     )
-    told = tracks(times)
-    assert told.valid.all()
+    result = tracks(times)
+    assert result.valid.all()
     x, P = all_at_once(walk, M, size, start, times)
-    np.testing.assert_allclose(told.mean[:, 0, :2], x[:, :2], atol=2e-5)
-    np.testing.assert_allclose(told.mean[:, 0, 2:4], x[:, 2:], rtol=1e-4, atol=2e-2)
+    np.testing.assert_allclose(result.mean[:, 0, :2], x[:, :2], atol=2e-5)
+    np.testing.assert_allclose(result.mean[:, 0, 2:4], x[:, 2:], rtol=1e-4, atol=2e-2)
     # Of a velocity in the pause the filter tells that it is not known afterwards.
     moving = (times < PAUSE[0]) | (times >= PAUSE[1])
-    np.testing.assert_allclose(told.covariance[moving, 0, :4, :4], P[moving], rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(told.covariance[:, 0, :2, :2], P[:, :2, :2], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        result.covariance[moving, 0, :4, :4], P[moving], rtol=1e-4, atol=1e-3
+    )
+    np.testing.assert_allclose(result.covariance[:, 0, :2, :2], P[:, :2, :2], rtol=1e-4, atol=1e-5)
     assert (tracks.filtered(times[:4]).covariance[:, 0, 0, 0] > 1.2 * P[:4, 0, 0]).all()
 
 
@@ -142,26 +144,26 @@ DETECTED = {
 
 
 @pytest.mark.slow
-def test_stretches_chunks_and_births_do_not_matter(three):
-    """One long stretch, and many short ones of which only some beginnings are kept."""
+def test_segments_chunks_and_births_do_not_matter(three):
+    """One long segment, and many short ones of which only some beginnings are kept."""
     (rec, _), tracker = three, blob.constant_velocity
     params = tracker.Params(**DETECTED)
     times = np.linspace(rec.start, rec.stop, 41).astype(np.int64)
     tracks = follow(rec, params, None, tracker, steps=64, chunks=64)
     short = follow(rec, params, None, tracker, steps=4, chunks=3)
     assert len(tracks) >= 3 and (tracks.death < tracks.stop).any()
-    assert len(short._later) > len(short._begins) > 8
+    assert len(short._segment_infos) > len(short._checkpoints) > 8
     for one, other in zip(tracks(times), short(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
-    assert len(short._following) == len(short._later)
-    short._following = {}  # as where there is no room for what later events say
+    assert len(short._kept_infos) == len(short._segment_infos)
+    short._kept_infos = {}  # as where there is no room for what later events say
     for one, other in zip(tracks(times), short(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
     # At its end a track rests on the same events either way.
     ends = np.minimum(tracks.death - 1, rec.stop)
     both = (tracks(ends), tracks.filtered(ends))
     for k in range(len(tracks)):
-        np.testing.assert_allclose(*(told.mean[k, k] for told in both), rtol=1e-9)
+        np.testing.assert_allclose(*(result.mean[k, k] for result in both), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -206,14 +208,14 @@ def test_pure_functions_agree_and_have_gradients(walk):
     # Compiling a gradient takes seconds: one program tells all.
     loss = jax.jit(jax.value_and_grad(loss, has_aux=True))
     raw = {name: params.raw[name] for name in ("Q_v", "Q_p", "P0_p")}
-    (_, read), slopes = loss(raw)
+    (_, read), gradient = loss(raw)
     for one, other in zip(read, follow(walk, params, seeds, tracker)(times), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
     h = 1e-5
     for name in raw:
         up, down = (loss({**raw, name: raw[name] + s})[0][0] for s in (h, -h))
-        assert slopes[name] == pytest.approx(float(up - down) / (2 * h), rel=2e-4, abs=1e-7)
-        assert slopes[name] != 0
+        assert gradient[name] == pytest.approx(float(up - down) / (2 * h), rel=2e-4, abs=1e-7)
+        assert gradient[name] != 0
 
 
 @pytest.mark.slow
@@ -231,9 +233,9 @@ def test_single_precision(walk, float32):
     tracker = blob.constant_velocity
     params = params_of(tracker, events_per_step=4, t_still=STILL, cycle=1.0)
     times, seeds = np.arange(1000, 139_000, 9000), [(58.0, 62.0, 4.0)]
-    told = follow(walk, params, seeds, tracker)(times)
+    result = follow(walk, params, seeds, tracker)(times)
     with jax.enable_x64(True):
         exact = follow(walk, params, seeds, tracker)(times)
-    assert told.mean.dtype == np.float32
-    np.testing.assert_allclose(told.mean[..., :2], exact.mean[..., :2], atol=5e-3)
-    np.testing.assert_allclose(told.mean[..., 2:4], exact.mean[..., 2:4], rtol=2e-3, atol=0.5)
+    assert result.mean.dtype == np.float32
+    np.testing.assert_allclose(result.mean[..., :2], exact.mean[..., :2], atol=5e-3)
+    np.testing.assert_allclose(result.mean[..., 2:4], exact.mean[..., 2:4], rtol=2e-3, atol=0.5)

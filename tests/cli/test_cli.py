@@ -25,7 +25,7 @@ from jaxevent.cli import reconstruct
 from jaxevent.methods import names
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import describe, export
-from jaxevent.show.report import tone_map
+from jaxevent.show.images import tone_map
 from jaxevent.simulate import SCENES, SENSORS, Pan, from_video, scene, simulate
 
 pytestmark = pytest.mark.slow
@@ -424,7 +424,7 @@ def test_info(tmp_path, capsys, monkeypatch):
     assert re.search(r"known\.h5: 6 events, 2 frames, 0\.\d MB\n", capsys.readouterr().out)
     assert cli.main(["info", str(path)]) == 0
     first = capsys.readouterr().out
-    monkeypatch.setattr(describe, "BLOCK", 2)
+    monkeypatch.setattr(describe, "BLOCK_EVENTS", 2)
     assert cli.main(["info", str(tmp_path / "known.h5")]) == 0
     assert capsys.readouterr().out.splitlines()[1:] == first.splitlines()[1:]
     lines = dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())
@@ -666,7 +666,7 @@ def test_a_pixel_without_bound_is_white_in_colour():
     red = np.full((1, HEIGHT, WIDTH, 3), np.array([0.5, 0, 0]), np.float32)
     red[0, 3, 4] = (np.inf, np.nan, np.nan)
     video = jaxevent.blend.estimate(small())
-    ((_, image),) = export.shown(video, times, "linear", lambda _: red)
+    ((_, image),) = export.display_images(video, times, "linear", lambda _: red)
     assert image[3, 4].tolist() == [255, 255, 255]
     assert image[0, 0].tolist() == [127, 0, 0]
 

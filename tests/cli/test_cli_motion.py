@@ -32,7 +32,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.parameters import read_toml
 from jaxevent.recording import Events, Frames, Imu, Recording
 from jaxevent.show import motion as pictures
-from jaxevent.show.motion_pictures import warped_events
+from jaxevent.show.motion_figures import warped_events
 from jaxevent.simulate import motion_scene
 
 pytestmark = pytest.mark.slow

@@ -22,7 +22,7 @@ from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.errors import InputError, install_command
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import tracks as written
-from jaxevent.show.track_pictures import track_colour
+from jaxevent.show.track_figures import track_colour
 from jaxevent.show.track_tables import COLUMNS
 from jaxevent.simulate import Line, Target, simulate_blobs
 
@@ -153,7 +153,7 @@ def test_a_folder_of_everything(folder, capsys):
 
 @pytest.mark.slow
 def test_a_row_for_each_event(folder, capsys, monkeypatch):
-    monkeypatch.setattr(written, "_STRETCH", 300)
+    monkeypatch.setattr(written, "_BATCH_EVENTS", 300)
     argv = ["track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"]
     path = folder / "events.csv"
     span = ["--start", "0.01", "--stop", "0.04"]
@@ -177,7 +177,7 @@ def test_a_row_for_each_event(folder, capsys, monkeypatch):
 @pytest.mark.slow
 def test_quantities_at_event_rate(folder, capsys, monkeypatch):
     """Two pairs and a range, stretch by stretch, against all events at once."""
-    monkeypatch.setattr(written, "_STRETCH", 300)
+    monkeypatch.setattr(written, "_BATCH_EVENTS", 300)
     out = folder / "out"
     argv = [
         *("track", folder / "two.h5", *METHOD, "--params", folder / "mine.toml", "--at", "events"),
@@ -299,7 +299,7 @@ def test_nothing_found_is_an_empty_table(tmp_path, capsys, monkeypatch):
         ("a.csv", {"camera_moves": True}, "the camera moves, and no blob was found"),
         ("b.csv", {"full": True}, "no blob was found, and most of the image changes"),
     ):
-        nothing = functools.partial(blob.Found, (), (), 0, 1.0, **given)
+        nothing = functools.partial(blob.TargetSearchResult, (), (), 0, 1.0, **given)
         monkeypatch.setattr(blob, "find", lambda one, nothing=nothing, **_: nothing(one))
         assert cli.main([*map(str, argv[:-1]), str(tmp_path / name)]) == 0
         assert told in capsys.readouterr().out

@@ -14,6 +14,7 @@ from numba.core import types
 from jaxevent import cache, codegen
 from jaxevent.codegen import cache as kernel_cache
 from jaxevent.codegen import module as kernel_module
+from jaxevent.codegen.graph import TranslationError
 
 
 @pytest.fixture
@@ -229,6 +230,13 @@ def test_a_module_of_text_is_made_again_from_damaged_files(tmp_path, monkeypatch
     assert kernel_module.make_module(text).third.ctypes(6) == 2.25
     assert path.read_bytes() == content[0]
     assert kernel_module.make_module(text).third.cache_hits == 1
+
+
+def test_what_numba_does_not_compile_is_left_to_xla(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path))
+    text = TEXT.format(number="new_in_no_release")
+    with pytest.warns(UserWarning, match="left to XLA"), pytest.raises(TranslationError):
+        kernel_module.make_module(text)
 
 
 def _double(x):

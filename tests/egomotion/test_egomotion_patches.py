@@ -25,8 +25,8 @@ from jaxevent.egomotion.patches import (
 )
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
-from jaxevent.show.motion import Written
-from jaxevent.show.motion_pictures import motion_figure
+from jaxevent.show.motion import WrittenMotion
+from jaxevent.show.motion_figures import motion_figure
 
 WIDTH, HEIGHT, F = 120, 96, 100.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -189,10 +189,10 @@ def test_unobservable_heading_is_reported():
         motion = dataclasses.replace(
             MotionEstimate.from_arrays("general", t, mean, covariance), n_extended=1
         )
-        lines = Written([], t, motion(t), motion, None, None, None).summary()
+        lines = WrittenMotion([], t, motion(t), motion, None, None, None).summary()
         assert lines[0].startswith("1 estimate, found")  # the other one holds it
-        assert ("not observable" in " ".join(lines)) == ("not told" in lines[2]) == said
-        # Nor is a heading drawn that is not told, or a panel without anything.
+        assert ("not observable" in " ".join(lines)) == ("unobservable" in lines[2]) == said
+        # An unobservable heading is not drawn, nor is an empty panel.
         figure = motion_figure(dataclasses.replace(motion, agreement=np.array([0.5, 0.9])), t)
         drawn = {axis.get_ylabel(): axis.lines[0].get_ydata() for axis in figure.axes}
         assert len(drawn) == 7 and np.isfinite(drawn["wx (rad/s)"]).all()

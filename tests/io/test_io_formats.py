@@ -720,7 +720,7 @@ def test_hot_pixels_and_jumps_of_clocks(monkeypatch):
     )
     recording = Recording("r", 40, 30, events, frames, imu=late, extra=extra, triggers=signals)
     told = describe.describe(recording)
-    monkeypatch.setattr(describe, "BLOCK", 7)
+    monkeypatch.setattr(describe, "BLOCK_EVENTS", 7)
     assert describe.describe(recording) == told
     lines = dict(told)
     assert lines["hot pixels"] == "1, with 33.33 % of the events"

@@ -32,10 +32,8 @@ from jaxevent.codegen import functions
 from jaxevent.codegen.graph import ParameterProgram, evaluate_jaxpr
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.compensated.images import instant_smoother
-from jaxevent.reconstruction.engine import bands, room
-from jaxevent.reconstruction.engine.images import FusedImages
-from jaxevent.reconstruction.engine.smoothed import SmoothedVideo
-from jaxevent.reconstruction.engine.video import FusedVideo
+from jaxevent.reconstruction.engine import bands
+from jaxevent.reconstruction.engine.images import FilterVideo, KernelImages, SmootherVideo
 from jaxevent.reconstruction.video import Video
 from jaxevent.recording import ColumnSource
 
@@ -50,7 +48,7 @@ def check(name, recording, values, **options):
     params = params_of(method, **{"weighting": "linear", **values})
     times = times_of(recording)
     video = method.estimate(recording, params, compiler="numba", **options)
-    assert isinstance(video, SmoothedVideo if name == "aks" else FusedVideo)
+    assert isinstance(video, SmootherVideo if name == "aks" else FilterVideo)
     image, variance = look(video, times)
     expected, P = oracles.reconstruct(name, recording, params.values(), times)
     # The oracle finds the moments of truncated Gaussians on a grid.
@@ -189,7 +187,7 @@ def test_stored_events_are_checked_while_they_are_divided(tmp_path):
 
 @pytest.mark.slow
 def test_images_that_are_held_are_not_written_over(monkeypatch):
-    monkeypatch.setattr(room, "IMAGE_PIXELS", 2 * 11 * 9)  # two images at once
+    monkeypatch.setattr(bands, "IMAGE_PIXELS", 2 * 11 * 9)  # two images at once
     recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
     times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
     params = params_of(jaxevent.high_pass, **PARAMS)
@@ -198,11 +196,11 @@ def test_images_that_are_held_are_not_written_over(monkeypatch):
     assert len(parts) > 3
     held = np.concatenate([estimate.mean for _, estimate in parts])
     np.testing.assert_array_equal(held, video(times).mean)
-    arrays = video._room.take(2).mean.base  # used again once nobody has them
-    assert video._room.take(1).mean.base is not arrays
+    arrays = video._buffers.take(2).mean.base  # used again once nobody has them
+    assert video._buffers.take(1).mean.base is not arrays
     address = arrays.ctypes.data
     del arrays
-    assert video._room.take(1).mean.ctypes.data == address
+    assert video._buffers.take(1).mean.ctypes.data == address
 
 
 def test_float_frames_are_those_of_their_levels():
@@ -220,8 +218,8 @@ def test_float_frames_are_those_of_their_levels():
 @pytest.mark.slow
 def test_which_compiler_serves(float32):
     recording, blend = small(), jaxevent.blend
-    assert isinstance(blend.estimate(recording), FusedVideo)
-    assert isinstance(blend.estimate(recording, devices=jax.devices()[:1]), FusedVideo)
+    assert isinstance(blend.estimate(recording), FilterVideo)
+    assert isinstance(blend.estimate(recording, devices=jax.devices()[:1]), FilterVideo)
     assert type(blend.estimate(recording, compiler="xla")) is Video
     with jax.enable_x64(True):
         assert type(blend.estimate(recording)) is Video
@@ -283,7 +281,7 @@ def test_numbers_of_parameters_are_found_without_compiling():
     program = ParameterProgram()
     first = program.add_input(np.asarray(2.0))
     greater = jax.make_jaxpr(lambda x: x > 1)(2.0).eqns[0]
-    program.decided += program.add(greater, [first, np.asarray(1.0)])
+    program.conditions += program.add(greater, [first, np.asarray(1.0)])
     assert program.evaluate([np.asarray(3.0)]) is not None
     assert program.evaluate([np.asarray(0.5)]) is None
 
@@ -308,7 +306,7 @@ def test_derivatives_by_kernels_are_those_of_the_scan(name, options):
     found = []
     for compiler in ("numba", "xla"):
         images = method.prepare_images(recording, times, params, compiler=compiler)
-        assert isinstance(images, FusedImages) == (compiler == "numba")
+        assert isinstance(images, KernelImages) == (compiler == "numba")
         value, slope = jax.jit(jax.value_and_grad(loss))(raw, images)
         ones = jax.tree.map(jnp.ones_like, raw)
         along = jax.jit(lambda r, t, i: jax.jvp(lambda v: loss(v, i), (r,), (t,)))(

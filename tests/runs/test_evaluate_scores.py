@@ -19,7 +19,7 @@ from jaxevent.runs import evaluate
 from jaxevent.runs.blob_positions import read_positions
 from jaxevent.runs.scores import Sample
 from jaxevent.show.page import page, picture
-from jaxevent.show.report import markdown_table, short_names
+from jaxevent.show.tables import markdown_table, short_names
 from jaxevent.simulate import blob_scene, motion_scene
 from jaxevent.simulate.blobs import Approach, Target, simulate_blobs
 

@@ -9,13 +9,13 @@ from noise import HEIGHT, WIDTH, small
 
 import jaxevent
 from jaxevent import events, show
-from jaxevent.blob.states import TrackStates
+from jaxevent.blob.track import TrackStates
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import MissingExtra
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events
-from jaxevent.show import notebook
+from jaxevent.show import figures
 from jaxevent.tuning import FitResult
 
 
@@ -126,10 +126,10 @@ def test_notebooks_show_a_table_and_a_picture(monkeypatch):
     for title, thing in titles.items():
         shown = thing._repr_html_()
         assert title in shown and "data:image/png;base64," in shown
-    assert notebook.as_html(3) == "<pre>3</pre>"
-    assert "&lt;b&gt;" in notebook.as_html(dataclasses.replace(small(), name="<b>"))
+    assert figures.as_html(3) == "<pre>3</pre>"
+    assert "&lt;b&gt;" in figures.as_html(dataclasses.replace(small(), name="<b>"))
     assert show.plot_events(small())._repr_png_().startswith(b"\x89PNG")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert "pip install" in notebook.as_html(small()) and "img" not in notebook.as_html(small())
+    assert "pip install" in figures.as_html(small()) and "img" not in figures.as_html(small())
     with pytest.raises(MissingExtra):
         show.plot_events(small())

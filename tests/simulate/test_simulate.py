@@ -10,7 +10,7 @@ from PIL import Image
 import jaxevent
 from jaxevent import simulate as sim
 from jaxevent.camera import SCurve, UnknownResponse
-from jaxevent.show.report import video_writer
+from jaxevent.show.images import video_writer
 
 pytestmark = pytest.mark.slow
 

@@ -1,8 +1,8 @@
-"""The loop that all trackers' kernels share: over chunks, steps and targets, as `run` has it.
+"""Loop over chunks, steps and tracks that the kernels of all filters share, as `run` has it.
 
-A target's numbers are a row of `cells` and a row of `whole`; the driver's own come first, in the
-order of `CELLS` and `WHOLE`. What differs from filter to filter are the functions of `Functions`,
-which `target` writes; so this module is compiled once.
+The numbers of a track are a row of `reals` and a row of `integers`; the loop's own come first, in
+the order of `REALS` and `INTEGERS`. What differs between filters are the functions of
+`TrackFunctions`, which `program` writes; so this module is compiled once.
 """
 
 from typing import Any, NamedTuple
@@ -10,49 +10,71 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.prepare import LONGEST
+from jaxevent.blob.prepare import MAX_CHUNK_US
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
-CELLS = (
-    "slot.gate.0", "slot.hits.0", "p.0", "p.1", "long.0", "xi.0", "xi.1", "size.0", "frame.0",
+REALS = (
+    "track.gate.0", "track.hits.0", "p.0", "p.1", "long.0", "xi.0", "xi.1", "size.0", "frame.0",
     "frame.1",
 )  # fmt: skip
 GATE, HITS, P, _, LONG, XI, _, SIZE, FRAME, _ = range(10)
-WHOLE = (
-    "slot.last.0", "slot.heard.0", "slot.born.0", "slot.apart.0", "slot.id.0", "slot.confirmed.0",
-    "limit.0", "time.0", "stop.0", "inside.0", "found.0", "verdict.confirmed.0", "verdict.ended.0",
-    "verdict.death.0", "verdict.apart.0", "touched.0",
+INTEGERS = (
+    "track.last_update.0", "track.last_hit.0", "track.birth.0", "track.last_apart.0", "track.id.0",
+    "track.confirmed.0", "limit.0", "events.time.0", "stop.0", "evidence.merging.0",
+    "evidence.detected.0", "decision.confirmed.0", "decision.end_reason.0", "decision.death.0",
+    "decision.last_apart.0", "touched.0",
 )  # fmt: skip
-LAST, HEARD, BORN, APART, ID, CONFIRMED, LIMIT, TIME, STOP, INSIDE = range(10)
-FOUND, NOW_CONFIRMED, ENDED, DEATH, NOW_APART, TOUCHED = range(10, 16)
+LAST_UPDATE, LAST_HIT, BIRTH, LAST_APART, ID, CONFIRMED, LIMIT, TIME, STOP, MERGING = range(10)
+DETECTED, NOW_CONFIRMED, END_REASON, DEATH, NOW_LAST_APART, TOUCHED = range(10, 16)
 
-# Rows of a step's `work`: the events', then four for each target that is alive.
-X, Y, AGE, POLARITY, VALID, TARGETS = range(6)
-HELD, NEAR, DENSITY, WEIGHT, ROWS = range(5)
+# Rows of a step's `work`: the events', then four for each track that is alive.
+X, Y, AGE, POLARITY, VALID, TRACKS = range(6)
+INSIDE, NEAR, LOG_LIKELIHOOD, WEIGHT, ROWS_PER_TRACK = range(5)
+
+GRID_TIME, NEXT_ID = 0, 1  # in `KernelState.counters`
 
 
-class Functions(NamedTuple):
-    """What is a filter's own."""
+class TrackFunctions(NamedTuple):
+    """Compiled functions of a filter."""
 
-    start: Any
-    solo: Any
-    ahead: Any
-    alone: Any
-    share: Any
+    init: Any
+    step: Any  # one event and the one track that is alive
+    predict: Any
+    weights_alone: Any  # of events that one gate alone contains
+    weights: Any
     update: Any
     limit: Any
-    expected: Any
-    verdict: Any
+    measurement: Any
+    decide: Any
 
 
-class Chunks(NamedTuple):
-    """The arrays of `prepare.Features` that the loop reads."""
+class LifecycleConfig(NamedTuple):
+    """Parameters of the life cycle that are not of one track."""
+
+    size: float  # px, of new tracks
+    births: bool
+    tau: float  # s, in which the grid forgets
+    cell: float  # px
+    min_events: float  # in 3x3 cells that begin a track
+    alone: bool  # whether an event in one gate alone is weighted by that track alone
+
+
+class TrackKernel(NamedTuple):
+    """Functions of a filter with the parameters' numbers."""
+
+    functions: TrackFunctions
+    numbers: NDArray[np.float64]
+    config: LifecycleConfig
+
+
+class ChunkArrays(NamedTuple):
+    """Arrays of `prepare.Features` that the loop reads."""
 
     t: NDArray[np.int32]
     xi: NDArray
     polarity: NDArray
     valid: NDArray[np.bool_]
-    owner: NDArray[np.int32]  # of two each, or empty
+    owner: NDArray[np.int32]  # two of each event, or empty
     elapsed: NDArray[np.int32]
     stop: NDArray[np.int32]
     cycle: NDArray[np.bool_]
@@ -61,234 +83,260 @@ class Chunks(NamedTuple):
     seed_size: NDArray
 
 
-class Settings(NamedTuple):
-    """Numbers of the life cycle that are not of one target."""
+class KernelState(NamedTuple):
+    """The tracks and the grid of unassociated events."""
 
-    size: float  # px, of targets that are born
-    births: bool
-    tau: float  # s, in which the grid forgets
-    cell: float  # px
-    least: float  # events in 3x3 cells that begin a track
-    apart: bool  # whether an event that one gate alone holds is that target's alone to weigh
-
-
-class Memory(NamedTuple):
-    """The targets and the grid of unassociated events."""
-
-    cells: NDArray  # [targets, ...]
-    whole: NDArray[np.int64]  # [targets, ...]
+    reals: NDArray  # [targets, ...]
+    integers: NDArray[np.int64]  # [targets, ...]
     sums: NDArray  # [3, rows, columns]
-    at: NDArray[np.int64]  # the grid's time, and the next id
+    counters: NDArray[np.int64]  # the grid's time, and the next id
 
 
-class Told(NamedTuple):
-    """What a run tells of each chunk; whose events are only where there is room."""
+class KernelOutput(NamedTuple):
+    """Report of each chunk; the association only where its arrays have room."""
 
-    owner: NDArray[np.int32]  # [chunks, steps, events], serial numbers; -1: nobody's
-    weight: NDArray  # how much of the event is the owner's
-    before: NDArray[np.int32]
-    after: NDArray[np.int32]
+    target: NDArray[np.int32]  # [chunks, steps, events], serial numbers; -1: none
+    weight: NDArray  # of the event for its target
+    id_before: NDArray[np.int32]
+    id_after: NDArray[np.int32]
     confirmed: NDArray[np.bool_]
-    ended: NDArray[np.int32]
+    end_reason: NDArray[np.int32]
     death: NDArray[np.int32]
 
 
-class Updates(NamedTuple):
-    """Rows: of each chunk all targets at its start, then each after each of its updates.
+class UpdateRecord(NamedTuple):
+    """Rows: of each chunk all tracks at its start, then each after each of its updates.
 
-    `count` goes on beyond the rows that there is room for. Without any nothing is counted.
+    `count` goes on beyond the capacity. Without rows nothing is counted.
     """
 
-    cells: NDArray  # [rows, ...]
-    whole: NDArray[np.int64]  # [rows, ...]
+    reals: NDArray  # [rows, ...]
+    integers: NDArray[np.int64]  # [rows, ...]
     target: NDArray[np.int64]  # of each row
-    before: NDArray[np.int64]  # the row before of the same target in the chunk; -1: none
+    previous: NDArray[np.int64]  # the row before of the same track in the chunk; -1: none
     step: NDArray[np.int64]  # steps of the chunk done by then
     begin: NDArray[np.int64]  # the first row of each chunk, and their number
-    latest: NDArray[np.int64]  # the last row of each target
+    latest: NDArray[np.int64]  # the last row of each track
     count: NDArray[np.int64]  # [1]
 
 
-class Space(NamedTuple):
-    """Where a step is worked on; nothing in it is kept."""
+class Scratch(NamedTuple):
+    """Scratch memory of a step."""
 
     work: NDArray  # [rows, events], see above
-    marks: NDArray[np.int64]  # whose the events are
-    targets: NDArray[np.int64]  # those that are alive
-    around: NDArray  # [rows, columns] sums over 3x3 cells of the grid,
-    above: NDArray  # [columns + 2] and over the three cells of a column
+    owners: NDArray[np.int64]  # possible tracks of the events
+    alive: NDArray[np.int64]  # indices of the tracks that are alive
+    sums3x3: NDArray  # [rows, columns]
+    sums3x1: NDArray  # [columns + 2]
+
+
+class _Context(NamedTuple):
+    """Everything that the parts of the loop share."""
+
+    functions: TrackFunctions
+    pointers: Any  # the first arguments of these
+    config: LifecycleConfig
+    chunks: ChunkArrays
+    state: KernelState
+    out: KernelOutput
+    scratch: Scratch
+    updates: UpdateRecord
+
+
+class _NewTrack(NamedTuple):
+    """A track that begins at rest."""
+
+    x: Any  # px
+    y: Any
+    size: Any  # px
+    time: Any  # us
+    id: Any
+    confirmed: Any
 
 
 @njit_noalloc
-def run(functions, numbers, settings, chunks, memory, told, space, updates):
-    """Track through chunks; the memory is that at their end."""
-    cells, whole = memory.cells, memory.whole
-    given = (
-        cells.ctypes, whole.ctypes, space.work.ctypes, space.marks.ctypes, numbers.ctypes,
+def run(kernel, chunks, state, out, scratch, updates):
+    """Track through chunks; the state becomes that at their end."""
+    reals, integers = state.reals, state.integers
+    pointers = (
+        reals.ctypes, integers.ctypes, scratch.work.ctypes, scratch.owners.ctypes,
+        kernel.numbers.ctypes,
     )  # fmt: skip
+    context = _Context(
+        kernel.functions, pointers, kernel.config, chunks, state, out, scratch, updates
+    )
     for chunk in range(len(chunks.t)):
-        _begin_chunk(functions, given, settings, chunks, memory, chunk)
+        _begin_chunk(context, chunk)
         updates.begin[chunk] = updates.count[0]
-        for k in range(len(cells)):
-            functions.limit(*given, k, 0, 0, 1)
+        for k in range(len(reals)):
+            context.functions.limit(*pointers, k, 0, 0, 1)
             updates.latest[k] = -1
             if len(updates.target):
-                _note(updates, cells, whole, k, -1)
-        _run_steps(functions, given, settings, chunks, memory, chunk, told, space, updates)
-        for k in range(len(cells)):
-            told.before[chunk, k] = told.after[chunk, k] = whole[k, ID]
-            told.confirmed[chunk, k] = whole[k, CONFIRMED] != 0
-            told.ended[chunk, k] = told.death[chunk, k] = 0
+                _record(updates, reals, integers, k, -1)
+        _run_steps(context, chunk)
+        for k in range(len(reals)):
+            out.id_before[chunk, k] = out.id_after[chunk, k] = integers[k, ID]
+            out.confirmed[chunk, k] = integers[k, CONFIRMED] != 0
+            out.end_reason[chunk, k] = out.death[chunk, k] = 0
         if chunks.cycle[chunk]:
-            _end_cycle(functions, given, settings, chunks, memory, chunk, told, space)
+            _manage_tracks(context, chunk)
     updates.begin[len(chunks.t)] = updates.count[0]
 
 
 @njit_noalloc_inlined
-def _begin_chunk(functions, given, settings, chunks, memory, chunk):
+def _begin_chunk(context, chunk):
     """Count times from the chunk's start, and begin the tracks of its seeds."""
-    cells, whole, elapsed = memory.cells, memory.whole, np.int64(chunks.elapsed[chunk])
-    for k in range(len(cells)):
-        for field in (LAST, HEARD, BORN, APART):
-            whole[k, field] = max(whole[k, field] - elapsed, -2 * LONGEST)
-    memory.at[0] = max(memory.at[0] - elapsed, -2 * LONGEST)
+    chunks, state = context.chunks, context.state
+    integers, elapsed = state.integers, np.int64(chunks.elapsed[chunk])
+    for k in range(len(integers)):
+        for field in (LAST_UPDATE, LAST_HIT, BIRTH, LAST_APART):
+            integers[k, field] = max(integers[k, field] - elapsed, -2 * MAX_CHUNK_US)
+    state.counters[GRID_TIME] = max(state.counters[GRID_TIME] - elapsed, -2 * MAX_CHUNK_US)
     for k in range(len(chunks.seed)):
         if chunks.seed[k] == chunk:
             size = chunks.seed_size[k]
-            size = size if size > 0 else cells.dtype.type(settings.size)
+            size = size if size > 0 else state.reals.dtype.type(context.config.size)
             x, y = chunks.seed_xi[k, 0], chunks.seed_xi[k, 1]
-            _begin_track(functions, given, cells, whole, k, x, y, size, 0, k, 1)
+            _init_track(context, k, _NewTrack(x, y, size, np.int64(0), k, 1))
 
 
 @njit_noalloc_inlined
-def _begin_track(functions, given, cells, whole, k, x, y, size, time, serial, confirmed):
-    """A track begins at rest."""
-    cells[k, XI], cells[k, XI + 1], cells[k, SIZE] = x, y, size
-    functions.start(*given, k, 0, 0, 1)
-    cells[k, HITS] = 0
-    whole[k, LAST] = whole[k, HEARD] = whole[k, BORN] = whole[k, APART] = time
-    whole[k, ID], whole[k, CONFIRMED] = serial, confirmed
+def _init_track(context, k, new):
+    """Begin a track in an entry of the buffer."""
+    reals, integers = context.state.reals, context.state.integers
+    reals[k, XI], reals[k, XI + 1], reals[k, SIZE] = new.x, new.y, new.size
+    context.functions.init(*context.pointers, k, 0, 0, 1)
+    reals[k, HITS] = 0
+    for field in (LAST_UPDATE, LAST_HIT, BIRTH, LAST_APART):
+        integers[k, field] = new.time
+    integers[k, ID], integers[k, CONFIRMED] = new.id, new.confirmed
 
 
 @njit_noalloc_inlined
-def _run_steps(functions, given, settings, chunks, memory, chunk, told, space, updates):
-    """The steps of a chunk; the grid counts the events that are near no target."""
-    cells, whole, sums = memory.cells, memory.whole, memory.sums
-    work, marks, targets = space.work, space.marks, space.targets
+def _run_steps(context, chunk):
+    """Run the steps of a chunk; the grid counts the events that are near no track."""
+    chunks, functions, scratch = context.chunks, context.functions, context.scratch
+    reals, integers = context.state.reals, context.state.integers
+    births, pointers = context.config.births, context.pointers
+    work, owners, tracks = scratch.work, scratch.owners, scratch.alive
     t, xi, polarity = chunks.t[chunk], chunks.xi[chunk], chunks.polarity[chunk]
     valid = chunks.valid[chunk]
-    steps, room = t.shape
+    steps, size = t.shape
     owned, micro = len(chunks.owner) > 0, work.dtype.type(1e-6)
-    asked, noted = len(told.owner) > 0, len(updates.target) > 0
+    associate, recording = len(context.out.target) > 0, len(context.updates.target) > 0
     stop, faded, none = np.int64(chunks.stop[chunk]), valid[0, 0] & False, np.int64(0)
     for step in range(steps):
         if not valid[step, 0]:
-            break  # the rest fills up
-        time = np.int64(t[step, room - 1])
-        for i in range(room):
+            break  # the rest is padding
+        time = np.int64(t[step, size - 1])
+        for i in range(size):
             work[X, i] = xi[step, i, 0]
             work[Y, i] = xi[step, i, 1]
             work[AGE, i] = work.dtype.type(time - t[step, i]) * micro
             work[POLARITY, i] = polarity[step, i]
             work[VALID, i] = valid[step, i]
         if owned:
-            for i in range(room):
-                marks[i] = chunks.owner[chunk, step, i, 0]
-                marks[room + i] = chunks.owner[chunk, step, i, 1]
+            for i in range(size):
+                owners[i] = chunks.owner[chunk, step, i, 0]
+                owners[size + i] = chunks.owner[chunk, step, i, 1]
         alive = none
-        for k in range(len(cells)):
-            if time - whole[k, HEARD] <= whole[k, LIMIT]:
-                targets[alive] = k
-                whole[k, TIME] = time
+        for k in range(len(reals)):
+            if time - integers[k, LAST_HIT] <= integers[k, LIMIT]:
+                tracks[alive] = k
+                integers[k, TIME] = time
                 alive += 1
-        if alive == 1 and not asked:
-            wanted, k = room if room > 1 or settings.births else 0, targets[0]
-            whole[k, TOUCHED] = 0
-            functions.solo(*given, k, TARGETS, room, wanted)
-            if noted and whole[k, TOUCHED] != 0:
-                _note(updates, cells, whole, k, step)
+        if alive == 1 and not associate:
+            needs_near, k = size if size > 1 or births else 0, tracks[0]
+            integers[k, TOUCHED] = 0
+            functions.step(*pointers, k, TRACKS, size, needs_near)
+            if recording and integers[k, TOUCHED] != 0:
+                _record(context.updates, reals, integers, k, step)
         elif alive > 0:
             for a in range(alive):
-                functions.ahead(*given, targets[a], TARGETS + ROWS * a, room, room)
-            _share_out(functions, given, settings, alive, room, work)
+                functions.predict(*pointers, tracks[a], TRACKS + ROWS_PER_TRACK * a, size, size)
+            _associate(context, alive, size)
             for a in range(alive):
-                k, row = targets[a], TARGETS + ROWS * a
+                k, row = tracks[a], TRACKS + ROWS_PER_TRACK * a
                 some = False
-                for i in range(room):
+                for i in range(size):
                     some |= work[row + WEIGHT, i] > 0
                 if some:
-                    functions.update(*given, k, row, room, room)
-                if some and noted:
-                    _note(updates, cells, whole, k, step)
-        if asked:
-            _tell_owners(work, whole, targets, alive, told.owner[chunk, step],
-                told.weight[chunk, step])  # fmt: skip
-        if settings.births:
-            faded = _count_strays(settings, sums, memory.at, t[step], stop, alive, work, faded)
+                    functions.update(*pointers, k, row, size, size)
+                if some and recording:
+                    _record(context.updates, reals, integers, k, step)
+        if associate:
+            _report_association(context, chunk, step, alive)
+        if births:
+            faded = _accumulate_clutter(context, t[step], stop, alive, faded)
 
 
 @njit_noalloc_inlined
-def _note(updates, cells, whole, k, step):
-    """Note a target after its update in a step."""
+def _record(updates, reals, integers, k, step):
+    """Record a track after its update in a step."""
     row = updates.count[0]
     updates.count[0] = row + 1
     if row >= len(updates.target):
         return
-    for field in range(cells.shape[1]):
-        updates.cells[row, field] = cells[k, field]
-    for field in range(whole.shape[1]):
-        updates.whole[row, field] = whole[k, field]
-    updates.target[row], updates.before[row] = k, updates.latest[k]
+    for field in range(reals.shape[1]):
+        updates.reals[row, field] = reals[k, field]
+    for field in range(integers.shape[1]):
+        updates.integers[row, field] = integers[k, field]
+    updates.target[row], updates.previous[row] = k, updates.latest[k]
     updates.step[row] = step + 1
     updates.latest[k] = row
 
 
 @njit_noalloc_inlined
-def _tell_owners(work, whole, targets, alive, owner, weight):
-    """Whose the events of a step are, and how much of them."""
-    for i in range(len(owner)):
-        owner[i], weight[i] = -1, 0
+def _report_association(context, chunk, step, alive):
+    """Report the likeliest track of each event of a step, and its weight."""
+    work, tracks = context.scratch.work, context.scratch.alive
+    target, weight = context.out.target[chunk, step], context.out.weight[chunk, step]
+    for i in range(len(target)):
+        target[i], weight[i] = -1, 0
         for a in range(alive):
-            share = work[TARGETS + ROWS * a + WEIGHT, i]
-            if share > weight[i]:
-                owner[i], weight[i] = whole[targets[a], ID], share
+            value = work[TRACKS + ROWS_PER_TRACK * a + WEIGHT, i]
+            if value > weight[i]:
+                target[i], weight[i] = context.state.integers[tracks[a], ID], value
 
 
 @njit_noalloc_inlined
-def _share_out(functions, given, settings, alive, room, work):
-    """The weight of each event for each target."""
-    apart = settings.apart
-    if apart:
-        for i in range(room):
-            held = 0.0
+def _associate(context, alive, size):
+    """Compute the weight of each event for each track."""
+    functions, work = context.functions, context.scratch.work
+    alone = context.config.alone
+    if alone:
+        for i in range(size):
+            gates = 0.0
             for a in range(alive):
-                held += work[TARGETS + ROWS * a + HELD, i]
-            if held > 1:
-                apart = False
+                gates += work[TRACKS + ROWS_PER_TRACK * a + INSIDE, i]
+            if gates > 1:
+                alone = False
                 break
-    if apart:
+    if alone:
         for a in range(alive):
-            functions.alone(*given, 0, TARGETS + ROWS * a, room, room)
+            row = TRACKS + ROWS_PER_TRACK * a
+            functions.weights_alone(*context.pointers, 0, row, size, size)
     else:
-        for i in range(room):
-            functions.share(*given, 0, i, room, alive)
+        for i in range(size):
+            functions.weights(*context.pointers, 0, i, size, alive)
 
 
 @njit_noalloc_inlined
-def _count_strays(settings, sums, at, t, stop, alive, work, faded):
-    """Add a step's unassociated events to the grid, as `lifecycle.count_strays` does."""
+def _accumulate_clutter(context, t, stop, alive, faded):
+    """Add a step's unassociated events to the grid, as `lifecycle.accumulate_clutter` does."""
+    sums, counters, work = context.state.sums, context.state.counters, context.scratch.work
     rows, columns = sums.shape[1:]
-    micro, tau = sums.dtype.type(1e-6), sums.dtype.type(settings.tau)
-    cell = sums.dtype.type(settings.cell)
+    micro, tau = sums.dtype.type(1e-6), sums.dtype.type(context.config.tau)
+    cell = sums.dtype.type(context.config.cell)
     for i in range(work.shape[1]):
         near = 1 - work[VALID, i]
         for a in range(alive):
-            near += work[TARGETS + ROWS * a + NEAR, i]
+            near += work[TRACKS + ROWS_PER_TRACK * a + NEAR, i]
         if near > 0:
             continue
         if not faded:
-            _fade(sums, np.exp(-(sums.dtype.type(stop - at[0]) * micro) / tau))
-            at[0], faded = stop, True
+            _fade(sums, np.exp(-(sums.dtype.type(stop - counters[GRID_TIME]) * micro) / tau))
+            counters[GRID_TIME], faded = stop, True
         weight = np.exp(-(sums.dtype.type(stop - t[i]) * micro) / tau)
         x, y = work[X, i], work[Y, i]
         column = min(max(np.int64(x / cell), 0), columns - 1)
@@ -301,7 +349,7 @@ def _count_strays(settings, sums, at, t, stop, alive, work, faded):
 
 @njit_noalloc_inlined
 def _fade(sums, factor):
-    """Multiply the grid."""
+    """Multiply the grid by a factor."""
     for kind in range(sums.shape[0]):
         for row in range(sums.shape[1]):
             for column in range(sums.shape[2]):
@@ -309,67 +357,71 @@ def _fade(sums, factor):
 
 
 @njit_noalloc_inlined
-def _end_cycle(functions, given, settings, chunks, memory, chunk, told, space):
-    """Confirmations, deaths, mergers and births at a chunk's end; see `lifecycle.end_cycle`."""
-    cells, whole, seeds = memory.cells, memory.whole, len(chunks.seed)
-    stop, number = np.int64(chunks.stop[chunk]), len(cells)
+def _manage_tracks(context, chunk):
+    """Confirm, delete, merge and begin tracks at a chunk's end; see `lifecycle.manage_tracks`."""
+    functions, pointers, out = context.functions, context.pointers, context.out
+    reals, integers = context.state.reals, context.state.integers
+    stop, number = np.int64(context.chunks.stop[chunk]), len(reals)
     for k in range(number):
-        whole[k, STOP] = stop
-        functions.expected(*given, k, 0, 0, 1)
+        integers[k, STOP] = stop
+        functions.measurement(*pointers, k, 0, 0, 1)
     for k in range(number):
-        inside = False
+        merging = False
         for j in range(number):
-            if whole[j, ID] >= 0 and whole[j, ID] < whole[k, ID]:
-                x, y = cells[k, P] - cells[j, P], cells[k, P + 1] - cells[j, P + 1]
-                inside |= not x * x + y * y > cells[j, LONG] * cells[j, LONG]
-        whole[k, INSIDE], whole[k, FOUND] = inside, k >= seeds
-        functions.verdict(*given, k, 0, 0, 1)
+            if integers[j, ID] >= 0 and integers[j, ID] < integers[k, ID]:
+                x, y = reals[k, P] - reals[j, P], reals[k, P + 1] - reals[j, P + 1]
+                merging |= not x * x + y * y > reals[j, LONG] * reals[j, LONG]
+        integers[k, MERGING] = merging
+        integers[k, DETECTED] = k >= len(context.chunks.seed)
+        functions.decide(*pointers, k, 0, 0, 1)
     for k in range(number):
-        ended = whole[k, ENDED] > 0
-        told.confirmed[chunk, k] = whole[k, NOW_CONFIRMED] != 0
-        told.ended[chunk, k], told.death[chunk, k] = whole[k, ENDED], whole[k, DEATH]
-        whole[k, APART] = whole[k, NOW_APART]
-        whole[k, CONFIRMED] = 0 if ended else whole[k, NOW_CONFIRMED]
+        ended = integers[k, END_REASON] > 0
+        out.confirmed[chunk, k] = integers[k, NOW_CONFIRMED] != 0
+        out.end_reason[chunk, k] = integers[k, END_REASON]
+        out.death[chunk, k] = integers[k, DEATH]
+        integers[k, LAST_APART] = integers[k, NOW_LAST_APART]
+        integers[k, CONFIRMED] = 0 if ended else integers[k, NOW_CONFIRMED]
         if ended:
-            whole[k, ID] = -1
-            gate = cells[k, GATE]
-            cells[k, XI] = cells[k, XI + 1] = 0
-            cells[k, SIZE] = settings.size
-            functions.start(*given, k, 0, 0, 1)
-            cells[k, GATE] = gate
-    if settings.births:
-        _bear(functions, given, settings, memory, stop, seeds, space)
+            integers[k, ID] = -1
+            gate = reals[k, GATE]
+            reals[k, XI] = reals[k, XI + 1] = 0
+            reals[k, SIZE] = context.config.size
+            functions.init(*pointers, k, 0, 0, 1)
+            reals[k, GATE] = gate
+    if context.config.births:
+        _begin_tracks(context, stop)
     for k in range(number):
-        told.after[chunk, k] = whole[k, ID]
+        out.id_after[chunk, k] = integers[k, ID]
 
 
 @njit_noalloc_inlined
-def _bear(functions, given, settings, memory, stop, seeds, space):
-    """Tracks are born where the grid's 3x3 sums are largest, which empties 5x5 cells."""
-    cells, whole, sums, at = memory.cells, memory.whole, memory.sums, memory.at
-    elapsed = sums.dtype.type(stop - at[0]) * sums.dtype.type(1e-6)
-    _fade(sums, np.exp(-elapsed / sums.dtype.type(settings.tau)))
-    at[0] = stop
+def _begin_tracks(context, stop):
+    """Begin tracks where the grid's 3x3 sums are largest, which empties 5x5 cells."""
+    integers, sums, counters = context.state.integers, context.state.sums, context.state.counters
+    config, real = context.config, sums.dtype.type
+    elapsed = real(stop - counters[GRID_TIME]) * real(1e-6)
+    _fade(sums, np.exp(-elapsed / real(config.tau)))
+    counters[GRID_TIME] = stop
     rows, columns = sums.shape[1:]
-    around, above, free = space.around, space.above, seeds
+    sums3x3, free = context.scratch.sums3x3, len(context.chunks.seed)
     while True:
-        while free < len(cells) and whole[free, ID] >= 0:
+        while free < len(integers) and integers[free, ID] >= 0:
             free += 1
-        if free == len(cells):
+        if free == len(integers):
             return
-        _sum_around(sums[0], above, around)
-        top, row, column = sums.dtype.type(0), 0, 0
+        _sum_3x3(sums[0], context.scratch.sums3x1, sums3x3)
+        top, row, column = real(0), 0, 0
         for r in range(rows):
             for c in range(columns):
-                if around[r, c] > top:
-                    top, row, column = around[r, c], r, c
-        if not top > settings.least:
+                if sums3x3[r, c] > top:
+                    top, row, column = sums3x3[r, c], r, c
+        if not top > config.min_events:
             return
         n = _sum_near(sums[0], row, column)
         x, y = _sum_near(sums[1], row, column) / n, _sum_near(sums[2], row, column) / n
-        size = cells.dtype.type(settings.size)
-        _begin_track(functions, given, cells, whole, free, x, y, size, stop, at[1], 0)
-        at[1] += 1
+        new = _NewTrack(x, y, real(config.size), stop, counters[NEXT_ID], 0)
+        _init_track(context, free, new)
+        counters[NEXT_ID] += 1
         for r in range(max(row - 2, 0), min(row + 3, rows)):
             for c in range(max(column - 2, 0), min(column + 3, columns)):
                 sums[0, r, c] = sums[1, r, c] = sums[2, r, c] = 0
@@ -377,7 +429,7 @@ def _bear(functions, given, settings, memory, stop, seeds, space):
 
 @njit_noalloc_inlined
 def _sum_near(counts, row, column):
-    """The sum over the 3x3 cells around one."""
+    """Sum over the 3x3 cells around one."""
     rows, columns = counts.shape
     total = counts.dtype.type(0)
     for r in range(max(row - 1, 0), min(row + 2, rows)):
@@ -387,10 +439,10 @@ def _sum_near(counts, row, column):
 
 
 @njit_noalloc_inlined
-def _sum_around(counts, above, around):
-    """Sums over 3x3 cells."""
+def _sum_3x3(counts, sums3x1, sums3x3):
+    """Sum over the 3x3 cells around each cell."""
     rows, columns = counts.shape
-    above[0] = above[columns + 1] = 0
+    sums3x1[0] = sums3x1[columns + 1] = 0
     for r in range(rows):
         for c in range(columns):
             total = counts[r, c]
@@ -398,6 +450,6 @@ def _sum_around(counts, above, around):
                 total = counts[r - 1, c] + total
             if r + 1 < rows:
                 total += counts[r + 1, c]
-            above[c + 1] = total
+            sums3x1[c + 1] = total
         for c in range(columns):
-            around[r, c] = above[c] + above[c + 1] + above[c + 2]
+            sums3x3[r, c] = sums3x1[c] + sums3x1[c + 1] + sums3x1[c + 2]

@@ -12,6 +12,7 @@ squared (beta would not hold), the shape stays.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,12 +21,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.ellipse import spread, truncation
-from jaxevent.blob.filters.motion import decay, transition
+from jaxevent.blob.filter import EventBatch, Filter, PredictedMeasurement, where_tree
+from jaxevent.blob.filters.motion import (
+    ellipse_covariance,
+    gated_moments,
+    transition,
+    turn_transition,
+)
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.states import wrap
-from jaxevent.blob.steps import Batch, Filter, choose
+from jaxevent.blob.track import wrap_angle
 from jaxevent.blob.tracker import Tracker
 from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Count, Positive
@@ -37,7 +41,9 @@ class WindowParams(TrackerParams):
     """Parameters of `chi2_split`."""
 
     n = Count(10, "", "steps in the window of squared residuals")
-    beta = Positive(0.01, "", "variance of the position over that of the events, in the window")
+    beta = Positive(
+        0.01, "", "ratio of the position's variance to that of the events, in the window"
+    )
 
 
 class Params(WindowParams):
@@ -45,15 +51,15 @@ class Params(WindowParams):
 
     target = Choice(
         ("2n+4", "2n"),
-        "what the window's sum is driven to; 2n is biased by sqrt((n+1)/(n-1))",
+        "expected sum of the window; 2n biases sizes by sqrt((n+1)/(n-1))",
     )
     current_in_jacobian = Choice(
-        (False, True), "whether the newest event's residual acts on p and theta in the window"
+        (False, True), "whether the newest event's residual acts on p and theta through the window"
     )
     formulation = Choice(
         ("corrected", "authors"),
-        "authors leaves the newest event out of the window, has no guards and keeps lambda itself "
-        "as state",
+        "authors: leaves the newest event out of the window, has no guards, and has lambda in "
+        "the state, not its logarithm",
     )
 
     presets = {
@@ -61,42 +67,23 @@ class Params(WindowParams):
         # As printed, but for the errors that docs/theory/tracking.md lists. Of the gate the paper
         # gives no numbers; its shape and that it follows the size are the paper's.
         "paper": {
-            "target": "2n",
-            "current_in_jacobian": True,
-            "association": "nearest",
-            "gate_shape": "circle",
-            "gate_position": 0.0,
+            "target": "2n", "current_in_jacobian": True, "association": "nearest",
+            "gate_shape": "circle", "gate_position": 0.0,
         },
         # Published settings of the authors' program, for cars.
         "authors": {
-            "formulation": "authors",
-            "association": "authors",
-            "target": "2n",
-            "beta": 0.0,
+            "formulation": "authors", "association": "authors", "target": "2n", "beta": 0.0,
             "polarity_offset": True,
-            "Q_p": 200.0,
-            "Q_v": 1e3,
-            "Q_lambda": 1.0,
-            "Q_theta": 0.005,
-            "Q_q": 0.01,
-            "P0_p": 10.0,
-            "P0_v": 500.0,
-            "P0_lambda": 5.0,
-            "P0_theta": 0.5,
-            "P0_q": 2.0,
-            "lambda0": 30.0,
-            "gate_shape": "circle",
-            "gate": 2.5,
-            "gate_decay": 1.4,
-            "gate_min": 10.0,
-            "gate_max": 1e6,
-            "t_coast": 1e3,
+            "Q_p": 200.0, "Q_v": 1e3, "Q_lambda": 1.0, "Q_theta": 0.005, "Q_q": 0.01,
+            "P0_p": 10.0, "P0_v": 500.0, "P0_lambda": 5.0, "P0_theta": 0.5, "P0_q": 2.0,
+            "lambda0": 30.0, "gate_shape": "circle", "gate": 2.5, "gate_decay": 1.4,
+            "gate_min": 10.0, "gate_max": 1e6, "t_coast": 1e3,
         },
-    }
+    }  # fmt: skip
 
 
 class ResidualWindow(eqx.Module):
-    """The squared residuals of the last n steps, along the axes that the blob had then.
+    """Squared residuals of the last n steps, along the axes that the blob had then.
 
     A row of `ring` holds a step's sums of w u1^2, w u2^2 and w over its events; as u is the
     residual of the state predicted for the step, |L^-1 e|^2 with any later sizes is u1^2 /
@@ -130,8 +117,8 @@ class ResidualWindow(eqx.Module):
         )
 
 
-class State(eqx.Module):
-    """The joint state and the window of residuals."""
+class Chi2State(eqx.Module):
+    """Joint state and window of residuals."""
 
     x: Float[Array, " d"]  # px py vx vy lambda1 lambda2 theta q [dx dy]; lambda or its log
     P: Float[Array, "d d"]
@@ -144,13 +131,13 @@ class State(eqx.Module):
         return jnp.exp(self.x[4:6]) if self.logarithmic else self.x[4:6]
 
 
-def _start(params: WindowParams, position: Array, size: Array, logarithmic: bool) -> State:
+def _init(params: WindowParams, position: Array, size: Array, logarithmic: bool) -> Chi2State:
     none = jnp.zeros_like(position)
     P_size = params.P0_lambda / params.lambda0**2 if logarithmic else params.P0_lambda
     blocks = [position, none, (jnp.log(size) if logarithmic else size) + none, none]
     P = [params.P0_p, params.P0_p, params.P0_v, params.P0_v, P_size, P_size]
     P += [params.P0_theta, params.P0_q] + [params.P0_d] * 2 * params.polarity_offset
-    return State(
+    return Chi2State(
         jnp.concatenate(blocks + [none] * params.polarity_offset),
         jnp.diag(jnp.stack(P)).astype(position.dtype),
         ResidualWindow.empty(params.n, position.dtype),
@@ -158,9 +145,9 @@ def _start(params: WindowParams, position: Array, size: Array, logarithmic: bool
     )
 
 
-def _predict(params: WindowParams, state: State, dt: Array, authors: bool) -> State:
+def _predict(params: WindowParams, state: Chi2State, dt: Array, authors: bool) -> Chi2State:
     x, P = state.x, state.P
-    to_theta, to_q, tt, tq, qq = decay(params, dt)
+    to_theta, to_q, tt, tq, qq = turn_transition(params, dt)
     pp, pv, vv = params.Q_p * dt, params.Q_v * dt**2 / 2, params.Q_v * dt
     if authors:
         tt, tq, pv = params.Q_theta * dt, 0 * dt, 0 * dt
@@ -170,22 +157,22 @@ def _predict(params: WindowParams, state: State, dt: Array, authors: bool) -> St
     if state.logarithmic:
         Q_size = Q_size * jnp.exp(-2 * x[4:6])
 
-    def advance(rows: Array) -> Array:
+    def propagate(rows: Array) -> Array:
         p, v, size, theta, q, rest = jnp.split(rows, [2, 4, 6, 7, 8])
         return jnp.concatenate([p + dt * v, v, size, theta + to_theta * q, to_q * q, rest])
 
-    P = advance(advance(P).T)
+    P = propagate(propagate(P).T)
     own = [pp, pp, vv, vv, Q_size[0], Q_size[1], tt, qq]
     Q = jnp.diag(jnp.stack(own + [params.Q_d * dt] * (len(x) - 8)))
     for i, j, covariance in ((0, 2, pv), (1, 3, pv), (6, 7, tq)):
         pair = np.zeros((len(x), len(x)))
         pair[i, j] = pair[j, i] = 1
         Q = Q + jnp.asarray(pair, P.dtype) * covariance
-    return dataclasses.replace(state, x=advance(x), P=P + Q)
+    return dataclasses.replace(state, x=propagate(x), P=P + Q)
 
 
 class _Residuals(NamedTuple):
-    """The events of a step along the blob's axes, of m in all."""
+    """Residuals of a step's events along the blob's axes, and the step's total weight m."""
 
     m: Array
     age: Array  # s, their mean
@@ -198,15 +185,28 @@ class _Residuals(NamedTuple):
 
 
 class _Measurement(NamedTuple):
-    """A scalar one: its row of the Jacobian, innovation, noise, and how often it counts."""
+    """Scalar measurement: row of the Jacobian, innovation, noise variance and weight."""
 
     row: Array  # (d,)
     innovation: Array
     noise: Array
-    times: Array
+    weight: Array
 
 
-def _residuals(params: WindowParams, state: State, batch: Batch, weight: Array) -> _Residuals:
+class _WindowStep(NamedTuple):
+    """Residuals of a step and the window of those before."""
+
+    residuals: _Residuals
+    trusted: Array  # whether the position is certain enough for the shape
+    shape: Array  # 1 where the shape is updated, else 0
+    past: Array  # (2,), px^2, sums of squares without this step
+    W: Array  # weight of the window
+    filled: Array  # steps in it
+
+
+def _rotate_residuals(
+    params: WindowParams, state: Chi2State, batch: EventBatch, weight: Array
+) -> _Residuals:
     x = state.x
     m = weight.sum()
     share = weight / jnp.where(m > 0, m, 1)
@@ -223,8 +223,8 @@ def _residuals(params: WindowParams, state: State, batch: Batch, weight: Array) 
     return _Residuals(m, age, (share * sign).sum(), cos, sin, state.size, mean, energy)
 
 
-def _cap(params: WindowParams, state: State) -> tuple[Array, Array]:
-    """P with limited variances, and whether the position is known well enough for the shape."""
+def _limit_variances(params: WindowParams, state: Chi2State) -> tuple[Array, Array]:
+    """Limit variances in P; return too whether the position is certain enough for the shape."""
     P = state.P
     limits = {0: P_POSITION_MAX, 1: P_POSITION_MAX, 6: params.P_theta_max}
     if state.logarithmic:
@@ -233,54 +233,59 @@ def _cap(params: WindowParams, state: State) -> tuple[Array, Array]:
     for i, limit in limits.items():
         keep[i] = limit / jnp.maximum(jnp.maximum(P[i, i], limit), 1e-30)
     keep = jnp.stack(keep)
-    # Covariances shrink as much as variances: the gain of a velocity stays what it was.
+    # Covariances shrink as much as variances: the gain of a velocity does not change.
     P = P * keep[:, None] * keep + jnp.diag((keep - keep**2) * jnp.diagonal(P))
     a, b, c = lax.stop_gradient((P[0, 0], P[0, 1], P[1, 1]))
     radius = (a + c) / 2 + jnp.hypot((a - c) / 2, b)
     return P, radius <= 0.25 * state.size.min() ** 2
 
 
-def _mean_measurements(
+def _measure_mean(
     params: WindowParams,
-    state: State,
-    seen: _Residuals,
+    state: Chi2State,
+    residuals: _Residuals,
     trusted: Array,
     on_size: Array | None,
 ) -> list[_Measurement]:
-    """0 = L^-1 e + N(0, I / m) along both axes.
+    """Return the measurements 0 = L^-1 e + N(0, I / m) along both axes.
 
-    `on_size` says whether it acts on lambda now; None: never.
+    Args:
+        params: Parameters.
+        state: Predicted state.
+        residuals: Residuals of the step.
+        trusted: Whether the position is certain enough for the orientation to be measured.
+        on_size: Factor of the derivative by lambda; None: the mean does not act on the sizes.
     """
     unit = jnp.eye(len(state.x), dtype=state.P.dtype)
-    size, mean = seen.size, seen.mean
+    size, mean = residuals.size, residuals.mean
     over = 1 / size
-    turning = (over[0] - over[1]) * (unit[6] - seen.age * unit[7]) * trusted
+    turning = (over[0] - over[1]) * (unit[6] - residuals.age * unit[7]) * trusted
     found = []
-    for i, (a, b) in enumerate(((seen.cos, seen.sin), (-seen.sin, seen.cos))):
-        along = a * (unit[0] - seen.age * unit[2]) + b * (unit[1] - seen.age * unit[3])
+    for i, (a, b) in enumerate(((residuals.cos, residuals.sin), (-residuals.sin, residuals.cos))):
+        along = a * (unit[0] - residuals.age * unit[2]) + b * (unit[1] - residuals.age * unit[3])
         if params.polarity_offset:
-            along = along + seen.sign * (a * unit[8] + b * unit[9])
+            along = along + residuals.sign * (a * unit[8] + b * unit[9])
         row = -over[i] * along + turning * mean[1 - i]
         if on_size is not None:
-            per = _per(state)
+            per = _size_derivative(state)
             row = row - on_size * over[i] ** 2 * mean[i] * per[i] * unit[4 + i]
-        found.append(_Measurement(row, -mean[i] * over[i], jnp.ones(()), seen.m))
+        found.append(_Measurement(row, -mean[i] * over[i], jnp.ones(()), residuals.m))
     return found
 
 
-def _per(state: State) -> Array:
-    """d lambda / d its state, (2,)."""
+def _size_derivative(state: Chi2State) -> Array:
+    """Return the derivative of lambda by its component of the state, (2,)."""
     return state.size if state.logarithmic else jnp.ones_like(state.size)
 
 
 @full_precision
 def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tuple[Array, Array]:
-    """One scalar after the other, all at the predicted state: equal to the joint update."""
+    """Update by one scalar after the other, all at the predicted state: equal to a joint update."""
     # Rounding may take a variance that falls a millionfold below 0; the last term is as large.
     step, rounding = jnp.zeros_like(x), 4 * jnp.finfo(P.dtype).eps * jnp.diagonal(P)
-    for row, innovation, noise, times in measurements:
+    for row, innovation, noise, weight in measurements:
         B = P @ row
-        gain = times * B / (times * jnp.maximum(row @ B, 0) + noise)
+        gain = weight * B / (weight * jnp.maximum(row @ B, 0) + noise)
         step = step + gain * (innovation - row @ step)
         P = P - gain[:, None] * B
     # What rounding makes P and its transpose differ by would grow, at one pixel to 1.9 standard
@@ -288,65 +293,78 @@ def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tup
     return x + step, (P + P.T) / 2 + jnp.diag(rounding)
 
 
-def _bound(params: WindowParams, x: Array, logarithmic: bool) -> Array:
-    """x with sizes between their limits and the angle in [-pi, pi]."""
-    low, high = params.lambda_min, params.lambda_max
-    if logarithmic:
-        low, high = jnp.log(low), jnp.log(high)
-    return jnp.concatenate([x[:4], jnp.clip(x[4:6], low, high), wrap(x[6])[None], x[7:]])
+def _clip_state(params: WindowParams, x: Array) -> Array:
+    """Clip log sizes to their limits, and wrap the angle to [-pi, pi]."""
+    low, high = jnp.log(params.lambda_min), jnp.log(params.lambda_max)
+    return jnp.concatenate([x[:4], jnp.clip(x[4:6], low, high), wrap_angle(x[6])[None], x[7:]])
+
+
+def _update(
+    params: Any,
+    state: Chi2State,
+    batch: EventBatch,
+    weight: Array,
+    measure: Callable[[Any, Chi2State, _WindowStep], list[_Measurement]],
+) -> Chi2State:
+    """Update by a step's mean residual and the window's sums, which `measure` compares."""
+    authors = not state.logarithmic
+    residuals = _rotate_residuals(params, state, batch, weight)
+    P, trusted = (state.P, jnp.bool(True)) if authors else _limit_variances(params, state)
+    push = jnp.concatenate([residuals.energy, residuals.m[None]])
+    window = state.window.push(push)
+    shape = (trusted & ((window.filled >= params.n) | authors)).astype(P.dtype)
+    W = jnp.where(residuals.m > 0, window.sums[2], 1)
+    step = _WindowStep(residuals, trusted, shape, (window.sums - push)[:2], W, window.filled)
+    x, P = _update_scalars(state.x, P, measure(params, state, step))
+    if not authors:
+        x = _clip_state(params, x)
+    window = where_tree(trusted, window, state.window)
+    return where_tree(residuals.m > 0, Chi2State(x, P, window, state.logarithmic), state)
 
 
 # ---- chi2: one sum.
 
 
-def start(params: Params, position: Array, size: Array) -> State:
-    return _start(params, position, size, params.formulation == "corrected")
+def init(params: Params, position: Array, size: Array) -> Chi2State:
+    return _init(params, position, size, params.formulation == "corrected")
 
 
-def predict(params: Params, state: State, dt: Array) -> State:
+def predict(params: Params, state: Chi2State, dt: Array) -> Chi2State:
     return _predict(params, state, dt, params.formulation == "authors")
 
 
-def update(params: Params, state: State, batch: Batch, weight: Array) -> State:
-    authors = params.formulation == "authors"
-    seen = _residuals(params, state, batch, weight)
-    P, trusted = (state.P, jnp.bool(True)) if authors else _cap(params, state)
-    push = jnp.concatenate([seen.energy, seen.m[None]])
-    window = state.window.push(push)
-    full = window.filled >= params.n
-    shape = (trusted & (full | authors)).astype(P.dtype)
-    measurements = _mean_measurements(params, state, seen, trusted, shape)
+def update(params: Params, state: Chi2State, batch: EventBatch, weight: Array) -> Chi2State:
+    return _update(params, state, batch, weight, _measure_sum)
 
-    unit = jnp.eye(len(state.x), dtype=P.dtype)
-    over = 1 / seen.size
-    past = window.sums - push
+
+def _measure_sum(params: Params, state: Chi2State, step: _WindowStep) -> list[_Measurement]:
+    """Return the measurements of the mean and of the window's one sum."""
+    authors, residuals = params.formulation == "authors", step.residuals
+    measurements = _measure_mean(params, state, residuals, step.trusted, step.shape)
+    unit = jnp.eye(len(state.x), dtype=state.P.dtype)
+    over = 1 / residuals.size
     scale = 1.0 if authors else 1 / (1 + params.beta)
-    W = jnp.where(seen.m > 0, window.sums[2], 1)
-    inside = past[:2] * scale + (0 if authors else seen.energy)
+    inside = step.past * scale + (0 if authors else residuals.energy)
     found = (inside * over**2).sum()
-    pull = -2 * inside * over**3 * _per(state)
+    pull = -2 * inside * over**3 * _size_derivative(state)
     row = pull[0] * unit[4] + pull[1] * unit[5]
     if params.current_in_jacobian and not authors:
         for i in range(2):
             other = measurements[i].row * (1 - unit[4] - unit[5])
-            row = row + 2 * seen.m * seen.mean[i] * over[i] * other
-    goal = 2 * W + (4 if params.target == "2n+4" else 0)
-    on = jnp.where(window.filled > 1, 1.0, 0.0) if authors else shape
-    measurements.append(_Measurement(row, goal - found, 4 * W, on))
-
-    x, P = _update_scalars(state.x, P, measurements)
-    if not authors:
-        x = _bound(params, x, state.logarithmic)
-    window = choose(trusted, window, state.window)
-    return choose(seen.m > 0, State(x, P, window, state.logarithmic), state)
+            row = row + 2 * residuals.m * residuals.mean[i] * over[i] * other
+    goal = 2 * step.W + (4 if params.target == "2n+4" else 0)
+    on = jnp.where(step.filled > 1, 1.0, 0.0) if authors else step.shape
+    return [*measurements, _Measurement(row, goal - found, 4 * step.W, on)]
 
 
-def expected(params: WindowParams, state: State) -> Expected:
+def predicted_measurement(params: WindowParams, state: Chi2State) -> PredictedMeasurement:
     x, size = state.x, state.size
-    return Expected(x[:2], x[2:4], spread(x[6], size), state.P[:2, :2], size)
+    return PredictedMeasurement(
+        x[:2], x[2:4], ellipse_covariance(x[6], size), state.P[:2, :2], size
+    )
 
 
-def halt(params: WindowParams, state: State, known: bool) -> State:
+def zero_velocity(params: WindowParams, state: Chi2State, known: bool) -> Chi2State:
     moving = np.zeros(len(state.x))
     moving[[2, 3, 7]] = 1  # velocity and turn rate
     keep = jnp.asarray(1 - moving, state.x.dtype)
@@ -357,7 +375,7 @@ def halt(params: WindowParams, state: State, known: bool) -> State:
     return dataclasses.replace(state, x=keep * state.x, P=P)
 
 
-def moments(params: WindowParams, state: State) -> tuple[Array, Array]:
+def readout(params: WindowParams, state: Chi2State) -> tuple[Array, Array]:
     x, P = state.x[:8], state.P[:8, :8]
     if state.logarithmic:
         size = state.size
@@ -370,50 +388,39 @@ def moments(params: WindowParams, state: State) -> tuple[Array, Array]:
 # ---- chi2_split: one sum per axis.
 
 
-def _update_split(params: WindowParams, state: State, batch: Batch, weight: Array) -> State:
-    seen = _residuals(params, state, batch, weight)
-    P, trusted = _cap(params, state)
-    push = jnp.concatenate([seen.energy, seen.m[None]])
-    window = state.window.push(push)
-    full = window.filled >= params.n
-    shape = (trusted & full).astype(P.dtype)
-    measurements = _mean_measurements(params, state, seen, trusted, None)
-
-    unit = jnp.eye(len(state.x), dtype=P.dtype)
-    over = 1 / seen.size
-    past = window.sums - push
+def _measure_axes(params: WindowParams, state: Chi2State, step: _WindowStep) -> list[_Measurement]:
+    """Return the measurements of the mean and of the window's sums along both axes."""
+    residuals = step.residuals
+    measurements = _measure_mean(params, state, residuals, step.trusted, None)
+    unit = jnp.eye(len(state.x), dtype=state.P.dtype)
+    over = 1 / residuals.size
     scale = 1 / (1 + params.beta)
-    W = jnp.where(seen.m > 0, window.sums[2], 1)
-    kappa, fourth = truncation(params)
+    kappa, fourth = gated_moments(params)
     variance = 3 * fourth / kappa**2 - 1
     for i in range(2):
-        found = (seen.energy[i] + scale * past[i]) * over[i] ** 2 / kappa
-        slope = -kappa * variance * W
-        noise = variance * W * params.n
-        measurements.append(_Measurement(slope * unit[4 + i], W - found, noise, shape))
-
-    x, P = _update_scalars(state.x, P, measurements)
-    x = _bound(params, x, True)
-    window = choose(trusted, window, state.window)
-    return choose(seen.m > 0, State(x, P, window, True), state)
+        found = (residuals.energy[i] + scale * step.past[i]) * over[i] ** 2 / kappa
+        row = -kappa * variance * step.W * unit[4 + i]
+        noise = variance * step.W * params.n
+        measurements.append(_Measurement(row, step.W - found, noise, step.shape))
+    return measurements
 
 
 chi2 = Tracker(
     "chi2",
     Params,
-    Filter(start, predict, update, expected, moments, halt, transition),
+    Filter(init, predict, update, predicted_measurement, readout, zero_velocity, transition),
     about="The asynchronous event-blob tracker (Wang et al. 2023), equations corrected.",
 )
 chi2_split = Tracker(
     "chi2_split",
     WindowParams,
     Filter(
-        functools.partial(_start, logarithmic=True),
+        functools.partial(_init, logarithmic=True),
         functools.partial(_predict, authors=False),
-        _update_split,
-        expected,
-        moments,
-        halt,
+        functools.partial(_update, measure=_measure_axes),
+        predicted_measurement,
+        readout,
+        zero_velocity,
         transition,
     ),
     about="The asynchronous event-blob tracker with one sum of squares per axis of the blob.",

@@ -4,17 +4,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.motion import Motion, expected_of, moments_of, transition
+from jaxevent.blob.filter import EventBatch, Filter, PredictedMeasurement, where_tree
+from jaxevent.blob.filters.motion import LinearMotion, join_blocks, predicted_ellipse, transition
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 
 
-class State(eqx.Module):
-    """A moving centre and the size it was started with."""
+class ConstantVelocityState(eqx.Module):
+    """A moving centre and its initial size."""
 
-    motion: Motion
+    motion: LinearMotion
     size: Float[Array, ""]
 
 
@@ -22,37 +21,48 @@ class Params(TrackerParams):
     """Parameters of `constant_velocity`."""
 
 
-def start(params: TrackerParams, position: Array, size: Array) -> State:
-    return State(Motion.start(params, position), size.astype(position.dtype))
+def init(params: TrackerParams, position: Array, size: Array) -> ConstantVelocityState:
+    return ConstantVelocityState(LinearMotion.init(params, position), size.astype(position.dtype))
 
 
-def predict(params: TrackerParams, state: State, dt: Array) -> State:
-    return State(state.motion.predict(params, dt), state.size)
+def predict(
+    params: TrackerParams, state: ConstantVelocityState, dt: Array
+) -> ConstantVelocityState:
+    return ConstantVelocityState(state.motion.predict(params, dt), state.size)
 
 
-def update(params: TrackerParams, state: State, batch: Batch, weight: Array) -> State:
+def update(
+    params: TrackerParams, state: ConstantVelocityState, batch: EventBatch, weight: Array
+) -> ConstantVelocityState:
     m = weight.sum()
     _, mean, factors = state.motion.residuals(batch, weight)
     R = state.size**2 * jnp.eye(2, dtype=state.size.dtype)
-    return choose(m > 0, State(state.motion.update(mean, factors, R, m), state.size), state)
+    return where_tree(
+        m > 0, ConstantVelocityState(state.motion.update(mean, factors, R, m), state.size), state
+    )
 
 
-def expected(params: TrackerParams, state: State) -> Expected:
-    return expected_of(state.motion, 0 * state.size, state.size * jnp.ones_like(state.motion.x[0]))
+def predicted_measurement(
+    params: TrackerParams, state: ConstantVelocityState
+) -> PredictedMeasurement:
+    size = state.size * jnp.ones_like(state.motion.x[0])
+    return predicted_ellipse(state.motion, 0 * state.size, size)
 
 
-def halt(params: TrackerParams, state: State, known: bool) -> State:
-    return State(state.motion.halt(params, known), state.size)
+def zero_velocity(
+    params: TrackerParams, state: ConstantVelocityState, known: bool
+) -> ConstantVelocityState:
+    return ConstantVelocityState(state.motion.zero_velocity(params, known), state.size)
 
 
-def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
+def readout(params: TrackerParams, state: ConstantVelocityState) -> tuple[Array, Array]:
     two = jnp.ones_like(state.motion.x[0])
-    return moments_of(state.motion, state.size * two, 0 * two, 0 * two, jnp.zeros(4, two.dtype))
+    return join_blocks(state.motion, state.size * two, 0 * two, 0 * two, jnp.zeros(4, two.dtype))
 
 
 constant_velocity = Tracker(
     "constant_velocity",
     Params,
-    Filter(start, predict, update, expected, moments, halt, transition),
+    Filter(init, predict, update, predicted_measurement, readout, zero_velocity, transition),
     about="A Kalman filter of position and velocity of round blobs; a baseline.",
 )

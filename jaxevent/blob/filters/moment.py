@@ -11,12 +11,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.ellipse import geometric_step, spread, truncation
-from jaxevent.blob.filters.motion import Motion, decay, expected_of, moments_of, transition
+from jaxevent.blob.filter import EventBatch, Filter, PredictedMeasurement, where_tree
+from jaxevent.blob.filters.motion import (
+    LinearMotion,
+    ellipse_covariance,
+    gated_moments,
+    join_blocks,
+    log_size_step,
+    predicted_ellipse,
+    transition,
+    turn_transition,
+)
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.states import wrap
-from jaxevent.blob.steps import Batch, Filter, choose
+from jaxevent.blob.track import wrap_angle
 from jaxevent.blob.tracker import Tracker
 
 
@@ -24,21 +31,21 @@ class Params(TrackerParams):
     """Parameters of `moment`."""
 
 
-class State(eqx.Module):
+class MomentState(eqx.Module):
     """Motion, log sizes and (theta, q), without covariance between the three."""
 
-    motion: Motion
+    motion: LinearMotion
     log_size: Float[Array, " 2"]
     P_size: Float[Array, " 2"]  # of log_size
     turn: Float[Array, " 2"]
     P_turn: Float[Array, " 3"]  # theta theta, theta q, q q
 
 
-def start(params: TrackerParams, position: Array, size: Array) -> State:
+def init(params: TrackerParams, position: Array, size: Array) -> MomentState:
     two = jnp.ones_like(position)
     P_turn = jnp.stack([params.P0_theta, jnp.zeros_like(params.P0_q), params.P0_q])
-    return State(
-        Motion.start(params, position),
+    return MomentState(
+        LinearMotion.init(params, position),
         jnp.log(size) * two,
         params.P0_lambda / params.lambda0**2 * two,
         0 * two,
@@ -46,11 +53,11 @@ def start(params: TrackerParams, position: Array, size: Array) -> State:
     )
 
 
-def predict(params: TrackerParams, state: State, dt: Array) -> State:
-    to_theta, to_q, tt, tq, qq = decay(params, dt)
+def predict(params: TrackerParams, state: MomentState, dt: Array) -> MomentState:
+    to_theta, to_q, tt, tq, qq = turn_transition(params, dt)
     theta, q = state.turn
     a, b, d = state.P_turn
-    return State(
+    return MomentState(
         state.motion.predict(params, dt),
         state.log_size,
         state.P_size + params.Q_lambda * dt / jnp.exp(state.log_size) ** 2,
@@ -66,7 +73,7 @@ def predict(params: TrackerParams, state: State, dt: Array) -> State:
 
 
 class _Residuals(NamedTuple):
-    """The events of a step along the blob's axes, of m in all."""
+    """Residuals of a step's events along the blob's axes, and the step's total weight m."""
 
     m: Array
     u: Array  # (2, M), px
@@ -77,14 +84,16 @@ class _Residuals(NamedTuple):
     cross: Array  # its covariance
 
 
-def update(params: TrackerParams, state: State, batch: Batch, weight: Array) -> State:
+def update(
+    params: TrackerParams, state: MomentState, batch: EventBatch, weight: Array
+) -> MomentState:
     m = weight.sum()
     e, mean, factors = state.motion.residuals(batch, weight)
     age = -factors[1]
     theta = state.turn[0] - age * state.turn[1]
     c, s = jnp.cos(theta), jnp.sin(theta)
     size = jnp.exp(state.log_size)
-    motion = state.motion.update(mean, factors, spread(theta, size), m)
+    motion = state.motion.update(mean, factors, ellipse_covariance(theta, size), m)
 
     share = weight / jnp.where(m > 0, m, 1)
     u = jnp.stack([c * e[:, 0] + s * e[:, 1], c * e[:, 1] - s * e[:, 0]])
@@ -96,37 +105,45 @@ def update(params: TrackerParams, state: State, batch: Batch, weight: Array) -> 
             P[0, 0] * s**2 - 2 * P[0, 1] * c * s + P[1, 1] * c**2,
         ]
     )
-    seen = _Residuals(m, u, share, age, size, P, cross)
-    new = State(motion, *_update_size(params, state, seen), *_update_turn(params, state, seen))
-    return choose(m > 0, new, state)
+    residuals = _Residuals(m, u, share, age, size, P, cross)
+    new = MomentState(
+        motion, *_update_size(params, state, residuals), *_update_turn(params, state, residuals)
+    )
+    return where_tree(m > 0, new, state)
 
 
-def _update_size(params: TrackerParams, state: State, seen: _Residuals) -> tuple[Array, Array]:
-    """Log sizes and their variances from u_i^2 / V_i - 1."""
-    m, size = seen.m, seen.size
-    kappa, fourth = truncation(params)
-    variance = 3 * fourth - kappa**2  # of u_i^2 / lambda_i^2, and its slope against log lambda
-    V = kappa * size**2 + seen.P
-    share_l, r = size**2 / V, seen.P / V
-    innovation = (seen.share * seen.u**2).sum(1) / V - 1
-    slope = variance * share_l
+def _update_size(
+    params: TrackerParams, state: MomentState, residuals: _Residuals
+) -> tuple[Array, Array]:
+    """Update log sizes and their variances by u_i^2 / V_i - 1."""
+    m, size = residuals.m, residuals.size
+    kappa, fourth = gated_moments(params)
+    variance = 3 * fourth - kappa**2  # of u_i^2 / lambda_i^2, and its derivative by log lambda
+    V = kappa * size**2 + residuals.P
+    share_l, r = size**2 / V, residuals.P / V
+    innovation = (residuals.share * residuals.u**2).sum(1) / V - 1
+    derivative = variance * share_l
     noise = variance * share_l**2 + 4 * kappa * share_l * r + 2 * m * r**2  # times m
     P_size = jnp.minimum(state.P_size, 1)
-    total = m * slope**2 * P_size + noise
-    log_size = state.log_size + geometric_step(m * slope * P_size / total * innovation, slope)
+    total = m * derivative**2 * P_size + noise
+    log_size = state.log_size + log_size_step(
+        m * derivative * P_size / total * innovation, derivative
+    )
     log_size = jnp.clip(log_size, jnp.log(params.lambda_min), jnp.log(params.lambda_max))
     return log_size, P_size * noise / total
 
 
-def _update_turn(params: TrackerParams, state: State, seen: _Residuals) -> tuple[Array, Array]:
-    """(theta, q) and their covariance from u1 u2 / sqrt(V1 V2)."""
-    m, size, age, u = seen.m, seen.size, seen.age, seen.u
-    kappa, fourth = truncation(params)
-    V = kappa * size**2 + seen.P
+def _update_turn(
+    params: TrackerParams, state: MomentState, residuals: _Residuals
+) -> tuple[Array, Array]:
+    """Update (theta, q) and their covariance by u1 u2 / sqrt(V1 V2)."""
+    m, size, age, u = residuals.m, residuals.size, residuals.age, residuals.u
+    kappa, fourth = gated_moments(params)
+    V = kappa * size**2 + residuals.P
     root = jnp.sqrt(V)
-    share_l, r, r12 = size**2 / V, seen.P / V, seen.cross / root[0] / root[1]
-    innovation = (seen.share * u[0] * u[1]).sum() / root[0] / root[1] - r12
-    slope = fourth * (
+    share_l, r, r12 = size**2 / V, residuals.P / V, residuals.cross / root[0] / root[1]
+    innovation = (residuals.share * u[0] * u[1]).sum() / root[0] / root[1] - r12
+    derivative = fourth * (
         size[0] / root[0] * (size[0] / root[1]) - size[1] / root[0] * (size[1] / root[1])
     )
     noise = fourth * share_l[0] * share_l[1] + kappa * (share_l[0] * r[1] + share_l[1] * r[0])
@@ -136,32 +153,32 @@ def _update_turn(params: TrackerParams, state: State, seen: _Residuals) -> tuple
     limit = limit / jnp.maximum(jnp.maximum(tt, limit), 1e-30)
     tt, tq = tt * limit, tq * limit
     with_theta, with_q = tt - age * tq, tq - age * qq
-    total = m * slope**2 * (with_theta - age * with_q) + noise
-    gain = m * slope / total
+    total = m * derivative**2 * (with_theta - age * with_q) + noise
+    gain = m * derivative / total
     turn = state.turn + gain * innovation * jnp.stack([with_theta, with_q])
-    turn = jnp.stack([wrap(turn[0]), turn[1]])
+    turn = jnp.stack([wrap_angle(turn[0]), turn[1]])
     # P - B B^T / S of a 2x2 P, with the difference of products worked out.
-    inner = m * slope**2 * jnp.maximum(tt * qq - tq**2, 0)
+    inner = m * derivative**2 * jnp.maximum(tt * qq - tq**2, 0)
     P_turn = jnp.stack([tt * noise + inner * age**2, tq * noise + inner * age, qq * noise + inner])
     return turn, P_turn / total
 
 
-def expected(params: TrackerParams, state: State) -> Expected:
-    return expected_of(state.motion, state.turn[0], jnp.exp(state.log_size))
+def predicted_measurement(params: TrackerParams, state: MomentState) -> PredictedMeasurement:
+    return predicted_ellipse(state.motion, state.turn[0], jnp.exp(state.log_size))
 
 
-def halt(params: TrackerParams, state: State, known: bool) -> State:
+def zero_velocity(params: TrackerParams, state: MomentState, known: bool) -> MomentState:
     theta, q = state.turn
     tt, tq, qq = state.P_turn
     P_turn = jnp.stack([tt, 0 * tq, 0 * qq if known else params.P0_q + 0 * qq])
-    motion = state.motion.halt(params, known)
-    return State(motion, state.log_size, state.P_size, jnp.stack([theta, 0 * q]), P_turn)
+    motion = state.motion.zero_velocity(params, known)
+    return MomentState(motion, state.log_size, state.P_size, jnp.stack([theta, 0 * q]), P_turn)
 
 
-def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
+def readout(params: TrackerParams, state: MomentState) -> tuple[Array, Array]:
     size = jnp.exp(state.log_size)
     tt, tq, qq = state.P_turn
-    return moments_of(
+    return join_blocks(
         state.motion, size, size**2 * state.P_size, state.turn, jnp.stack([tt, tq, tq, qq])
     )
 
@@ -169,6 +186,6 @@ def moments(params: TrackerParams, state: State) -> tuple[Array, Array]:
 moment = Tracker(
     "moment",
     Params,
-    Filter(start, predict, update, expected, moments, halt, transition),
+    Filter(init, predict, update, predicted_measurement, readout, zero_velocity, transition),
     about="Tracking of blobs by second moments of the events' residuals; the default.",
 )

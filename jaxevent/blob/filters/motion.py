@@ -1,4 +1,8 @@
-"""Motion that filters share: a linear filter of the position, and the decay of the turn rate."""
+"""Parts that filters share: linear motion, turning, and the ellipse of the events.
+
+The numerical matrices are 2x2. Products of them are written elementwise, so that XLA compiles a
+whole scan to one kernel.
+"""
 
 import math
 
@@ -7,15 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.ellipse import spread
+from jaxevent.blob.filter import EventBatch, PredictedMeasurement
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.steps import Batch
 
 
 def _product(a: Float[Array, "2 2"], b: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    # Elementwise, so that a whole scan compiles to one kernel: 0.03 us per event for the motion
-    # block against 2 us with calls of a matrix product.
     return a[:, :1] * b[:1] + a[:, 1:] * b[1:]
 
 
@@ -26,15 +26,15 @@ def _inverse(a: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
     return adjugate / ((a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) * scale)
 
 
-def _weighted(factors: list, terms: list[Array]) -> Array:
+def _weighted_sum(factors: list, terms: list[Array]) -> Array:
     total = factors[0] * terms[0]
     for factor, term in zip(factors[1:], terms[1:], strict=True):
         total = total + factor * term
     return total
 
 
-class Motion(eqx.Module):
-    """Position, velocity and, if estimated, polarity offset: a linear filter.
+class LinearMotion(eqx.Module):
+    """Kalman filter of position, velocity and, if estimated, polarity offset.
 
     `P` holds the blocks on and above the diagonal, column by column: pp, pv, vv[, pd, vd, dd].
     """
@@ -43,7 +43,8 @@ class Motion(eqx.Module):
     P: tuple[Float[Array, "2 2"], ...]
 
     @classmethod
-    def start(cls, params: TrackerParams, position: Array) -> "Motion":
+    def init(cls, params: TrackerParams, position: Array) -> "LinearMotion":
+        """Return the state at rest at a position (2,) in px."""
         variances = [params.P0_p, params.P0_v] + [params.P0_d] * params.polarity_offset
         none = jnp.zeros_like(position)
         eye = jnp.eye(2, dtype=position.dtype)
@@ -51,10 +52,11 @@ class Motion(eqx.Module):
         return cls((position, *(none for _ in variances[1:])), tuple(P))
 
     def block(self, i: int, j: int) -> Float[Array, "2 2"]:
-        """Covariance of components i and j (0 position, 1 velocity, 2 offset)."""
+        """Return the covariance of components i and j (0 position, 1 velocity, 2 offset)."""
         return self.P[j * (j + 1) // 2 + i] if i <= j else self.P[i * (i + 1) // 2 + j].T
 
-    def predict(self, params: TrackerParams, dt: Array) -> "Motion":
+    def predict(self, params: TrackerParams, dt: Array) -> "LinearMotion":
+        """Predict the state `dt` seconds ahead, exactly over any gap."""
         p, v, *offset = self.x
         pp, pv, vv, *rest = self.P
         eye = jnp.eye(2, dtype=p.dtype)
@@ -64,20 +66,25 @@ class Motion(eqx.Module):
         if rest:
             pd, vd, dd = rest
             rest = [pd + dt * vd, vd, dd + params.Q_d * dt * eye]
-        return Motion((p + dt * v, v, *offset), (pp, pv, vv, *rest))
+        return LinearMotion((p + dt * v, v, *offset), (pp, pv, vv, *rest))
 
-    def halt(self, params: TrackerParams, known: bool) -> "Motion":
-        """The same at rest: the velocity is 0, and known or as uncertain as at the start."""
+    def zero_velocity(self, params: TrackerParams, known: bool) -> "LinearMotion":
+        """Set the velocity to 0, either known or as uncertain as that of a new track."""
         p, v, *offset = self.x
         pp, pv, vv, *rest = self.P
         if rest:
             rest[1] = 0 * rest[1]
         variance = 0 if known else params.P0_v
         vv = variance * jnp.eye(2, dtype=vv.dtype)
-        return Motion((p, 0 * v, *offset), (pp, 0 * pv, vv, *rest))
+        return LinearMotion((p, 0 * v, *offset), (pp, 0 * pv, vv, *rest))
 
-    def residuals(self, batch: Batch, weight: Array) -> tuple[Array, Array, list[Array | float]]:
-        """Of each event (M, 2), their weighted mean, and the factors of x in what it measures."""
+    def residuals(
+        self, batch: EventBatch, weight: Array
+    ) -> tuple[Array, Array, list[Array | float]]:
+        """Return the events' residuals (M, 2) in px, their weighted mean, and its model.
+
+        The model is the factor of each component of x in the mean position of the events.
+        """
         total = weight.sum()
         share = weight / jnp.where(total > 0, total, 1)
         age = (share * batch.age).sum()
@@ -90,13 +97,13 @@ class Motion(eqx.Module):
         return e, (share[:, None] * e).sum(0), factors
 
     def covariances(self, factors: list) -> tuple[list[Array], Array]:
-        """Of z = sum factors x: with each component, and with itself."""
+        """Return the covariances of z = sum factors x with each component, and its own."""
         k = range(len(self.x))
-        B = [_weighted(factors, [self.block(i, j) for i in k]) for j in k]
-        return B, _weighted(factors, B)
+        B = [_weighted_sum(factors, [self.block(i, j) for i in k]) for j in k]
+        return B, _weighted_sum(factors, B)
 
-    def update(self, mean: Array, factors: list, R: Array, m: Array) -> "Motion":
-        """Of a mean residual of m events, each with the covariance R.
+    def update(self, mean: Array, factors: list, R: Array, m: Array) -> "LinearMotion":
+        """Update by the mean residual (2,) of `m` events, each with the covariance R (2, 2).
 
         The rows of the position come from those of z, whose covariance afterwards is R S^-1 times
         that before: a difference would lose R of 100 px^2 behind P of 1e14 px^2 after a pause.
@@ -110,19 +117,33 @@ class Motion(eqx.Module):
         new = {(i, j): self.block(i, j) - _product(B[i].T, gain[j]) for i in k for j in k}
         row = {j: _product(left, B[j]) for j in k}
         for j in k:
-            new[0, j] = row[j] - _weighted(factors[1:], [new[i, j] for i in k])
-        pp = _product(left, own) - _weighted(factors[1:], [row[i].T + new[0, i] for i in k])
+            new[0, j] = row[j] - _weighted_sum(factors[1:], [new[i, j] for i in k])
+        pp = _product(left, own) - _weighted_sum(factors[1:], [row[i].T + new[0, i] for i in k])
         new[0, 0] = (pp + pp.T) / 2
         for j in k:
             new[j, j] = (new[j, j] + new[j, j].T) / 2
-        return Motion(tuple(x), tuple(new[i, j] for j in range(len(x)) for i in range(j + 1)))
+        blocks = tuple(new[i, j] for j in range(len(x)) for i in range(j + 1))
+        return LinearMotion(tuple(x), blocks)
 
 
-def expected_of(motion: Motion, theta: Array, size: Array) -> Expected:
-    return Expected(motion.x[0], motion.x[1], spread(theta, size), motion.P[0], size)
+def predicted_ellipse(motion: LinearMotion, theta: Array, size: Array) -> PredictedMeasurement:
+    """Return the predicted events of an ellipse with orientation (rad) and sizes (2,) in px."""
+    spread = ellipse_covariance(theta, size)
+    return PredictedMeasurement(motion.x[0], motion.x[1], spread, motion.P[0], size)
 
 
-def moments_of(motion: Motion, size: Array, P_size: Array, turn: Array, P_turn: Array):
+def join_blocks(
+    motion: LinearMotion, size: Array, P_size: Array, turn: Array, P_turn: Array
+) -> tuple[Float[Array, " 8"], Float[Array, "8 8"]]:
+    """Join independent motion, sizes and turn (theta, q) to one mean and covariance.
+
+    Args:
+        motion: Position and velocity.
+        size: (2,) px.
+        P_size: (2,) variances, px^2.
+        turn: (2,) rad and rad/s.
+        P_turn: (4,) covariance of the turn, row by row.
+    """
     mean = jnp.concatenate([motion.x[0], motion.x[1], size, turn])
     parts = [
         jnp.block([[motion.P[0], motion.P[1]], [motion.P[1].T, motion.P[2]]]),
@@ -132,12 +153,15 @@ def moments_of(motion: Motion, size: Array, P_size: Array, turn: Array, P_turn: 
     return mean, jax.scipy.linalg.block_diag(*parts)
 
 
-def decay(params: TrackerParams, dt: Array) -> tuple[Array, ...]:
-    """Of (theta, q) over dt: factors of q in theta and in q, covariances added to both.
+def turn_transition(params: TrackerParams, dt: Array) -> tuple[Array, ...]:
+    """Return the transition of (theta, q) over `dt` seconds: dq = -g q dt + dW, g = 1 / tau_q.
 
-    dq = -g q dt + dW with g = 1 / tau_q. With a = g dt the variance of theta is that of W times
-    dt^3 (a - 2 (1 - exp(-a)) + (1 - exp(-2 a)) / 2) / a^3, which cancels for small a; there its
-    series serves.
+    With a = g dt the variance of theta is that of W times dt^3 (a - 2 (1 - exp(-a)) +
+    (1 - exp(-2 a)) / 2) / a^3, which cancels for small a; there its series serves.
+
+    Returns:
+        Factors of q in theta and in q, and the process noise: variance of theta, covariance,
+        variance of q.
     """
     tau = params.tau_q
     a = jnp.where(tau > 0, dt / jnp.where(tau > 0, tau, 1), 0)
@@ -162,11 +186,56 @@ def decay(params: TrackerParams, dt: Array) -> tuple[Array, ...]:
     )
 
 
-def transition(params: TrackerParams, dt: Array, still: Array) -> Float[Array, "8 8"]:
-    """Of (px, py, vx, vy, lambda1, lambda2, theta, q) over dt; at rest where `still`."""
-    to_theta, to_q, *_ = decay(params, dt)
+def transition(params: TrackerParams, dt: Array, static: Array) -> Float[Array, "8 8"]:
+    """Return the transition matrix of the common state over `dt` (s), at rest where `static`."""
+    to_theta, to_q, *_ = turn_transition(params, dt)
     pairs = jnp.array([0, 1, 6, 7]), jnp.array([2, 3, 7, 7])
     F = jnp.eye(8, dtype=dt.dtype).at[pairs].set(jnp.stack([dt, dt, to_theta, to_q]))
     moving = jnp.zeros(8, bool).at[jnp.array([2, 3, 7])].set(True)
-    keep = jnp.where(still & moving, 0.0, 1.0).astype(dt.dtype)
+    keep = jnp.where(static & moving, 0.0, 1.0).astype(dt.dtype)
     return keep[:, None] * F * keep
+
+
+def ellipse_covariance(theta: Array, size: Float[Array, " 2"]) -> Float[Array, "2 2"]:
+    """Return L L^T = R diag(size^2) R^T, px^2."""
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    a, b = size[0] ** 2, size[1] ** 2
+    xy = (a - b) * c * s
+    return jnp.stack([a * c**2 + b * s**2, xy, xy, a * s**2 + b * c**2]).reshape(2, 2)
+
+
+def ellipse_axes(covariance: Float[Array, "2 2"]) -> tuple[Array, Array]:
+    """Return the orientation (rad) and the standard deviations along the axes, larger first."""
+    half, xy = (covariance[0, 0] - covariance[1, 1]) / 2, covariance[0, 1]
+    middle = (covariance[0, 0] + covariance[1, 1]) / 2
+    apart = half**2 + xy**2
+    long = apart > 1e-12 * middle**2
+    radius = jnp.where(long, jnp.sqrt(jnp.where(long, apart, 1)), 0)
+    theta = jnp.where(long, jnp.arctan2(jnp.where(long, xy, 0), jnp.where(long, half, 1)) / 2, 0)
+    variances = jnp.maximum(jnp.stack([middle + radius, middle - radius]), 1e-12)
+    return theta, jnp.sqrt(variances)
+
+
+def gated_moments(params: TrackerParams) -> tuple[Array | float, Array | float]:
+    """Return E[u1^2] and E[u1^2 u2^2] of standard normal u that an elliptical gate lets pass.
+
+    r^2 / 2 = (u1^2 + u2^2) / 2 is exponential, cut at g = gate^2 / 2; E[u1^4] is three times the
+    second.
+    """
+    if params.gate_shape != "ellipse":
+        return 1.0, 1.0
+    g = jnp.maximum(params.gate**2 / 2, 0.01)
+    passed = -jnp.expm1(-g)
+    first = 1 - g * jnp.exp(-g) / passed
+    return first, (1 - jnp.exp(-g) * (g**2 / 2 + g + 1)) / passed
+
+
+def log_size_step(step: Array, derivative: Array) -> Array:
+    """Return log(1 + derivative step) / derivative, a step of log lambda valid for any length.
+
+    Without P_p and a gate, log lambda of variance P is lambda^2 of an inverse gamma distribution of
+    the shape 1 / (4 P). Its update by u^2 multiplies lambda^2 by 1 + 2 step, `step` being that of
+    the Kalman filter, and has the same variance. From a size twice too large the Kalman
+    filter's variance would shrink long before the size is right, as u^2 / V - 1 is never below -1.
+    """
+    return jnp.log1p(jnp.maximum(derivative * step, -0.999)) / jnp.maximum(derivative, 1e-15)

@@ -1,6 +1,6 @@
 """Baseline: mean and covariance of the events with weights exp(-age / tau_moments).
 
-The position lags by `tau_moments`; the velocity is the slope of the line through the events.
+The position lags by `tau_moments`; the velocity is that of the line through the events.
 """
 
 import dataclasses
@@ -9,17 +9,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.blob.association import Expected
-from jaxevent.blob.filters.ellipse import axes, spread
-from jaxevent.blob.filters.motion import Motion, moments_of
+from jaxevent.blob.filter import EventBatch, Filter, PredictedMeasurement, where_tree
+from jaxevent.blob.filters.motion import LinearMotion, ellipse_axes, ellipse_covariance, join_blocks
 from jaxevent.blob.params import TrackerParams
-from jaxevent.blob.steps import Batch, Filter, choose
 from jaxevent.blob.tracker import Tracker
 from jaxevent.parameters import Positive
 
 
-class State(eqx.Module):
-    """Weighted moments of the events; times are ages before the state's time."""
+class WeightedMoments(eqx.Module):
+    """Weighted moments of the events; times are ages at the state's time."""
 
     mass: Float[Array, ""]
     center: Float[Array, " 2"]  # px
@@ -35,18 +33,20 @@ class Params(TrackerParams):
     tau_moments = Positive(0.002, "s", "time constant of the window")
 
 
-def start(params: Params, position: Array, size: Array) -> State:
+def init(params: Params, position: Array, size: Array) -> WeightedMoments:
     none = jnp.zeros((), position.dtype)
     around = size**2 * jnp.eye(2, dtype=position.dtype)
-    return State(none + 1, position, none, around, 0 * position, none)
+    return WeightedMoments(none + 1, position, none, around, 0 * position, none)
 
 
-def predict(params: Params, state: State, dt: Array) -> State:
+def predict(params: Params, state: WeightedMoments, dt: Array) -> WeightedMoments:
     mass = state.mass * jnp.exp(-dt / params.tau_moments)
     return dataclasses.replace(state, mass=mass, age=state.age + dt)
 
 
-def update(params: Params, state: State, batch: Batch, weight: Array) -> State:
+def update(
+    params: Params, state: WeightedMoments, batch: EventBatch, weight: Array
+) -> WeightedMoments:
     m = weight.sum()
     share = weight / jnp.where(m > 0, m, 1)
     xi = jnp.where(weight[:, None] > 0, batch.xi, 0)
@@ -66,29 +66,33 @@ def update(params: Params, state: State, batch: Batch, weight: Array) -> State:
         (1 - new) * a + new * b + new * (1 - new) * c
         for a, b, c in zip(old, own, between, strict=True)
     )
-    moved = State(mass, state.center + new * d, state.age - new * dt, around, drift, duration)
-    return choose(m > 0, moved, state)
+    moved = WeightedMoments(
+        mass, state.center + new * d, state.age - new * dt, around, drift, duration
+    )
+    return where_tree(m > 0, moved, state)
 
 
-def expected(params: Params, state: State) -> Expected:
-    theta, _, size = axes(state.spread)
+def predicted_measurement(params: Params, state: WeightedMoments) -> PredictedMeasurement:
+    theta, size = ellipse_axes(state.spread)
     size = jnp.clip(size, params.lambda_min, params.lambda_max)
-    around = spread(theta, size)
-    v, _, _ = _line(state)
-    return Expected(state.center, v, around, around / jnp.maximum(state.mass, 1e-6), size)
+    around = ellipse_covariance(theta, size)
+    v, _, _ = _fit_line(state)
+    return PredictedMeasurement(
+        state.center, v, around, around / jnp.maximum(state.mass, 1e-6), size
+    )
 
 
-def moments(params: Params, state: State) -> tuple[Array, Array]:
-    theta, _, size = axes(state.spread)
-    v, P_p, P_v = _line(state)
-    motion = Motion((state.center, v), (P_p, 0 * P_p, P_v))
+def readout(params: Params, state: WeightedMoments) -> tuple[Array, Array]:
+    theta, size = ellipse_axes(state.spread)
+    v, P_p, P_v = _fit_line(state)
+    motion = LinearMotion((state.center, v), (P_p, 0 * P_p, P_v))
     turn = jnp.stack([theta, 0 * theta])
     mass = jnp.maximum(state.mass, 1e-6)
-    return moments_of(motion, size, size**2 / (2 * mass), turn, jnp.zeros(4, theta.dtype))
+    return join_blocks(motion, size, size**2 / (2 * mass), turn, jnp.zeros(4, theta.dtype))
 
 
-def _line(state: State) -> tuple[Array, Array, Array]:
-    """The velocity, and the variances of the position and of it."""
+def _fit_line(state: WeightedMoments) -> tuple[Array, Array, Array]:
+    """Fit a line: the velocity, and the covariances of position and velocity."""
     known = state.duration > 0
     duration = jnp.where(known, state.duration, 1)
     mass = jnp.maximum(state.mass, 1e-6)
@@ -99,6 +103,6 @@ def _line(state: State) -> tuple[Array, Array, Array]:
 moving_moments = Tracker(
     "moving_moments",
     Params,
-    Filter(start, predict, update, expected, moments),
+    Filter(init, predict, update, predicted_measurement, readout),
     about="Moving mean and covariance of the events near a blob; a baseline.",
 )

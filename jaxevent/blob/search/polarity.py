@@ -89,9 +89,8 @@ def _mains_coherence(
     every = max(1, int(faintest * piece / CONFIG.lamp_piece_events))
     n = np.zeros((len(paths), pieces))
     z = np.zeros((len(MAINS_HZ), len(paths) * pieces), complex)
-    for _, part, near in batches_near_paths(
-        recording.events, table, CONFIG.gate_sigmas, every=every
-    ):
+    gate = CONFIG.gate_sigmas
+    for _, part, near in batches_near_paths(recording.events, table, gate, every=every):
         owner = near[:, 0]
         seen = (owner != NO_OWNER) & ~hot[part.y, part.x]
         t = part.t[seen] - begin
@@ -122,27 +121,22 @@ def prefer_sharper(
     """
     if not paths:
         return paths
+    table = tabulate_paths(paths)
+    first, gate = table.first, CONFIG.gate_sigmas
     # Few of the events of bright targets suffice to find that no polarity lags.
     least = min(float(np.median(path.n)) for path in paths)
-    every = max(1, int(least / CONFIG.lag_test_events))
-    sharper = _prefer_sharper(paths, recording, hot, every)
-    lags = any(one is not path for one, path in zip(sharper, paths, strict=True))
-    return _prefer_sharper(paths, recording, hot, 1) if lags and every > 1 else sharper
-
-
-def _prefer_sharper(
-    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_], every: int
-) -> list[TargetPath]:
-    """Compute `prefer_sharper` from one event of `every`."""
-    table = tabulate_paths(paths)
-    sums = np.zeros((len(table.t), 2, 6))
-    for _, part, near in batches_near_paths(
-        recording.events, table, CONFIG.gate_sigmas, every=every
-    ):
-        events = part.t, part.x, part.y, part.p
-        _add_residuals(events, near, table, hot, table.first[:-1].copy(), sums)
-    ends = zip(table.first[:-1], table.first[1:], strict=True)
-    return [_sharper_path(path, sums[a:b]) for path, (a, b) in zip(paths, ends, strict=True)]
+    some = max(1, int(least / CONFIG.lag_test_events))
+    sharper = paths
+    for every in dict.fromkeys((some, 1)):
+        sums = np.zeros((len(table.t), 2, 6))
+        for _, part, owner in batches_near_paths(recording.events, table, gate, every=every):
+            events = part.t, part.x, part.y, part.p
+            _add_residuals(events, owner, table, hot, first[:-1].copy(), sums)
+        rows = zip(paths, first[:-1], first[1:], strict=True)
+        sharper = [_sharper_path(path, sums[a:b]) for path, a, b in rows]
+        if all(one is path for one, path in zip(sharper, paths, strict=True)):
+            break
+    return sharper
 
 
 def _sharper_path(path: TargetPath, sums: NDArray[np.float64]) -> TargetPath:

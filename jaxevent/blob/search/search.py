@@ -28,7 +28,7 @@ from jaxevent.blob.search.scene import (
 )
 from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.search.window_tracker import WindowTracker
-from jaxevent.blob.seeds import span_of
+from jaxevent.blob.seeds import tracking_span
 from jaxevent.deprecated import RenamedAttribute
 from jaxevent.display import plural
 from jaxevent.errors import InputError
@@ -279,7 +279,7 @@ def find(
     Raises:
         InputError: There is no time between `start` and `stop`.
     """
-    stream = Stream(recording, *span_of(recording, start, stop))
+    stream = Stream(recording, *tracking_span(recording, start, stop))
     if len(stream) < CONFIG.min_recording_events:
         return TargetSearchResult((), (), 0, 0.0, recording)
     found: list[TargetPath] = []

@@ -113,32 +113,30 @@ MAX_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to tak
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
+class PreparedTarget(NamedTuple):
+    """The instants of a target, and the motion of its points; of several, stacked."""
+
+    rows: Int[Numeric, "*times k"]  # its instants among all
+    layout: InstantLayout
+    p: Float[Numeric, "*times rows columns 4"]  # trajectories of nodes, px
+    path_index: Int[Numeric, "*times h w"]  # the pixel whose path each one takes
+    exposures: AdjacentExposures
+    steady: Float[Numeric, "*times"]  # 1 where frames keep their brightness, else 0
+    brightness: BrightnessPrior
+
+
 class PreparedTargets(ShortRepr):
-    """Targets to read images of: their instants, and the motion of their points."""
+    """Targets to read images of."""
 
     instants: ReadOut  # all instants of all targets, sorted
-    rows: Int[Numeric, "times k"]  # of each target's instants
-    layout: InstantLayout  # each (times, k) or (times,)
-    p: Float[Numeric, "times rows columns 4"]  # trajectories of nodes, px
-    path_index: Int[Numeric, "times h w"]  # the pixel whose path each one takes
-    exposures: AdjacentExposures  # each (times, n)
-    steady: Float[Numeric, " times"]  # 1 where frames keep their brightness, else 0
-    brightness: BrightnessPrior  # each (times,)
+    targets: PreparedTarget  # stacked
     # Of exposures; None: images are not fitted to them.
     samples: int | None = eqx.field(static=True, default=None)
 
-    @property
-    def each(self) -> tuple:
-        """The fields that have a row for each target."""
-        return (
-            self.rows, self.layout, self.p, self.path_index, self.exposures, self.steady,
-            self.brightness,
-        )  # fmt: skip
-
     def images(self, rows: NDArray) -> "PreparedTargets":
         """Select images, in the order of `rows`."""
-        chosen = jax.tree.map(lambda leaf: leaf[rows], self.each)
-        return PreparedTargets(self.instants, *chosen, samples=self.samples)
+        chosen = jax.tree.map(lambda leaf: leaf[rows], self.targets)
+        return PreparedTargets(self.instants, chosen, self.samples)
 
     def over(self, devices: Sequence[Any]) -> "PreparedTargets":
         """Return the targets as they are: pixels read each other and are not shared out."""
@@ -701,13 +699,17 @@ class MotionCompensation(ImageEstimator[Params]):
             one, rows = target.instants, np.zeros(count, np.int32)
             rows[: len(one)] = np.searchsorted(every, one.t)
             path_index = own if target.path_index is None else target.path_index
-            layout = make_layout(one, target.clear, count)
-            steady, exposures = np.float32(target.smooth is None), trajectories.exposures(t, one)
-            brightness = trajectories.brightness.prior(t)
-            targets.append((rows, layout, target.p, path_index, exposures, steady, brightness))
-        each = jax.tree.map(lambda *leaves: np.stack(leaves), *targets)
-        samples = trajectories.exposures.samples
-        return features, jax.device_put(PreparedTargets(instants, *each, samples=samples))
+            layout, exposures = (
+                make_layout(one, target.clear, count),
+                trajectories.exposures(t, one),
+            )
+            steady, prior = np.float32(target.smooth is None), trajectories.brightness.prior(t)
+            targets.append(
+                PreparedTarget(rows, layout, target.p, path_index, exposures, steady, prior)
+            )
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *targets)
+        out = PreparedTargets(instants, stacked, trajectories.exposures.samples)
+        return features, jax.device_put(out)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
         """Smooth each pixel; pure.
@@ -738,7 +740,7 @@ class MotionCompensation(ImageEstimator[Params]):
         L, V, clear = (v.reshape(len(v), -1, frames.width) for v in (L, V, clear.astype(L.dtype)))
 
         @jax.checkpoint
-        def one(target: tuple) -> tuple[Array, Array]:
+        def one(target: PreparedTarget) -> tuple[Array, Array]:
             rows, layout, p, path_index, exposures, steady, brightness = target
             smooth = (1 - steady) * smooth_part(L[rows])
             images = (L[rows] - smooth, V[rows], clear[rows])
@@ -758,7 +760,7 @@ class MotionCompensation(ImageEstimator[Params]):
             base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
             return fused.L + (1 - steady) * base, fused.P + variance
 
-        found, P = jax.lax.map(one, out.each)
+        found, P = jax.lax.map(one, out.targets)
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)
         return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))

@@ -114,17 +114,12 @@ class InstantImages:
         self._cache: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
 
     @property
-    def dtype(self) -> np.dtype:
-        """Type of the smoother's images."""
-        return self._video.dtype
-
-    @property
     def size(self) -> tuple[int, int]:
         """Height and width, px."""
         return self._video.recording.height, self._video.recording.width
 
-    def fetch(self, times: NDArray[np.int64]) -> None:
-        """Compute the images at sorted times (us) that are not remembered."""
+    def __call__(self, times: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Return L, V and clear, each (times, h, w) float32, at sorted times (us)."""
         missing = np.array([t for t in times.tolist() if t not in self._cache], np.int64)
         for t in times.tolist():
             if t in self._cache:
@@ -134,10 +129,6 @@ class InstantImages:
                 self._cache[t] = Estimate(*(np.array(v[n], np.float32) for v in part))
         while len(self._cache) > max(N_CACHED_IMAGES, len(times)):
             self._cache.popitem(last=False)
-
-    def __call__(self, times: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return L, V and clear, each (times, h, w) float32, at sorted times (us)."""
-        self.fetch(times)
         chosen = [self._cache[t] for t in times.tolist()]
         L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
         return L, V, clear

@@ -1,56 +1,164 @@
-"""Bands of rows: which there are, and how events are divided among them."""
+"""Events, frames and images in bands of rows, and what loops over bands have in common.
+
+A band is a few rows of pixels with one more on each side, whose events act on the neighbourhood.
+All numbers of a pixel lie at the same place of arrays of `stride` numbers, one after another in
+`cells`: they stay in the processor's cache while the band's images are made.
+"""
 
 import dataclasses
-from typing import NamedTuple
+import sys
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc
-from jaxevent.reconstruction.engine.timeline import NEVER
-from jaxevent.recording import EventColumns
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.codegen.graph import TranslationError
+from jaxevent.errors import InputError
+from jaxevent.reconstruction.frames import FrameImages, Timing
+from jaxevent.reconstruction.stream import Stream, StreamState, event_weights
+from jaxevent.reconstruction.windows import WindowedRecording
+from jaxevent.recording import ColumnSource, EventColumns, Recording
 
-# Room for pixels of a band and its border. A dozen numbers each fill half a megabyte, of a
-# second-level cache of one; each number begins a cache line further than a power of two. Where
-# derivatives lie beside them the smaller bands are a tenth faster.
+NEVER = 1 << 45  # us, longer than any recording and within an event's bits
+# Pixels of a band and its border. A dozen numbers each fill half a megabyte, of a second-level
+# cache of one; each number begins a cache line further than a power of two. Where derivatives lie
+# beside them the smaller bands are a tenth faster.
 STRIDES = (8208, 16400, 32784, 65488)
-SMALLER = (4112, *STRIDES)
-LEAST_ROWS = 6  # the two rows of a border are read for nothing
+STRIDES_WITH_DERIVATIVES = (4112, *STRIDES)
+MIN_ROWS = 6  # the two rows of a border are read for nothing
+WINDOW_FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
+IMAGE_PIXELS = 1 << 22  # made in one pass, 9 bytes each
+N_BUFFERS = 2  # the last images are held while the next ones are made
+
+
+class Bands(NamedTuple):
+    """Events divided among bands, and the rows of each band."""
+
+    events: NDArray[np.int64]  # time since the recording's start (us), place in the band, polarity
+    weights: NDArray  # events that each one stands for; empty: one
+    first: NDArray[np.int64]  # of each band's events, and one more
+    edges: NDArray[np.int64]  # rows of the image, and one more
+    width: int
+    stride: int
+
+
+class FrameRows(NamedTuple):
+    """Frames of a window or segment."""
+
+    images: NDArray  # [frames, pixels], levels; or empty
+    tables: NDArray  # [3, levels]: grey value, intensity, certainty
+    values: NDArray  # [3, frames, pixels], the same where there are no levels
+    gain: NDArray
+    left: NDArray[np.float64]  # us, exact
+    mid: NDArray[np.float64]
+    right: NDArray[np.float64]
+    number: int  # of the first frame in the recording
+
+
+class ImageBuffers(NamedTuple):
+    """Images [times, pixels], and derivatives of those that have any."""
+
+    mean: NDArray
+    variance: NDArray
+    valid: NDArray[np.uint8]
+    derivatives: NDArray  # [times, pixels, images, lanes]
+
+    @classmethod
+    def empty(
+        cls, times: int, pixels: int, dtype: np.dtype, outputs: int = 0, lanes: int = 0
+    ) -> "ImageBuffers":
+        """Make buffers for some times, with derivatives of `outputs` images."""
+        mean, variance = (np.empty((times, pixels), dtype) for _ in range(2))
+        valid = np.empty((times, pixels), np.uint8)
+        return cls(mean, variance, valid, np.zeros((times, pixels, outputs, lanes), dtype))
+
+
+class BufferPool:
+    """Memory for at most `times` images at once, used again when nobody holds the images.
+
+    Fresh memory costs as much as the images: the system clears each page when it is first written.
+    """
+
+    def __init__(self, pixels: int, dtype: np.dtype):
+        self.times = max(1, IMAGE_PIXELS // pixels)
+        self._pixels, self._dtype = pixels, dtype
+        self._sets: list[tuple[NDArray, ...]] = []
+
+    def take(self, times: int) -> ImageBuffers:
+        """Take memory for some images, which nothing else writes until they are released."""
+        free = [arrays for arrays in self._sets if _count_references(arrays) == _UNUSED]
+        arrays: tuple[NDArray, ...]
+        if free:
+            arrays = free[0]
+        else:
+            arrays = tuple(ImageBuffers.empty(self.times, self._pixels, self._dtype)[:3])
+            self._sets = [*self._sets, arrays][-N_BUFFERS:]
+        mean, variance, valid = (array[:times] for array in arrays)
+        return ImageBuffers(
+            mean, variance, valid, np.empty((times, self._pixels, 0, 0), self._dtype)
+        )
+
+
+def _count_references(arrays: tuple[NDArray, ...]) -> int:
+    """Count the references to arrays; each part of one that somebody holds is one."""
+    return sum(sys.getrefcount(array) for array in arrays)
+
+
+# References to unused arrays. Versions of Python count their own references differently.
+_UNUSED = _count_references((np.empty(1), np.empty(1), np.empty(1)))
 
 
 @dataclasses.dataclass(frozen=True)
 class BandLayout:
-    """How a sensor's rows are divided; depends on nothing but its size."""
+    """Division of a sensor's rows into bands; depends on nothing but its size."""
 
     stride: int
     edges: NDArray[np.int64]
 
     @classmethod
-    def of(cls, width: int, height: int, smaller: bool = False) -> "BandLayout | None":
-        """None for sensors too wide for a band."""
+    def of(cls, width: int, height: int, derivatives: bool = False) -> "BandLayout":
+        """Lay out the bands of a sensor, for kernels with derivatives or without.
+
+        Raises:
+            TranslationError: The sensor is too wide for a band.
+        """
         rows, stride = 0, 0
-        for stride in SMALLER if smaller else STRIDES:
+        for stride in STRIDES_WITH_DERIVATIVES if derivatives else STRIDES:
             rows = stride // (width + 2) - 2
-            if rows >= min(LEAST_ROWS, height):
+            if rows >= min(MIN_ROWS, height):
                 break
         if rows < min(3, height):  # a row borders on one other band at most
-            return None
+            raise TranslationError(f"a sensor {width} pixels wide")
         number = -(-height // rows)
         return cls(stride, np.arange(number + 1) * height // number)
 
-    def divide(
+    @property
+    def bands(self) -> int:
+        """Number of bands."""
+        return len(self.edges) - 1
+
+    def partition(
         self,
         stored: EventColumns,
         weight: NDArray,
         width: int,
         origin: int,
-        room: NDArray[np.int64],
-    ) -> tuple[NDArray[np.int64], NDArray, NDArray[np.int64]] | None:
-        """Events band by band, in order of time, with their weights; where each band's begin.
+        memory: NDArray[np.int64],
+    ) -> Bands | None:
+        """Divide events among the bands, in order of time.
 
-        An event is one number: time, place in the band, polarity (`loop.Bands`). It is given to
-        every band that it lies in or borders on. They are written into `room` if they fit. None:
-        the events are not in order or not on the sensor.
+        Every event is given to each band that it lies in or borders on.
+
+        Args:
+            stored: The events, which are checked.
+            weight: Events that each one stands for; empty: one.
+            width: Width of the sensor, px.
+            origin: Time from which to count, us.
+            memory: Where the bands' events are written if they fit.
+
+        Returns:
+            The bands, or None if the events are not in order or not on the sensor.
         """
         origin, height = origin - stored.offset, int(self.edges[-1])
         if len(stored.t) and (stored.t[0] < origin - NEVER or stored.t[-1] > origin + NEVER):
@@ -63,38 +171,37 @@ class BandLayout:
         low, high = np.maximum(self.edges[:-1] - 1, 0), np.minimum(self.edges[1:] + 1, height)
         first = np.concatenate([[0], np.cumsum(before[high] - before[low])])
         total = int(first[-1])
-        events = room if len(room) >= total else np.empty(total + total // 4, np.int64)
+        events = memory if len(memory) >= total else np.empty(total + total // 4, np.int64)
         weights = np.empty(total if len(weight) else 0, weight.dtype)
-        good = _divide(
-            stored.t, stored.x, stored.y, stored.p, weight, self._rows(width), width, origin,
-            stored.previous, first.astype(np.uint64), events, weights,
-        )  # fmt: skip
-        return (events, weights, first) if good else None
+        bands = Bands(events, weights, first, self.edges, width, self.stride)
+        in_order = _partition(
+            stored, weight, self._rows(width), origin, first.astype(np.uint64), bands
+        )
+        return bands if in_order else None
 
     def _rows(self, width: int) -> "_Rows":
-        bands, height, padded = len(self.edges) - 1, int(self.edges[-1]), width + 2
+        height, padded = int(self.edges[-1]), width + 2
         rows = np.arange(height)
-        mine = np.searchsorted(self.edges, rows, "right") - 1
-        above, below = rows == self.edges[mine], rows + 1 == self.edges[mine + 1]
-        beside = np.where(above & (mine > 0), mine - 1, np.where(below, mine + 1, bands))
+        own = np.searchsorted(self.edges, rows, "right") - 1
+        above, below = rows == self.edges[own], rows + 1 == self.edges[own + 1]
+        next_to = np.where(above & (own > 0), own - 1, np.where(below, own + 1, self.bands))
 
         def place(band: NDArray) -> NDArray[np.int64]:
-            return ((rows - self.edges[np.minimum(band, bands)] + 1) * padded + 1) << 1
+            return ((rows - self.edges[np.minimum(band, self.bands)] + 1) * padded + 1) << 1
 
-        of = (mine.astype(np.uint64), beside.astype(np.uint64))
-        return _Rows(of[0], place(mine), of[1], place(beside))
+        return _Rows(own.astype(np.uint64), place(own), next_to.astype(np.uint64), place(next_to))
 
 
 class _Rows(NamedTuple):
-    """Of each row its band and where it begins there, and the same of a band above or below.
+    """The band of each row and the place where it begins there, and of a band above or below.
 
     Bands are unsigned, as other places are tried for being negative; one too many is none.
     """
 
-    mine: NDArray[np.uint64]
-    base: NDArray[np.int64]
-    beside: NDArray[np.uint64]
-    aside: NDArray[np.int64]
+    own: NDArray[np.uint64]
+    own_place: NDArray[np.int64]
+    next_to: NDArray[np.uint64]
+    next_place: NDArray[np.int64]
 
 
 @njit_noalloc
@@ -104,12 +211,13 @@ def _count_rows(y, counts):
 
 
 @njit_noalloc
-def _divide(t, x, y, p, weight, rows, width, origin, previous, at, events, weights):
-    """Write each event to its band and to one that it borders on; whether all are valid.
+def _partition(stored, weight, rows, origin, at, bands):
+    """Write each event to its band and to one that it borders on; return whether all are valid.
 
     `at` are the places where each band's events begin, and one more.
     """
-    mine, base, beside, aside = rows
+    t, x, y, p, previous = stored.t, stored.x, stored.y, stored.p, stored.previous
+    events, weights, width = bands.events, bands.weights, bands.width
     weighted, bad = len(weight) > 0, False
     none, one = np.uint64(len(at) - 1), np.uint64(1)
     for i in range(len(t)):
@@ -117,15 +225,256 @@ def _divide(t, x, y, p, weight, rows, width, origin, previous, at, events, weigh
         bad |= (t[i] < previous) | (column >= width) | (up > 1)
         previous = t[i]
         event = ((t[i] - origin) << 17) + (column << 1 | up)
-        band = mine[row]
-        events[at[band]] = event + base[row]
+        band = rows.own[row]
+        events[at[band]] = event + rows.own_place[row]
         if weighted:
             weights[at[band]] = weight[i]
         at[band] += one
-        band = beside[row]
+        band = rows.next_to[row]
         if band != none:
-            events[at[band]] = event + aside[row]
+            events[at[band]] = event + rows.next_place[row]
             if weighted:
                 weights[at[band]] = weight[i]
             at[band] += one
     return not bad
+
+
+class PartitionedRecording:
+    """Recording whose events are divided among bands of rows, window by window.
+
+    Args:
+        recording: Events and frames.
+        timing: Clock and dead time of the method.
+        filtering: Whether the method is a filter.
+        events: Most events of a window; None: one window is the whole, for derivatives.
+        factors: (2, pixels) of single pixels' ON and OFF thresholds.
+
+    Raises:
+        TranslationError: Kernels cannot do it.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        timing: Timing,
+        filtering: bool,
+        events: int | None = None,
+        factors: NDArray[np.floating] | None = None,
+    ):
+        self.layout = BandLayout.of(recording.width, recording.height, filtering and events is None)
+        if recording.stop - recording.start >= NEVER:
+            raise TranslationError("a recording of over a year")
+        whole = max(len(recording.events), 1)
+        self.recording, self._factors = recording, factors
+        self.windows = WindowedRecording(
+            recording, timing, filtering=filtering, events=whole if events is None else events
+        )
+        self.windows.frames = max(8, WINDOW_FRAME_PIXELS // self.windows.pixels)
+        if events is None:
+            self.windows.frames = len(self.windows.clock) + 2
+        self.images = FrameImages(recording, self.dtype)
+        none = np.zeros((3, 1), self.dtype)
+        self._tables = self.images.tables() if len(self.windows.clock) else none
+        self._response = self.images.response()
+        # Memory of the windows, one after another.
+        self._stored: EventColumns | None = None
+        self._events = np.empty(0, np.int64)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Kind of real numbers."""
+        return self.windows.dtype
+
+    @property
+    def origin(self) -> int:
+        """The recording's start (us), from which kernels count."""
+        return self.windows.clock.origin
+
+    def fixed_inputs(self, clock_offset: Any) -> dict[str, NDArray]:
+        """Return what kernels know beside parameters, for the clock that windows were made for."""
+        return {
+            "clock_offset": np.asarray(clock_offset, self.dtype),
+            "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
+            "response": self._response,
+        }
+
+    def partition(self, state: StreamState, begin: int, end: int) -> tuple[Bands, StreamState]:
+        """Divide the events of a range of rows among the bands.
+
+        Bands that were made before are overwritten.
+
+        Args:
+            state: State of the stream before or at the first row.
+            begin: First row.
+            end: Row after the last.
+
+        Returns:
+            The bands, and the state at the first row.
+        """
+        windows, source = self.windows, self.recording.events
+        weight = np.empty(0, self.dtype)
+        plain = state.context_last is None and self._factors is None
+        if plain and isinstance(source, ColumnSource):
+            self._stored = source.columns(slice(begin, end), self._stored)
+            bands = None if self._stored is None else self._bands_of(self._stored, weight)
+            if bands is not None:
+                return bands, state
+        events = source[begin:end]  # raises `InputError` for what is not valid
+        if state.context_last is not None:
+            state = windows.move_context(state, begin)
+            assert state.context_last is not None
+            stream = Stream.of(events, self.recording.width)
+            weight = event_weights(stream, state.context_last.copy(), windows.dead).astype(
+                self.dtype
+            )
+        if self._factors is not None:
+            pixel = events.y.astype(np.int64) * self.recording.width + events.x
+            factors = self._factors[np.where(events.p, 0, 1), pixel]
+            weight = (factors * weight if len(weight) else factors).astype(self.dtype)
+        earliest = np.iinfo(np.int64).min
+        checked = EventColumns(events.t, events.x, events.y, events.p.view(np.uint8), 0, earliest)
+        bands = self._bands_of(checked, weight)
+        if bands is None:  # somebody changed arrays after they were checked
+            name = self.recording.name
+            events.check(self.recording.width, self.recording.height, name, begin)
+            raise InputError(f"{name}: events changed while they were read; make a new recording")
+        return bands, state
+
+    def _bands_of(self, stored: EventColumns, weight: NDArray) -> Bands | None:
+        width = self.recording.width
+        bands = self.layout.partition(stored, weight, width, self.origin, self._events)
+        if bands is not None:
+            self._events = bands.events
+        return bands
+
+    def frames(self, used: slice) -> FrameRows:
+        """Return a range of the frames, as loops read them."""
+        clock, frames = self.windows.clock, self.recording.frames
+        left, mid, right = (e[used].astype(float) for e in (clock.left, clock.mid, clock.right))
+        images, values = np.zeros((0, 1), np.uint8), np.zeros((0, 0, 1), self.dtype)
+        if frames is not None and len(clock):
+            images = np.asarray(frames[used].images)
+            images = np.ascontiguousarray(images.reshape(len(images), -1))
+            if images.dtype.kind == "f":
+                values = self.images.values(images)
+                images = np.zeros((0, 1), np.uint8)
+        gain = self.recording.gain[used].astype(self.dtype)
+        return FrameRows(images, self._tables, values, gain, left, mid, right, used.start)
+
+
+# Compilers take several numbers at once where no place can be negative: in parts from 0 on.
+@njit_noalloc_inlined
+def copy(cells, to, of, count):
+    """Copy some numbers from one place to another."""
+    out, given = cells[to : to + count], cells[of : of + count]
+    for z in range(len(out)):
+        out[z] = given[z]
+
+
+@njit_noalloc_inlined
+def fill(cells, at, count, value):
+    """Set some numbers to one value."""
+    out = cells[at : at + count]
+    for z in range(len(out)):
+        out[z] = value
+
+
+@njit_noalloc_inlined
+def ceil_time(time):
+    """Round a time up: events earlier than this whole number of us are before it."""
+    return np.int64(np.ceil(time))
+
+
+@njit_noalloc_inlined
+def load_image(frames, kind, k, bands, band, field):
+    """Write grey values (kind 0), intensities or certainties of frame k into a field."""
+    gain, width = frames.gain[k], bands.width
+    is_plain = kind != 1 or gain == 1  # divisions take longest
+    for line in range(bands.edges[band], bands.edges[band + 1]):
+        z, pixel = (line - bands.edges[band] + 1) * (width + 2) + 1, line * width
+        out = field[z : z + width]
+        if len(frames.values) == 0:
+            table, levels = frames.tables[kind], frames.images[k, pixel : pixel + width]
+            for column in range(len(out)):
+                out[column] = table[levels[column]]
+        else:
+            given = frames.values[kind, k, pixel : pixel + width]
+            for column in range(len(out)):
+                out[column] = given[column]
+        if not is_plain:
+            for column in range(len(out)):
+                out[column] /= gain
+
+
+@njit_noalloc_inlined
+def find(events, begin, end, time):
+    """Find the first of a band's events, from begin to end, that is not before a time."""
+    while begin < end:
+        middle = (begin + end) >> 1
+        if events[middle] >> 17 < time:
+            begin = middle + 1
+        else:
+            end = middle
+    return begin
+
+
+@njit_noalloc_inlined
+def count_events(bands, band, span, cells, on, off):
+    """Count each pixel's ON and OFF events with span[0] <= t < span[1] into two fields."""
+    events, weights, stride, end = bands.events, bands.weights, bands.stride, bands.first[band + 1]
+    weighted, (left, right) = len(weights) > 0, span
+    fill(cells, on, stride, 0.0)
+    fill(cells, off, stride, 0.0)
+    for i in range(find(events, bands.first[band], end, left), end):
+        event = events[i]
+        if event >> 17 >= right:
+            break
+        z = np.uint64(((event >> 1) & 0xFFFF) + (on if event & 1 else off))
+        cells[z] += weights[i] if weighted else 1
+
+
+class ExposureSums(NamedTuple):
+    """Arguments of `sum_exposure_segments`."""
+
+    excess: Any  # function of the module
+    numbers: NDArray
+    totals: NDArray[np.int64]  # fields of the sums, in strides
+    counts: NDArray  # [3, stride], scratch
+    bound: NDArray[np.float64]  # [stride], scratch
+
+
+@njit_noalloc_inlined
+def sum_exposure_segments(bands, band, frames, k, cells, sums):
+    """Add up what the segments of constant brightness of frame k's exposure say, into fields."""
+    events, weights, stride = bands.events, bands.weights, bands.stride
+    excess, numbers, totals, counts, bound = sums
+    begin, end = bands.first[band], bands.first[band + 1]
+    left, mid, right = frames.left[k], frames.mid[k], frames.right[k]
+    length = right - left
+    a, b = find(events, begin, end, ceil_time(left)), find(events, begin, end, ceil_time(right))
+    middle = find(events, begin, end, ceil_time(mid))
+    if length <= 0 or a == b:
+        return
+    added = counts[2]
+    for half in range(2):  # backwards from the middle to the left edge, then forwards
+        for z in range(stride):
+            counts[0, z] = counts[1, z] = 0
+            bound[z] = np.nan
+        for j in range(b - middle if half else middle - a):
+            i = middle + j if half else middle - 1 - j
+            z, now = (events[i] >> 1) & 0xFFFF, np.float64(events[i] >> 17)
+            if bound[z] == bound[z]:
+                share = abs(now - bound[z]) / length
+                excess(share, 0.0, counts[0, z], counts[1, z], numbers.ctypes, added.ctypes)
+                for n in range(len(totals)):
+                    cells[totals[n] * stride + z] += added[n]
+            bound[z] = now
+            one = np.float64(weights[i]) if len(weights) else 1.0
+            counts[0 if events[i] & 1 else 1, z] += one if half else -one
+        outer, edge = (right, 1e6 / length) if half else (left, -1e6 / length)
+        for z in range(stride):
+            if bound[z] == bound[z]:
+                share = abs(outer - bound[z]) / length
+                excess(share, edge, counts[0, z], counts[1, z], numbers.ctypes, added.ctypes)
+                for n in range(len(totals)):
+                    cells[totals[n] * stride + z] += added[n]

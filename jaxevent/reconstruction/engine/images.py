@@ -1,16 +1,19 @@
-"""Images and their derivatives by parameters in one pass of a kernel, as a function for JAX.
+"""Images made by kernels: videos, and functions of parameters with derivatives.
 
-A kernel carries the derivatives of each pixel's state beside it (`slopes`), forwards along the
-parameters that are asked for. JAX sees a function with a rule for its derivatives (`custom_jvp`),
-which is linear in the parameters' changes; so gradients in reverse cost the same one pass.
+Videos pass over windows of events or segments of frames, one after another. For fits a kernel
+carries the derivatives of each pixel's state beside it, forwards along the parameters that move.
+JAX sees a function with a rule for its derivatives (`custom_jvp`), which is linear in the
+parameters' changes; so gradients in reverse cost the same one pass.
 """
 
 import abc
 import functools
 import itertools
+import math
+import queue
 import weakref
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,41 +23,361 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
+from jaxevent.codegen import run_over_rows
+from jaxevent.codegen.derivative import Directions
 from jaxevent.codegen.module import choose_backend, make_kernel
+from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.locks import TurnLock
-from jaxevent.reconstruction.engine.loop import Images
-from jaxevent.reconstruction.engine.passes import DividedRecording, Passes
-from jaxevent.reconstruction.engine.pixel import Directions
-from jaxevent.reconstruction.engine.video import serves_images
+from jaxevent.progress import bar
+from jaxevent.reconstruction.engine.bands import (
+    NEVER,
+    BufferPool,
+    ImageBuffers,
+    PartitionedRecording,
+)
+from jaxevent.reconstruction.engine.filter_loop import (
+    BandedWindow,
+    FilterPasses,
+    PixelStates,
+    cut_window,
+)
+from jaxevent.reconstruction.engine.filter_program import check_filter_kernel
+from jaxevent.reconstruction.engine.smoother_loop import (
+    ImageTimes,
+    Segment,
+    SegmentInputs,
+    SmootherPasses,
+    filter_frames,
+    read_images,
+    smooth_frames,
+)
+from jaxevent.reconstruction.engine.smoother_program import LATER, LINK, STATE, SmoothingMethod
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import Timing
+from jaxevent.reconstruction.frames import Clock, Timing
+from jaxevent.reconstruction.stream import StreamState
+from jaxevent.reconstruction.video import MAX_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 
+WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
+SEGMENT_EVENTS = 1 << 22  # 8 bytes each
+SEGMENT_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
 IS_SYNCHRONOUS = dispatch.use_synchronous_dispatch()  # so that programs may call kernels
 
-_held: "weakref.WeakValueDictionary[int, Divided]" = weakref.WeakValueDictionary()
+
+class WindowStart(NamedTuple):
+    """State from which filtering goes on at a window's start."""
+
+    start: int | None
+    context: StreamState  # of weighted events
+    states: PixelStates | None  # None: the recording's beginning
+
+    @property
+    def time(self) -> float:
+        """Start of the window, us."""
+        return -math.inf if self.start is None else float(self.start)
+
+
+class FilterVideo(ImageSequence[P]):
+    """Images of a filter, made by a kernel; as `Video` in all else.
+
+    Args:
+        estimator: The filter.
+        recording: Events and frames.
+        params: Parameters of the filter.
+        window_events: Most events of a window.
+        progress: Whether a bar is shown; None: if it takes long.
+
+    Raises:
+        TranslationError: There is no kernel for the method.
+    """
+
+    def __init__(
+        self,
+        estimator: Any,
+        recording: Recording,
+        params: P,
+        *,
+        window_events: int = WINDOW_EVENTS,
+        progress: bool | None = None,
+    ):
+        super().__init__(estimator, recording, params, progress=progress)
+        self._partitioned = PartitionedRecording(
+            recording, Timing.of(params), estimator.is_event_driven, window_events
+        )
+        # Divided for the parameters' own clock: the lag is exactly 0.
+        self._passes = FilterPasses(self._partitioned, estimator, params, params.clock_offset)
+        self._buffers = BufferPool(self._partitioned.windows.pixels, self.dtype)
+        self._begins = [WindowStart(None, self._partitioned.windows.initial(), None)]
+        self._open: BandedWindow | None = None
+        self._done = -NEVER  # the time up to which the open window is passed over
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._partitioned.dtype
+
+    def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        done, origin = 0, self._partitioned.origin
+        while done < len(times):
+            window = self._window_of(int(times[done]))
+            end = len(times)
+            if window.stop is not None:
+                end = int(np.searchsorted(times, window.stop))
+            batch = times[done : min(end, done + self._buffers.times)]
+            images = self._buffers.take(len(batch))
+            last = int(batch[-1]) - origin
+            self._open = None  # until it is passed over up to a time that is known
+            self._passes.run(window, last + 1, batch - origin, images)
+            self._open, self._done = window, last
+            done += len(batch)
+            made = Estimate(images.mean, images.variance, images.valid.view(bool))
+            del images
+            yield batch, made
+
+    def _window_of(self, time: int) -> BandedWindow:
+        """Return the open window that contains a time (us), not passed over beyond it."""
+        at, window = time - self._partitioned.origin, self._open
+        if window is not None and window.contains(time) and self._done <= at:
+            return window
+        begin = [b for b in self._begins if b.time <= time][-1]
+        behind = window is None or time < window.begins or window.begins < begin.time
+        if window is None or behind or window.contains(time):
+            window = self._enter(begin)
+        while not window.contains(time):
+            window = self._enter(self._finish(window))
+        return window
+
+    def _finish(self, window: BandedWindow) -> WindowStart:
+        """Pass over the rest of a window, and return the start of the next one."""
+        assert window.stop is not None
+        self._open = None
+        self._passes.run(window, window.stop - self._partitioned.origin)
+        begin = WindowStart(window.stop, window.context, self._passes.copy_states())
+        if all(b.start != window.stop for b in self._begins):
+            self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
+            if (
+                len(self._begins) > MAX_STARTS
+            ):  # the first one, the last one, and half of the others
+                self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
+        return begin
+
+    def _enter(self, begin: WindowStart) -> BandedWindow:
+        """Divide a window's events among the bands, and put the bands at its start."""
+        self._open = None  # so that two windows are never held at once
+        window = cut_window(self._partitioned, begin.start, begin.context)
+        if begin.states is None or begin.start is None:
+            self._passes.init(window)
+        else:
+            self._passes.resume(window, begin.states, begin.start - self._partitioned.origin)
+        self._open, self._done = window, -NEVER
+        return window
+
+
+def _make_segments(clock: Clock, recording: Recording, events: int) -> list[Segment]:
+    """Divide frames into segments of so many events, one frame at least."""
+    most = max(6, SEGMENT_PIXELS // (recording.width * recording.height))
+    rows = [recording.events.index(int(np.ceil(t)) + clock.origin) for t in clock.mid]
+    rows.append(len(recording.events))
+    found, begin = list[Segment](), 0
+    while begin < len(clock):
+        end = int(np.searchsorted(rows, rows[begin] + events, "right")) - 1
+        end = min(max(end, begin + 1), begin + most, len(clock))
+        found.append(Segment(begin, end))
+        begin = end
+    return found
+
+
+class SmootherVideo(ImageSequence[P]):
+    """Images of a smoother, made by a kernel; as `Video` in all else.
+
+    Of every frame of a segment its message and the state before it are stored, of all other
+    segments only how the message of later frames passes through them (`LINK`).
+
+    Args:
+        estimator: The smoother.
+        recording: Events and frames.
+        params: Parameters of the smoother.
+        window_events: Most events of a segment of frames, if it has more than one frame.
+        progress: Whether a bar is shown; None: if it takes long.
+        factors: (2, pixels), of ON and OFF thresholds of single pixels.
+
+    Raises:
+        TranslationError: There is no kernel for the method.
+    """
+
+    def __init__(
+        self,
+        estimator: SmoothingMethod,
+        recording: Recording,
+        params: P,
+        *,
+        window_events: int = SEGMENT_EVENTS,
+        progress: bool | None = None,
+        factors: NDArray[np.floating] | None = None,
+    ):
+        super().__init__(estimator, recording, params, progress=progress)
+        self._method = estimator
+        partitioned = PartitionedRecording(
+            recording, Timing.of(params), False, window_events, factors
+        )
+        self._passes = SmootherPasses(partitioned, estimator, params, params.clock_offset)
+        self._segments = _make_segments(self._passes.clock, recording, window_events)
+        most = max(segment.end - segment.begin for segment in self._segments)
+        self._memory = self._passes.memory(self._passes.layout.bands, most)
+        self._buffers = BufferPool(partitioned.windows.pixels, self.dtype)
+        self._field("given")[:] = self._passes.fractions
+        self._context = partitioned.windows.initial()
+        self._states: list[NDArray] = []  # before each segment
+        self._later: list[NDArray] = []  # messages of all frames after each segment
+        self._open: tuple[int, SegmentInputs] | None = None
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self._passes.dtype
+
+    def _field(self, name: str) -> NDArray:
+        return self._passes.field(self._memory, f"{name}.0")
+
+    def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
+        passes, done, origin = self._passes, 0, self._passes.recording.origin
+        frame = passes.frame_before(times - origin)
+        begins = [segment.begin for segment in self._segments]
+        while done < len(times):
+            place = max(int(np.searchsorted(begins, frame[done], "right")) - 1, 0)
+            last = place == len(begins) - 1
+            end = len(times) if last else int(np.searchsorted(frame, self._segments[place].end))
+            batch = times[done : min(end, done + self._buffers.times)]
+            given, images = self._smoothed(place), self._buffers.take(len(batch))
+            image_times = passes.image_times(batch - origin, begins[place])
+            self._over_bands(read_images, given, self._memory, image_times, images)
+            made = Estimate(images.mean, images.variance, images.valid.view(bool))
+            del images
+            yield batch, made
+            done += len(batch)
+
+    def _over_bands(self, loop: Any, *args: Any) -> None:
+        run_over_rows(loop, self._passes.layout.bands, *args)
+
+    def _smoothed(self, place: int) -> SegmentInputs:
+        """Return the inputs of a segment, which is smoothed."""
+        if not self._later:
+            self._look_ahead()
+        if self._open is not None and self._open[0] == place:
+            return self._open[1]
+        self._open = None  # so that two are never held at once
+        for name, values in zip(STATE, self._states[place], strict=True):
+            self._field(name)[:] = values
+        given = self._filter(place, False)
+        self._smooth(place, given)
+        return given
+
+    def _smooth(self, place: int, given: SegmentInputs) -> None:
+        for name, values in zip(LATER, self._later[place], strict=True):
+            self._field(name)[:] = values
+        self._over_bands(smooth_frames, given, self._memory)
+        self._open = place, given
+
+    def _filter(self, place: int, linked: bool) -> SegmentInputs:
+        """Divide a segment's events among the bands, and filter its frames."""
+        segment, passes = self._segments[place], self._passes
+        bands, self._context = passes.partition(segment, self._context)
+        given = passes.inputs(segment, bands, np.arange(passes.layout.bands))
+        self._over_bands(filter_frames, given, self._memory, place == 0, linked)
+        return given
+
+    def _look_ahead(self) -> None:
+        """Pass over all segments once, for the messages of later frames at each."""
+        states, links, last = list[NDArray](), list[NDArray](), len(self._segments) - 1
+        given = None
+
+        def fields(names: tuple[str, ...]) -> NDArray:
+            return np.stack([self._field(name) for name in names])
+
+        with bar(
+            total=last + 1, desc="look ahead", unit="stretch", progress=self.progress
+        ) as shown:
+            for place in range(last + 1):
+                states.append(fields(STATE))
+                for k, name in enumerate(LINK):
+                    self._field(name)[:] = k == 0
+                given = self._filter(place, last > 0)
+                links.append(fields(LINK))
+                shown.update()
+        assert given is not None
+        later = [np.zeros_like(states[0])]
+        while len(links) > 1:
+            later.insert(0, self._method.apply_message_map(links.pop(), later[0]))
+        self._states, self._later = states, later
+        self._smooth(last, given)
+
+
+def _serves(devices: Sequence[Any]) -> bool:
+    """Return whether kernels are the faster way to images: in single precision, on one device."""
+    return jnp.result_type(float) == np.float32 and len(devices) < 2
+
+
+def video_from_kernel(
+    kind: Callable[..., ImageSequence[P]],
+    method: Any,
+    recording: Recording,
+    params: P,
+    compiler: str | None,
+    options: dict[str, Any],
+) -> ImageSequence[P] | None:
+    """Make the images of a method by a kernel.
+
+    Args:
+        kind: Class of the images.
+        method: The method.
+        recording: Events and frames.
+        params: Parameters of the method.
+        compiler: "numba" or "xla" if the user names one.
+        options: Further options of the method's `estimate`.
+
+    Returns:
+        The images, or None where XLA compiles the method.
+
+    Raises:
+        InputError: The user names numba, and there is no kernel.
+    """
+    own = {name: value for name, value in options.items() if name != "devices"}
+    serves = _serves(options.get("devices", ()))
+    return make_kernel(
+        method.name, compiler, serves, lambda: kind(method, recording, params, **own)
+    )
+
+
+# What programs call by number; see `ImageKernel`.
+_image_kernels: "weakref.WeakValueDictionary[int, ImageKernel]" = weakref.WeakValueDictionary()
 _numbers = itertools.count()
 
 
-class Divided(abc.ABC):
-    """A recording divided among bands, with the kernels that have passed over it.
+class ImageKernel(abc.ABC):
+    """Kernels of a method for the images of a recording at some times, and their derivatives.
 
-    What is of one method, precision and size is equal: programs that JAX compiles for one serve
-    all. Which one is meant is told by its number, when they run. Raises `TranslationError` unless
-    there are kernels for the images and their derivatives.
+    Those of one method, precision and size are equal: programs that JAX compiles for one serve all.
+    The number, which programs get when they run, names the one that is meant.
+
+    Args:
+        method: The method.
+        recording: Events and frames.
+        times: Sorted times of the images, us.
+        params: Parameters of the kind that images are made for.
+
+    Raises:
+        TranslationError: There are no kernels for the images and their derivatives.
     """
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self.recording = DividedRecording(recording, Timing.of(params), method.is_event_driven)
+        self.recording = PartitionedRecording(recording, Timing.of(params), method.is_event_driven)
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)
         self._times = times - self.recording.origin
-        self._made_of = method, recording, times, params
+        self._arguments = method, recording, times, params
         self._turns = TurnLock(f"images of {recording.name}")
         dead = params.without_gradient()
         numbers = [
@@ -65,115 +388,223 @@ class Divided(abc.ABC):
         ]
         self.check(params, Directions(tuple(numbers), ("mean", "variance")))
         self.number = next(_numbers)
-        _held[self.number] = self
+        _image_kernels[self.number] = self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), self._made_of
+        return type(self), self._arguments
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Divided) and self._kind() == other._kind()
+        return isinstance(other, ImageKernel) and self._key() == other._key()
 
     def __hash__(self) -> int:
-        return hash(self._kind())
+        return hash(self._key())
 
-    def _kind(self) -> tuple:
+    def _key(self) -> tuple:
         return self.method, self.pixels, self.dtype.name
 
     @abc.abstractmethod
     def check(self, params: Any, directions: Directions) -> None:
-        """Raise `TranslationError` unless there are kernels for images and these derivatives."""
+        """Raise `TranslationError` unless there are kernels for images and derivatives.
+
+        Args:
+            params: Parameters of the method.
+            directions: Numbers by which derivatives are taken.
+        """
 
     @abc.abstractmethod
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> Images:
-        """Images at sorted times (us since the recording's start), and their derivatives."""
+    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+        """Make images and their derivatives.
+
+        Args:
+            times: Sorted times, us since the recording's start.
+            params: Parameters of the method.
+            directions: Numbers by which derivatives are taken.
+
+        Returns:
+            The images and their derivatives.
+        """
 
     def images(
         self, rows: NDArray, params: Any, directions: Directions
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Images at some of the times, and their derivatives (times, pixels, images, lanes)."""
+        """Make images at some of the times.
+
+        Args:
+            rows: Numbers of the times.
+            params: Parameters of the method.
+            directions: Numbers by which derivatives are taken.
+
+        Returns:
+            Mean, variance and validity (rows, pixels); derivatives (rows, pixels, images, lanes).
+        """
         wanted, places = np.unique(rows, return_inverse=True)
         with self._turns:
             images = self.make(self._times[wanted], params, directions)
-        made = images.mean, images.variance, images.valid.view(bool), images.slopes
+        made = images.mean, images.variance, images.valid.view(bool), images.derivatives
         if len(wanted) == len(rows) and (places == np.arange(len(rows))).all():
             return made
-        mean, variance, valid, slopes = (array[places] for array in made)
-        return mean, variance, valid, slopes
+        mean, variance, valid, derivatives = (array[places] for array in made)
+        return mean, variance, valid, derivatives
 
 
-class DividedEvents(Divided):
-    """Of a filter, which passes over the events."""
+class FilterImages(ImageKernel):
+    """Image kernel of a filter, which passes over the events."""
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
+        self._passes: dict[Directions, FilterPasses] = {}
         super().__init__(method, recording, times, params)
-        self._window = self.recording.cut(None, self.recording.windows.initial())
-        self._passes: dict[Directions, Passes] = {}
+        self._window = cut_window(self.recording, None, self.recording.windows.initial())
 
     def check(self, params: Any, directions: Directions) -> None:
-        self.recording.kernel(self.method, params, self.clock_offset)
-        self.recording.check(self.method, params, self.clock_offset, directions)
+        passes = self._passes_of(params, Directions())
+        kind = passes.kind._replace(directions=directions)
+        fixed = self.recording.fixed_inputs(self.clock_offset)
+        check_filter_kernel(self.method, params, fixed, kind)
 
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> Images:
-        kernel = self.recording.kernel(self.method, params, self.clock_offset, directions)
-        passes = self._passes.get(directions)
-        if passes is None or passes.kernel.places is not kernel.places:
-            passes = Passes(kernel, self.recording.layout, self.dtype)
-            self._passes[directions] = passes
-        passes.kernel = kernel
-        passes.begin(self._window)
-        images = passes.room(len(times), self.pixels)
+    def _passes_of(self, params: Any, directions: Directions) -> FilterPasses:
+        if directions not in self._passes:
+            self._passes[directions] = FilterPasses(
+                self.recording, self.method, params, self.clock_offset, directions
+            )
+        passes = self._passes[directions]
+        passes.use(params)
+        return passes
+
+    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+        passes = self._passes_of(params, directions)
+        passes.init(self._window)
+        images = passes.image_buffers(len(times), self.pixels)
         passes.run(self._window, int(times[-1]) + 1 if len(times) else 0, times, images)
         return images
 
 
-class FusedImages(eqx.Module):
-    """`PreparedImages` by kernels."""
+class SmootherImages(ImageKernel):
+    """Image kernel of a smoother, which passes over all frames of a recording, band by band."""
 
-    number: Int[Numeric, ""]  # of what is held
+    def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
+        self._passes: dict[Directions, SmootherPasses] = {}
+        super().__init__(method, recording, times, params)
+        passes = self._passes_of(params, Directions())
+        self._whole = Segment(0, len(passes.clock))
+        self._bands, _ = passes.partition(self._whole, self.recording.windows.initial())
+
+    def check(self, params: Any, directions: Directions) -> None:
+        SmootherPasses(self.recording, self.method, params, self.clock_offset, directions)
+
+    def _passes_of(self, params: Any, directions: Directions) -> SmootherPasses:
+        if directions not in self._passes:
+            self._passes[directions] = SmootherPasses(
+                self.recording, self.method, params, self.clock_offset, directions
+            )
+        passes = self._passes[directions]
+        passes.use(params)
+        return passes
+
+    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+        passes = self._passes_of(params, directions)
+        images, image_times = passes.image_buffers(len(times)), passes.image_times(times, 0)
+        given = passes.inputs(self._whole, self._bands, np.zeros(passes.layout.bands, np.int64))
+        run_over_rows(_smooth_bands, passes.layout.bands, passes, given, image_times, images)
+        return images
+
+
+def _smooth_bands(
+    begin: int,
+    end: int,
+    passes: SmootherPasses,
+    given: SegmentInputs,
+    image_times: ImageTimes,
+    images: ImageBuffers,
+) -> None:
+    """Make the images of some bands, one after another in the same memory."""
+    try:
+        memory = passes.spare.get_nowait()
+    except queue.Empty:
+        memory = passes.memory(1, len(given.line.mid))
+    program = passes.kernel.program
+    later = [n for leaf in LATER for n in (f"{leaf}.0", *program.derivatives(f"{leaf}.0"))]
+    for band in range(begin, end):
+        passes.field(memory, "given.0")[:] = passes.fractions[band]
+        filter_frames(band, band + 1, given, memory, True, False)
+        for name in later:
+            passes.field(memory, name)[:] = 0
+        smooth_frames(band, band + 1, given, memory)
+        read_images(band, band + 1, given, memory, image_times, images)
+    passes.spare.put(memory)
+
+
+class KernelImages(eqx.Module):
+    """Images made by kernels as a function of parameters; see `PreparedImages`."""
+
+    number: Int[Numeric, ""]  # of the kernel
     rows: Int[Numeric, " times"]
-    held: Divided = eqx.field(static=True)
+    kernel: ImageKernel = eqx.field(static=True)
 
     @classmethod
-    def of(cls, held: Divided, times: int) -> "FusedImages":
-        return _again(held, np.arange(times))
+    def of(cls, kernel: ImageKernel, times: int) -> "KernelImages":
+        """Return the images at the first times of a kernel.
+
+        Args:
+            kernel: The kernel.
+            times: Number of times.
+
+        Returns:
+            The function.
+        """
+        return _rebuild(kernel, np.arange(times))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _again, (self.held, np.asarray(self.rows))
+        return _rebuild, (self.kernel, np.asarray(self.rows))
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
         outputs = ("mean", "variance") if variance else ("mean",)
         # No image depends on `point`: without a tangent of it the kernel carries none.
         params = eqx.tree_at(lambda p: p.point, params, jax.lax.stop_gradient(params.point))
-        mean, P, valid = _images((self.held, outputs), self.number, self.rows, params)
+        mean, P, valid = _images((self.kernel, outputs), self.number, self.rows, params)
         return Estimate(mean, P, valid)
 
-    def take(self, rows: NDArray) -> "FusedImages":
-        return FusedImages(self.number, np.asarray(self.rows)[rows], self.held)
+    def take(self, rows: NDArray) -> "KernelImages":
+        """Return the images at some of the times."""
+        return KernelImages(self.number, np.asarray(self.rows)[rows], self.kernel)
 
-    def over(self, devices: Sequence[Any]) -> "FusedImages":
-        """Images of kernels are made on the host."""
+    def over(self, devices: Sequence[Any]) -> "KernelImages":
+        """Return the images themselves: kernels make them on the host."""
         return self
 
 
-def _again(held: Divided, rows: NDArray) -> FusedImages:
-    """Images of what a pickle or copy holds, which has a number of its own."""
-    return FusedImages(np.asarray(held.number, np.int32), rows, held)
+def _rebuild(kernel: ImageKernel, rows: NDArray) -> KernelImages:
+    """Return images of a kernel that a pickle or copy holds, which has a number of its own."""
+    return KernelImages(np.asarray(kernel.number, np.int32), rows, kernel)
 
 
-def prepared_by_kernel(
-    kind: type[Divided],
+def images_from_kernel(
+    kind: type[ImageKernel],
     method: Any,
     recording: Recording,
     times: Times,
     params: Any,
+    *,
     extrapolate: bool,
     compiler: str | None,
-) -> FusedImages | None:
-    """A method's images at sorted times by kernels; None where these do not serve.
+) -> KernelImages | None:
+    """Prepare a method's images by kernels; see `Filter.prepare_images`.
 
-    See `Filter.prepare_images`. Raises `InputError` where numba is asked for what it cannot do.
+    Args:
+        kind: Class of the kernels.
+        method: The method.
+        recording: Events and frames.
+        times: Times of the images, us.
+        params: Parameters of the method.
+        extrapolate: Whether times may lie outside the recording.
+        compiler: "numba" or "xla" if the user names one.
+
+    Returns:
+        The images, or None where XLA compiles the method.
+
+    Raises:
+        InputError: The user names numba, and there is no kernel.
     """
-    serves = serves_images(jax.local_devices()) and not has_accelerator()
+    serves = _serves(jax.local_devices()) and not has_accelerator()
     backend = choose_backend(compiler, serves)
     if backend == "xla" or not IS_SYNCHRONOUS or "rho_ref" in params.followed:
         return None
@@ -183,8 +614,8 @@ def prepared_by_kernel(
     if not extrapolate:
         method.check_span(recording, times, params)
 
-    def make() -> FusedImages:
-        return FusedImages.of(kind(method, recording, times, params), len(times))
+    def make() -> KernelImages:
+        return KernelImages.of(kind(method, recording, times, params), len(times))
 
     return make_kernel(method.name, compiler, serves, make)
 
@@ -192,23 +623,23 @@ def prepared_by_kernel(
 def _evaluate(
     tree: Any, directions: Directions, number: Any, rows: Any, leaves: list[Any]
 ) -> tuple[NDArray, ...]:
-    held = _held[int(number)]
+    kernel = _image_kernels[int(number)]
     params = jax.tree.unflatten(tree, [np.asarray(leaf) for leaf in leaves])
-    made = held.images(np.asarray(rows), params, directions)
+    made = kernel.images(np.asarray(rows), params, directions)
     return made if directions.numbers else made[:3]
 
 
-def _called(
-    about: tuple[Divided, tuple[str, ...]], number: Any, rows: Any, params: Any, numbers: tuple
+def _call_kernel(
+    about: tuple[ImageKernel, tuple[str, ...]], number: Any, rows: Any, params: Any, numbers: tuple
 ) -> Any:
-    held, outputs = about
+    kernel, outputs = about
     leaves, tree = jax.tree.flatten(params)
     directions = Directions(numbers, outputs if numbers else Directions().of)
-    shape = len(rows), held.pixels
-    shapes = [jax.ShapeDtypeStruct(shape, kind) for kind in (held.dtype, held.dtype, bool)]
+    shape = len(rows), kernel.pixels
+    shapes = [jax.ShapeDtypeStruct(shape, kind) for kind in (kernel.dtype, kernel.dtype, bool)]
     if numbers:
         shape = *shape, len(outputs), directions.lanes
-        shapes.append(jax.ShapeDtypeStruct(shape, held.dtype))
+        shapes.append(jax.ShapeDtypeStruct(shape, kernel.dtype))
     evaluate = functools.partial(_evaluate, tree, directions)
     return jax.pure_callback(
         evaluate, tuple(shapes), number, rows, leaves, vmap_method="sequential"
@@ -217,23 +648,23 @@ def _called(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _images(about: Any, number: Any, rows: Any, params: Any) -> Any:
-    return _called(about, number, rows, params, ())
+    return _call_kernel(about, number, rows, params, ())
 
 
 @full_precision
 def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
-    """The images' changes: sums of derivatives by numbers times the numbers' changes."""
+    """Return the images' changes: sums of derivatives by numbers times the numbers' changes."""
     number, rows, params = primals
     changes = jax.tree.leaves(tangents[2], is_leaf=_is_zero)
     moving = [k for k, change in enumerate(changes) if not _is_zero(change)]
     numbers = tuple((k, place) for k in moving for place in range(changes[k].size))
     if not numbers:
         images = _images(about, number, rows, params)
-        return images, tuple(jnp.zeros(image.shape, _tangent(image)) for image in images)
-    mean, variance, valid, slopes = _with_derivatives((*about, numbers), number, rows, params)
-    change = jnp.concatenate([jnp.ravel(changes[k]) for k in moving]).astype(slopes.dtype)
-    change = jnp.pad(change, (0, slopes.shape[-1] - change.size))
-    moved = jnp.einsum("tpil,l->tpi", slopes, change)
+        return images, tuple(jnp.zeros(image.shape, _tangent_dtype(image)) for image in images)
+    mean, variance, valid, derivatives = _with_derivatives((*about, numbers), number, rows, params)
+    change = jnp.concatenate([jnp.ravel(changes[k]) for k in moving]).astype(derivatives.dtype)
+    change = jnp.pad(change, (0, derivatives.shape[-1] - change.size))
+    moved = jnp.einsum("tpil,l->tpi", derivatives, change)
     d_variance = moved[..., 1] if moved.shape[-1] > 1 else jnp.zeros_like(variance)
     d_valid = np.zeros(valid.shape, jax.dtypes.float0)
     return (mean, variance, valid), (moved[..., 0], d_variance, d_valid)
@@ -241,8 +672,8 @@ def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_derivatives(about: Any, number: Any, rows: Any, params: Any) -> Any:
-    held, outputs, numbers = about
-    return _called((held, outputs), number, rows, params, numbers)
+    kernel, outputs, numbers = about
+    return _call_kernel((kernel, outputs), number, rows, params, numbers)
 
 
 def _with_derivatives_jvp(about: Any, primals: Any, tangents: Any) -> Any:
@@ -253,16 +684,18 @@ def _with_derivatives_jvp(about: Any, primals: Any, tangents: Any) -> Any:
             'second ones, as of jax.hessian, give prepare_images(..., compiler="xla")'
         )
     made = _with_derivatives(about, *primals)
-    return made, tuple(jnp.zeros(one.shape, _tangent(one)) for one in made)
+    return made, tuple(jnp.zeros(one.shape, _tangent_dtype(one)) for one in made)
 
 
 def _is_zero(tangent: Any) -> bool:
     return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
 
 
-def _tangent(image: Any) -> Any:
+def _tangent_dtype(image: Any) -> Any:
     return image.dtype if jnp.issubdtype(image.dtype, jnp.inexact) else jax.dtypes.float0
 
 
 _images.defjvp(_images_jvp, symbolic_zeros=True)
 _with_derivatives.defjvp(_with_derivatives_jvp, symbolic_zeros=True)
+
+__getattr__ = renamed_names(__name__)

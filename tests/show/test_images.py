@@ -12,15 +12,14 @@ from PIL import Image
 from jaxevent.egomotion.scores import UNITS
 from jaxevent.errors import InputError, install_command
 from jaxevent.metrics import MEANINGS
-from jaxevent.show.report import (
-    COLUMNS,
+from jaxevent.show.images import (
     comparison_figure,
     display_limits,
-    markdown_table,
     tone_map,
     video_writer,
     write_png,
 )
+from jaxevent.show.tables import COLUMNS, markdown_table
 
 pytestmark = pytest.mark.slow
 
@@ -90,12 +89,12 @@ def test_common_limits_show_a_frame_alike_alone_and_in_a_video(how):
 
 
 @pytest.mark.parametrize("how", TONES)
-@pytest.mark.parametrize("value", [-1.0, 0.0, 0.3, 1e-30])
-def test_constant_images_can_be_shown(how, value):
-    shown = tone_map(np.full((16, 20), value, np.float32), how)
-    assert np.ptp(shown) == 0
-    if how == "percentile" or (how in ("log", "clahe") and value > 0):
-        assert shown[0, 0] in (127, 128)
+def test_constant_images_can_be_shown(how):
+    for value in (-1.0, 0.0, 0.3, 1e-30):
+        shown = tone_map(np.full((16, 20), value, np.float32), how)
+        assert np.ptp(shown) == 0
+        if how == "percentile" or (how in ("log", "clahe") and value > 0):
+            assert shown[0, 0] in (127, 128)
 
 
 def test_clahe_brings_out_contrast_in_the_dark_half():
@@ -116,30 +115,24 @@ def test_tone_map_names_bad_input(how):
         tone_map(RAMP, how, limits=(1.0, 1.0))
     with pytest.raises(InputError, match="'gamma'; choose one of linear"):
         tone_map(RAMP, "gamma")
+    if how in ("log", "clahe"):
+        with pytest.raises(InputError, match="two finite positive"):
+            tone_map(RAMP, how, limits=(0.0, 1.0))
 
 
-def test_logarithms_need_positive_limits():
-    with pytest.raises(InputError, match="two finite positive"):
-        tone_map(RAMP, "log", limits=(0.0, 1.0))
-
-
-@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3)])
-def test_png_keeps_every_pixel(tmp_path, shape):
-    image = np.random.default_rng(2).integers(0, 256, shape, np.uint8)
-    write_png(tmp_path / "image.png", image[::-1])
-    with Image.open(tmp_path / "image.png") as stored:
-        assert stored.format == "PNG"
-        np.testing.assert_array_equal(np.asarray(stored), image[::-1])
+def test_png_keeps_every_pixel_of_display_images(tmp_path):
+    path = tmp_path / "image.png"
+    for bad in (np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4), np.uint8)):
+        with pytest.raises(InputError, match="image.png: cannot show .* give uint8"):
+            write_png(path, bad)
+        assert not path.exists()
+    for shape in ((5, 7), (5, 7, 3)):
+        image = np.random.default_rng(2).integers(0, 256, shape, np.uint8)
+        write_png(path, image[::-1])
+        with Image.open(path) as stored:
+            assert stored.format == "PNG"
+            np.testing.assert_array_equal(np.asarray(stored), image[::-1])
     assert [path.name for path in tmp_path.iterdir()] == ["image.png"]
-
-
-@pytest.mark.parametrize(
-    "image", [np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4), np.uint8)]
-)
-def test_png_takes_display_images_only(tmp_path, image):
-    with pytest.raises(InputError, match="image.png: cannot show .* give uint8"):
-        write_png(tmp_path / "image.png", image)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("colour", [(), (3,)])
@@ -218,7 +211,7 @@ def panels():
     ]
 
 
-@pytest.mark.parametrize("count, rows, columns", [(1, 1, 1), (3, 1, 3), (5, 2, 3), (6, 2, 3)])
+@pytest.mark.parametrize("count, rows, columns", [(1, 1, 1), (5, 2, 3)])
 def test_figure_is_a_grid_of_panels(tmp_path, count, rows, columns):
     path = tmp_path / "figure.png"
     comparison_figure(path, panels()[:count], "Filters compared")
@@ -235,7 +228,7 @@ def test_figure_is_a_grid_of_panels(tmp_path, count, rows, columns):
 def test_figures_do_not_depend_on_each_other(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)  # of another test
     for name in ("a.png", "b.png"):
-        comparison_figure(tmp_path / name, panels())
+        comparison_figure(tmp_path / name, panels()[4:])
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert "matplotlib.pyplot" not in sys.modules
 

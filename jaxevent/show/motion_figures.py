@@ -1,8 +1,9 @@
-"""Pictures of a motion: its components over time, events moved back along it, their flow."""
+"""Figures of a motion: components over time, events warped along it, and their flow."""
 
 import dataclasses
 import functools
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,27 +23,15 @@ from jaxevent.egomotion.motion import MotionEstimate, is_observable
 from jaxevent.egomotion.scores import axis_error, endpoint_error
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.estimator import Estimate
-from jaxevent.io.output import complete
 from jaxevent.recording import Events, Recording
-from jaxevent.show.canvas import new_figure
+from jaxevent.show.images import new_figure, save_figure
 
-_PLOTTED = 4096  # most times of the plot
-_PARTICLES = 30_000  # most particles of a component in the plot
-_WAY, _SHORTEST, _USUAL, _LONGEST = 8.0, 0.02, 0.05, 0.5  # px and s: of the window that is warped
-_MOST = 500_000  # events that are warped or coloured
+_MAX_TIMES = 4096  # times of the plot
+_MAX_PARTICLES = 30_000  # particles of a component in the plot
+_WINDOW_WAY_PX = 8.0  # px that the image moves in the window that is warped,
+_MIN_WINDOW_S, _DEFAULT_WINDOW_S, _MAX_WINDOW_S = 0.02, 0.05, 0.5  # whose length has bounds
+_MAX_EVENTS = 500_000  # events that are warped or coloured
 _TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
-
-
-def plot_motion(
-    path: str | Path,
-    motion: MotionEstimate,
-    times: NDArray[np.int64],
-    truth: KnownMotion | None = None,
-    *,
-    centred: bool = False,
-) -> None:
-    """Draw `motion_figure` as PNG."""
-    _save(motion_figure(motion, times, truth, centred=centred), path)
 
 
 def motion_figure(
@@ -52,20 +41,31 @@ def motion_figure(
     *,
     centred: bool = False,
 ) -> Any:
-    """The components over times (us), against the truth and with errors where known.
+    """Draw the components over times, against the truth and with errors where it is known.
 
     Bands are two standard deviations, grey spans those in which the motion is lost, dots some of
     the particles, where the motion has a `cloud` (estimates, particles, components). Where a
-    direction is not told there is neither line nor band.
+    direction is not observable there is neither line nor band.
+
+    Args:
+        motion: A motion.
+        times: (T,) us.
+        truth: The true motion.
+        centred: Whether estimates count for the middle of the events that they use.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
     """
     figure = new_figure()
-    if len(times) > _PLOTTED:
-        times = times[np.linspace(0, len(times) - 1, _PLOTTED).astype(int)]
-    told = motion(times, centred=centred)
+    if len(times) > _MAX_TIMES:
+        times = times[np.linspace(0, len(times) - 1, _MAX_TIMES).astype(int)]
+    estimated = motion(times, centred=centred)
     model, seconds = motion.model, times * 1e-6
-    judged = _judged(model, times, told, truth)
-    trust = np.where(told.valid[:, None] & is_observable(model, told.covariance), 1.0, np.nan)
-    extra = judged or _contrasts(motion, times)
+    errors = _errors(model, times, estimated, truth)
+    trust = np.where(
+        estimated.valid[:, None] & is_observable(model, estimated.covariance), 1.0, np.nan
+    )
+    extra = errors or _contrasts(motion, times)
     sizes = [len(model.components[part.rows]) for part in model.parts]
     rows, columns = max(sizes), len(sizes)  # a column for each part
     figure.set_size_inches(6.0 * columns + 2 * (columns == 1), 1.9 * rows + 1.9 * bool(extra))
@@ -75,11 +75,11 @@ def motion_figure(
         for column, part in enumerate(model.parts)
         for row, i in enumerate(range(len(model.components))[part.rows])
     }
-    sigma = np.sqrt(np.diagonal(told.covariance, axis1=1, axis2=2).clip(0))
+    sigma = np.sqrt(np.diagonal(estimated.covariance, axis1=1, axis2=2).clip(0))
     for i, name in enumerate(model.components):
         row, column, part = order[i]
         axis = grid[row, column]
-        value = told.mean[:, i] * trust[:, i]
+        value = estimated.mean[:, i] * trust[:, i]
         _cloud(axis, motion, i, centred)
         low, high = value - 2 * sigma[:, i], value + 2 * sigma[:, i]
         axis.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0)
@@ -95,11 +95,13 @@ def motion_figure(
         axis.set_ylabel(name if unit == "1" else f"{name} ({unit})")
         if part.direction:
             axis.set_ylim(-1.08, 1.08)
-            _untold(axis, seconds, told.valid & np.isnan(value))
+            _mark_unobservable(axis, seconds, estimated.valid & np.isnan(value))
         elif any(map(len, seen)):
             # A component that hardly changes is not enlarged until its noise fills the axis.
             low, high = np.concatenate(seen).min(), np.concatenate(seen).max()
-            half = max(0.6 * (high - low), 0.08 * np.abs(told.mean[told.valid]).max(initial=0))
+            half = max(
+                0.6 * (high - low), 0.08 * np.abs(estimated.mean[estimated.valid]).max(initial=0)
+            )
             axis.set_ylim((low + high) / 2 - half - 1e-9, (low + high) / 2 + half + 1e-9)
     for k, (label, series) in enumerate(extra):
         axis = grid[rows, min(k, columns - 1)]
@@ -116,8 +118,9 @@ def motion_figure(
         axis.tick_params(labelbottom=True)
         axis.set_xlabel("t (s)")
     for axis in figure.axes:
-        _shade(axis, seconds, ~told.valid)
-        if not told.valid.any():
+        for begin, end in _spans(seconds, ~estimated.valid):
+            axis.axvspan(begin, end, color=_LOST, alpha=0.4, lw=0)
+        if not estimated.valid.any():
             axis.text(0.5, 0.5, "never found", transform=axis.transAxes, ha="center", va="center")
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
@@ -127,40 +130,40 @@ def motion_figure(
     return figure
 
 
-def _judged(
-    model: type[Model], times: NDArray[np.int64], told: Estimate, truth: KnownMotion | None
+def _errors(
+    model: type[Model], times: NDArray[np.int64], estimated: Estimate, truth: KnownMotion | None
 ) -> list[tuple[str, NDArray[np.float64]]]:
-    """Errors over time, with the labels of their axes."""
+    """Compute errors over time, with the labels of their axes."""
     if truth is None:
         return []
-    inside = truth.covers(times) & told.valid
+    inside = truth.covers(times) & estimated.valid
     if not inside.any():
         return []
-    true, mean = truth(times[inside]), told.mean[inside]
+    true, mean = truth(times[inside]), estimated.mean[inside]
 
     def spread(values: NDArray) -> NDArray[np.float64]:
         series = np.full(len(times), np.nan)
         series[inside] = values
         return series
 
-    judged = []
+    errors = []
     for part in model.parts:
         pair = mean[:, part.rows], true[:, part.rows]
         if part.direction:
-            judged.append((f"{part.name} error (deg)", spread(axis_error(*pair))))
+            errors.append((f"{part.name} error (deg)", spread(axis_error(*pair))))
             continue
         far, unit = endpoint_error(*pair), part.unit
         if unit.startswith("rad"):
             far, unit = np.degrees(far), unit.replace("rad", "deg", 1)
         of = f" of {part.name}" if len(model.parts) > 1 else ""
-        judged.append((f"|error{of}| ({unit})", spread(far)))
-    return judged
+        errors.append((f"|error{of}| ({unit})", spread(far)))
+    return errors
 
 
 def _contrasts(
     motion: MotionEstimate, times: NDArray[np.int64]
 ) -> list[tuple[str, NDArray[np.float64]]]:
-    """Without a truth: how well the motion explains the events."""
+    """Return the contrast of the events or the share explained, where there is no truth."""
     for label, values in (("contrast", motion.contrast), ("events explained", motion.agreement)):
         if values is not None and np.isfinite(values).any():
             return [(label, np.interp(times, motion.t, values))]
@@ -172,7 +175,7 @@ def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> 
     if cloud is None or not len(cloud):
         return
     keep = np.unique(
-        np.linspace(0, len(cloud) - 1, max(1, min(len(cloud), _PARTICLES // cloud.shape[1])))
+        np.linspace(0, len(cloud) - 1, max(1, min(len(cloud), _MAX_PARTICLES // cloud.shape[1])))
         .round().astype(int)
     )  # fmt: skip
     t = (motion.t * 1e-6 - (motion.lag if centred else 0))[keep]
@@ -184,27 +187,25 @@ def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> 
     axis.plot([], [], ".", color=_CLOUD, label="particles")
 
 
-def _untold(axis: Any, seconds: NDArray, untold: NDArray[np.bool_]) -> None:
-    """Say where a direction is not told."""
-    edges = np.flatnonzero(np.diff(np.r_[False, untold, False].astype(int)))
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        last = seconds[min(end, len(seconds) - 1)]
-        axis.axvspan(seconds[begin], last, fc="none", ec=_LOST, hatch="///", lw=0)
-    if untold.any():
-        place = float(seconds[untold].mean())
-        axis.text(place, 0, "not told", ha="center", va="center", backgroundcolor="white")
+def _mark_unobservable(axis: Any, seconds: NDArray, rows: NDArray[np.bool_]) -> None:
+    """Mark the times at which a direction is not observable."""
+    for begin, end in _spans(seconds, rows):
+        axis.axvspan(begin, end, fc="none", ec=_LOST, hatch="///", lw=0)
+    if rows.any():
+        place = float(seconds[rows].mean())
+        axis.text(place, 0, "not observable", ha="center", va="center", backgroundcolor="white")
 
 
-def _shade(axis: Any, seconds: NDArray, lost: NDArray[np.bool_]) -> None:
-    edges = np.flatnonzero(np.diff(np.r_[False, lost, False].astype(int)))
+def _spans(seconds: NDArray, rows: NDArray[np.bool_]) -> Iterator[tuple[float, float]]:
+    """Yield begin and end (s) of consecutive rows."""
+    edges = np.flatnonzero(np.diff(np.r_[False, rows, False].astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        last = seconds[min(end, len(seconds) - 1)]
-        axis.axvspan(seconds[begin], last, color=_LOST, alpha=0.4, lw=0)
+        yield seconds[begin], seconds[min(end, len(seconds) - 1)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """Rows start to stop of the events, and the time (us) to which they are moved."""
+    """Rows start to stop of the events, and the time (us) to which they are warped."""
 
     start: int
     stop: int
@@ -212,40 +213,41 @@ class Window:
 
 
 def span_of(recording: Recording) -> tuple[int, int]:
-    """The times (us) of the first and the last event."""
+    """Return the times (us) of the first and the last event."""
     first, last = (recording.events[i : i + 1].t[0] for i in (0, len(recording.events) - 1))
     return int(first), int(last)
 
 
 def window_of(recording: Recording, motion: MotionEstimate) -> Window:
-    """In the middle of the recording, or of where the motion is found: 20 to 500 ms.
+    """Choose a window of 20 to 500 ms in the middle of the recording, or where motion is found.
 
-    So long that the image moves by 8 px, at the median speed over the sensor. Events beyond the
-    first half million are left out.
+    The image moves by 8 px in it, at the median speed over the sensor. Events beyond the first half
+    million are left out.
     """
     events = recording.events
     middle = sum(span_of(recording)) // 2
     good = motion.t[motion.valid]
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])
-    told = motion(middle, extrapolate=True)
-    span = _USUAL
-    if told.valid[0] and np.isfinite(told.mean).all():
+    estimated = motion(middle, extrapolate=True)
+    span = _DEFAULT_WINDOW_S
+    if estimated.valid[0] and np.isfinite(estimated.mean).all():
         xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
         xi = xi[::8, ::8].reshape(-1, 2)
         U = _linear_flow(
-            motion.model(f), xi, np.broadcast_to(told.mean, (len(xi), told.mean.shape[1]))
+            motion.model(f), xi, np.broadcast_to(estimated.mean, (len(xi), estimated.mean.shape[1]))
         )
         speed = float(np.median(np.hypot(*U.T)))
-        span = min(max(_WAY / max(speed, 1e-9), _SHORTEST), _LONGEST)
+        span = _WINDOW_WAY_PX / max(speed, 1e-9)
+        span = min(max(span, _MIN_WINDOW_S), _MAX_WINDOW_S)
     half = round(5e5 * span)
     begin = events.index(middle - half)
-    end = min(events.index(middle + half), begin + _MOST)
+    end = min(events.index(middle + half), begin + _MAX_EVENTS)
     return Window(begin, end, middle)
 
 
 def flow_of(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
-    """The flow of a window's events, given those of the 100 ms before, which are candidates."""
+    """Estimate the flow of a window's events, with those of 100 ms before as candidates."""
     if part.start == part.stop:
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
     begin = recording.events.index(
@@ -264,11 +266,18 @@ def warped_events(
     reference: int,
     moved: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float64]:
-    """Where events (n,) would be at the time `reference` (us): (n, 2) px, columns and rows.
+    """Warp events along the motion to one time, by the model's `warp` of the motion's integral.
 
-    They are moved by the model's `warp` of the motion's integral. Of motion along half-lines
-    `moved` (n, 2) is the flow (px/s) due to translation at each event. Without a calibration
-    coordinates are those of pixels, else undistorted ones about the principal point.
+    Args:
+        recording: Recording of the events.
+        motion: A motion.
+        events: n events.
+        reference: Time, us.
+        moved: (n, 2) px/s, flow due to translation at each event, for motion along half-lines.
+
+    Returns:
+        (n, 2) px, columns and rows: pixels, or with a calibration undistorted coordinates about the
+        principal point.
     """
     xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     xy = xi[events.y, events.x]
@@ -307,12 +316,18 @@ def plot_warped(
     part: Window | None = None,
     flows: Flow | None = None,
 ) -> None:
-    """Draw the events of a window as they fell and moved back along the motion, side by side, PNG.
+    """Draw the events of a window before and after warping, side by side.
 
-    Images are sums of polarities under a bilinear kernel, of one grey scale; the titles tell their
-    contrast, the variance in the sensor, relative to that of the events as they fell. `flows` are
-    of the window's events; motion along half-lines needs them for its translation, and events whose
-    flow is not known are left out of both images.
+    Images are sums of polarities under a bilinear kernel, of one grey scale. The titles have their
+    contrast, the variance in the sensor. For motion along half-lines events without flow are left
+    out of both images.
+
+    Args:
+        path: PNG file that is written.
+        recording: Recording of the events.
+        motion: A motion.
+        part: The window; None for `window_of`.
+        flows: Flow of the window's events, which motion along half-lines needs.
     """
     part = part or window_of(recording, motion)
     events = recording.events[part.start : part.stop]
@@ -332,8 +347,8 @@ def plot_warped(
         warped_events(recording, motion, events, part.reference, moved),
     )
     sign = _padded(sign)
-    told = [_image(_padded(xy), sign, shape) for xy in places]
-    images, sharp = [np.asarray(one[0]) for one in told], [float(one[1]) for one in told]
+    drawn = [_image(_padded(xy), sign, shape) for xy in places]
+    images, sharp = [np.asarray(one[0]) for one in drawn], [float(one[1]) for one in drawn]
     limit = max(np.percentile(np.abs(images[1]), 99.7), 1e-9)
     figure = new_figure()
     wide = 5.2
@@ -353,11 +368,11 @@ def plot_warped(
         axis.imshow(image, cmap="gray", vmin=-limit, vmax=limit, interpolation="nearest")
         axis.set_title(title, fontsize=10)
         axis.set_axis_off()
-    _save(figure, path)
+    save_figure(figure, path, dpi=130)
 
 
 def _padded(array: NDArray) -> NDArray:
-    """The rows, and zeros up to a power of two: programs are compiled for few lengths."""
+    """Pad rows with zeros up to a power of two, so that few lengths are compiled."""
     more = (1 << max(len(array) - 1, 0).bit_length()) - len(array)
     return np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)])
 
@@ -371,7 +386,7 @@ def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Arr
 def _linear_flow(
     model: Model, xi: NDArray[np.floating], mean: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """What each of n motions makes at a place (n, 2), px/s; of half-lines their begins."""
+    """Compute the flow (n, 2) px/s of n motions at n places, of half-lines without translation."""
     return np.asarray(_flows(model, _padded(xi), _padded(mean)))[: len(xi)]
 
 
@@ -386,9 +401,15 @@ def _warped(model: Model, xi: Numeric, way: Numeric) -> Array:
 
 
 def plot_flow(path: str | Path, recording: Recording, part: Window, flows: Flow) -> None:
-    """Draw a window's events in colours of their flow (PNG): hue the direction, depth the speed.
+    """Draw a window's events in colours of their flow: hue is direction, saturation is speed.
 
-    The wheel shows which. Events without flow are grey, of several at a pixel the last is drawn.
+    Events without flow are grey. Of several events at a pixel the last one is drawn.
+
+    Args:
+        path: PNG file that is written.
+        recording: Recording of the events.
+        part: The window.
+        flows: Flow of its events.
     """
     from matplotlib.colors import hsv_to_rgb
 
@@ -421,9 +442,4 @@ def plot_flow(path: str | Path, recording: Recording, part: Window, flows: Flow)
     right.imshow(wheel, interpolation="nearest")
     right.set_title(f"{most:.3g} px/s\nat the rim", fontsize=9)
     right.set_axis_off()
-    _save(figure, path)
-
-
-def _save(figure: Any, path: str | Path) -> None:
-    with complete(Path(path)) as partial:
-        figure.savefig(partial, format="png", dpi=130)
+    save_figure(figure, path, dpi=130)

@@ -60,7 +60,7 @@ def still(grey, moves=()):
     return Recording("still", WIDTH, HEIGHT, events, Frames(STAMPS, grey, np.zeros_like(STAMPS)))
 
 
-def steady(recording):
+def frame_brightness(recording):
     return images.FrameBrightness(recording, recording.frames.t, 0.3)
 
 
@@ -68,40 +68,44 @@ def test_frames_are_steady_unless_they_change_without_events():
     rng = np.random.default_rng(3)
     wall = rng.integers(40, 160, (1, HEIGHT, WIDTH)) + rng.integers(-3, 4, (5, HEIGHT, WIDTH))
     wall = wall.astype(np.uint8)
-    assert steady(still(wall, [3])).is_steady(0, 200_000)
-    told = steady(brightened(still(wall, [3])))
-    assert not told.is_steady(0, 200_000)
+    assert frame_brightness(still(wall, [3])).is_steady(0, 200_000)
+    brightness = frame_brightness(brightened(still(wall, [3])))
+    assert not brightness.is_steady(0, 200_000)
     before, around, after = (0, 99_999), (50_000, 100_000), (100_001, 200_000)
-    assert [told.is_steady(*span) for span in (before, around, after)] == [True, False, True]
+    assert [brightness.is_steady(*span) for span in (before, around, after)] == [
+        True,
+        False,
+        True,
+    ]
     # Where events are everywhere the change may be that of the scene.
-    assert steady(brightened(still(wall, range(0, WIDTH, 2)))).is_steady(0, 200_000)
+    assert frame_brightness(brightened(still(wall, range(0, WIDTH, 2)))).is_steady(0, 200_000)
     # What goes by without events is brighter here and darker there.
     passing = wall.astype(float)
     passing[BRIGHT] *= np.where(np.arange(WIDTH) < WIDTH // 2, 1.3, 1 / 1.3)
-    assert steady(still(passing.astype(np.uint8), [3])).is_steady(0, 200_000)
+    assert frame_brightness(still(passing.astype(np.uint8), [3])).is_steady(0, 200_000)
     moving = wall.copy()
     moving[BRIGHT, :, : WIDTH // 2] += 50
-    assert steady(still(moving, range(WIDTH // 2))).is_steady(0, 200_000)
+    assert frame_brightness(still(moving, range(WIDTH // 2))).is_steady(0, 200_000)
 
 
 def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
     wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
-    assert steady(still(wall, [3])).variance(75_000) == 0
+    assert frame_brightness(still(wall, [3])).variance(75_000) == 0
     wall[BRIGHT] = 145
-    told = steady(still(wall, [3]))
+    brightness = frame_brightness(still(wall, [3]))
     b = np.log((145 / 255 + 0.3) / (100 / 255 + 0.3))
     left_out = np.mean([(b / 2) ** 2, b**2, (b / 2) ** 2])  # frames 1 to 3, from their neighbours
-    np.testing.assert_allclose(told.variance(75_000), left_out, rtol=1e-5)
-    np.testing.assert_allclose(told.variance(62_500), 0.75 * left_out, rtol=1e-5)
-    np.testing.assert_allclose(told.variance(250_000), left_out, rtol=1e-5)
-    assert told.variance(100_000) == 0
-    two = steady(still(wall, [3]).with_frames(slice(1, 3)))
+    np.testing.assert_allclose(brightness.variance(75_000), left_out, rtol=1e-5)
+    np.testing.assert_allclose(brightness.variance(62_500), 0.75 * left_out, rtol=1e-5)
+    np.testing.assert_allclose(brightness.variance(250_000), left_out, rtol=1e-5)
+    assert brightness.variance(100_000) == 0
+    two = frame_brightness(still(wall, [3]).with_frames(slice(1, 3)))
     doubts = [two.variance(t) for t in (75_000, 62_500, 250_000, 0, 100_000)]
     np.testing.assert_allclose(doubts, b**2 * np.array([0.75, 0.75**2, 1, 1, 0]), rtol=1e-5)
     # An exposure that adapts evenly leaves nothing in doubt.
     wall = np.exp(np.linspace(-1, -0.4, 5))[:, None, None] * np.ones((5, HEIGHT, WIDTH))
-    told = steady(still((255 * wall - 0.3 * 255).round().astype(np.uint8), [3]))
-    assert not told.is_steady(0, 200_000) and told.variance(75_000) == 0
+    brightness = frame_brightness(still((255 * wall - 0.3 * 255).round().astype(np.uint8), [3]))
+    assert not brightness.is_steady(0, 200_000) and brightness.variance(75_000) == 0
 
 
 def test_smooth_part():
@@ -117,13 +121,13 @@ def test_beyond_the_frames_brightness_is_that_of_the_nearest_along_trajectories(
     wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
     wall[4] = 145
     b = np.log((145 / 255 + 0.3) / (100 / 255 + 0.3))
-    told = steady(still(wall, [3]))
-    usual = [told.prior(t).offset for t in (-50_000, 100_000, 200_000, 225_000, 900_000)]
-    np.testing.assert_allclose(usual, [0, 0, 0, -b / 2, -b], rtol=1e-5)
-    flipped = steady(still(wall[::-1], [3])).prior(-25_000).offset
+    brightness = frame_brightness(still(wall, [3]))
+    offsets = [brightness.prior(t).offset for t in (-50_000, 100_000, 200_000, 225_000, 900_000)]
+    np.testing.assert_allclose(offsets, [0, 0, 0, -b / 2, -b], rtol=1e-5)
+    flipped = frame_brightness(still(wall[::-1], [3])).prior(-25_000).offset
     np.testing.assert_allclose(flipped, -b / 2, rtol=1e-5)
-    wall[3] = 60  # which of the three is unusual is not told
-    assert steady(still(wall, [3])).prior(900_000).offset == 0
+    wall[3] = 60  # which of the three is unusual is not determined
+    assert frame_brightness(still(wall, [3])).prior(900_000).offset == 0
     # The point of a pixel was 3 px farther right in the nearest frame, at s = -1.
     frame, own = np.random.default_rng(2).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
     paths = np.zeros((HEIGHT, WIDTH, 4), np.float32)
@@ -170,9 +174,9 @@ def test_frames_on_one_side_do_not_confirm_each_other():
     video = mc.estimate(
         given, mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4), progress=False
     )
-    told, seen = estimator.compare_images(video.params, video.trajectories(t))
-    assert float(seen.beyond) == 1 and seen.inside_before.max() == 1
-    assert np.asarray(seen.inside_after).max() == 0
+    _, references = estimator.compare_images(video.params, video.trajectories(t))
+    assert float(references.beyond) == 1 and references.inside_before.max() == 1
+    assert np.asarray(references.inside_after).max() == 0
     sources = video.sources(np.array([t]))
     assert sources["visible_after"].max() == 0 and sources["visible_before"].max() > 0.5
-    assert sources["blend"].mean() < 0.5  # what is last seen is no longer there
+    assert sources["blend"].mean() < 0.5  # what is last references is no longer there

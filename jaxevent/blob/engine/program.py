@@ -1,0 +1,469 @@
+"""The functions of one track, traced to expressions and written as a module for numba."""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.blob.engine import loop, smoother_loop
+from jaxevent.blob.engine.loop import ROWS_PER_TRACK, TRACKS, TrackFunctions
+from jaxevent.blob.engine.smoother_loop import ReadoutFunctions
+from jaxevent.blob.filter import EventBatch, Filter
+from jaxevent.blob.lifecycle import TrackEvidence, decide_track, predict_measurement
+from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.track import (
+    StepEvents,
+    TrackBuffer,
+    canonical_ellipse,
+    coast_limits_us,
+    initial_gate,
+    is_static,
+    predict,
+    predict_and_gate,
+    track_params,
+    update_track,
+)
+from jaxevent.codegen.graph import Graph, ParameterProgram, TranslationError, constant_value
+from jaxevent.codegen.module import KernelCache
+from jaxevent.codegen.trace import (
+    ELEMENTS,
+    TracedFunction,
+    TracedProgram,
+    name_leaves,
+    name_numbers,
+    translate_function,
+)
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
+
+MAX_OPERATIONS = 4000  # of a module; beyond, numba compiles longer than XLA's scan takes
+
+FUNCTION = """@cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **OPTIONS)
+def {name}(reals, integers, work, owners, numbers, target, row, size, count):
+    of_reals, of_integers = target * {n_reals}, target * {n_integers}
+{body}
+
+
+"""
+ALONE = """@numba.njit(**LOOP_OPTIONS)
+def alone_0(work, numbers, row, size, count):
+    for i in range(count):
+{body}
+
+
+"""
+ARGUMENTS = ("work", "owners", "row", "size", "count")
+EVENTS = ElementLoop("i", "count", ARGUMENTS)
+TRACKS_OF_EVENT = ElementLoop("k", "count", ARGUMENTS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Columns of a track's numbers in its rows of `reals` and `integers`, by name."""
+
+    reals: dict[str, int]
+    integers: dict[str, int]
+
+    def places(self) -> dict[str, Address]:
+        """Return the places from which the numbers are read."""
+        places = {name: ("reals", "of_reals", at) for name, at in self.reals.items()}
+        return places | {
+            name: ("integers", "of_integers", at) for name, at in self.integers.items()
+        }
+
+    def stores(self) -> dict[str, str]:
+        """Return the texts that write the numbers."""
+        stores = {name: f"reals[of_reals + {at}] = {{}}" for name, at in self.reals.items()}
+        return stores | {
+            name: f"integers[of_integers + {at}] = {{}}" for name, at in self.integers.items()
+        }
+
+    def function(self, name: str, lines: list[str]) -> str:
+        """Return the text of a function with these lines."""
+        return FUNCTION.format(
+            name=name,
+            body="\n".join(lines),
+            n_reals=len(self.reals),
+            n_integers=len(self.integers),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackProgram(TracedProgram):
+    """The traced functions of a filter's track."""
+
+    track: Any  # the shapes of one track
+    single: bool  # whether a step has one event
+    graph: Graph
+
+
+class _TrackSteps(NamedTuple):
+    """Functions of one track to be traced: of parameters and of numbers by name."""
+
+    filter: Filter
+    single: bool
+
+    def init(self, params: Any, track: Any, xi: Any, size: Any) -> dict[str, Any]:
+        state = self.filter.init(track_params(params, track.overrides), xi, size)
+        gate = initial_gate(params, size).astype(xi.dtype)
+        return {"track.state": state, "track.gate": gate}
+
+    def predict(self, params: Any, track: Any, limit: Any, events: Any) -> dict[str, Any]:
+        events = self._aged(events)
+        return {"prediction": predict_and_gate(self.filter, params, track, limit, events)}
+
+    def update(
+        self, params: Any, track: Any, prediction: Any, events: Any, weight: Any
+    ) -> dict[str, Any]:
+        events = self._aged(events)
+        return {"track": update_track(self.filter, params, track, prediction, events, weight)}
+
+    def step(self, params: Any, track: Any, limit: Any, events: Any) -> dict[str, Any]:
+        events = self._aged(events)
+        prediction = predict_and_gate(self.filter, params, track, limit, events)
+        weights = jax.vmap(functools.partial(self.filter.association_weights, params), 1, 1)
+        weight = weights(prediction.inside[None], prediction.log_likelihood[None])[0]
+        return {
+            "track": update_track(self.filter, params, track, prediction, events, weight),
+            "prediction.near": prediction.near,
+            "touched": (weight > 0).any(),
+        }
+
+    def limit(self, params: Any, track: Any) -> dict[str, Any]:
+        return {"limit": coast_limits_us(params, track)}
+
+    def measurement(self, params: Any, track: Any, stop: Any) -> dict[str, Any]:
+        predicted = predict_measurement(self.filter, params, track, stop)
+        long = predicted.size.max()
+        return {"evidence.predicted": predicted, "p": predicted.p, "long": long}
+
+    def decide_track(
+        self, params: Any, frame: Any, track: Any, evidence: Any, stop: Any
+    ) -> dict[str, Any]:
+        return {"decision": decide_track(params, frame, track, evidence, stop)}
+
+    def weights(self, params: Any, inside: Any, log_likelihood: Any) -> dict[str, Any]:
+        return {"weight": self.filter.association_weights(params, inside, log_likelihood)}
+
+    def _aged(self, events: StepEvents) -> StepEvents:
+        """Set a single event's age to 0 for the compiler too, as `track.run_steps` does."""
+        if not self.single:
+            return events
+        batch = events.batch
+        batch = EventBatch(batch.xi, jnp.zeros_like(batch.xi[:, 0]), batch.polarity)
+        return dataclasses.replace(events, batch=batch)
+
+
+class _ReadoutSteps(NamedTuple):
+    """Functions of the readout to be traced."""
+
+    filter: Filter
+
+    def predict(self, params: Any, track: Any, dt: Any, silence: Any) -> dict[str, Any]:
+        own = track_params(params, track.overrides)
+        state = predict(self.filter, own, track.state, dt, is_static(own, silence))
+        x, P = self.filter.readout(own, state)
+        return {"x": x, "P": P}
+
+    def transition(self, params: Any, track: Any, dt: Any, silence: Any) -> dict[str, Any]:
+        if self.filter.transition is None:
+            return {}
+        own = track_params(params, track.overrides)
+        return {"F": self.filter.transition(own, dt, is_static(own, silence))}
+
+    def canonical(self, params: Any, x: Any, P: Any) -> dict[str, Any]:
+        mean, covariance = canonical_ellipse(x, P)
+        return {"mean": mean, "covariance": covariance}
+
+
+class _Shapes(NamedTuple):
+    """Shapes of arrays of one real type."""
+
+    dtype: np.dtype
+
+    def __call__(self, *size: int, kind: Any = None) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(size, self.dtype if kind is None else kind)
+
+
+def _host_program(params: TrackerParams) -> ParameterProgram:
+    host = ParameterProgram()
+    for leaf in jax.tree.leaves(params):
+        host.add_input(np.asarray(leaf))
+    return host
+
+
+def trace_track(
+    filter: Filter,
+    params: TrackerParams,
+    overrides: tuple[str, ...],
+    has_owners: bool,
+    dtype: np.dtype,
+) -> TrackProgram:
+    """Trace the functions of one track.
+
+    Args:
+        filter: Filter of the track.
+        params: Parameters of the tracker.
+        overrides: Names of the parameters that differ between tracks.
+        has_owners: Whether only some tracks may own an event.
+        dtype: Type of real numbers.
+
+    Raises:
+        TranslationError: A function has no translation.
+    """
+    single = params.events_per_step == 1
+    graph, steps, shape = Graph(), _TrackSteps(filter, single), _Shapes(dtype)
+    host = _host_program(params)
+    time, flag = shape(kind=np.int32), shape(kind=bool)
+
+    def make_track(params: Any, own: Any, xi: Any, size: Any, time: Any, flag: Any) -> TrackBuffer:
+        state = filter.init(track_params(params, own), xi, size)
+        return TrackBuffer(state, size, size, time, time, time, time, time, flag, own)
+
+    own = {name: shape() for name in overrides}
+    track = jax.eval_shape(make_track, params, own, shape(2), shape(), time, flag)
+    M = 1 if single else ELEMENTS
+    batch = jax.eval_shape(EventBatch, shape(M, 2), shape(M), shape(M))
+    owner = shape(M, 2, kind=np.int32) if has_owners else None
+    events = jax.eval_shape(StepEvents, time, batch, shape(M, kind=bool), owner)
+    gated = {"track": track, "limit": time, "events": events}
+    at_stop = {"track": track, "stop": time}
+    prediction = jax.eval_shape(steps.predict, params, **gated)["prediction"]
+    predicted = jax.eval_shape(steps.measurement, params, **at_stop)["evidence.predicted"]
+    evidence = jax.eval_shape(TrackEvidence, predicted, flag, flag)
+    update = {"track": track, "events": events, "prediction": prediction, "weight": shape(M)}
+    weights = {"inside": shape(ELEMENTS, kind=bool), "log_likelihood": shape(ELEMENTS)}
+    decide = {**at_stop, "frame": shape(2), "evidence": evidence}
+    functions = {
+        "init": (steps.init, {"track": track, "xi": shape(2), "size": shape()}, True),
+        "step": (steps.step, gated, single),
+        "predict": (steps.predict, gated, single),
+        "weights_alone": (steps.weights, weights, True),
+        "weights": (steps.weights, weights, False),
+        "update": (steps.update, update, single),
+        "limit": (steps.limit, {"track": track}, True),
+        "measurement": (steps.measurement, at_stop, True),
+        "decide": (steps.decide_track, decide, True),
+    }
+    traced = {
+        name: translate_function(function, params, values, graph, host, single=alone)
+        for name, (function, values, alone) in functions.items()
+    }
+    layout = _make_layout({"track": track, "prediction": prediction, "evidence": evidence})
+    return TrackProgram(traced, host, layout, dtype, track, single, graph)
+
+
+def _make_layout(trees: Mapping[str, Any]) -> Layout:
+    """Lay out the loop's own numbers first, then all others of one track."""
+    reals = {name: k for k, name in enumerate(loop.REALS)}
+    integers = {name: k for k, name in enumerate(loop.INTEGERS)}
+    for name, tree in trees.items():
+        for leaf_name, leaf in name_leaves(name, tree).items():
+            if ELEMENTS in leaf.shape:
+                continue
+            columns = reals if leaf.dtype.kind == "f" else integers
+            for number in name_numbers(leaf_name, leaf):
+                columns.setdefault(number, len(columns))
+    return Layout(reals, integers)
+
+
+def _event_texts(single: bool) -> tuple[dict[str, str], dict[str, str]]:
+    """Return texts that read and write the numbers of an event, in the loop over events."""
+    i = "0" if single else "i"
+
+    def of_track(row: int) -> str:
+        return f"work[(row + {row}) * size + {i}]"
+
+    read = {
+        "events.batch.xi.0": f"work[{loop.X} * size + {i}]",
+        "events.batch.xi.1": f"work[{loop.Y} * size + {i}]",
+        "events.batch.age.0": f"work[{loop.AGE} * size + {i}]",
+        "events.batch.polarity.0": f"work[{loop.POLARITY} * size + {i}]",
+        "events.valid.0": f"work[{loop.VALID} * size + {i}] != 0",
+        "events.owner.0": f"owners[{i}]",
+        "events.owner.1": f"owners[size + {i}]",
+        "prediction.inside.0": f"{of_track(loop.INSIDE)} != 0",
+        "prediction.near.0": f"{of_track(loop.NEAR)} != 0",
+        "prediction.log_likelihood.0": of_track(loop.LOG_LIKELIHOOD),
+        "weight.0": of_track(loop.WEIGHT),
+    }
+    truth = " = REAL(1) if {} else REAL(0)"
+    write = {
+        "prediction.inside.0": of_track(loop.INSIDE) + truth,
+        "prediction.near.0": of_track(loop.NEAR) + truth,
+        "prediction.log_likelihood.0": of_track(loop.LOG_LIKELIHOOD) + " = {}",
+    }
+    return read, write
+
+
+def _weight_texts(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
+    """Return texts that read and write the numbers of an event for a track."""
+    read = {
+        "inside.0": f"work[({row} + {loop.INSIDE}) * size + {i}] != 0",
+        "log_likelihood.0": f"work[({row} + {loop.LOG_LIKELIHOOD}) * size + {i}]",
+        "element": "k",
+    }
+    return read, {"weight.0": f"work[({row} + {loop.WEIGHT}) * size + {i}] = {{}}"}
+
+
+def _step_lines(
+    writer: Writer, program: TrackProgram, function: TracedFunction, stores: dict[str, str]
+) -> list[str]:
+    """Write a step of one event, which updates the track or leaves it unchanged.
+
+    Whether it is near the track is stored where `count` is not 0.
+    """
+    truth, cases = function.results["touched.0"], []
+    for line, value in (("if {}:", True), ("else:", False)):
+        case = program.graph.suppose(function.results, truth, value)
+        changed = {k: n for k, n in case.items() if k.startswith("track.") and n.args != (k,)}
+        if value:
+            changed["touched.0"] = program.graph.constant(True)
+        if changed:
+            cases.append((line, changed))
+    cases.append(("if count:", {"prediction.near.0": function.results["prediction.near.0"]}))
+    return writer.branches(truth, cases, stores)
+
+
+def write_track(program: TrackProgram) -> ModuleText:
+    """Write the module of a track's functions."""
+    read, write = _event_texts(program.single)
+    places, stores = program.layout.places() | read, program.layout.stores() | write
+    writer, texts = Writer(program, places), []
+    for name, function in program.functions.items():
+        results = function.results
+        if name == "weights_alone":
+            writer.addresses, to = _weight_texts("row", "i")
+            lines = writer.lines([*results.values()], 8)
+            lines += [f"        {to[k].format(writer.name(n))}" for k, n in results.items()]
+            writer.loops.append(ALONE.format(body="\n".join(lines)))
+            lines = ["    alone_0(work, numbers, row, size, count)"]
+        elif name == "weights":
+            writer.addresses, to = _weight_texts(f"{TRACKS} + {ROWS_PER_TRACK} * k", "row")
+            lines = writer.body(name, function, to, TRACKS_OF_EVENT)
+        elif name == "step" and program.single:
+            writer.addresses = places
+            lines = _step_lines(writer, program, function, stores)
+        else:
+            writer.addresses = places
+            changed = {
+                key: text
+                for key, text in stores.items()
+                if key in results and results[key].args != (key,)
+            }
+            lines = writer.body(name, function, changed, EVENTS)
+        texts.append(program.layout.function(name, lines))
+    return writer.module("Functions of one track (`jaxevent.blob.engine`).", texts, program.layout)
+
+
+def trace_readout(
+    filter: Filter, params: TrackerParams, track: Any, layout: Layout, dtype: np.dtype
+) -> TracedProgram:
+    """Trace the functions of the readout; raises `TranslationError`."""
+    host, graph, steps, shape = (
+        _host_program(params),
+        Graph(),
+        _ReadoutSteps(filter),
+        _Shapes(dtype),
+    )
+    values = {"track": track, "dt": shape(), "silence": shape()}
+    functions = {
+        "predict": (steps.predict, values),
+        "transition": (steps.transition, values),
+        "canonical": (steps.canonical, {"x": shape(8), "P": shape(8, 8)}),
+    }
+    traced = {
+        name: translate_function(function, params, given, graph, host, single=True)
+        for name, (function, given) in functions.items()
+    }
+    return TracedProgram(traced, host, layout, dtype)
+
+
+def write_readout(program: TracedProgram) -> ModuleText:
+    """Write the module of the readout's functions."""
+    m = smoother_loop
+    outputs = {"x": m.X, "P": m.P, "F": m.F, "mean": m.MEAN, "covariance": m.COVARIANCE}
+    work = {"dt.0": ("work", "row", m.DT), "silence.0": ("work", "row", m.SILENCE)}
+    for name, size in (("x", 8), ("P", 64)):
+        work |= {f"{name}.{k}": ("work", "row", outputs[name] + k) for k in range(size)}
+    writer, texts = Writer(program, program.layout.places() | work), []
+    for name, function in program.functions.items():
+        store = {}
+        for key in function.results:
+            what, number = key.split(".")
+            store[key] = f"work[{outputs[what] + int(number)}] = {{}}"
+        texts.append(program.layout.function(name, writer.body(name, function, store)))
+    return writer.module("Readout of a track (`jaxevent.blob.engine`).", texts, program.layout)
+
+
+def find_blocks(program: TracedProgram) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find blocks of the 8 components that neither correlate nor pass into each other.
+
+    Returns:
+        The components in an order, and where blocks of it begin, with 8 at the end.
+    """
+    predict, transition = (program.functions[name].results for name in ("predict", "transition"))
+    tied = np.eye(8, dtype=bool)
+    for i, j in itertools.product(range(8), range(8)):
+        entries = predict[f"P.{8 * i + j}"], transition.get(f"F.{8 * i + j}")
+        tied[i, j] |= any(node is not None and constant_value(node) != 0 for node in entries)
+    tied |= tied.T
+    for k in range(8):
+        tied |= tied[:, k, None] & tied[k]
+    first = np.argmax(tied, axis=1)  # of each one's block
+    order = np.argsort(first, kind="stable")
+    begins = np.flatnonzero(np.diff(first[order], prepend=-1))
+    return order, np.append(begins, 8)
+
+
+_track_kernels = KernelCache(TrackFunctions, write_track, max_nodes=MAX_OPERATIONS)
+_readout_kernels = KernelCache(ReadoutFunctions, write_readout, max_nodes=MAX_OPERATIONS)
+
+
+class TrackCompiler:
+    """Compiled functions of a filter's track, those of the readout on request.
+
+    Args:
+        filter: Filter of the track.
+        params: Parameters of the tracker.
+        overrides: Names of the parameters that differ between tracks.
+        has_owners: Whether only some tracks may own an event.
+        dtype: Type of real numbers.
+
+    Raises:
+        TranslationError: A function has no translation.
+    """
+
+    def __init__(
+        self,
+        filter: Filter,
+        params: TrackerParams,
+        overrides: tuple[str, ...],
+        has_owners: bool,
+        dtype: np.dtype,
+    ):
+        if params.association == "authors":
+            raise TranslationError('association = "authors"')
+        self._filter, self._params, self._dtype = filter, params, dtype
+        leaves, tree = jax.tree.flatten(params)
+        shapes = tuple(np.shape(leaf) for leaf in leaves)
+        self._key = filter, tree, shapes, overrides, has_owners, dtype
+        compiled = _track_kernels.get(
+            self._key, params, lambda: trace_track(filter, params, overrides, has_owners, dtype)
+        )
+        self.functions, self.numbers = compiled.functions, compiled.numbers
+        self.layout, self.track = compiled.places, compiled.program.track
+
+    def readout(self) -> smoother_loop.ReadoutKernel:
+        """Compile the functions of the readout."""
+        filter, params, dtype = self._filter, self._params, self._dtype
+        compiled = _readout_kernels.get(
+            self._key, params, lambda: trace_readout(filter, params, self.track, self.layout, dtype)
+        )
+        blocks, smallest = find_blocks(compiled.program), 4 * float(np.finfo(dtype).eps)
+        return smoother_loop.ReadoutKernel(compiled.functions, compiled.numbers, *blocks, smallest)
