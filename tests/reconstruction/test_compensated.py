@@ -876,7 +876,7 @@ def test_bad_input():
     recording = slide()
     with pytest.raises(InputError, match="holds no frames"):
         mc.estimate(jaxevent.recording.Recording("bare", 48, 40, recording.events, None))
-    with pytest.raises(InputError, match="were asked for"):
+    with pytest.raises(InputError, match="were requested"):
         video()(np.array([-5_000_000]))
     with pytest.raises(InputError, match="no option"):
         mc.estimate(recording, params(), devices=())

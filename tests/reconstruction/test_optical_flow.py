@@ -147,7 +147,7 @@ def test_what_cannot_be_used_is_said(cv2):
         jaxevent.flow.prepare(tiny, [0])
     with pytest.raises(jaxevent.InputError, match="no option 'window_events'"):
         jaxevent.flow.estimate(small(), window_events=3)
-    with pytest.raises(jaxevent.InputError, match="1000000 us were asked for"):
+    with pytest.raises(jaxevent.InputError, match="1000000 us were requested"):
         jaxevent.flow.prepare(small(), [1.0])
     black = dataclasses.replace(
         small(), frames=Frames(STAMPS, np.zeros((4, HEIGHT, WIDTH), np.uint8), 0 * STAMPS)
