@@ -1,9 +1,9 @@
 """Compiled programs are kept in the user's cache folder, for later processes.
 
 Compiling takes seconds, running often less. So `import jaxevent` tells JAX to keep programs that
-took longer than `LEAST` to compile. JAX's own settings win: jax_compilation_cache_dir,
-JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE. JAXEVENT_CACHE=0 leaves all as it is and
-keeps nothing, and JAXEVENT_CACHE=FOLDER names another folder.
+took longer than `MIN_COMPILE_SECONDS` to compile. JAX's own settings win:
+jax_compilation_cache_dir, JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE. JAXEVENT_CACHE=0
+leaves all as it is and keeps nothing, and JAXEVENT_CACHE=FOLDER names another folder.
 
 Machine code that is loaded runs with the user's rights. So the folder is the user's alone: it is
 made with mode 0700, and not used where another user owns it or may write to it. Files of kernels,
@@ -22,11 +22,11 @@ import tempfile
 import warnings
 from pathlib import Path
 
-LEAST = 0.3  # s; shorter compilations are not worth a file
+MIN_COMPILE_SECONDS = 0.3  # s; shorter compilations are not worth a file
 
 # Of Linux's limit of 65,530, at which LLVM aborts the process. The programs that a method needs
 # for a recording of another shape have 500 (smoother) to 900 (mc).
-MAPS = 30_000
+MAX_MEMORY_MAPS = 30_000
 
 KEY_BYTES = 32
 _OPEN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # which not every system has
@@ -48,7 +48,7 @@ def keep_compiled() -> Path | None:
     if folder is None or theirs:
         return None
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(MIN_COMPILE_SECONDS))
     if jax:
         least = float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
         jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -129,7 +129,7 @@ def _make_key(path: Path) -> None:
             os.unlink(name)
 
 
-def release_compiled(maps: int = MAPS) -> bool:
+def release_compiled(maps: int = MAX_MEMORY_MAPS) -> bool:
     """Forget all compiled programs if the process has more than so many memory maps.
 
     Each program keeps several maps. What is needed again is read from the cache folder. Returns

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.parameters import LARGEST, Number, Parameters, Positive, UnitInterval
 from jaxevent.tuning import (
-    FORWARD,
+    MAX_FORWARD_NUMBERS,
     Batches,
     Interval,
     Loss,
@@ -47,18 +47,18 @@ from jaxevent.tuning import (
     map_batches,
 )
 
-LEVEL = 0.95
-STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
-WIDE = 2.0  # half widths in logarithms from which the curvature at one place does not tell them
-FIRST, DOUBLINGS, HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
-AWAY = math.log(10.0)  # how far a number has run that ran away
-NEAR = 0.25  # of a bound, in the same measure
+CONFIDENCE = 0.95
+DIFFERENCE_STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
+MAX_TRUSTED_WIDTH = 2.0  # half widths in logarithms beyond which the curvature is not trusted
+FIRST_SEARCH_STEP, MAX_DOUBLINGS, N_HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
+RUNAWAY_DISTANCE = math.log(10.0)  # distance from the start of a number that ran away
+BOUND_TOLERANCE = 0.25  # of a bound, in the same measure
 
-AT_BOUND = "ran to its bound {:g}"
-AT_END = "ran to the end of its search, {:g}"
-RAN_AWAY = "ran away: the loss does not hold it"
-UNKNOWN = "these data do not tell it"
-UNSETTLED = "had not come to rest"
+REACHED_BOUND = "ran to its bound {:g}"
+REACHED_SEARCH_END = "ran to the end of its search, {:g}"
+RAN_AWAY = "ran away: the loss does not bound it"
+UNDETERMINED = "these data do not determine it"
+NOT_CONVERGED = "had not converged"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,7 +193,7 @@ class _Sample:
         leaves = {name: np.asarray(found.raw[name], np.float64) for name in names}
         self.places = [(name, index) for name in names for index in np.ndindex(leaves[name].shape)]
         self.at = np.array([leaves[name][index] for name, index in self.places])
-        self.forward = len(self.at) <= FORWARD if forward is None else forward
+        self.forward = len(self.at) <= MAX_FORWARD_NUMBERS if forward is None else forward
         self.likelihood = bool(getattr(loss, "likelihood", False))
         self.values, self.weights = self.losses(found)
         self.measurements = float(self.weights.sum())
@@ -213,7 +213,7 @@ class _Sample:
     @property
     def quantile(self) -> float:
         """Half width of the interval in standard deviations."""
-        tail = 0.5 + LEVEL / 2
+        tail = 0.5 + CONFIDENCE / 2
         degrees = self.count - max(len(self.at), 1)
         return float(
             scipy.special.stdtrit(degrees, tail) if self.robust else scipy.special.ndtri(tail)
@@ -309,8 +309,8 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
     widths, newton = _widths(sample, scales) if len(numbers) else (scales, scales)
     findings = []
     for k, ((name, index), number) in enumerate(zip(sample.places, numbers, strict=True)):
-        settled = abs(newton[k]) <= max(widths[k], STEP)
-        trusted = widths[k] < WIDE and settled
+        settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_STEP)
+        trusted = widths[k] < MAX_TRUSTED_WIDTH and settled
         if trusted:
             ends = [-widths[k], widths[k]]
         else:
@@ -319,7 +319,7 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
-            remark = UNSETTLED
+            remark = NOT_CONVERGED
         label = name if not index else f"{name}[{index[0] + 1}]"
         began, value = (_physical(number, raw) for raw in (begun[k], sample.at[k]))
         low, high = (None if raw is None else _physical(number, raw) for raw in (low, high))
@@ -338,9 +338,9 @@ def _widths(
     rows = []
     for k in range(p):
         step = np.zeros(p)
-        step[k] = STEP * scales[k]
+        step[k] = DIFFERENCE_STEP * scales[k]
         rows.append(sample.mean_slope(sample.at + step) - sample.mean_slope(sample.at - step))
-    H = np.array(rows) * scales / (2 * STEP)
+    H = np.array(rows) * scales / (2 * DIFFERENCE_STEP)
     H = (H + H.T) / 2
     widths, newton = np.full(p, np.inf), np.full(p, np.inf)
     kept = [k for k in range(p) if np.isfinite(H[k]).all()]
@@ -386,8 +386,8 @@ def _find_interval_end(
 
     None if not found, NaN if undetermined.
     """
-    inside, step = 0.0, FIRST
-    for _ in range(DOUBLINGS + 1):
+    inside, step = 0.0, FIRST_SEARCH_STEP
+    for _ in range(MAX_DOUBLINGS + 1):
         values = objective(sign * step)
         if values is None:
             return None
@@ -399,7 +399,7 @@ def _find_interval_end(
         inside, step = step, 2 * step
     else:
         return None
-    for _ in range(HALVINGS):
+    for _ in range(N_HALVINGS):
         middle = (inside + step) / 2
         values = objective(sign * middle)
         if values is None or sample.rises(values):
@@ -418,14 +418,14 @@ def _remark(
         if abs(bound) >= LARGEST or (bound == 0 and isinstance(number, Positive)):
             continue
         away = (float(number.unconstrained(jnp.asarray(bound))) - sample.at[k]) / scale
-        if abs(away) < NEAR:
+        if abs(away) < BOUND_TOLERANCE:
             values = _losses_at_step(sample, k, scale, away * (1 - 1e-3))
             if values is not None and sample.shares @ (values - sample.values) <= 0:
-                return AT_BOUND.format(bound)
+                return REACHED_BOUND.format(bound)
     low, high = ends
-    if abs(moved) > AWAY and (high if moved > 0 else low) is None:
+    if abs(moved) > RUNAWAY_DISTANCE and (high if moved > 0 else low) is None:
         return RAN_AWAY
-    return UNKNOWN if low is None and high is None else ""
+    return UNDETERMINED if low is None and high is None else ""
 
 
 def _interval_of_searched(
@@ -455,9 +455,9 @@ def _interval_of_searched(
     remark = ""
     for bound in (low, high):
         if abs(value - bound) < 1e-3 * scale:
-            remark = AT_END.format(bound)
+            remark = REACHED_SEARCH_END.format(bound)
     if not remark and ends == [None, None]:
-        remark = UNKNOWN
+        remark = UNDETERMINED
     began = float(getattr(start, name))
     return ParameterInterval(name, number.unit, began, value, below, above, remark)
 

@@ -44,7 +44,7 @@ from jaxevent.dispatch import check_platform
 from jaxevent.errors import InputError
 
 AXIS = "devices"
-START = 300  # s that processes wait for each other at the start
+JOIN_TIMEOUT_S = 300  # s that processes wait for each other at the start
 
 Q = ParamSpec("Q")
 T = TypeVar("T")
@@ -194,7 +194,7 @@ def join(
     try:
         # By default the coordinator would listen on all interfaces.
         jax.distributed.initialize(
-            *given, initialization_timeout=START, coordinator_bind_address=coordinator
+            *given, initialization_timeout=JOIN_TIMEOUT_S, coordinator_bind_address=coordinator
         )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]

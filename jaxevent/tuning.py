@@ -34,7 +34,7 @@ P = TypeVar("P", bound=Parameters)
 # the AKF on slider_depth (1.08 M events, 22 images, 2 cores): the loss alone 67 ms; forwards 135 ms
 # for 1 number, 181 ms for 2; in reverse 213 ms for any. Forwards over reverse, both in turn: 0.60
 # for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
-FORWARD = 2
+MAX_FORWARD_NUMBERS = 2
 
 Loss = Callable[[Any, Any], Array]
 Batches = tuple[Sequence[Any], Sequence[Any]]
@@ -544,7 +544,9 @@ class _Loop:
         self.prepare = prepare
         self.intervals, self.run, self.save = intervals, run, save
         numbers = sum(leaf[0].size for leaf in run.position.raw.values())
-        self.forward = numbers <= FORWARD if settings.forward is None else settings.forward
+        self.forward = (
+            numbers <= MAX_FORWARD_NUMBERS if settings.forward is None else settings.forward
+        )
 
     def leader(self) -> Any:
         """The parameters of the best start."""

@@ -137,7 +137,7 @@ def test_what_ran_away_and_what_does_nothing_is_told():
     told = confidence_intervals(loss, start, fitted.params, names, EACH[:20])
     assert told["gain"].remark == confidence.RAN_AWAY and told["gain"].high is None
     assert told["gain"].interval.startswith("above") and told["gain"].value > 10
-    assert told["idle"].remark == confidence.UNKNOWN and told["idle"].interval == "any"
+    assert told["idle"].remark == confidence.UNDETERMINED and told["idle"].interval == "any"
     assert not told["mean"].remark and told["mean"].holds(2.0)
 
 
@@ -147,18 +147,18 @@ def test_what_ran_to_its_bound_is_told():
 
     fitted = optimise(loss, Toy(), ["capped"], EACH[:8], settings=STEPS)
     (one,) = confidence_intervals(loss, Toy(), fitted.params, ["capped"], EACH[:8]).intervals
-    assert 0.7 < one.value <= 0.8 and one.remark == confidence.AT_BOUND.format(0.8)
+    assert 0.7 < one.value <= 0.8 and one.remark == confidence.REACHED_BOUND.format(0.8)
 
 
 def test_a_number_that_stopped_on_its_way_is_told():
     settings = Settings(iterations=3, learning_rate=0.1, rounds=1)
     fitted = optimise(square, Toy(), ["mean"], EACH, settings=settings)
     one = confidence_intervals(square, Toy(), fitted.params, ["mean"], EACH)["mean"]
-    assert one.remark == confidence.UNSETTLED and one.value < 1
+    assert one.remark == confidence.NOT_CONVERGED and one.value < 1
 
 
 @pytest.mark.parametrize(
-    "to, found, remark", [(1.0, 0.37, ""), (0.3, 0.3, confidence.AT_END.format(0.3))]
+    "to, found, remark", [(1.0, 0.37, ""), (0.3, 0.3, confidence.REACHED_SEARCH_END.format(0.3))]
 )
 def test_a_searched_number(to, found, remark):
     """The loss is prepared anew for every value: least at the mean of numbers around 0.37."""

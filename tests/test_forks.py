@@ -47,7 +47,7 @@ def test_images(name):
 
 
 def test_rows_are_divided_among_new_threads(monkeypatch):
-    monkeypatch.setattr(codegen, "THREADS", 2)
+    monkeypatch.setattr(codegen, "N_THREADS", 2)
 
     def numbered(begin, end, out):
         out[begin:end] = np.arange(begin, end)

@@ -6,7 +6,7 @@ from typing import Any
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
 
-OWN = Path("jaxevent-demo")
+DEFAULT_FOLDER = Path("jaxevent-demo")
 
 
 def add(commands: Any) -> None:
@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
         "--out",
         shared=True,
         metavar="DIR",
-        default=OWN,
+        default=DEFAULT_FOLDER,
         help="default: %(default)s, whose files are replaced without --force",
     )
 
@@ -31,4 +31,4 @@ def add(commands: Any) -> None:
 def run(out: Path, force: bool) -> None:
     from jaxevent.runs.demo import demo
 
-    demo(out, progress=show_progress(), replace=force or out == OWN)
+    demo(out, progress=show_progress(), replace=force or out == DEFAULT_FOLDER)

@@ -82,16 +82,16 @@ def add(commands: Any) -> None:
     arguments.add_reading(one)
 
 
-_MC = 5e-6  # s of a core that `mc` takes for a pixel of an image: 0.2 for 240x180
-_PATIENCE = 600.0  # s
+_MC_SECONDS_PER_PIXEL = 5e-6  # s of a core that `mc` takes for a pixel of an image: 0.2 for 240x180
+_MAX_MC_SECONDS = 600.0  # s
 
 
 def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
     """The method where none is named, for images of so many pixels in all; says why it is that."""
-    seconds = _MC * pixels
+    seconds = _MC_SECONDS_PER_PIXEL * pixels
     if not has_frames:
         method, why = "high-pass", f"there are no frames{missing}, so images show changes alone"
-    elif seconds > _PATIENCE:
+    elif seconds > _MAX_MC_SECONDS:
         method, why = "aks", f"mc, the best, would take {seconds / 60:.0f} minutes of a core"
     else:
         method, why = "mc", "the best where there are frames"

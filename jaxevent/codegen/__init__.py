@@ -18,21 +18,24 @@ from jaxevent.codegen import cache, support
 
 # numba makes two functions more of each. The one for those that call it by its address is left out;
 # without the one for Python a call from there would end the process.
-_USUAL: dict[str, Any] = {"nogil": True}
+_COMMON_OPTIONS: dict[str, Any] = {"nogil": True}
 # Counting references to arrays is two thirds of a function that takes many of them.
-_LEAN: dict[str, Any] = {}
+_NOALLOC_OPTIONS: dict[str, Any] = {}
 if support.HAS_INTERNALS:
     from jaxevent.codegen.internals import njit_linked
 
-    _USUAL |= {"no_cfunc_wrapper": True}
-    _LEAN |= {"_nrt": False}
+    _COMMON_OPTIONS |= {"no_cfunc_wrapper": True}
+    _NOALLOC_OPTIONS |= {"_nrt": False}
 # Sums in any order, so that several are taken at once.
-_LOOSE: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
+_FASTMATH_OPTIONS: dict[str, Any] = {
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz"},
+}
 
 
 def njit(function: Callable) -> Any:
     """Compile a function with numba, without the checks of arguments that tests add."""
-    return cache.njit_cached(inspect.unwrap(function), **_USUAL)
+    return cache.njit_cached(inspect.unwrap(function), **_COMMON_OPTIONS)
 
 
 def njit_inlined(function: Callable) -> Any:
@@ -40,27 +43,29 @@ def njit_inlined(function: Callable) -> Any:
 
     It has no cache entry of its own: its machine code is stored with each caller.
     """
-    return _inside(function, error_model="numpy", **_USUAL)
+    return _inside(function, error_model="numpy", **_COMMON_OPTIONS)
 
 
 def njit_noalloc(function: Callable) -> Any:
     """Compile a function that makes no arrays of its own, in less time than `njit`."""
-    return cache.njit_cached(inspect.unwrap(function), **_USUAL, **_LEAN)
+    return cache.njit_cached(inspect.unwrap(function), **_COMMON_OPTIONS, **_NOALLOC_OPTIONS)
 
 
 def njit_noalloc_inlined(function: Callable) -> Any:
     """Compile a function that only `njit_noalloc` ones call; Python cannot call it."""
-    return _lean_inside(function, error_model="numpy", nogil=True, **_LEAN)
+    return _lean_inside(function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS)
 
 
 def njit_fastmath(function: Callable) -> Any:
     """Compile a function as `njit_noalloc` does, with sums in the fastest order."""
-    return cache.njit_cached(inspect.unwrap(function), **_USUAL, **_LEAN, **_LOOSE)
+    return cache.njit_cached(
+        inspect.unwrap(function), **_COMMON_OPTIONS, **_NOALLOC_OPTIONS, **_FASTMATH_OPTIONS
+    )
 
 
 def njit_fastmath_inlined(function: Callable) -> Any:
     """Compile a function that only `njit_fastmath` ones call; Python cannot call it."""
-    return _lean_inside(function, nogil=True, **_LEAN, **_LOOSE)
+    return _lean_inside(function, nogil=True, **_NOALLOC_OPTIONS, **_FASTMATH_OPTIONS)
 
 
 def _inside(function: Callable, **options: Any) -> Any:
@@ -95,7 +100,9 @@ class ZeroedScratch:
         return known[shape]
 
 
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+N_THREADS = (
+    len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+)
 
 
 def row_scratch(rows: int, *shape: int) -> NDArray[np.float32]:
@@ -108,7 +115,7 @@ def row_scratch(rows: int, *shape: int) -> NDArray[np.float32]:
 
 @functools.cache
 def _workers() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(THREADS)
+    return ThreadPoolExecutor(N_THREADS)
 
 
 def run_over_rows(kernel: Callable, rows: int, *args: Any) -> None:
@@ -116,7 +123,7 @@ def run_over_rows(kernel: Callable, rows: int, *args: Any) -> None:
 
     Kernels release the interpreter's lock. What they compute must not depend on the parts.
     """
-    parts = min(THREADS, rows)
+    parts = min(N_THREADS, rows)
     if parts <= 1:
         kernel(0, rows, *args)
         return

@@ -38,14 +38,16 @@ from jaxevent.io.checks import ReadOptions
 FEWEST_EVENTS = 300
 SAMPLE = 1 << 16  # events from which order, unit and signs are inferred
 _FEWEST_REPETITIONS = 100  # intervals between events of one pixel
-_BURST = 0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
-_DOUBT = 2.7  # nats by which an undoubted unit exceeds the next
-_SUPERIORITY = 1.0  # nats by which a unit must exceed the usual one
-_CONTRADICTION = 8.0  # nats by which another unit must exceed a stated one for a warning
+_BURST_FRACTION = (
+    0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
+)
+_CERTAIN_NATS = 2.7  # nats by which an undoubted unit exceeds the next
+_WINNING_NATS = 1.0  # nats by which a unit must exceed the usual one
+_CONTRADICTION_NATS = 8.0  # nats by which another unit must exceed a stated one for a warning
 _LONGEST_US = 1e12  # of a recording with times that have decimals: 11.6 days
-_GAP = 1000.0  # times the sum of all other steps that a gap lasts
+_GAP_RATIO = 1000.0  # times the sum of all other steps that a gap lasts
 _INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
-_LITTLE, _MUCH = 0.02, 0.5  # intersection over union of the spans of two clocks
+_MIN_OVERLAP, _CLEAR_OVERLAP = 0.02, 0.5  # intersection over union of the spans of two clocks
 
 _SPELLED = {
     "s": r"s|secs?|seconds?",
@@ -64,10 +66,15 @@ _NAMED = {
     for unit, words in _SPELLED.items()
 }
 # Log-probabilities of a unit before any number but the kind is known.
-_WHOLE = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
-_DECIMAL = {"s": 0.0, "ms": -3.5, "us": -4.0, "ns": -8.0}
-_ROUNDED = {"s": 0.0, "us": -0.5, "ms": -3.0, "ns": -3.0}  # whole, since their type is coarse
-_UNUSUAL = -4.0  # of units other than the usual one of a layout
+_WHOLE_NUMBER_NATS = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
+_DECIMAL_NUMBER_NATS = {"s": 0.0, "ms": -3.5, "us": -4.0, "ns": -8.0}
+_ROUNDED_NUMBER_NATS = {
+    "s": 0.0,
+    "us": -0.5,
+    "ms": -3.0,
+    "ns": -3.0,
+}  # whole, since their type is coarse
+_UNUSUAL_UNIT_NATS = -4.0  # of units other than the usual one of a layout
 
 
 class InferredUnit(NamedTuple):
@@ -167,7 +174,7 @@ def infer_unit(
     elif stated is not None:
         unit = stated[0]
         notes.append(f"event times are {UNITS[unit]}, by {stated[1]}")
-        if known and scores[best] > scores[unit] + _CONTRADICTION:
+        if known and scores[best] > scores[unit] + _CONTRADICTION_NATS:
             doubt = (
                 f"{source}: event times are {UNITS[unit]} by {stated[1]}, but "
                 f"{numbers.describe(unit)}; as {UNITS[best]} {numbers.describe(best)}: if the "
@@ -184,9 +191,9 @@ def infer_unit(
             notes.append(f"event times are taken as {UNITS[unit]}, by their magnitude")
             doubt = _doubt(source, numbers, unit, expected)
     else:
-        unit = best if scores[best] > scores[expected] + _SUPERIORITY else expected
+        unit = best if scores[best] > scores[expected] + _WINNING_NATS else expected
         after = max((u for u in scores if u != unit), key=lambda u: scores[u])
-        is_doubtful = scores[unit] < scores[after] + _DOUBT
+        is_doubtful = scores[unit] < scores[after] + _CERTAIN_NATS
         if unit != expected or is_doubtful:
             notes.append(f"event times are taken as {UNITS[unit]}, since {numbers.describe(unit)}")
             doubt = _doubt(source, numbers, unit, expected if unit != expected else after)
@@ -247,14 +254,14 @@ class _Numbers(NamedTuple):
         # step that exceeds all others by far is a gap or a damaged time.
         span = float(steps[steps > 0].sum())
         longest = float(steps[: count - 1 if count <= len(t) else -1].max(initial=0.0))
-        span -= longest if longest > _GAP * (span - longest) else 0.0
+        span -= longest if longest > _GAP_RATIO * (span - longest) else 0.0
         if len(steps) and steps[-1] < 0 and count > len(t):
             span *= count / len(t)
         largest = float(np.abs(t).max())
         repetition = _repetition(stored, sample["x"][kept], sample["y"][kept])
         if repetition is not None:
             held = float(steps[: SAMPLE - 1][steps[: SAMPLE - 1] > 0].sum())
-            if repetition > _BURST * min(span * pixels / count, held):
+            if repetition > _BURST_FRACTION * min(span * pixels / count, held):
                 repetition = None
         return cls(
             count,
@@ -299,12 +306,14 @@ class _Numbers(NamedTuple):
 
     def _prior(self, unit: str, usual: str | None) -> float:
         if self.rounding >= 1:
-            return _ROUNDED[unit] + (_UNUSUAL if usual not in (None, unit) else 0.0)
+            return _ROUNDED_NUMBER_NATS[unit] + (
+                _UNUSUAL_UNIT_NATS if usual not in (None, unit) else 0.0
+            )
         if usual is None:
-            return _DECIMAL[unit] if self.has_decimals else _WHOLE[unit]
+            return _DECIMAL_NUMBER_NATS[unit] if self.has_decimals else _WHOLE_NUMBER_NATS[unit]
         if unit == "s" and not self.has_decimals:
-            return _WHOLE["s"]  # no recording has its events at whole seconds
-        return 0.0 if unit == usual else _UNUSUAL
+            return _WHOLE_NUMBER_NATS["s"]  # no recording has its events at whole seconds
+        return 0.0 if unit == usual else _UNUSUAL_UNIT_NATS
 
     def _of_resolution(self, unit: str) -> float:
         """Return the log-likelihood of the decimal places."""
@@ -436,8 +445,10 @@ class Clock(NamedTuple):
             return in_usual
         others = {other: self._overlap(values, other) for other in SCALES if other != unit}
         # The unit of the events first, where several would do.
-        best = max(others, key=lambda u: (others[u] > _MUCH / 2, u == self.unit, others[u]))
-        if others[best] <= _MUCH / 2 or not self._has_plausible_intervals(values, best):
+        best = max(
+            others, key=lambda u: (others[u] > _CLEAR_OVERLAP / 2, u == self.unit, others[u])
+        )
+        if others[best] <= _CLEAR_OVERLAP / 2 or not self._has_plausible_intervals(values, best):
             return in_usual
         note = f"{what} times are taken as {UNITS[best]}, on the clock of the events"
         is_new = note not in notes
@@ -456,7 +467,7 @@ class Clock(NamedTuple):
         if last < self.first or first > self.last:
             return False
         inside = first >= self.first and last <= self.last
-        return not inside or self._overlap(values, unit) > _LITTLE
+        return not inside or self._overlap(values, unit) > _MIN_OVERLAP
 
     def _overlap(self, values: NDArray, unit: str) -> float:
         """Return the intersection of the spans over their union."""

@@ -7,13 +7,15 @@ import numpy as np
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.recording import Recording
 
-INTERVALS = 4  # between frames, evenly spread over the recording, in which both are compared
+N_COMPARED_INTERVALS = (
+    4  # between frames, evenly spread over the recording, in which both are compared
+)
 NET_EVENTS = 2  # least size of ON minus OFF events of a pixel that is compared
 GREY_MARGIN = 0.02  # of the range at either end, within which a frame may be clipped
 MIN_PIXELS = 100  # fewer do not determine the ratio
 MIN_AGREEMENT = 0.8  # of signs; below, events and frames differ by more than a scale
 MAX_FACTOR = 2.0  # the ratio may be off by; real recordings at the defaults are within 0.6 to 0.8
-SIGMAS = 6.0  # of independent pixels; about 3 where neighbours err alike
+CONTRADICTION_SIGMAS = 6.0  # of independent pixels; about 3 where neighbours err alike
 
 
 class ChangeRatio(NamedTuple):
@@ -56,7 +58,9 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
     t, gain = frames.t + round(offset * 1e6), recording.gain
     response = FrameImages(recording, np.dtype(np.float32)).response()
     parts = []
-    for first in np.unique(np.linspace(0, len(t) - 2, INTERVALS).round().astype(int)).tolist():
+    for first in np.unique(
+        np.linspace(0, len(t) - 2, N_COMPARED_INTERVALS).round().astype(int)
+    ).tolist():
         begin, end = (recording.events.index(int(one)) for one in t[first : first + 2])
         events = recording.events[begin:end]
         place = events.y.astype(np.int64) * recording.width + events.x
@@ -95,8 +99,8 @@ def events_contradict_frames(recording: Recording, params: Any) -> str | None:
     found = change_ratio(recording, params)
     if found is None or found.agreement < MIN_AGREEMENT:
         return None
-    less = found.ratio + SIGMAS * found.sigma < 1 / MAX_FACTOR
-    more = found.ratio - SIGMAS * found.sigma > MAX_FACTOR
+    less = found.ratio + CONTRADICTION_SIGMAS * found.sigma < 1 / MAX_FACTOR
+    more = found.ratio - CONTRADICTION_SIGMAS * found.sigma > MAX_FACTOR
     if not (less or more):
         return None
     c_on, c_off, I0 = (f"{float(v):.3g}" for v in (params.c_on, params.c_off, params.I0))

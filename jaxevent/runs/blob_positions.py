@@ -42,14 +42,23 @@ SETTINGS: Mapping[str, Check] = {
 }
 
 
-MORE = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "range")  # columns beside x, y
+OPTIONAL_COLUMNS = (
+    "vx",
+    "vy",
+    "lambda1",
+    "lambda2",
+    "theta",
+    "inverse_ttc",
+    "range",
+)  # columns beside x, y
 
 
 @dataclasses.dataclass(frozen=True)
 class KnownPositions:
     """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where unknown.
 
-    `more` are further columns, of `MORE`, (T, targets) each, and `id` the targets' numbers.
+    `more` are further columns, of `OPTIONAL_COLUMNS`, (T, targets) each, and `id` the targets'
+    numbers.
     """
 
     t: NDArray[np.int64]
@@ -93,7 +102,7 @@ def positions_of(
     missing = [name for name in ("t", "x", "y") if name not in table.columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]!r}; give the columns t (s), x, y (px)")
-    more = [name for name in MORE if name in table.columns]
+    more = [name for name in OPTIONAL_COLUMNS if name in table.columns]
     for name in ("t", "x", "y", *(["id"] if "id" in table.columns else []), *more):
         numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), np.float64)
         good = np.isfinite(numbers)

@@ -57,8 +57,8 @@ MEASURES = (
     "rmse", "median", "covered", "tracks", "missed", "false", "switches", "mota", "idf1", "hota",
     "velocity", "size", "theta", "inverse_ttc", "range",
 )  # fmt: skip
-BEGINS = ("positions", "found", "born")
-REACH = 10.0  # px
+BEGINNINGS = ("positions", "found", "born")
+MATCH_DISTANCE_PX = 10.0  # px
 
 
 def _above_0(value: Any) -> bool:
@@ -77,7 +77,7 @@ class TrackProtocol(Protocol):
 
     settings: Mapping[str, Check] = {
         **SETTINGS,
-        "begin": (lambda value: value in BEGINS, '"positions", "found" or "born"'),
+        "begin": (lambda value: value in BEGINNINGS, '"positions", "found" or "born"'),
         "smooth": (lambda value: type(value) is bool, "true or false"),
         "metrics": METRICS,
         "pairs": (_are_pairs, "a list of [id, id], two targets each"),
@@ -131,7 +131,7 @@ class TrackProtocol(Protocol):
             mean, covariance = _states(tracks, known.t)
             noise = float(tracks.params.Q_lambda)
         seconds = time.perf_counter() - clock
-        told = score_tracks(known.xi, mean[..., :2], options.get("reach", REACH))
+        told = score_tracks(known.xi, mean[..., :2], options.get("reach", MATCH_DISTANCE_PX))
         own = told.match
         if begin == "positions" and not isinstance(
             method, MethodFunction

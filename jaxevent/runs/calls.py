@@ -23,7 +23,7 @@ from jaxevent.runs.own import Metric, find_method, import_path, named_metric
 
 PathLike = str | os.PathLike
 OF_TRUTH = ("positions", "truth")  # settings that take tables
-CALLED = "# As called from Python; of objects only the names are told.\n"
+CALL_HEADER = "# As called from Python; of objects only the names are told.\n"
 
 
 class Forms(NamedTuple):

@@ -131,8 +131,8 @@ class FileHashes:
                 partial.write_text(json.dumps(known))
 
 
-ROWS = 1 << 20  # events that are hashed at once
-IMAGES = 64  # images that are hashed at once
+HASHED_EVENTS = 1 << 20  # events that are hashed at once
+HASHED_IMAGES = 64  # images that are hashed at once
 
 
 def digest(thing: Any) -> str:
@@ -162,8 +162,8 @@ def _feed(thing: Any, update: Callable[[Any], None]) -> None:
         _feed({str(name): thing[name].to_numpy() for name in thing.columns}, update)
     elif isinstance(thing, EventSource):
         begin("events", len(thing))
-        for first in range(0, len(thing), ROWS):
-            part = thing[first : first + ROWS]
+        for first in range(0, len(thing), HASHED_EVENTS):
+            part = thing[first : first + HASHED_EVENTS]
             for column in (part.t, part.x, part.y, part.p):
                 update(np.ascontiguousarray(column).data)
     elif isinstance(thing, type):
@@ -187,7 +187,7 @@ def _feed(thing: Any, update: Callable[[Any], None]) -> None:
         if len(thing.shape) == 0 or np.dtype(thing.dtype).kind == "O":
             _feed(np.asarray(thing).tolist(), update)
             return
-        rows = ROWS if len(thing.shape) == 1 else IMAGES
+        rows = HASHED_EVENTS if len(thing.shape) == 1 else HASHED_IMAGES
         for first in range(0, thing.shape[0], rows):
             update(np.ascontiguousarray(thing[first : first + rows]).tobytes())
     else:

@@ -76,7 +76,7 @@ from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs.calls import (
-    CALLED,
+    CALL_HEADER,
     Forms,
     PathLike,
     format_setting,
@@ -203,10 +203,10 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
 
 
 # Arguments of both forms that say where rows are computed, and what may be replaced.
-WHERE = ("workers", "cluster", "scheduler_file", "retries", "replace")
+RESOURCE_ARGUMENTS = ("workers", "cluster", "scheduler_file", "retries", "replace")
 FORMS = Forms(
     'jaxevent.evaluate(recording, ["akf"])',
-    ("config", "out", "progress", "metrics", *WHERE),
+    ("config", "out", "progress", "metrics", *RESOURCE_ARGUMENTS),
     ("recordings", "methods", "protocol"),
 )
 
@@ -240,14 +240,14 @@ def _evaluate_objects(
 ) -> Evaluation:
     if methods is None:
         raise InputError(f"no method is given; give a recording and methods, as {FORMS.example}")
-    where = {name: settings.pop(name) for name in WHERE if name in settings}
+    where = {name: settings.pop(name) for name in RESOURCE_ARGUMENTS if name in settings}
     table = settings_of({**settings, "protocol": protocol})
     table |= {"recordings": recordings_of(recordings), "method": methods_of(methods)}
     further = metrics_of(metrics)
     if further:
         table["metrics"] = further
     plan = plan_of(table, Path())
-    text = CALLED + toml.dump(to_toml_table(table))
+    text = CALL_HEADER + toml.dump(to_toml_table(table))
     return _evaluate(
         plan,
         Origin("evaluation", text.encode(), plan.inputs()),

@@ -38,9 +38,11 @@ from jaxevent.runs.family import Source
 
 Normalise = Literal["none", "affine"]
 
-HUBER = 0.1  # intensity; larger errors count linearly
-HOT = 3  # pixels so many times the image's 5-95 % range off its median are not fitted to
-SAMPLE = 1 << 13  # pixels that the brightness is fitted to, at most
+HUBER_INTENSITY = 0.1  # intensity; larger errors count linearly
+HOT_PIXEL_RANGES = (
+    3  # pixels so many times the image's 5-95 % range off its median are not fitted to
+)
+MAX_FITTED_PIXELS = 1 << 13  # pixels that the brightness is fitted to, at most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,8 +144,8 @@ def check_normalise(how: Any) -> None:
 def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
     """Fit a * image + b, a >= 0, to the truth by Huber's loss.
 
-    Hot pixels and pixels that are not finite are left out, and at most `SAMPLE` others are used,
-    evenly spread.
+    Hot pixels and pixels that are not finite are left out, and at most `MAX_FITTED_PIXELS` others
+    are used, evenly spread.
 
     Args:
         image: Image, (height, width).
@@ -157,9 +159,11 @@ def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
     image = np.asarray(image, np.float64)
     usable = np.isfinite(image) & np.isfinite(truth)
     given, wanted = image[usable], np.asarray(truth, np.float64)[usable]
-    if len(given) > SAMPLE:
+    if len(given) > MAX_FITTED_PIXELS:
         # Multiples of the golden ratio are evenly spread, and not in columns of the image.
-        chosen = (np.arange(SAMPLE) * ((math.sqrt(5) - 1) / 2) % 1 * len(given)).astype(int)
+        chosen = (np.arange(MAX_FITTED_PIXELS) * ((math.sqrt(5) - 1) / 2) % 1 * len(given)).astype(
+            int
+        )
         given, wanted = given[chosen], wanted[chosen]
     if not len(given):
         return image
@@ -167,7 +171,7 @@ def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
     low, middle, high = np.percentile(given, [5, 50, 95])
     scale = float(high - low) or 1.0
     x = (given - middle) / scale
-    x, wanted = x[np.abs(x) < HOT], wanted[np.abs(x) < HOT]
+    x, wanted = x[np.abs(x) < HOT_PIXEL_RANGES], wanted[np.abs(x) < HOT_PIXEL_RANGES]
     spread = max(float(np.ptp(np.percentile(wanted, [5, 95]))), 1e-6)
     found = least_squares(
         lambda ab: ab[0] * x + ab[1] - wanted,
@@ -175,7 +179,7 @@ def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
         jac=lambda ab: np.stack([x, np.ones_like(x)], axis=1),
         bounds=([0, -np.inf], [np.inf, np.inf]),
         loss="huber",
-        f_scale=HUBER,
+        f_scale=HUBER_INTENSITY,
         xtol=1e-10,
         ftol=1e-12,
         gtol=1e-10,

@@ -205,7 +205,7 @@ class Family(abc.ABC):
         """
 
 
-HOMES = {
+MODULE_OF_FAMILY = {
     "reconstruction": "jaxevent.runs.reconstruction:FAMILY",
     "blob": "jaxevent.runs.blob:FAMILY",
     "egomotion": "jaxevent.runs.egomotion:FAMILY",
@@ -214,16 +214,16 @@ HOMES = {
 
 def family_of(method: Estimator) -> Family:
     """Return the family of an estimator; raise `InputError` for an unknown one."""
-    if method.family not in HOMES:
+    if method.family not in MODULE_OF_FAMILY:
         raise InputError(
             f"the method {method.name!r} is of the family {method.family!r}; "
-            f"{suggest_name(method.family, HOMES)}"
+            f"{suggest_name(method.family, MODULE_OF_FAMILY)}"
         )
     return find_family(method.family)
 
 
 def find_family(name: str) -> Family:
-    return imported(HOMES[name], Family, "family")
+    return imported(MODULE_OF_FAMILY[name], Family, "family")
 
 
 def find_protocol(name: Any) -> tuple[Protocol, str]:
@@ -231,7 +231,11 @@ def find_protocol(name: Any) -> tuple[Protocol, str]:
 
     Raise `InputError` for an unknown one.
     """
-    known = {protocol: family for family in HOMES for protocol in find_family(family).protocols}
+    known = {
+        protocol: family
+        for family in MODULE_OF_FAMILY
+        for protocol in find_family(family).protocols
+    }
     if name not in known:
         raise InputError(f"there is no protocol {name!r}; {suggest_name(str(name), known)}")
     return find_family(known[name]).protocols[name], known[name]

@@ -62,7 +62,7 @@ from jaxevent.io import load, toml
 from jaxevent.progress import stage
 from jaxevent.recording import Recording
 from jaxevent.runs.calls import (
-    CALLED,
+    CALL_HEADER,
     Forms,
     PathLike,
     recordings_of,
@@ -89,13 +89,13 @@ from jaxevent.show import plot_losses
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import FitResult, Run, optimise
 
-CHECKPOINT = "checkpoint"  # the name of the file in the folder
+CHECKPOINT_FILE = "checkpoint"  # the name of the file in the folder
 FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
-DIVERGED = (
+DIVERGED_WARNING = (
     "{}: the steps led away, to a greater loss than at the start or to none; the parameters are "
     "the best that were seen, so lower learning_rate or start elsewhere"
 )
-PERIOD = 2.0  # s between checkpoints
+CHECKPOINT_PERIOD_S = 2.0  # s between checkpoints
 
 
 @overload
@@ -220,14 +220,14 @@ def _fit_objects(
             "others apart"
         )
     given = settings_of(settings)
-    entry = {"name": method, **{k: given.pop(k) for k in ENTRY if k in given}}
+    entry = {"name": method, **{k: given.pop(k) for k in METHOD_SETTINGS if k in given}}
     table = {"recordings": recordings_of(recordings), **given, "method": [entry]}
     for split in ("validation", "test"):
         if split in table:
             table[split] = recordings_of(settings[split])
     if resume and out is None:
         raise InputError("resume goes on from the checkpoint in out; give out")
-    text = CALLED + toml.dump(to_toml_table(table))
+    text = CALL_HEADER + toml.dump(to_toml_table(table))
     plan = devices.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
     if out is None:
         return _fit(plan, None, resume, progress, replace)
@@ -242,7 +242,13 @@ def _fit_objects(
     return _fit(plan, Path(out), resume, progress, replace)
 
 
-ENTRY = ("fit", "search", "params", "label", "prior")  # settings of a method, not of the file
+METHOD_SETTINGS = (
+    "fit",
+    "search",
+    "params",
+    "label",
+    "prior",
+)  # settings of a method, not of the file
 
 
 def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
@@ -280,7 +286,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             (out / "loss.png").unlink(missing_ok=True)  # that of a run before
         write_rows(rows, write, lambda _: fits.table(), found=found, gains=gained)
         write("params.toml", _tables(plan.tasks, done).encode())
-        (out / CHECKPOINT).unlink()
+        (out / CHECKPOINT_FILE).unlink()
     return fits
 
 
@@ -308,7 +314,7 @@ def _ended_before(
     """
     if out.is_dir():
         held.enter_context(lock_folder(out))
-    checkpoint = out / CHECKPOINT
+    checkpoint = out / CHECKPOINT_FILE
     if checkpoint.exists() and not resume:
         raise InputError(
             f"{out}: holds the checkpoint of an interrupted fit; go on with --resume, or choose "
@@ -351,7 +357,7 @@ def _fit_tasks(
             write = new.enter_context(open_results(out))
             if missing:
                 held.enter_context(lock_folder(out))
-            checkpoint = out / CHECKPOINT
+            checkpoint = out / CHECKPOINT_FILE
             content = checkpoint.read_bytes() if checkpoint.exists() else None
             for remains in out.glob(".*.part"):  # of a write during which the run was killed
                 remains.unlink(missing_ok=True)
@@ -360,14 +366,16 @@ def _fit_tasks(
         if out is not None:
             content = devices.on_process_zero(lambda: open_folder(out))
             if content is not None:
-                done, run = restore_checkpoint(content, out / CHECKPOINT, key, plan)
+                done, run = restore_checkpoint(content, out / CHECKPOINT_FILE, key, plan)
 
         def keep(run: Run | None, certain: bool) -> None:
             nonlocal saved
             if out is None:
                 return
-            if devices.is_process_zero() and (certain or time.monotonic() - saved > PERIOD):
-                save_checkpoint(out / CHECKPOINT, key, done, run)
+            if devices.is_process_zero() and (
+                certain or time.monotonic() - saved > CHECKPOINT_PERIOD_S
+            ):
+                save_checkpoint(out / CHECKPOINT_FILE, key, done, run)
                 saved = time.monotonic()
             new.close()
 
@@ -397,7 +405,7 @@ def _score(
     """Rows of all methods, before and after; several processes share them out."""
     scored: list[tuple[Task, str, Any, dict[str, str]]] = []
     for task, one in zip(plan.tasks, done, strict=True):
-        warning = {"warning": DIVERGED.format(task.label)} if one.diverged else {}
+        warning = {"warning": DIVERGED_WARNING.format(task.label)} if one.diverged else {}
         scored.append((task, f"{task.label}, before", task.params, {}))
         scored.append((task, task.label, one.params, warning))
     mine = range(jax.process_index(), len(scored), jax.process_count())

@@ -34,7 +34,7 @@ from jaxevent.runs.config import (
     is_texts,
     read_params,
 )
-from jaxevent.runs.family import HOMES, Goal, Shares, family_of, find_family
+from jaxevent.runs.family import MODULE_OF_FAMILY, Goal, Shares, family_of, find_family
 from jaxevent.runs.own import MethodFunction, find_method
 from jaxevent.splits import SPLITS
 from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
@@ -205,7 +205,7 @@ def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: b
     Raises:
         InputError: A setting cannot be used; the message names it.
     """
-    families = {name: find_family(name) for name in HOMES}
+    families = {name: find_family(name) for name in MODULE_OF_FAMILY}
     further = {k: v for one in families.values() for k, v in one.fit_settings.items()}
     check(table, {**_COMMON, **further})
     found = {

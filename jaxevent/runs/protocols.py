@@ -30,8 +30,8 @@ from jaxevent.events.clocks import check_clocks
 from jaxevent.parameters import suggest_name
 from jaxevent.recording import Frames, Recording, microseconds
 
-GAP = 2  # every second frame is given
-A_GAP = "a whole number of frames from one that is kept to the next, 2 or more"
+DEFAULT_GAP = 2  # every second frame is given
+GAP_DOMAIN = "a whole number of frames from one that is kept to the next, 2 or more"
 
 
 def is_gap(value: Any) -> bool:
@@ -39,7 +39,7 @@ def is_gap(value: Any) -> bool:
     return type(value) is int and value >= 2
 
 
-def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
+def held_out(recording: Recording, gap: int = DEFAULT_GAP) -> tuple[Recording, Frames]:
     """Split a recording into the frames to give and those to hide.
 
     Args:
@@ -53,7 +53,7 @@ def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
         InputError: The gap is below 2, there are fewer than gap + 1 frames, or no events.
     """
     if not is_gap(gap):
-        raise InputError(f"a gap of {gap!r} hides no frame; give {A_GAP}")
+        raise InputError(f"a gap of {gap!r} hides no frame; give {GAP_DOMAIN}")
     frames = recording.frames
     if frames is None or len(frames) <= gap:
         which = "second one" if gap == 2 else f"one but each {gap}th"
@@ -67,7 +67,7 @@ def held_out(recording: Recording, gap: int = GAP) -> tuple[Recording, Frames]:
     return recording.with_frames(slice(0, None, gap)), frames[hidden]
 
 
-def frames_around(given: Frames, row: int, gap: int = GAP) -> tuple[int, int] | None:
+def frames_around(given: Frames, row: int, gap: int = DEFAULT_GAP) -> tuple[int, int] | None:
     """Return the given frames before and after a hidden one.
 
     Args:
@@ -171,7 +171,7 @@ PROTOCOLS: dict[str, Callable[..., tuple[Recording, Frames]]] = {
 }
 
 
-def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recording, Frames]:
+def divide(recording: Recording, protocol: str, gap: int = DEFAULT_GAP) -> tuple[Recording, Frames]:
     """Apply a protocol to a recording.
 
     Args:
@@ -191,7 +191,7 @@ def divide(recording: Recording, protocol: str, gap: int = GAP) -> tuple[Recordi
     check_clocks(recording)
     if protocol == "held-out":
         return held_out(recording, gap)
-    if gap != GAP:
+    if gap != DEFAULT_GAP:
         raise InputError(f"the protocol {protocol!r} hides no frames; omit gap")
     return PROTOCOLS[protocol](recording)
 

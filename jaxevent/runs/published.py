@@ -24,7 +24,7 @@ from jaxevent.runs.config import check, check_choice, is_number, is_texts
 from jaxevent.runs.family import Source
 from jaxevent.show.tables import COLUMNS
 
-PLACES = [place for _, place, _, _ in COLUMNS if "." not in place]
+MEASURE_NAMES = [place for _, place, _, _ in COLUMNS if "." not in place]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class PublishedResults(Source):
             if name not in table:
                 raise InputError(f"{name} is missing; published numbers need measures and values")
         for measure in table["measures"]:
-            check_choice(measure, "measure", PLACES)
+            check_choice(measure, "measure", MEASURE_NAMES)
         for name, numbers in table["values"].items():
             few = isinstance(numbers, list) and len(numbers) <= len(table["measures"])
             if not few or not all(map(is_number, numbers)):

@@ -29,7 +29,15 @@ from jaxevent.reconstruction.frames import Timing
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, check_choice, is_number
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
-from jaxevent.runs.protocols import A_GAP, GAP, PROTOCOLS, Reference, divide, frame_times, is_gap
+from jaxevent.runs.protocols import (
+    DEFAULT_GAP,
+    GAP_DOMAIN,
+    PROTOCOLS,
+    Reference,
+    divide,
+    frame_times,
+    is_gap,
+)
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
 from jaxevent.show.tables import markdown_table
 from jaxevent.splits import SPLITS, interleave
@@ -196,7 +204,7 @@ def cut_windows(
     split: Sequence[int] = (1, 0, 0),
     window: float | int | None = None,
     warm_up: float | int = 0.2,
-    gap: int = GAP,
+    gap: int = DEFAULT_GAP,
 ) -> list[RecordingWindow]:
     """Cut a recording into windows of `window` seconds (None: one part, the whole).
 
@@ -331,7 +339,7 @@ class ImageGoal(Goal):
     protocol: str
     warm_up: float | int
     weights: Mapping[str, float | int] | None
-    gap: int = GAP
+    gap: int = DEFAULT_GAP
 
     @property
     def part_name(self) -> str:
@@ -405,7 +413,7 @@ class Reconstruction(Family):
             "a table of numbers named dark, well, bright",
         ),
         "warm_up": NOT_NEGATIVE,
-        "gap": (is_gap, A_GAP),
+        "gap": (is_gap, GAP_DOMAIN),
     }
     own = ("loss", "error")
 
@@ -426,7 +434,7 @@ class Reconstruction(Family):
         elif settings.get("protocol", loss) != loss:
             raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
         error = check_choice(settings.get("error", "linear"), "error", ERRORS)
-        weights, gap = settings.get("weights"), settings.get("gap", GAP)
+        weights, gap = settings.get("weights"), settings.get("gap", DEFAULT_GAP)
         if "gap" in settings and protocol != "held-out":
             raise InputError("gap is for frames that are hidden, the protocol 'held-out'; omit it")
         if weights is not None and protocol != "reference":

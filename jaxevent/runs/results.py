@@ -192,8 +192,8 @@ def open_results(folder: Path) -> Iterator[Write]:
         raise
 
 
-TITLES = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
-INDEPENDENT = "measurements, taken as independent"
+INTERVAL_COLUMNS = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
+INDEPENDENT_MEASUREMENTS = "measurements, taken as independent"
 
 
 def find_intervals(
@@ -208,7 +208,7 @@ def find_intervals(
         task.loss, task.params, one.params, task.names, problem, task.search,
         task.settings.forward,
     )  # fmt: skip
-    of = f"{told.parts} {task.goal.part_name}s" if told.parts else INDEPENDENT
+    of = f"{told.parts} {task.goal.part_name}s" if told.parts else INDEPENDENT_MEASUREMENTS
     return [_row(task, finding, of) for finding in told.intervals]
 
 
@@ -251,7 +251,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping[str, Any]]) -> str:
     """Format the table of the numbers found, and a line for each method's gain."""
-    table: list[list[str]] = [list(TITLES)]
+    table: list[list[str]] = [list(INTERVAL_COLUMNS)]
     for row in found:
         cells = (row["method"], row["parameter"], f"{row['start']:.4g}", f"{row['found']:.4g}")
         table.append([*cells, row["interval"], row["unit"], row["remark"]])

@@ -37,8 +37,8 @@ from jaxevent.runs.external import ExternalImages, Normalise, check_normalise, f
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 from jaxevent.runs.protocols import (
-    A_GAP,
-    GAP,
+    DEFAULT_GAP,
+    GAP_DOMAIN,
     Reference,
     divide,
     frame_times,
@@ -60,14 +60,14 @@ MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
 
 
 # Those that every image has, of a protocol by its name.
-ALWAYS = {
+DEFAULT_MEASURES = {
     "held-out": ("mse", "ssim"),
     "reference": ("mse", "ssim", "log_mse", "log_ssim"),
 }
 
 
 class Measures(NamedTuple):
-    """Measures of images beyond those of `ALWAYS`: names in `MEASURES`, and the user's own."""
+    """Measures beyond those of `DEFAULT_MEASURES`: names in `MEASURES`, and the user's own."""
 
     names: tuple[str, ...]
     own: tuple[Metric, ...]
@@ -78,7 +78,7 @@ class Measures(NamedTuple):
 
         Raise `InputError` for unknown ones and missing extras.
         """
-        given, always = list(given), ALWAYS.get(protocol, ())
+        given, always = list(given), DEFAULT_MEASURES.get(protocol, ())
         own = find_metrics(given, [*MEASURES, *always])
         names = [one for one in given if isinstance(one, str) and one in MEASURES]
         check_extras(names)
@@ -101,7 +101,7 @@ def check_extras(names: Iterable[str]) -> None:
             require("pycvvdp", "hdr")
 
 
-MOVING = 0.05  # of white, by which frames differ where something moves
+MOTION_THRESHOLD = 0.05  # of white, by which frames differ where something moves
 
 # The scores of one image; those of parts of it are nested under "regions" and "moving".
 Scores = dict[str, Any]
@@ -326,7 +326,7 @@ def score(
     *,
     metrics: Iterable[str | Metric | Callable] = (),
     normalise: Normalise = "none",
-    gap: int = GAP,
+    gap: int = DEFAULT_GAP,
     moving: bool = False,
     progress: bool | None = None,
 ) -> dict[str, Any]:
@@ -374,7 +374,7 @@ class ScoringOptions:
     protocol: str = "held-out"
     metrics: tuple[str | Metric | Callable, ...] = ()
     normalise: str = "none"
-    gap: int = GAP
+    gap: int = DEFAULT_GAP
     moving: bool = False
     measures: Measures = dataclasses.field(init=False)
 
@@ -413,8 +413,8 @@ class ImageProtocol(Protocol):
         return {**found, "metrics": list(dict.fromkeys(names))} if names else found
 
     def label(self, options: Mapping[str, Any]) -> str:
-        gap = options.get("gap", GAP)
-        hidden = "" if gap == GAP else f", gap {gap}"
+        gap = options.get("gap", DEFAULT_GAP)
+        hidden = "" if gap == DEFAULT_GAP else f", gap {gap}"
         fitted = "" if options.get("normalise", "none") == "none" else ", brightness fitted"
         return hidden + fitted
 
@@ -434,7 +434,7 @@ class ImageProtocol(Protocol):
                 self.name,
                 tuple(options.get("metrics", ())),
                 options.get("normalise", "none"),
-                options.get("gap", GAP),
+                options.get("gap", DEFAULT_GAP),
                 options.get("moving", False),
             ),
             progress,
@@ -448,7 +448,7 @@ class HeldOut(ImageProtocol):
 
     settings = {
         **ImageProtocol.settings,
-        "gap": (is_gap, A_GAP),
+        "gap": (is_gap, GAP_DOMAIN),
         "moving": (lambda value: isinstance(value, bool), "true or false"),
     }
 
@@ -519,7 +519,7 @@ def score_and_sample(
         "events": len(recording.events),
         "seconds": None if external else seconds,
         **({} if normalise == "none" else {"normalise": normalise}),
-        **({} if asked.gap == GAP else {"gap": asked.gap}),
+        **({} if asked.gap == DEFAULT_GAP else {"gap": asked.gap}),
         **own_names(measures.own),
         "params": values,
         "per_frame": per_frame,
@@ -534,7 +534,7 @@ def moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
     if around is None:
         return np.zeros((given.height, given.width), bool)
     before, after = given.frames[around[0] : around[1] + 1].intensity
-    return np.abs(after - before) > MOVING
+    return np.abs(after - before) > MOTION_THRESHOLD
 
 
 # The number of the first image, and some images with their variances, each (images, height, width).

@@ -35,8 +35,8 @@ from jaxevent.display import describe_type
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
 
-CONNECT = 30  # s that a scheduler has to answer
-LEAVE = 5  # s that a process has to end
+CONNECT_TIMEOUT_S = 30  # s that a scheduler has to answer
+EXIT_TIMEOUT_S = 5  # s that a process has to end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -381,7 +381,7 @@ def _in_processes(
             process.kill()
             connection.close()
         for process in [*(p for _, p in idle), *(p for p, _, _ in busy.values())]:
-            process.join(LEAVE)
+            process.join(EXIT_TIMEOUT_S)
             process.kill()
             process.join()
 
@@ -439,7 +439,7 @@ def _on_cluster(
     if given is None:
         where = {"scheduler_file": address}
     try:
-        client = distributed.Client(**where, timeout=CONNECT, set_as_default=False)
+        client = distributed.Client(**where, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import THREADS
+from jaxevent.codegen import N_THREADS
 from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
@@ -126,7 +126,7 @@ def write_hdf5(
         for field, unit in units.items():
             fields[field].attrs["unit"] = unit
         row, finite = 0, False
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(N_THREADS) as pool:
             waiting: list[tuple[h5py.Dataset, int, Future[bytes]]] = []
             # One batch is compressed while the next one is made.
             for batch, values in _batches(video, times, colours):

@@ -21,7 +21,7 @@ from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET, MEANINGS
 from jaxevent.show.images import display_limits, tone_map
 from jaxevent.show.tables import (
-    WORK,
+    COST_COLUMNS,
     Column,
     columns_of,
     format_number,
@@ -220,7 +220,7 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Tabl
     """
     found = means(rows)
     measures = [column for column in columns if column[1] in found[0]]
-    unmarked = WORK.union(*(row.get("own_metrics", ()) for row in rows))
+    unmarked = COST_COLUMNS.union(*(row.get("own_metrics", ()) for row in rows))
     most = max(one["recordings"] for one in found)
     best = {}
     for _, place, _, _ in measures:

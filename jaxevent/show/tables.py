@@ -14,7 +14,7 @@ from jaxevent.metrics import MEANINGS
 Column = tuple[str, str, float | int, int]
 
 # Columns of a row of an evaluation: title, place in the row, factor, digits.
-ALWAYS = {"mse", "ssim", "frames", "seconds"}  # of images, None too
+REQUIRED_COLUMNS = {"mse", "ssim", "frames", "seconds"}  # of images, None too
 COLUMNS: list[Column] = [
     ("MSE x 1e-2", "mse", 100, 3),
     ("SSIM", "ssim", 1, 3),
@@ -61,22 +61,22 @@ COLUMNS: list[Column] = [
 ]
 
 
-WORK = {"frames", "missing", "seconds", "times"}  # columns that measure no quality
+COST_COLUMNS = {"frames", "missing", "seconds", "times"}  # columns that measure no quality
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    """Choose the columns of a table: those of `COLUMNS` that rows have, and those of `ALWAYS`.
+    """Choose the columns of a table: those that rows have, and those of `REQUIRED_COLUMNS`.
 
     Metrics of the user's own, which rows name in `own_metrics`, follow the other measures.
     """
-    always = set() if any("per_time" in row for row in rows) else ALWAYS
+    always = set() if any("per_time" in row for row in rows) else REQUIRED_COLUMNS
     known = [
         column
         for column in COLUMNS
         if column[1] in always or any(value_at(row, column[1]) is not None for row in rows)
     ]
     own = dict.fromkeys(name for row in rows for name in row.get("own_metrics", ()))
-    work = next((i for i, column in enumerate(known) if column[1] in WORK), len(known))
+    work = next((i for i, column in enumerate(known) if column[1] in COST_COLUMNS), len(known))
     return [*known[:work], *((name, name, 1, 4) for name in own), *known[work:]]
 
 
@@ -91,7 +91,7 @@ def rows_of_method(
     rows: Sequence[Mapping[str, Any]], method: str, columns: Sequence[Column]
 ) -> list[Mapping[str, Any]]:
     """Choose the rows of a method with a number in any column that measures quality."""
-    places = [place for _, place, _, _ in columns if place not in WORK]
+    places = [place for _, place, _, _ in columns if place not in COST_COLUMNS]
     return [
         row
         for row in rows

@@ -330,9 +330,10 @@ class WrittenTracks:
         if len(tracks) > most:
             lines.append(f"and {len(tracks) - most} shorter ones")
         reasons = dict.fromkeys(tracks.ended[i] for i in order)
-        lines += ["", f"ended: {'; '.join(f'{one}, {ENDED[one]}' for one in reasons)}"] * bool(
-            order
-        )
+        lines += [
+            "",
+            f"ended: {'; '.join(f'{one}, {END_REASONS[one]}' for one in reasons)}",
+        ] * bool(order)
         if order and abs(zero) >= 1000:
             at = f"{zero * 1e-6:.4f} s on its clock, which tables tell"
             lines.append(f"birth, death: from the recording's start, {at}")
@@ -343,7 +344,7 @@ class WrittenTracks:
         return lines
 
 
-ENDED = {  # of `Tracks.ended`, what it means
+END_REASONS = {  # of `Tracks.ended`, what it means
     "end": "with the events",
     "idle": "no event for too long",
     "left": "it left the image",

@@ -153,7 +153,7 @@ def test_smoothers_of_one_kernel_equal_the_scan(monkeypatch):
     np.testing.assert_allclose(variance, scan.covariance, rtol=1e-9)
     np.testing.assert_array_equal(shown, scan.valid)
     assert 0.02 < shown.mean() < 0.9
-    monkeypatch.setattr(codegen, "THREADS", 1)
+    monkeypatch.setattr(codegen, "N_THREADS", 1)
     np.testing.assert_array_equal(images("numba").mean, mean)
     # Bands of three rows each.
     monkeypatch.setattr(bands, "STRIDES", (5 * 13,))
@@ -196,7 +196,7 @@ def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
     layout = bands.BandLayout.of(11, 9)
     assert layout is not None and len(layout.edges) == 4
     np.testing.assert_array_equal(images(), whole)
-    monkeypatch.setattr(codegen, "THREADS", 1)
+    monkeypatch.setattr(codegen, "N_THREADS", 1)
     np.testing.assert_array_equal(images(), whole)
 
 

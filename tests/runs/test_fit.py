@@ -661,7 +661,7 @@ def interrupted(monkeypatch, after: int) -> None:
 
 
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
-    monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
+    monkeypatch.setattr(jaxevent.runs.fit, "CHECKPOINT_PERIOD_S", 0.0)
     config, out = write(folder, TWO), folder / "out"
     fit(config, folder / "whole")
     same = ("params.toml", "loss.csv", "config.toml")

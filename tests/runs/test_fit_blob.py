@@ -180,7 +180,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
     tracks = tracker.estimate(
         recording, tracker.Params(**START), seeds=[(85.0, 45.0, 6.0)]
     ).filtered
-    parts = mine._parts(sources, (2, 1, 1), None)
+    parts = mine._windows(sources, (2, 1, 1), None)
     assert [part.split for part in parts] == [0, 1, 0, 2, 0, 1, 0, 2]
     assert parts[0].start == recording.start and parts[-1].stop == recording.stop + 1
     assert all(a.stop == b.start for a, b in zip(parts, parts[1:], strict=False))
@@ -192,7 +192,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
         np.testing.assert_allclose((x, y, size), mean[[0, 1, 4]], rtol=1e-12)
         assert at == part.start
     # Without seeds and positions tracks are born in every window.
-    assert all(part.seeds is None for part in goal()._parts(sources, None, 0.05))
+    assert all(part.seeds is None for part in goal()._windows(sources, None, 0.05))
 
 
 def test_sizes_that_are_not_given_can_be_fitted(folder):
@@ -228,11 +228,11 @@ class Killed(BaseException):
 
 @pytest.mark.slow
 def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
-    monkeypatch.setattr(jaxevent.runs.fit, "PERIOD", 0.0)
+    monkeypatch.setattr(jaxevent.runs.fit, "CHECKPOINT_PERIOD_S", 0.0)
     text = CONFIG.replace("iterations = 12", "iterations = 3").replace("every = 4", "every = 1")
     config, out = write(folder, text), folder / "out"
     fit(config, folder / "whole")
-    save, count = jaxevent.runs.fit.save, 0
+    save, count = jaxevent.runs.fit.save_checkpoint, 0
 
     def dying(*arguments):
         nonlocal count
@@ -242,7 +242,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
         save(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(jaxevent.runs.fit, "save", dying)
+        patch.setattr(jaxevent.runs.fit, "save_checkpoint", dying)
         fit(config, out)
     assert [path.name for path in out.iterdir()] == ["checkpoint"]
     kept = (folder / "a.csv").read_bytes()

@@ -139,7 +139,7 @@ def test_places_that_cannot_be(tmp_path, monkeypatch):
         run(errand, [], tmp_path / "file" / "x")
     with pytest.raises(InputError, match="none.json: there is no such scheduler file"):
         run(errand, [], None, ComputeResources(scheduler_file=tmp_path / "none.json"))
-    monkeypatch.setattr("jaxevent.runs.tasks.CONNECT", 1)
+    monkeypatch.setattr("jaxevent.runs.tasks.CONNECT_TIMEOUT_S", 1)
     with pytest.raises(InputError, match="tcp://127.0.0.1:9: no Dask scheduler answers"):
         run(errand, tasks_of(tmp_path, a=""), None, ComputeResources(cluster="tcp://127.0.0.1:9"))
     monkeypatch.setitem(sys.modules, "distributed", None)

@@ -48,7 +48,7 @@ BLURRED_PX = 0.5  # motion within an exposure, below which the frame counts as s
 DISAGREEMENT_PX = 0.5  # by which points that met within an exposure may move differently
 MAX_SAMPLE_PX = 2.0  # motion from one sample of an exposure to the next
 SAMPLE_COUNTS = (3, 7, 15, 31)  # of an exposure; few numbers, so that few programs are compiled
-FASTEST = 2.0  # times the measured speed, for which exposures are sampled
+SPEED_MARGIN = 2.0  # times the measured speed, for which exposures are sampled
 
 
 class AdjacentExposures(NamedTuple):
@@ -109,7 +109,7 @@ class FrameExposures:
         clock = Clock.of(recording, Timing.of(params))
         self.mid = np.ceil(clock.mid).astype(np.int64) + clock.origin
         self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
-        moved = FASTEST * speed * 2e-6 * float(self._half.max(initial=0))
+        moved = SPEED_MARGIN * speed * 2e-6 * float(self._half.max(initial=0))
         samples = choose_samples(moved) if params.deblur else 1
         wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
         self.samples = samples if params.integrate and wanted else None

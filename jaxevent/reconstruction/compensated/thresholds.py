@@ -28,7 +28,7 @@ MIN_EVENTS = 40.0  # per pixel in all changes together; with fewer nothing is le
 EXPECTED_SIGMA = 0.1  # standard deviation of d, before it is known
 MIN_SIGMA = 0.05  # of d; pixels that differ less are averaged by the fusion as well
 AROUND_SIGMA_PX = 4.0  # of the Gaussian over the pixels that one is compared with
-TAIL = 5.0  # standardised squares beyond which changes count less
+HUBER_SQUARE = 5.0  # standardised squares beyond which changes count less
 FACTOR_BOUNDS = (0.5, 2.0)  # on the common threshold
 
 ImageFunction = Callable[[int], tuple[NDArray, NDArray]]  # log intensity, variance at a time (us)
@@ -65,7 +65,7 @@ def regress(changes: LogChanges, mismatch: float) -> ThresholdDeviations:
         The deviations.
     """
     rest, on, off, V = changes
-    W = 1 / (V + rest**2 / TAIL)
+    W = 1 / (V + rest**2 / HUBER_SQUARE)
     A = (W * on * on).sum(0) + mismatch**-2
     B = (W * on * off).sum(0)
     C = (W * off * off).sum(0) + mismatch**-2
