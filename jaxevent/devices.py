@@ -40,7 +40,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxevent.deprecated import renamed_names
-from jaxevent.dispatch import check_platform
+from jaxevent.dispatch import check_platform_available
 from jaxevent.errors import InputError
 
 AXIS = "devices"
@@ -79,7 +79,7 @@ def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:
 
 def has_accelerator() -> bool:
     """Return true if JAX computes on a GPU, or another device than the CPU, by default."""
-    check_platform()
+    check_platform_available()
     return jax.default_backend() != "cpu"
 
 
@@ -96,7 +96,7 @@ def local_devices() -> list[Any]:
 
     `jax.default_device` thereby confines computations to one device.
     """
-    check_platform()
+    check_platform_available()
     chosen = jax.config.jax_default_device  # ty: ignore[missing-attribute]
     if chosen is None:
         return list(jax.local_devices())

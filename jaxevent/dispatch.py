@@ -38,7 +38,7 @@ def use_synchronous_dispatch() -> bool:
 
 
 @functools.cache
-def check_platform() -> None:
+def check_platform_available() -> None:
     """Raise `InputError` if JAX has no device of the platform that JAX_PLATFORMS names.
 
     JAX raises errors of several kinds, where an array is made first. This starts JAX's platform.
@@ -57,7 +57,7 @@ def check_platform() -> None:
         ) from None
 
 
-def check_threads() -> None:
+def check_not_forked() -> None:
     """Raise `InputError` in a forked process whose parent has computed with JAX."""
     if _lacks_threads:
         _refuse()

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxevent.deprecated import renamed_names
-from jaxevent.dispatch import check_platform
+from jaxevent.dispatch import check_platform_available
 from jaxevent.display import with_article
 from jaxevent.errors import InputError
 
@@ -294,7 +294,7 @@ class Parameters(_Module):
         cls.__doc__ = "\n".join([about, "", "Arguments:", *_describe_settings(cls)])
 
     def __init__(self, *, preset: str | None = None, **values: Any):
-        check_platform()  # the first arrays that JAX makes
+        check_platform_available()  # the first arrays that JAX makes
         _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
             if preset not in self.presets:

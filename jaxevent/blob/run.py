@@ -169,7 +169,7 @@ class XlaRunner:
 
     @property
     def _parts(self) -> tuple[Filter, TrackerParams]:
-        dispatch.check_threads()
+        dispatch.check_not_forked()
         return self._arguments
 
     def init(self, features: Features) -> TrackerState:

@@ -404,7 +404,7 @@ class Video(ImageSequence[P]):
 
     def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Yield batches of images that are being computed on the device."""
-        dispatch.check_threads()
+        dispatch.check_not_forked()
         done, mine = 0, object()
         while done < len(times):
             window, reader, trajectory = self._window_of(int(times[done]))
@@ -499,7 +499,7 @@ class Video(ImageSequence[P]):
 
     def _filter(self, begin: WindowStart) -> tuple[FilteredWindow, WindowStart]:
         """Prepare and filter the window that begins there; return it and the start of the next."""
-        dispatch.check_threads()
+        dispatch.check_not_forked()
         window, features = self._windows.prepare(begin.start, begin.before)
         features = self._put(features)
         state = begin.state

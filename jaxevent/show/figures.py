@@ -26,7 +26,7 @@ from jaxevent.show.motion_figures import motion_figure
 from jaxevent.show.track_figures import draw_paths
 from jaxevent.tuning import FitResult
 
-ON, OFF = "#c8401e", "#3a78b5"
+ON_COLOUR, OFF_COLOUR = "#c8401e", "#3a78b5"
 WIDTH_INCHES = 7.0
 MAX_EVENTS_3D = 20_000  # events drawn in x, y and t
 PATH_TIMES = 400  # at which a track's path is drawn
@@ -59,7 +59,7 @@ def plot_events(
     polarity = event_image(events, size=(width, height))
     top = max(1, int(np.percentile(np.abs(polarity[polarity != 0]), 95))) if len(events) else 1
     colours = np.zeros((height, width, 4))
-    colours[polarity > 0, :3], colours[polarity < 0, :3] = _rgb(ON), _rgb(OFF)
+    colours[polarity > 0, :3], colours[polarity < 0, :3] = _rgb(ON_COLOUR), _rgb(OFF_COLOUR)
     colours[..., 3] = np.where(polarity == 0, 0, 0.35 + 0.65 * np.clip(abs(polarity) / top, 0, 1))
     axis.imshow(colours, interpolation="nearest")
     axis.set_title(_title(part, events), fontsize=10)
@@ -91,7 +91,7 @@ def plot_events_3d(
     figure = new_figure(WIDTH_INCHES, 5.5)
     axis = figure.add_subplot(projection="3d")
     zero = t[0] if len(t) else 0
-    for chosen, colour, label in ((p, ON, "ON"), (~p, OFF, "OFF")):
+    for chosen, colour, label in ((p, ON_COLOUR, "ON"), (~p, OFF_COLOUR, "OFF")):
         ms = (t[chosen] - zero) / 1000
         axis.scatter(ms, x[chosen], y[chosen], c=colour, s=1, lw=0, label=label)
     axis.set(xlabel="t (ms)", ylabel="x (px)", zlabel="y (px)", ylim=(0, width), zlim=(height, 0))

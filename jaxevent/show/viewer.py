@@ -19,11 +19,11 @@ from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, microseconds
 from jaxevent.show.track_tables import COLUMNS
 
-ON, OFF = (200, 64, 30), (58, 120, 181)
+ON_COLOUR, OFF_COLOUR = (200, 64, 30), (58, 120, 181)
 BLOCK_EVENTS = 1 << 20  # events sent at a time
-STEP_US = 5_000  # us between states of tracks and of motion
-TABLES = "tracks.csv", "motion.csv"  # of the folders that the commands write
-CIRCLE = np.linspace(0, 2 * np.pi, 25)
+STATE_STEP_US = 5_000  # us between states of tracks and of motion
+TABLE_FILES = "tracks.csv", "motion.csv"  # of the folders that the commands write
+CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 25)
 
 Result = ImageSequence | Tracks | MotionEstimate | str | Path
 
@@ -130,7 +130,7 @@ class _Sender:
             lengths = np.diff(begin, append=len(events))
             columns = rerun.Points2D.columns(
                 positions=np.stack([events.x + 0.5, events.y + 0.5], 1),
-                colors=np.where(events.p[:, None], ON, OFF).astype(np.uint8),
+                colors=np.where(events.p[:, None], ON_COLOUR, OFF_COLOUR).astype(np.uint8),
                 radii=np.full(len(events), 0.5, np.float32),
             ).partition(lengths=lengths)
             times = self._start + number[begin] * window
@@ -159,7 +159,7 @@ class _Sender:
             x, y, along, across, angle = (
                 rows[name].to_numpy()[:, None] for name in ("x", "y", "lambda1", "lambda2", "theta")
             )
-            u, v = 2 * along * np.cos(CIRCLE), 2 * across * np.sin(CIRCLE)
+            u, v = 2 * along * np.cos(CIRCLE_ANGLES), 2 * across * np.sin(CIRCLE_ANGLES)
             c, s = np.cos(angle), np.sin(angle)
             outline = np.stack([x + c * u - s * v, y + s * u + c * v], 2) + 0.5
             t = microseconds(rows["t"].to_numpy(np.float64))
@@ -198,7 +198,7 @@ def _layer(result: Any, recording: Recording) -> _Layer:
     if isinstance(result, ImageSequence):
         return result.estimator.name, functools.partial(_send_video, result, recording)
     path = Path(result)
-    for name in TABLES:
+    for name in TABLE_FILES:
         if (path / name).exists():
             return _layer_of_table(path / name)
     if path.suffix.lower() == ".csv":
@@ -241,7 +241,7 @@ def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name:
 
 def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
     """Tabulate tracks at even times."""
-    times = np.arange(tracks.start, tracks.stop, STEP_US)
+    times = np.arange(tracks.start, tracks.stop, STATE_STEP_US)
     states = tracks(times)
     row, column = np.nonzero(states.valid)
     mean = np.asarray(states.mean)[row, column]
@@ -251,7 +251,7 @@ def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
 
 def _table_of_motion(motion: MotionEstimate) -> pd.DataFrame:
     """Tabulate a motion at even times."""
-    times = np.arange(motion.t[0], motion.t[-1] + 1, STEP_US) if len(motion) else motion.t
+    times = np.arange(motion.t[0], motion.t[-1] + 1, STATE_STEP_US) if len(motion) else motion.t
     estimated = motion(times)
     values = np.where(estimated.valid[:, None], estimated.mean, np.nan)
     return pd.DataFrame(

@@ -565,7 +565,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     Returns:
         The estimate.
     """
-    dispatch.check_threads()
+    dispatch.check_not_forked()
     windows = WindowSequence(inputs.recording, params, inputs.model, inputs.camera, inputs.seed)
     if not len(windows):
         return MotionEstimate.empty(inputs.model)

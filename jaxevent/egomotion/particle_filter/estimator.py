@@ -215,7 +215,7 @@ class VotingEstimator(MotionEstimator[Params]):
                 is "numba" and there is no kernel.
         """
         self.check_options(seed=seed, progress=progress, smooth=smooth, cloud=cloud)
-        dispatch.check_threads()
+        dispatch.check_not_forked()
         if params is None:
             found, _ = self.find_model_and_camera(recording, model, camera)
             start = self.initial_params(found)

@@ -535,7 +535,7 @@ class CompensatedVideo(ImageSequence[Params]):
     @synchronized
     def _target(self, t: int) -> tuple[TrajectoryEstimate, FusedImage]:
         if self._latest is None or self._latest[0] != t:
-            dispatch.check_threads()
+            dispatch.check_not_forked()
             target = self.trajectories(t)
             self._latest = t, target, self._fuse(t, target)
         return self._latest[1:]
