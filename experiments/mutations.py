@@ -168,7 +168,7 @@ MUTATIONS = (
         "jaxevent/codegen/cache.py",
         "return pickle.loads(payload) if own else None",
         "return pickle.loads(payload)",
-        "tests/codegen/test_cache.py -k signed",
+        "tests/codegen/test_compiled_cache.py -k signed",
     ),
     Mutation(
         "a layer of the house imports upwards",

@@ -141,7 +141,7 @@ def test_motion(again):
 def test_streams_say_what_to_keep(again):
     lives = [jaxevent.akf.live((20, 16), frames=False), jaxevent.blob.moment.live((20, 16))]
     for live in lives:
-        with pytest.raises(InputError, match=r"keep what .* live\(times\)"):
+        with pytest.raises(InputError, match=r"keep .* live\(times\)"):
             again(live)
     devices = {"compiler": "xla", "devices": jax.devices()[:1]}
     with pytest.raises(InputError, match="estimate again"):

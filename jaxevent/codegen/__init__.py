@@ -47,8 +47,13 @@ def njit_inlined(function: Callable) -> Any:
 
 
 def njit_noalloc(function: Callable) -> Any:
-    """Compile a function that makes no arrays of its own, in less time than `njit`."""
-    return cache.njit_cached(inspect.unwrap(function), **_COMMON_OPTIONS, **_NOALLOC_OPTIONS)
+    """Compile a function that makes no arrays of its own, in less time than `njit`.
+
+    A division by zero gives an infinite number or NaN, as in NumPy.
+    """
+    return cache.njit_cached(
+        inspect.unwrap(function), error_model="numpy", **_COMMON_OPTIONS, **_NOALLOC_OPTIONS
+    )
 
 
 def njit_noalloc_inlined(function: Callable) -> Any:

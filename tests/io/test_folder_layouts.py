@@ -304,7 +304,7 @@ def test_starts_and_ends_of_exposures(tmp_path, images, times):
     np.testing.assert_array_equal(recording.frames.t, MIDDLES)
     np.testing.assert_array_equal(recording.frames.exposure, LENGTHS)
     refuses(
-        "its timestamps tell the exposures; leave out exposure", read_frames, folder, exposure=0.002
+        "its timestamps hold the exposures; leave out exposure", read_frames, folder, exposure=0.002
     )
 
 

@@ -772,7 +772,7 @@ def test_cut_files_are_refused(tmp_path, format):
     content = path.read_bytes()
     for part in (0.01, 0.1, 0.3, 0.5, 0.8, 0.99):
         path.write_bytes(content[: int(part * len(content))])
-        assert str(path) in refuses("", load, path)
+        assert str(path) in refuses(re.escape(str(path)), load, path)
 
 
 @pytest.mark.parametrize("format", ["zip", "npz", "v5"])

@@ -102,10 +102,10 @@ def test_workers_end_with_the_process_that_started_them(tmp_path):
 import sys
 sys.path.insert(0, {str(Path(errands.__file__).parent)!r})
 from errands import errand, log
-from jaxevent.runs.tasks import Place, Task, run
+from jaxevent.runs.tasks import ComputeResources, Task, run
 if __name__ == "__main__":
     some = [Task(n, dict(folder={str(tmp_path)!r}, name=n, seconds=60.0), n) for n in "ab"]
-    run(errand, some, None, Place(workers=2))
+    run(errand, some, None, ComputeResources(workers=2))
 """
     script = tmp_path / "script.py"
     script.write_text(code)

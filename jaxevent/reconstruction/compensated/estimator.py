@@ -133,8 +133,8 @@ class PreparedTargets(ShortRepr):
     # Of exposures; None: images are not fitted to them.
     samples: int | None = eqx.field(static=True, default=None)
 
-    def images(self, rows: NDArray) -> "PreparedTargets":
-        """Select images, in the order of `rows`."""
+    def take(self, rows: NDArray) -> "PreparedTargets":
+        """Choose some of the images, in the order of `rows`."""
         chosen = jax.tree.map(lambda leaf: leaf[rows], self.targets)
         return PreparedTargets(self.instants, chosen, self.samples)
 
