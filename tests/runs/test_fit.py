@@ -711,7 +711,10 @@ def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder, capsys):
     """kill -9 in a descent; elsewhere the test above lets it die."""
     one = TWO[: TWO.rindex("[[")].replace("iterations = 6", "iterations = 100")
     config = write(folder, one.replace("every = 3", "patience = 100"))
-    program = "import jaxevent.runs.fit as f, sys; f.CHECKPOINT_PERIOD_S = 0; from jaxevent.cli import main; main()"
+    program = (
+        "import jaxevent.runs.fit as f; f.CHECKPOINT_PERIOD_S = 0; "
+        "from jaxevent.cli import main; main()"
+    )
 
     def begin_fit(out: Path, *more: str) -> subprocess.Popen:
         argv = [sys.executable, "-c", program, "fit", config, "--out", out, *more]
