@@ -11,7 +11,7 @@ import functools
 import jax
 import numba
 import numpy as np
-from timing import cpu_seconds, least_cpu
+from common import cpu_seconds, least_cpu
 
 from jaxevent.blob import find, moment
 from jaxevent.blob.engine.runner import KernelRunner

@@ -22,7 +22,7 @@ from typing import Any
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from bench import machine
+from common import machine
 
 from jaxevent.blob import (
     Tracker,

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from bench import machine
+from common import machine
 
 import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting

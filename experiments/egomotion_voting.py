@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import machine
+from common import machine
 from numpy.typing import NDArray
 
 from jaxevent.egomotion import voting
