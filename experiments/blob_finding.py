@@ -1,6 +1,6 @@
 """Tracking without settings: simulated scenes and what simple trackers make of them.
 
-    python experiments/blob_finding.py --out finding --first 10 [--varied] [--data DIR]
+    python experiments/blob_finding.py --out finding --first 10 [--varied]
 
 Every scene is tracked as a new user does it, `moment.estimate(recording)`, whose states rest on all
 events. Beside it: `filter`, the same tracks from the events up to each time; the targets that
@@ -12,24 +12,22 @@ the centred mean of a window's events within three sizes of the mean before, tol
 begins. All get the window and cell that `find` chose. `by hand` is `moment`, smoothed, from seeds
 at the true beginnings, with the truth's sizes, times and changes of velocity (Q_v is the rms
 acceleration times the median speed: squared, times the time in which it turns). Makes
-table.md and results.json. With --data, a folder that holds spinning_dot.npz and
-davis346_street.npz, these are tracked too.
+table.md and results.json.
 
 Scores are those of `jaxevent.blob.scores` at 200 times: a track and a target are one where they are
 nearer than 2 sizes and 3 px.
 """
 
-import argparse
 import importlib
 import importlib.util
 import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from blob_scenes import SCENES, VARIED
+from common import command_line
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -38,14 +36,12 @@ from jaxevent.blob.scores import score_tracks
 from jaxevent.blob.search.background import measure_background
 from jaxevent.blob.search.detection import clutter_model, detect, measure_blobs
 from jaxevent.blob.search.stream import Stream
-from jaxevent.io import load
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import Truth
 
 NORFAIR = importlib.util.find_spec("norfair") is not None
 
 TIMES = 200
-DOT_CENTRE = (314.29, 202.35)  # px, of a circle fitted to the same events
 
 
 class Answer(NamedTuple):
@@ -235,19 +231,14 @@ def score(answer: Answer, truth: Truth, times: NDArray[np.int64], size: tuple[in
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, required=True)
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--scenes", nargs="+", help="default: all of SCENES")
     parser.add_argument("--search", action="store_true", help="only `find` and the baselines")
     parser.add_argument("--varied", action="store_true", help="all of VARIED instead")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--data", type=Path, help="folder of real recordings")
     args = parser.parse_args()
     rows, scenes = [], SCENES | VARIED
-    args.out.mkdir(parents=True, exist_ok=True)
     for name in args.scenes or (VARIED if args.varied else SCENES):
         for seed in range(args.first, args.first + args.seeds):
             recording, truth = scenes[name](seed)
@@ -279,29 +270,7 @@ def main() -> None:
                 )
         (args.out / "results.json").write_text(json.dumps(rows, indent=1))
         (args.out / "table.md").write_text(_table(rows))
-    if args.data is not None:
-        print("\n".join(_real(args.data)))
     print(_table(rows))
-
-
-def _real(data: Path) -> list[str]:
-    """Lines about tracks of real recordings, as a new user gets them, filtered."""
-    lines = []
-    for name in ("spinning_dot", "davis346_street"):
-        recording = load(data / f"{name}.npz")
-        tracks = moment.estimate(recording, smooth=False, progress=False)
-        lives = (tracks.death - tracks.birth) * 1e-6
-        lines.append(f"{name}: tracks of {', '.join(f'{life:.3f}' for life in lives)} s")
-        if name == "spinning_dot":
-            t = np.linspace(0.003, 0.0499, 900)
-            state = tracks(t, [int(tracks.id[np.argmax(lives)])]).mean[:, 0]
-            radius = np.hypot(state[:, 0] - DOT_CENTRE[0], state[:, 1] - DOT_CENTRE[1])
-            speed = np.hypot(state[:, 2], state[:, 3])
-            lines[-1] += (
-                f"; radius {radius.mean():.2f} +- {radius.std():.2f} px, "
-                f"speed {np.median(speed):,.0f} px/s"
-            )
-    return lines
 
 
 def _table(rows: list[dict]) -> str:

@@ -3,7 +3,7 @@
     python experiments/blob_real.py --data DIR --out blob_real
 
 DIR holds spinning_dot.npz, davis346_street.npz and gen4.dat; by default $JAXEVENT_DATA/data. Makes
-table.md, results.json and a picture of each. No reference uses the tracker, and all are made with
+table.md and results.json. No reference uses the tracker, and all are made with
 hindsight: the dot's path is a circle fitted to centroids, the cars are found in the frames, the
 sky's drift is the one motion that makes the events sharpest. The cars'
 settings were chosen on the first second and the sky's on 2.5 to 5 s; what is reported comes after.
@@ -11,21 +11,17 @@ The dot has the preset "fast"; that detection needs the prefilter (hot pixels) a
 dot's tail) was seen on all of its 50 ms.
 """
 
-import argparse
 import json
-import os
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from common import command_line, write_text
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 import jaxevent
 from jaxevent.blob import Tracker, Tracks, chi2, chi2_split, constant_velocity, moment
-from jaxevent.io.output import complete
 from jaxevent.recording import Recording
-from jaxevent.show.track_figures import track_colour, track_frames
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
 DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}
@@ -143,7 +139,7 @@ def score_dot(tracks: Tracks, path: Circling, span: tuple[float, float]) -> dict
     }
 
 
-def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
+def spinning_dot(recording: Recording) -> tuple[dict, str]:
     path = fit_circling(recording)
     start, _ = path(np.zeros(1))
     speed = np.hypot(*path(np.arange(0, 0.05, 1e-4))[1].T)
@@ -182,39 +178,7 @@ def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     assert shown is not None
     lines += ["", f"Detection: {len(shown)} confirmed track(s), {', '.join(shown.ended)}."]
-    draw_dot(out, recording, shown, path)
     return results, "\n".join(lines)
-
-
-def draw_dot(out: Path, recording: Recording, tracks: Tracks, path: Circling) -> None:
-    times = np.arange(1000, 50_000, 100)
-    states = tracks(times)
-    arrays = recording, times, tracks.id, states.mean, states.valid
-    images = list(track_frames(*arrays, trail=0.02, window=2e-4))
-    figure = new_figure(15, 9)
-    grid = figure.add_gridspec(2, 3)
-    for column, at in enumerate((5000, 20_000, 45_000)):
-        axis = figure.add_subplot(grid[0, column])
-        axis.imshow(images[int(np.searchsorted(times, at))])
-        axis.set_title(f"{at / 1e3:g} ms; ellipses of 2 standard deviations")
-        axis.set(xlim=(150, 480), ylim=(370, 40))
-    p, v = path(times * 1e-6)
-    m, speed = states.mean[:, np.argmax(tracks.death - tracks.birth)], np.hypot(*v.T)
-    axes = [figure.add_subplot(grid[1, column]) for column in range(3)]
-    axes[0].plot(times / 1e3, m[:, 2], times / 1e3, m[:, 3])
-    axes[0].plot(times / 1e3, v, "k--", lw=0.8)
-    axes[0].set(title="vx, vy; reference dashed", ylabel="px/s")
-    axes[1].plot(times / 1e3, m[:, 4], times / 1e3, m[:, 5])
-    for size in path.size:
-        axes[1].axhspan(0.97 * size, 1.03 * size, color="k", alpha=0.2)
-    axes[1].set(title="lambda1, lambda2; reference +- 3 %", ylabel="px", ylim=(0, 25))
-    theta = m[:, 6] - np.arctan2(v[:, 1] / speed, v[:, 0] / speed) - path.turned
-    axes[2].plot(times / 1e3, np.degrees((theta + np.pi / 2) % np.pi - np.pi / 2))
-    axes[2].axhspan(-2, 2, color="k", alpha=0.2)
-    axes[2].set(title="error of theta", ylabel="deg", ylim=(-10, 10))
-    for axis in axes:
-        axis.set_xlabel("t (ms)")
-    keep(figure, out / "spinning_dot.png")
 
 
 class Car(NamedTuple):
@@ -315,7 +279,7 @@ def score_cars(
     }
 
 
-def street(recording: Recording, out: Path) -> tuple[dict, str]:
+def street(recording: Recording) -> tuple[dict, str]:
     assert recording.frames is not None
     cars = find_cars(np.asarray(recording.frames.images))
     times = recording.frames.t
@@ -345,34 +309,7 @@ def street(recording: Recording, out: Path) -> tuple[dict, str]:
                 f"{row['strays']} | {each} |"
             )
     assert shown is not None
-    draw_street(out, recording, shown, cars)
     return results, "\n".join(lines)
-
-
-def draw_street(out: Path, recording: Recording, tracks: Tracks, cars: list[Car]) -> None:
-    assert recording.frames is not None
-    times, scale = recording.frames.t[1:], 3
-    states = tracks(times, extrapolate=True)
-    settings: dict[str, Any] = {"trail": 1.0, "scale": scale, "window": 0.02}
-    frames = np.asarray(recording.frames.images)[1:]
-    arrays = recording, times, tracks.id, states.mean, states.valid
-    behind = {
-        "events": list(track_frames(*arrays, **settings)),
-        "frame": list(track_frames(*arrays, images=iter(frames), **settings)),
-    }
-    figure = new_figure(20, 11)
-    axes = figure.subplots(4, 3)
-    for column, k in enumerate((9, 29, 38, 46, 50, 57)):
-        for row, name in enumerate(behind):
-            axis = axes[row + 2 * (column // 3), column % 3]
-            axis.imshow(behind[name][k])
-            for car in cars:
-                if k + 1 in car.frame:
-                    x, y = scale * car.centre[car.frame == k + 1][0] + 1
-                    axis.plot(x, y, "r+", ms=12)
-            axis.set(ylim=(scale * 255, scale * 120), xticks=[], yticks=[])
-            axis.set_title(f"{name} at {times[k] * 1e-6:.2f} s; + frame's centroid")
-    keep(figure, out / "street.png")
 
 
 def away(xy: NDArray) -> NDArray[np.bool_]:
@@ -504,7 +441,7 @@ def score_sky(tracks: Tracks, recording: Recording) -> dict[str, Any]:
     return row
 
 
-def sky(recording: Recording, out: Path) -> tuple[dict, str]:
+def sky(recording: Recording) -> tuple[dict, str]:
     results: dict[str, Any] = {}
     lines = [
         f"Long: {SKY_LIFE:g} s and more; stars: long tracks away from the planet's glare and its "
@@ -539,52 +476,7 @@ def sky(recording: Recording, out: Path) -> tuple[dict, str]:
                 f"{100 * row['explained_away']:.0f} % | {100 * row['found']['covered']:.0f} % | "
                 f"{row['found']['ever']} of {row['found']['stars']} | {row['found']['false']} |"
             )
-            if part == "reported" and values is SKY:
-                draw_sky(out, cut, tracks, row)
     return results, "\n".join(lines)
-
-
-def draw_sky(out: Path, recording: Recording, tracks: Tracks, row: dict) -> None:
-    events = recording.events[:]
-    count = np.zeros((recording.height, recording.width))
-    np.add.at(count, (events.y, events.x), 1)
-    image = (255 * np.clip(np.log1p(count) / np.log(40), 0, 1)).astype(np.uint8)
-    times = np.linspace(tracks.start, tracks.stop - 1, 27).astype(np.int64)[1:]
-    long = [one[0] for one in row["states"]]
-    states = tracks(times, long)
-    last = np.array([int(np.flatnonzero(a)[-1]) for a in states.valid.T])
-    mean, alive = states.mean.copy(), states.valid.copy()
-    for i, k in enumerate(last):  # tracks that ended keep their last place in the picture
-        mean[k:, i], alive[k:, i] = mean[k, i], True
-    arrays = recording, times, np.array(long), mean, alive
-    images = iter([image] * len(times))
-    *_, picture = track_frames(*arrays, images=images, trail=100.0, sigmas=3.0, scale=2)
-    figure = new_figure(22, 10)
-    grid = figure.add_gridspec(1, 2, width_ratios=(2.4, 1))
-    axis = figure.add_subplot(grid[0])
-    axis.imshow(picture)
-    axis.set_title("all events, tracks of long life with ellipses of 3 standard deviations")
-    axis = figure.add_subplot(grid[1])
-    for number, _, _, vx, vy, _, _, gx, gy, star in row["states"]:
-        colour = np.array(track_colour(number, dark=True)) / 255
-        axis.plot([vx, gx], [vy, gy], "-", color=colour, lw=0.5)
-        axis.plot(gx, gy, "o" if star else "x", color=colour)
-        axis.annotate(str(number), (gx, gy), fontsize=8)
-    axis.plot(*row["drift"], "k*", ms=14)
-    axis.set(xlim=(-8, 3), ylim=(-2, 9), xlabel="vx (px/s)", ylabel="vy (px/s)")
-    axis.set_title("way gone (o stars, x in the glare), line to the filter's v; * sharpest drift")
-    keep(figure, out / "sky.png")
-
-
-def new_figure(width: float, height: float):
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def keep(figure, path: Path) -> None:
-    with complete(path) as partial:
-        figure.savefig(partial, format="png", dpi=75)
 
 
 PARTS = {
@@ -595,32 +487,23 @@ PARTS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    root = os.environ.get("JAXEVENT_DATA")
-    parser.add_argument("--data", type=Path, default=Path(root) / "data" if root else None)
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
-    parser.add_argument("--only", choices=list(PARTS), nargs="+", default=list(PARTS))
+    parser = command_line(__doc__, out=True, data=True, parts=PARTS)
     arguments = parser.parse_args()
-    if arguments.data is None:
-        parser.error("give --data, the folder of the recordings, or set JAXEVENT_DATA")
     out = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
     stored = out / "results.json"
     results = json.loads(stored.read_text()) if stored.exists() else {}
     for name in arguments.only:
         file, title, part = PARTS[name]
-        values, text = part(jaxevent.load(arguments.data / file), out)
+        values, text = part(jaxevent.load(arguments.data / file))
         results[name] = {"title": f"{title} ({file})", "values": values, "table": text}
         print(f"{title}\n\n{text}\n", flush=True)
-        with complete(stored) as partial:
-            partial.write_text(json.dumps(results, indent=1))
+        write_text(stored, json.dumps(results, indent=1))
     text = "\n".join(
         f"## {results[name]['title']}\n\n{results[name]['table']}\n"
         for name in PARTS
         if name in results
     )
-    with complete(out / "table.md") as partial:
-        partial.write_text(text)
+    write_text(out / "table.md", text)
 
 
 if __name__ == "__main__":

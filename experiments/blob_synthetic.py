@@ -1,28 +1,25 @@
 """Blob tracking on simulated scenes with known states: all filters and two baselines, one table.
 
-    python experiments/blob_synthetic.py --out blob_synthetic [--seeds 6] [--only a,f]
+    python experiments/blob_synthetic.py --out blob_synthetic [--seeds 6] [--only a f]
 
 (a) a turning ellipse at up to 2014 px/s, (b) growth by approach, (c) two lights and their inverse
-time to contact, (d) background noise, (e) a disc's edges, (f) crossings, (g) drop-outs, (h) bias
-and consistency on paths drawn from the filter's own model, (i) three cars at event rate. Each track
+time to contact, (d) background noise, (f) crossings, (g) drop-outs, (i) three cars at event
+rate. Each track
 is begun by a seed 5 px (one standard deviation along each axis) beside the truth, of about twice
 the true size and at rest; those of (i) at the truth. States rest on the events up to each time,
 smoothed ones of (i) on all.
-Writes table.md, results.json and figure.png. Done parts are kept in the folder and not repeated.
+Writes table.md and results.json. Done parts are kept in the folder and not repeated.
 """
 
-import argparse
 import json
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from common import machine
+from common import command_line, machine, markdown_table, write_text
 
 from jaxevent.blob import (
     Tracker,
@@ -36,7 +33,6 @@ from jaxevent.blob import (
     moving_moments,
 )
 from jaxevent.blob.quantities import inverse_ttc, size_range
-from jaxevent.io.output import complete
 from jaxevent.recording import Recording
 from jaxevent.simulate import blob_scene
 from jaxevent.simulate.blobs import CARS, Approach, Truth
@@ -190,10 +186,6 @@ def lissajous(seeds: Sequence[int]) -> dict[str, Any]:
     return over_seeds(lambda s: blob_scene("lissajous", s), list(METHODS), seeds, start_up=True)
 
 
-def disc(seeds: Sequence[int]) -> dict[str, Any]:
-    return over_seeds(lambda s: blob_scene("disc", s), list(METHODS), seeds[:3])
-
-
 def noise(seeds: Sequence[int]) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     for ratio in (0.1, 0.5, 1.0, 10.0):
@@ -331,45 +323,20 @@ def dropouts(seeds: Sequence[int]) -> dict[str, Any]:
     return rows
 
 
-def consistency(seeds: Sequence[int]) -> dict[str, Any]:
-    """Bias with a gate of 6 sizes, by n; NEES with the process noises that drew the path."""
-    walk: dict[str, Any] = {"Q_p": 0.0, "Q_v": 1e6, "Q_lambda": 10.0, "Q_theta": 0.1, "Q_q": 50.0}
-    scene = lambda s: blob_scene("walk", s, walk_seed=s, **walk)  # noqa: E731
-    rows: dict[str, Any] = {}
-    wide: dict[str, Any] = {"gate": 6.0, "gate_max": 200.0, **walk}
-    for n in (5, 10, 20):
-        for method in ("chi2, target 2n", "chi2, target 2n+4", "chi2_split")[: 3 if n == 10 else 2]:
-            (row,) = over_seeds(scene, [method], seeds, n=n, **wide).values()
-            rows[f"gate 6 | {method} | {n}"] = row
-    (row,) = over_seeds(scene, ["moment"], seeds, **wide).values()
-    rows["gate 6 | moment | "] = row
-    for method in list(METHODS)[:6]:
-        (row,) = over_seeds(scene, [method], seeds, **walk).values()
-        rows[f"gate 3.5 | {method} | "] = row
-    return rows
-
-
 SECTIONS: dict[str, tuple[str, Callable[[Sequence[int]], dict[str, Any]]]] = {
     "a": ("a blob of (10, 5) px at up to 2014 px/s, turning, 100,000 events/s", lissajous),
     "b": ("growing from 3.5 to 12 px: 17 m to 5 m at 8 m/s", growing),
     "c": ("inverse time to contact of two lights, 0.08 to 0.67 1/s, preset ttc", contact),
     "d": ("background events, as a multiple of the blob's", noise),
-    "e": ("leading and trailing edges of a disc of 12 px", disc),
     "f": ("two blobs crossing at 1200 px/s: runs in which both keep their track", crossings),
     "g": ("drop-outs at 1900 to 2014 px/s: runs in which the target is found again", dropouts),
     "i": ("three cars, two lights each: 1 / TTC at every event", cars),
-    "h": ("bias and consistency on paths drawn from the model, 0.5 s each", consistency),
 }  # fmt: skip
 
 HEADER = (
     "", "rmse px", "velocity px/s", "lag us", "bias 1, 2 %", "std 1, 2 %", "theta deg",
     "settled ms", "NEES p/2", "NEES l/2", "lost",
 )  # fmt: skip
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join("| " + " | ".join(one) + " |" for one in lines)
 
 
 def line(name: str, row: dict[str, Any]) -> tuple[str, ...]:
@@ -433,88 +400,16 @@ def table(letter: str, rows: dict[str, Any]) -> str:
             for k, r in rows.items()
         ]
         return markdown_table(("pause", "", "recovered", "error at return, px, median"), body)
-    if letter == "h":
-        body = []
-        for key, r in rows.items():
-            gate, method, n = key.split(" | ")
-            law = f"{100 * (np.sqrt((int(n) + 1) / (int(n) - 1)) - 1):+.1f}" if n else ""
-            law = law if method.endswith("2n") else ""
-            body.append(
-                (gate, method, n, law, pm(r, "bias1", 2), pm(r, "bias2", 2), pm(r, "nees_p", 2),
-                 pm(r, "nees_l", 2), f"{r['rmse']:.3f}")
-            )  # fmt: skip
-        return markdown_table(
-            ("", "", "n", "law %", "bias 1 %", "bias 2 %", "NEES p/2", "NEES l/2", "rmse px"), body
-        )
     header = ("noise", *HEADER) if letter == "d" else HEADER
     body = [(*key.split(" | "), *line("", row)[1:]) for key, row in rows.items()]
     return markdown_table(header, body)
 
 
-def picture(path: Path, seed: int, rows: dict[str, Any]) -> None:
-    """Start-up of the shape, range, inverse time to contact, and sizes in noise."""
-    figure, axes = plt.subplots(2, 2, figsize=(11, 7.5), layout="constrained")
-    shown = ("chi2, target 2n", "chi2_split", "moment", "moving moments, 2 ms")
-    recording, truth = blob_scene("lissajous", seed)
-    ms = np.arange(0, 20_000, 100)
-    for method in shown:
-        tracks = followed(recording, truth, choose(method), 20.0, seed, stop=0.1)
-        (dots,) = axes[0, 0].plot(ms / 1e3, tracks(ms).mean[:, 0, 4], label=method)
-        axes[0, 0].plot(ms / 1e3, tracks(ms).mean[:, 0, 5], color=dots.get_color())
-    for value in (10, 5):
-        axes[0, 0].axhline(value, color="k", lw=0.8)
-    axes[0, 0].set(xlabel="ms since the seed", ylabel="lambda1, lambda2 (px)")
-    axes[0, 0].legend()
-
-    recording, truth = blob_scene("growing", seed)
-    times = np.arange(0.02, 1.498, 0.004)
-    motion = truth.targets[0].motion
-    assert isinstance(motion, Approach)
-    axes[0, 1].plot(times, motion.depth(times), "k", lw=0.8)
-    for method in shown[:1] + shown[2:]:
-        states = followed(recording, truth, choose(method), 8.0, seed)(times)
-        value, _ = range_of(states, 0.24)
-        axes[0, 1].plot(times, value, label=method, lw=0.8)
-    axes[0, 1].set(xlabel="s", ylabel="range from size (m)", ylim=(3, 20))
-    axes[0, 1].legend()
-
-    recording, truth = blob_scene("ttc", seed)
-    times = np.arange(0.02, 3.44, 0.01)
-    motion = truth.targets[0].motion
-    assert isinstance(motion, Approach)
-    states = followed(recording, truth, choose("moment", preset="ttc"), 10.0, seed)(times)
-    value, variance = contact_of(states)
-    sigma = np.sqrt(variance)
-    axes[1, 0].fill_between(times, value - 2 * sigma, value + 2 * sigma, alpha=0.3)
-    axes[1, 0].plot(times, value, label="moment, ± 2 standard deviations", lw=0.8)
-    true = (motion.speed + motion.acceleration * times) / motion.depth(times)
-    axes[1, 0].plot(times, true, "k", lw=0.8)
-    axes[1, 0].set(xlabel="s", ylabel="1 / TTC (1/s)", ylim=(-0.3, 1.0))
-    axes[1, 0].legend()
-
-    noisy = {tuple(key.split(" | ")): row["bias2"] for key, row in rows.get("d", {}).items()}
-    for method in {name: None for _, name in noisy if name != CONSTANT}:
-        ratios = [ratio for ratio, name in noisy if name == method]
-        biases = [noisy[ratio, method] for ratio in ratios]
-        axes[1, 1].plot([float(ratio) for ratio in ratios], biases, "o-", label=method)
-    axes[1, 1].set(
-        xscale="log", xlabel="background events / the blob's", ylabel="bias of lambda2, %"
-    )
-    if noisy:
-        axes[1, 1].legend()
-    with complete(path) as part:
-        figure.savefig(part, dpi=110, format="png")
-    plt.close(figure)
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("blob_synthetic"))
+    parser = command_line(__doc__, out=True, parts=SECTIONS)
     parser.add_argument("--seeds", type=int, default=6, help="recordings of each scene")
     parser.add_argument("--first-seed", type=int, default=1000)
-    parser.add_argument("--only", default="".join(SECTIONS), help="sections, as a,f")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     kept = arguments.out / "results.json"
     about: dict[str, Any] = {"machine": machine(), "seeds": [seeds[0], seeds[-1]]}
@@ -522,13 +417,12 @@ def main() -> int:
     if results and results["seeds"] != about["seeds"]:
         raise SystemExit(f"{kept} is of seeds {results['seeds']}; give another folder or remove it")
     results = {**results, **about}
-    for letter in [one for one in SECTIONS if one in arguments.only]:
+    for letter in arguments.only:
         if letter in results:
             continue
         begin = time.perf_counter()
         results[letter] = SECTIONS[letter][1](seeds)
-        with complete(kept) as part:
-            part.write_text(json.dumps(results, indent=1) + "\n")
+        write_text(kept, json.dumps(results, indent=1) + "\n")
         print(
             f"\n({letter}) {time.perf_counter() - begin:.0f} s\n\n{table(letter, results[letter])}"
         )
@@ -539,9 +433,7 @@ def main() -> int:
         for letter, (title, _) in SECTIONS.items()
         if letter in results
     ]
-    with complete(arguments.out / "table.md") as part:
-        part.write_text("\n".join(text))
-    picture(arguments.out / "figure.png", seeds[0], results)
+    write_text(arguments.out / "table.md", "\n".join(text))
     return 0
 
 

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from compensated_choice import noise_of
-from motion_compensated import Row, Store, evenly, markdown
+from motion_compensated import Row, Store, evenly, table
 from numpy.typing import NDArray
 
 import jaxevent
@@ -124,7 +124,7 @@ def main() -> None:
         least = min((r["mse"] for r in same if r["method"] in INGREDIENTS), default=np.nan)
         if row["method"] == "mc":
             row["ratio"] = row["mse"] / least
-    text = markdown(rows, {key: key for key in keys}, COLUMNS)
+    text = table(rows, {key: key for key in keys}, COLUMNS)
     (out / f"{kind}.md").write_text(text)
     print(text)
 

@@ -1,4 +1,4 @@
-"""Methods that follow motion against those that do not: hidden frames, moving objects, blur, flow.
+"""Methods that follow motion against those that do not: hidden frames, moving objects, blur.
 
     JAXEVENT_DATA=FOLDER python experiments/motion_compensated.py --params fitted --out compared
 
@@ -8,11 +8,6 @@
     street   davis346_street, every 2nd, 4th, 8th; all pixels, and where something moves
     objects  simulated objects, frames at 25 and 100 Hz, halfway between frames
     blur     pans and objects, long exposures: at the frames' middles, and halfway between them
-    exposures  the same of `mc`, not fitted, with and without exposures along trajectories
-    flow     the optical flow of objects, against the true one
-    video    seconds of all cores per image of `mc` on slider_depth, 100 images per second and far
-             apart, of the smoother's images at the same times, and the error of hidden frames: as
-             it is, and with an anchor for every target
 
 Of hidden frames a few are scored, evenly chosen among those that lie between given ones. Simulated
 recordings are those of seeds 101 to 103; the smoother and the filter are fitted to seeds 1 to 3.
@@ -24,7 +19,6 @@ reconstruction and reading, without compilation.
 
 import argparse
 import dataclasses
-import functools
 import itertools
 import json
 import os
@@ -35,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import command_line, markdown_table
 from compensated_choice import noise_of
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -42,7 +37,6 @@ from tqdm import tqdm
 import jaxevent
 from jaxevent.camera import UnknownResponse
 from jaxevent.parameters import Parameters, read_toml
-from jaxevent.reconstruction.compensated import estimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import frame_times, held_out
@@ -56,7 +50,6 @@ CHOOSING, SCORING = (1, 2, 3), (101, 102, 103)  # seeds
 RATES = (25.0, 100.0)  # Hz
 IMAGES = {2: 10, 4: 10, 8: 10, 16: 8}  # by gap
 BLURS = ((0.02, 0.05, 0.1), (25.0, 100.0, 300.0))  # s; px/s
-FAR = 3.0  # px, errors of the flow that count as wrong
 
 FIT = """
 recordings = [{recordings}]
@@ -341,38 +334,19 @@ def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
         store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
 
 
-def exposures(store: Store, folder: Path) -> None:
-    """Score `mc` on the same images, with and without exposures integrated along trajectories."""
-    mc = jaxevent.METHODS["mc"]
-    params = mc.Params.of({"c_on": 0.2, "c_off": 0.18, "I0": 0.1, "rho_ref": 5e-4})
-    both = {"mc": (mc, params), "mc, per pixel": (mc, params.replace(integrate=False))}
-    for cell, source, recording in tqdm(blurred(folder), disable=not sys.stderr.isatty()):
-        t, parts = at_and_between(recording)
-        store.add(cell, both, _scorer(recording, truth_of(source, t), None, parts))
-
-
-def blurred(
-    folder: Path,
-    blurs: tuple[tuple[float, ...], tuple[float, ...]] = BLURS,
-    label: str = "",
-    **other: Any,
-) -> Iterator[tuple[Row, Source, Recording]]:
-    """Recordings of long exposures, with what tells them apart: exposures (s), speeds (px/s).
-
-    The label is of the sensor's `other` settings, in the names of files.
-    """
+def blurred(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
+    """Iterate over recordings of long exposures, with scene, exposure and speed."""
     light, seed = panorama(), SCORING[0]
-    for kind, exposure, speed in itertools.product(("pan", "objects"), *blurs):
+    for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
-        camera = dataclasses.replace(camera, **other)
         size, duration = (160, 120), 7 / rate + exposure
         source: Source = (
             Objects(size, duration, speed, seed=seed)
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )
-        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px{label}.h5"
+        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px.h5"
         recording = recorded(folder / "recordings" / name, source, camera, seed)
         yield {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}, source, recording
 
@@ -385,148 +359,49 @@ def at_and_between(recording: Recording) -> tuple[NDArray[np.int64], dict[str, N
     return t, {"at_frames": np.flatnonzero(at), "between": np.flatnonzero(~at)}
 
 
-def flow_errors(
-    found: NDArray, true: NDArray, where: NDArray[np.bool_] | None = None
-) -> tuple[float, float]:
-    """Mean end-point error in px, and per cent of pixels where it is above `FAR`."""
-    error = np.linalg.norm(found - true, axis=-1)
-    error = error if where is None else error[where]
-    return float(np.nanmean(error)), float(100 * np.mean(~(error <= FAR)))
-
-
-def dense_flow(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
-    """Score flows, in px per frame: halfway between frames, and from each to the next."""
-    methods = fits(fitted_to_objects(folder))
-    methods = {n: (m, p) for n, (m, p) in methods.items() if n in ("flow", "mc")}
-    for rate in RATES:
-        for seed in tqdm(SCORING, desc=f"flow, {rate:g} Hz", disable=not sys.stderr.isatty()):
-            source, recording = objects_at(folder, rate, seed)
-            score = _flow_scorer(source, recording, halfway(recording, 6), 1 / rate)
-            store.add({"rate": rate, "seed": seed}, methods, score)
-
-
-def _flow_scorer(
-    source: Objects, recording: Recording, middles: NDArray[np.int64], step: float
-) -> Callable[..., Row]:
-    def score(method: Any, params: Any) -> Row:
-        late = round(1e6 * float(params.clock_offset))
-        video = method.estimate(recording, params, progress=False)
-        video(middles[:1] + late)  # compiles
-        clock = time.perf_counter()
-        now = video.flow(middles + late) * step
-        seconds = (time.perf_counter() - clock) / len(middles)
-        begins = middles - round(0.5e6 * step)
-        ahead = video.flow(begins + late, extrapolate=True) * step
-        columns: dict[str, list[float]] = {}
-        for k, (middle, begin) in enumerate(zip(middles, begins, strict=True)):
-            t, t0 = float(middle) * 1e-6, float(begin) * 1e-6
-            moved, hidden = source.displacement(t0, t0 + step)
-            for name, pair in (
-                ("now", flow_errors(now[k], source.flow(t) * step)),
-                ("next", flow_errors(ahead[k], moved, ~hidden)),
-                ("all", flow_errors(ahead[k], moved)),
-            ):
-                for what, value in zip(("epe", "far"), pair, strict=True):
-                    columns.setdefault(f"{what}_{name}", []).append(value)
-        row: Row = {name: float(np.mean(values)) for name, values in columns.items()}
-        return {**row, "seconds": seconds, "images": len(middles)}
-
-    return score
-
-
-def video(store: Store, recording: Recording, fits: Chosen) -> None:
-    """Time evenly spaced images, with the motion of anchors and with every target's own."""
-    frames = recording.frames
-    assert frames is not None
-    for gap, apart in itertools.product((2, 8), (estimator.ANCHOR_STEPS, 1)):
-        given, hidden = held_out(recording, gap)
-        rows = evenly(hidden_between(len(frames), gap), IMAGES[gap])
-        truth = hidden[np.searchsorted(hidden.t, frames.t[rows])]
-        smoother = functools.partial(jaxevent.METHODS["aks"].estimate, given, fits["aks"][1])
-        score = functools.partial(_paced, smoother=smoother, given=given, truth=truth, apart=apart)
-        store.add({"gap": gap, "apart": apart}, {"mc": fits["mc"]}, score)
-
-
-def _paced(
-    method: Any,
-    params: Any,
-    smoother: Callable[..., Any],
-    given: Recording,
-    truth: Frames,
-    apart: int,
-) -> Row:
-    kept, estimator.ANCHOR_STEPS = estimator.ANCHOR_STEPS, apart
-    times = frame_times(truth, params)
-    evenly_spaced = times[len(times) // 2] + np.arange(16) * 10_000
-
-    def seconds(made: Any, wanted: NDArray[np.int64]) -> float:
-        """CPU time per image."""
-        made(wanted[-1:])  # the smoother has gone through the recording
-        clock = time.process_time()
-        made(wanted)
-        return (time.process_time() - clock) / len(wanted)
-
-    try:
-        image = method.estimate(given, params, progress=False)(times).mean
-        paces = {"seconds": evenly_spaced, "alone": times[:-1]}
-        row: Row = {
-            name: seconds(method.estimate(given, params, progress=False), wanted)
-            for name, wanted in paces.items()
-        }
-        row["smoother"] = seconds(smoother(progress=False), evenly_spaced)
-    finally:
-        estimator.ANCHOR_STEPS = kept
-    errors = (np.clip(image, 0, 1) - truth.intensity) ** 2
-    return {**row, "mse": float(errors.mean()), "images": len(times)}
-
-
 IMAGE_COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4),
     ("SSIM", "ssim", 1, 3),
     ("z2", "z2", 1, 2),
     ("s", "seconds", 1, 3),
 )
-FLOW_COLUMNS = tuple(
-    (f"{title}{ending}", f"{name}_{what}", 1, 2)
-    for what, ending in (("now", ", halfway"), ("next", ", to the next"), ("all", ", hidden too"))
-    for title, name in (("EPE px", "epe"), (f"% > {FAR:g} px", "far"))
-)
 
 
-def markdown(
+def table(
     rows: Sequence[Row], keys: Mapping[str, str], columns: Iterable[tuple[str, str, int, int]]
 ) -> str:
-    """A Markdown table."""
+    """Return a Markdown table of rows.
+
+    Args:
+        rows: Rows by column.
+        keys: Titles of the columns that tell rows apart.
+        columns: Title, name, factor and digits of each column of numbers.
+    """
     columns = list(columns)
-    head = [*keys.values(), *(title for title, *_ in columns)]
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(keys) + "---:|" * len(columns)]
+    lines = []
     for row in rows:
         cells = [f"{row[k]:g}" if isinstance(row[k], float) else str(row[k]) for k in keys]
         for _, name, factor, digits in columns:
             value = row.get(name)
-            if value is None or not np.isfinite(value):
-                cells.append("-")
-            else:
-                cells.append(f"{factor * value:.{digits}f}")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            missing = value is None or not np.isfinite(value)
+            cells.append("-" if missing else f"{factor * value:.{digits}f}")
+        lines.append(cells)
+    return markdown_table([*keys.values(), *(title for title, *_ in columns)], lines, len(keys))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = ("slider", "street", "objects", "blur", "exposures", "flow", "video")
+    parser = command_line(__doc__, out=True)
+    tables = ("slider", "street", "objects", "blur")
     parser.add_argument("--params", type=Path, help="folder of a fit to slider_depth")
     parser.add_argument("--street-params", type=Path, help="of one to davis346_street; or the same")
     parser.add_argument("--mc-params", type=Path, help="file or folder with the parameters of mc")
     parser.add_argument("--mc-label", default="mc", help="their label; default: %(default)s")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
     parser.add_argument("--tables", nargs="+", default=tables, choices=tables)
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     arguments = parser.parse_args()
-    if arguments.params is None and {"slider", "street", "video"} & set(arguments.tables):
-        parser.error("the tables slider, street and video need --params")
+    if arguments.params is None and {"slider", "street"} & set(arguments.tables):
+        parser.error("the tables slider and street need --params")
     out = arguments.out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
     names, compensated = arguments.methods, Compensated(arguments.mc_params, arguments.mc_label)
 
     def fits(folder: Path) -> Chosen:
@@ -548,7 +423,7 @@ def _tables(
         halves = {"1st": 0, "2nd": 1}
         real(store, recording, fits(arguments.params), IMAGES, halves)
         keys = {"gap": "gap", "half": "half", "method": "method"}
-        yield "slider", markdown(store.means(list(keys), names), keys, IMAGE_COLUMNS)
+        yield "slider", table(store.means(list(keys), names), keys, IMAGE_COLUMNS)
     if "street" in wanted:
         store = Store(out / "street.json")
         recording = jaxevent.load(data / "davis346_street.npz")
@@ -557,40 +432,21 @@ def _tables(
         keys = {"gap": "gap", "method": "method"}
         more = (("moving MSE x 1e-2", "moving_mse", 100, 4), ("share", "moving_share", 1, 4))
         rows = store.means(list(keys), names)
-        yield "street", markdown(rows, keys, (*IMAGE_COLUMNS, *more))
+        yield "street", table(rows, keys, (*IMAGE_COLUMNS, *more))
     keys = {"rate": "frames (Hz)", "method": "method"}
     if "objects" in wanted:
         store = Store(out / "objects.json")
         objects(store, out, fits)
-        yield "objects", markdown(store.means(list(keys), names), keys, IMAGE_COLUMNS)
-    for name in ("blur", "exposures"):
-        if name not in wanted:
-            continue
-        store = Store(out / f"{name}.json")
-        if name == "blur":
-            blur(store, out, fits)
-        else:
-            exposures(store, out)
+        yield "objects", table(store.means(list(keys), names), keys, IMAGE_COLUMNS)
+    if "blur" in wanted:
+        store = Store(out / "blur.json")
+        blur(store, out, fits)
         parts = (("at frames", "at_frames", 100, 4), ("between", "between", 100, 4))
         how = {
             "scene": "scene", "exposure_ms": "exposure (ms)", "speed": "px/s", "method": "method",
         }  # fmt: skip
         rows = store.means(list(how), names)
-        yield name, markdown(rows, how, (*IMAGE_COLUMNS, *parts))
-    if "flow" in wanted:
-        store = Store(out / "flow.json")
-        dense_flow(store, out, fits)
-        columns = (*FLOW_COLUMNS, ("s", "seconds", 1, 3))
-        yield "flow", markdown(store.means(list(keys), names), keys, columns)
-    if "video" in wanted and "mc" in names:
-        store = Store(out / "video.json")
-        video(store, jaxevent.load(data / "slider_depth.zip"), fits(arguments.params))
-        columns = (
-            ("MSE x 1e-2", "mse", 100, 4), ("s", "seconds", 1, 3), ("s, far apart", "alone", 1, 3),
-            ("s, smoother", "smoother", 1, 4),
-        )  # fmt: skip
-        keys = {"gap": "gap", "apart": "steps between anchors"}
-        yield "video", markdown(store.means(list(keys), names), keys, columns)
+        yield "blur", table(rows, how, (*IMAGE_COLUMNS, *parts))
 
 
 if __name__ == "__main__":

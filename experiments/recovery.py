@@ -21,9 +21,11 @@ import numpy as np
 
 import jaxevent
 from jaxevent.confidence import FitIntervals, confidence_intervals
+from jaxevent.egomotion.models import Planar
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.blob import FAMILY as BLOBS
-from jaxevent.runs.egomotion import MotionLoss
+from jaxevent.runs.egomotion import MotionGoal, MotionLoss
 from jaxevent.runs.reconstruction import Objective, Problem, RecordingWindow, cut_windows
 from jaxevent.simulate import Pan, Sensor, blob_scene, scene, simulate
 from jaxevent.tuning import Settings, optimise
@@ -196,22 +198,68 @@ def blob_recovery(seed: int) -> Recovered:
 
 
 NOISE = {"noise": 1.0}
+STEP = 2e-4  # s, of points that move
+SEQUENCES, RUNS, SETTLE = 6, 2, 0.05  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedGoal(MotionGoal):
+    """Goal of recordings whose true motion is given, not read from a file."""
+
+    truths: tuple[KnownMotion, ...] = ()
+
+    def known(self, recording: Recording) -> KnownMotion:
+        return self.truths[int(recording.name)]
+
+
+def drifting_points(
+    seed: int, size: tuple[int, int], noise: float, seconds: float = 0.4
+) -> tuple[Recording, KnownMotion]:
+    """Draw points whose velocity wanders by `noise` of its speed per square root of a second."""
+    rng = np.random.default_rng([seed, 5])
+    angle = rng.uniform(0, 2 * np.pi)
+    path = [200.0 * np.array([np.cos(angle), np.sin(angle)])]
+    for step in rng.normal(size=(round(seconds / STEP) - 1, 2)):
+        path.append(path[-1] + noise * np.linalg.norm(path[-1]) * np.sqrt(STEP) * step)
+    return events_of_points(seed, size, np.array(path))
+
+
+def events_of_points(
+    seed: int, size: tuple[int, int], path: np.ndarray, number: int = 60
+) -> tuple[Recording, KnownMotion]:
+    """Draw points that move by a path of velocities (times, 2), `STEP` apart, px/s."""
+    rng = np.random.default_rng([seed, 1])
+    at, sign = rng.uniform([0, 0], size, (number, 2)), rng.random(number) < 0.5
+    cell, rows = np.floor(at), []
+    times = STEP * np.arange(len(path))
+    for t, U in zip(times, path, strict=True):
+        at = at + U * STEP
+        left = ((at < 0) | (at >= size)).any(1)
+        at = np.where(left[:, None], np.mod(at, size), at)
+        new = np.flatnonzero((np.floor(at) != cell).any(1) & ~left)
+        cell = np.floor(at)
+        rows.append(np.c_[1e6 * (t + STEP * rng.random(len(new))), cell[new], sign[new]])
+    table = np.concatenate(rows)
+    t, x, y, p = table[np.argsort(table[:, 0], kind="stable")].T
+    events = Events(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p > 0)
+    grid = np.rint(1e6 * times).astype(np.int64)
+    return Recording("points", *size, events), KnownMotion(Planar, grid, path)
 
 
 def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> Recovered:
     """Of the soft vote, by the error of the motion; noise too small by a factor of 5."""
-    from egomotion_tuning import Problem as Sequences
-    from egomotion_tuning import drifting
-
-    def make(number: int, size: tuple[int, int]):
-        return drifting(number + 10 * seed, size, NOISE["noise"])
-
-    start = jaxevent.egomotion.voting.Params(particles=100, batch=32, noise=0.2)
-    _, batches, _ = Sequences(make, 6, (96, 72))(start)
+    drawn = [drifting_points(k + 10 * seed, (96, 72), NOISE["noise"]) for k in range(SEQUENCES)]
+    named = [dataclasses.replace(one, name=str(k)) for k, (one, _) in enumerate(drawn)]
+    truths = tuple(truth for _, truth in drawn)
+    voting, loss = jaxevent.egomotion.voting, MotionLoss()
+    goal = SimulatedGoal(voting, loss, "planar", "", RUNS, SETTLE, {}, truths)
+    start = voting.Params(particles=100, batch=32, noise=0.2)
+    sources: Any = {"fit": [(one.name, one) for one in named], "validation": [], "test": []}
+    batches, _ = goal.problem(sources, None, None)(start)
     settings = Settings(
         iterations=30, learning_rate=0.2, rounds=1, every=10, patience=1000, forward=True
     )
-    return NOISE, found_by(MotionLoss(), start, list(names), batches, settings)
+    return NOISE, found_by(loss, start, list(names), batches, settings)
 
 
 def sensor_recovery(seed: int) -> Recovered:
