@@ -13,7 +13,6 @@ each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have i
 every sixth image.
 """
 
-import argparse
 import importlib.util
 import json
 import os
@@ -21,6 +20,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from common import command_line, markdown_table
 from tqdm import tqdm
 
 import jaxevent
@@ -139,20 +139,24 @@ def summary(rows: list[dict], measure) -> tuple[float, float]:
 
 def table(rows: list[dict]) -> str:
     labels = list(dict.fromkeys(row["method"] for row in rows))
-    lines = ["| method | " + " | ".join(MEASURES) + " |", "|---|" + "---:|" * len(MEASURES)]
+    lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label]
         cells = [
             f"{m:.3g} +- {100 * s:.0f} %" for m, s in (summary(mine, f) for f in MEASURES.values())
         ]
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    lines += ["", "| method | z2 bright, dark, well | Q |", "|---|---|---:|"]
+        lines.append([label, *cells])
+    quality_lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label]
         seen = [row["Q"] for row in mine]
         Q = "-" if None in seen else f"{np.mean(seen):.2f}"
-        lines.append(f"| {label} | {calibration(mine)} | {Q} |")
-    return "\n".join(lines) + "\n"
+        quality_lines.append([label, calibration(mine), Q])
+    tables = (
+        markdown_table(["method", *MEASURES], lines),
+        markdown_table(["method", "z2 bright, dark, well", "Q"], quality_lines, 2),
+    )
+    return "\n\n".join(tables) + "\n"
 
 
 def calibration(rows: list[dict]) -> str:
@@ -169,21 +173,17 @@ def calibration(rows: list[dict]) -> str:
 def scenes_apart(rows: list[dict]) -> str:
     """The table of z2, scene by scene."""
     labels = dict.fromkeys(row["method"] for row in rows)
-    lines = [
-        "| z2 bright, dark, well | " + " | ".join(TESTING) + " |",
-        "|---|" + "---|" * len(TESTING),
-    ]
+    lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label and row.get("z2") is not None]
         own = {n: [r for r in mine if r["recording"].startswith(f"{n}_")] for n in TESTING}
         if mine:
-            lines.append(f"| {label} | " + " | ".join(map(calibration, own.values())) + " |")
-    return "\n".join(lines) + "\n"
+            lines.append([label, *map(calibration, own.values())])
+    return markdown_table(["z2 bright, dark, well", *TESTING], lines) + "\n"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sensor", choices=list(SENSORS), default="davis")
     parser.add_argument(

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from blob_scenes import SCENES, VARIED
-from common import command_line
+from common import command_line, markdown_table
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -275,7 +275,7 @@ def main() -> None:
 
 def _table(rows: list[dict]) -> str:
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = ["| scene | " + " | ".join(methods) + " |", "|---|" + "---|" * len(methods)]
+    lines = []
     for name in [*dict.fromkeys(row["scene"] for row in rows), "all"]:
         cells = []
         for method in methods:
@@ -286,8 +286,9 @@ def _table(rows: list[dict]) -> str:
                 f"{found}/{targets}, {sum(r['false'] for r in own)}, "
                 f"{np.mean([r['idf1'] for r in own]):.2f}, {np.mean(errors or [np.nan]):.2f}"
             )
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "found, false tracks, IDF1, rms px\n\n" + "\n".join(lines) + "\n"
+        lines.append([name, *cells])
+    table = markdown_table(["scene", *methods], lines)
+    return f"found, false tracks, IDF1, rms px\n\n{table}\n"
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Blob tracking on real recordings: a spinning dot, cars on a street, a night sky.
+"""Blob tracking on real recordings: a spinning dot and cars on a street.
 
     python experiments/blob_real.py --data DIR --out blob_real
 
-DIR holds spinning_dot.npz, davis346_street.npz and gen4.dat; by default $JAXEVENT_DATA/data. Makes
+DIR holds spinning_dot.npz and davis346_street.npz; by default $JAXEVENT_DATA/data. Makes
 table.md and results.json. No reference uses the tracker, and all are made with
 hindsight: the dot's path is a circle fitted to centroids, the cars are found in the frames, the
 sky's drift is the one motion that makes the events sharpest. The cars'
@@ -15,7 +15,6 @@ import json
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import command_line, write_text
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
@@ -47,7 +46,6 @@ STREET: dict[str, Any] = {
     "n_confirm": 200.0, "t_confirm": 0.05, "t_tentative": 0.1, "t_coast": 0.3, "surround": 2.0,
 }  # fmt: skip
 
-SKY_PARTS = {"chosen": (2.5, 5.0), "reported": (5.0, 10.2)}
 # The glare of a planet fills the preset's 8 px: a star is a point. Faint stars need fewer events to
 # begin and confirm a track, which the prefilter affords.
 SKY: dict[str, Any] = {
@@ -55,7 +53,6 @@ SKY: dict[str, Any] = {
     "gate": 3.0, "n_birth": 6.0, "n_confirm": 20.0,
     "prefilter": True, "prefilter_time": 0.5, "prefilter_neighbours": 1,
 }  # fmt: skip
-SKY_LIFE = 2.0  # s, of the tracks whose drift is compared
 GLARE = ((470, 300, 170), (800, 450, 130))  # x, y, radius in px of the planet and of its ghost
 
 
@@ -383,110 +380,15 @@ def find_stars(recording: Recording, drift: NDArray, rate: float = 12.0) -> NDAr
     return places[stay & away(places) & away(end)]
 
 
-def score_sky(tracks: Tracks, recording: Recording) -> dict[str, Any]:
-    """Stars found, life times, drift of long tracks, and the share of events explained."""
-    life = (tracks.death - tracks.birth) * 1e-6
-    long = life >= min(SKY_LIFE, 0.8e-6 * (tracks.stop - tracks.start))
-    last = np.maximum(tracks.death - 1, tracks.birth)
-    rows = np.arange(len(tracks))
-    end = tracks(last).mean[rows, rows].astype(np.float64)
-    # Half a life of settling, and then the way that was gone.
-    half = (tracks.birth + last) // 2
-    middle = tracks(half).mean[rows, rows].astype(np.float64)
-    gone = (end[:, :2] - middle[:, :2]) / np.maximum((last - half) * 1e-6, 1e-6)[:, None]
-    stars = long & away(end[:, :2])
-    row: dict[str, Any] = {
-        "confirmed": len(tracks),
-        "life": [float(q) for q in np.percentile(life, [25, 50, 75])] if len(life) else [],
-        "long": int(long.sum()),
-        "stars": int(stars.sum()),
-        "lambda1": float(np.median(end[stars, 4])) if stars.any() else None,
-        "ended": {why: tracks.ended.count(why) for why in sorted(set(tracks.ended))},
-        "drift": sharpest_drift(recording).tolist(),
-    }
-    drift = np.array(row["drift"])
-    stars_at = find_stars(recording, drift)
-    times = np.linspace(tracks.start + 1_000_000, tracks.stop - 1, 12).astype(np.int64)
-    states = tracks(times)
-    places = stars_at + ((times - tracks.start) * 1e-6)[:, None, None] * drift
-    far = np.linalg.norm(places[:, :, None] - states.mean[:, None, :, :2], axis=-1)
-    near = (far < 5) & states.valid[:, None]
-    follows = near.any((0, 1))
-    row["found"] = {
-        "stars": len(stars_at),
-        "covered": float(near.any(2).mean()) if len(stars_at) else None,
-        "ever": int(near.any((0, 2)).sum()),
-        "distance": float(np.median(far[near])) if near.any() else None,
-        "false": int((long & away(end[:, :2]) & ~follows).sum()),
-    }
-    for name, which in (("long", long), ("stars", stars)):
-        for what, v in (("filter", end[:, 2:4]), ("way", gone)):
-            if which.any():
-                centre = np.median(v[which], 0)
-                spread = np.median(abs(v[which] - centre), 0)
-                row[f"{name}_{what}"] = [*centre.tolist(), *spread.tolist()]
-    near = np.hypot(*(gone - row["drift"]).T) < 1.5
-    row["stars_alike"] = int((stars & near).sum())
-    row["long_alike"] = int((long & near).sum())
-    row["states"] = [
-        [int(tracks.id[i]), *end[i, :6].tolist(), *gone[i].tolist(), bool(stars[i])]
-        for i in np.flatnonzero(long)
-    ]
-    held, events = np.zeros(4), recording.events[:]
-    for part in tracks.events():
-        xi = np.stack([events.x[part.row], events.y[part.row]], 1)
-        far, mine = away(xi.astype(float)), part.id >= 0
-        held += [mine.sum(), len(mine), (mine & far).sum(), far.sum()]
-    row["explained"], row["explained_away"] = held[0] / held[1], held[2] / held[3]
-    return row
-
-
-def sky(recording: Recording) -> tuple[dict, str]:
-    results: dict[str, Any] = {}
-    lines = [
-        f"Long: {SKY_LIFE:g} s and more; stars: long tracks away from the planet's glare and its "
-        "ghost; alike: on its way within 1.5 px/s of the drift that makes the events sharpest. "
-        "Medians, with the median absolute deviation in brackets (px/s).",
-        "",
-        "| part (s) | settings | confirmed | life, quartiles (s) | long, alike | stars, alike | "
-        "stars' v by the filter | stars' v on the way | sharpest drift | events explained, away "
-        "from the glare | stars covered | stars ever found | long tracks on no star |",
-        "|---|---|" + "---:|" * 11,
-    ]
-
-    def velocity(row: dict, name: str) -> str:
-        if name not in row:
-            return "-"
-        x, y, dx, dy = row[name]
-        return f"{x:.2f}, {y:.2f} ({dx:.2f}, {dy:.2f})"
-
-    for part, span in SKY_PARTS.items():
-        cut = recording[span[0] : span[1]]
-        plain: dict[str, Any] = {"preset": "slow", "events_per_step": 16, "max_targets": 128}
-        rows = {"for stars": SKY} | ({"slow preset": plain} if part == "reported" else {})
-        for label, values in rows.items():
-            tracks = moment.estimate(cut, moment.Params(**values), smooth=False)
-            row = results[f"{label}, {part}"] = score_sky(tracks, cut)
-            life = ", ".join(f"{one:.1f}" for one in row["life"])
-            lines.append(
-                f"| {part} {span[0]:g} to {span[1]:g} | {label} | {row['confirmed']} | {life} | "
-                f"{row['long']}, {row['long_alike']} | {row['stars']}, {row['stars_alike']} | "
-                f"{velocity(row, 'stars_filter')} | {velocity(row, 'stars_way')} | "
-                f"{row['drift'][0]:.1f}, {row['drift'][1]:.1f} | {100 * row['explained']:.0f} %, "
-                f"{100 * row['explained_away']:.0f} % | {100 * row['found']['covered']:.0f} % | "
-                f"{row['found']['ever']} of {row['found']['stars']} | {row['found']['false']} |"
-            )
-    return results, "\n".join(lines)
-
-
 PARTS = {
     "spinning_dot": ("spinning_dot.npz", "A spinning dot", spinning_dot),
     "street": ("davis346_street.npz", "Cars on a street", street),
-    "sky": ("gen4.dat", "A night sky", sky),
 }
 
 
 def main() -> None:
+    from common import command_line, write_text
+
     parser = command_line(__doc__, out=True, data=True, parts=PARTS)
     arguments = parser.parse_args()
     out = arguments.out

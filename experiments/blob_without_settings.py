@@ -13,9 +13,7 @@ in them goes its own way; `--cuts` looks at short parts of these instead. Makes 
 results.json.
 """
 
-import argparse
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,6 +30,7 @@ from blob_real import (
     fit_circling,
     sharpest_drift,
 )
+from common import command_line
 from numpy.typing import NDArray
 
 from jaxevent.blob import TargetSearchResult, Tracks, find, moment
@@ -216,16 +215,11 @@ def cuts(data: Path) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--data", type=Path)
+    parser = command_line(__doc__, out=True, data=True)
     parser.add_argument("--only", nargs="+", default=[*KNOWN, *CAMERA])
     parser.add_argument("--cuts", action="store_true")
     args = parser.parse_args()
-    data = args.data or Path(os.environ["JAXEVENT_DATA"]) / "data"
-    args.out.mkdir(parents=True, exist_ok=True)
+    data = args.data
     if args.cuts:
         (args.out / "table.md").write_text("\n".join(cuts(data)) + "\n")
         return

@@ -1,6 +1,6 @@
 """The numbers by which `mc` chooses between its ingredients: fits `choice` and `doubt`.
 
-    python experiments/compensated_choice.py --data $JAXEVENT_DATA --out choice
+    JAXEVENT_DATA=FOLDER python experiments/compensated_choice.py --out choice
 
 Every image that is scored here was hidden from the methods: frames of the first half of
 slider_depth, at gaps of 2 to 16 frames, and true images of simulated HDR scenes, of moving
@@ -13,7 +13,6 @@ scores them on davis346_street and the second half of slider_depth, cut likewise
 Frames that serve as truth are noisy: their own variance is added to that of the images.
 """
 
-import argparse
 import dataclasses
 import itertools
 import pickle
@@ -25,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from common import command_line, markdown_table
 from tqdm import tqdm
 
 import jaxevent
@@ -483,64 +483,6 @@ class Fit:
         return w.at[-1].add(np.log(factor))
 
 
-def eliminate(value: Callable[..., Any], weights: Any, *data: Any) -> list[int]:
-    """Order features by backward elimination: the first one is the first to go.
-
-    At each turn the feature goes without which the loss is least when the other weights adapt, by
-    the second-order expansion of the loss about its minimum.
-    """
-    flat = np.asarray(weights, float).ravel()
-    hessian = jax.hessian(lambda w: value(w.reshape(weights.shape), *data))
-    H = np.asarray(hessian(jnp.asarray(flat, jnp.float32)), float)
-    step, rest = weights.shape[-1], list(range(len(FEATURES)))
-    kept = np.arange(len(flat))
-    order: list[int] = []
-    while rest:
-        inverse, found = np.linalg.inv(H[np.ix_(kept, kept)]), []
-        for k in rest:
-            own = np.flatnonzero(kept % step == k)
-            change = np.linalg.solve(inverse[np.ix_(own, own)], flat[kept[own]])
-            found.append((flat[kept[own]] @ change, k, own, change))
-        _, gone, own, change = min(found, key=lambda one: one[0])
-        flat[kept] -= inverse[:, own] @ change
-        kept = np.delete(kept, own)
-        rest.remove(gone)
-        order.append(gone)
-    return order
-
-
-COUNTS = (16, 12, 8, 4, 0)  # of features, whose held-out losses are printed
-
-
-def select(fitting: list[dict], testing: list[dict], noises: dict[str, float]) -> None:
-    """Print the held-out losses of fewer features, in a table."""
-    fit, held_out = Fit(gather(fitting, noises, 61), 300), gather(testing, noises, 61)
-    every = jnp.ones(len(FEATURES) + 1)
-    W = fit.choice(every)
-    squares = fit.squares(W)
-    choice_order = eliminate(penalised_image_loss, W, fit.pixels)
-    w = fit.variance(every, squares)
-    variance_order = eliminate(penalised_variance_loss, w, fit.pixels, squares)
-    for name, order in (("choice", choice_order), ("variance", variance_order)):
-        print(name, [FEATURES[k] for k in order], flush=True)
-    held_out_squares = (blend(held_out, plain(W, *fit.scales)) - held_out.level) ** 2
-    print("| features | image loss, fitted | held out | variance loss, fitted | held out |")
-    print("|---:|---:|---:|---:|---:|")
-    for count in COUNTS:
-        gone = len(FEATURES) - count
-        used = [every.at[jnp.array(o[:gone], int)].set(0) for o in (choice_order, variance_order)]
-        W, w = fit.choice(used[0]), fit.variance(used[1], squares)
-        cells = (
-            image_loss(fit.pixels, W),
-            image_loss(held_out, plain(W, *fit.scales)),
-            variance_loss(fit.pixels, w, squares),
-            variance_loss(held_out, plain(w, *fit.variance_scales), held_out_squares),
-        )
-        print(f"| {count} | " + " | ".join(f"{float(v):.4f}" for v in cells) + " |", flush=True)
-        weights = plain(W, *fit.scales), plain(w, *fit.variance_scales)
-        print("<!--", *(np.round(np.asarray(v), 3).tolist() for v in weights), "-->", flush=True)
-
-
 def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
     """Errors of the ingredients and of the choice, by label.
 
@@ -567,26 +509,23 @@ def show(rows: list[dict], params: Params, noises: dict[str, float]) -> None:
         vague, wrong = bound <= P, squares > bound
         counts = [vague.mean(), (vague & wrong).mean(), (~vague & wrong).mean()]
         table.setdefault(r["label"], []).append([*line, z2.mean(), *counts])
-    print(
-        "| images | along | smoothed | blend | mc | SSIM | z2 | vague | wrong there | elsewhere |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    header = (
+        "images", "along", "smoothed", "blend", "mc", "SSIM", "z2", "vague", "wrong there",
+        "elsewhere",
+    )  # fmt: skip
+    means_by_label = []
     for label, lines in table.items():
         means = np.mean(lines, 0)
         means[-2:] /= np.maximum([means[-3], 1 - means[-3]], 1e-9)
-        cells = " | ".join(f"{v:.4f}" for v in means)
-        print(f"| {label} | {cells} |", flush=True)
+        means_by_label.append([label, *(f"{v:.4f}" for v in means)])
+    print(markdown_table(header, means_by_label), flush=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    parser = command_line(__doc__, out=True, data=True)
     parser.add_argument("--beyond", action="store_true", help="where frames are on one side alone")
-    parser.add_argument("--features", action="store_true", help="print losses of fewer features")
     given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    data = given.data / "data"
+    data = given.data
 
     def kept(name: str, *targets: Iterator[tuple]) -> list[dict]:
         path = given.out / f"{name}.pkl"
@@ -598,9 +537,6 @@ def main() -> None:
     slider, street = data / "slider_depth.zip", data / "davis346_street.npz"
     noises = {path.stem: noise_of(frames_of(path)) for path in (slider, street)}
     fitting, testing = (_beyond if given.beyond else _two_sided)(kept, slider, street)
-    if given.features:
-        rows = ([row for part in parts for row in part] for parts in (fitting, testing))
-        return select(*rows, noises)
     fit = Fit(gather([row for part in fitting for row in part], noises))
     every = jnp.ones(len(FEATURES) + 1)
     W = fit.choice(every)

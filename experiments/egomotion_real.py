@@ -21,33 +21,27 @@ themselves, but for those named here:
   motion, 180 degrees. General motion: heading and |Omega| from window to window.
 - stop: the end of the slider's way, which slows down, stands still from 3.22 to 3.31 s and goes
   back. How far the heading is from that of the motion there, and what it tells.
-- axis: the slider's direction in the camera's axes, by corners tracked in the frames, of which it
-  is known that the camera does not turn (needs OpenCV). The stored poses have it along x, as the
-  camera's mounting was not measured. This finds (1, .0088, -.002), each good to .001 and .002.
 
 With --without-frames general motion of evbench and the slider is fitted to events alone. Prints
 tables in Markdown and writes them.
 """
 
-import argparse
-import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import command_line, machine, table_of_rows
 
 import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, geometry, voting
-from jaxevent.egomotion.baselines.points import Params, interpolate_positions, track_points
 from jaxevent.egomotion.bundle.windows import stamp_offset
 from jaxevent.egomotion.candidates import pixel_coordinates
-from jaxevent.errors import require
 
 Rows = list[dict[str, Any]]
-AXIS = np.array([1.0, 0.0088, 0.0]) / np.hypot(1.0, 0.0088)  # of the slider, by `axis`
+AXIS = np.array([1.0, 0.0088, 0.0]) / np.hypot(1.0, 0.0088)  # of the slider
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -267,52 +261,6 @@ def stop(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
-def axis(data: Path) -> Rows:
-    """Of ways of ten frames each: what all epipolar lines through tracked corners meet in."""
-    cv2 = require("cv2", "vision")
-    recording = jaxevent.load(data / "slider_depth.zip")
-    frames, camera, params = recording.frames, recording.camera, Params.of({})
-    assert frames is not None and camera is not None
-    positions, f = pixel_coordinates(recording.width, recording.height, camera)
-    found = []
-    for first in range(2, len(frames) - 10, 8):
-        grey = frames[first : first + 11].intensity
-        images = [np.rint(255 * image).astype(np.uint8) for image in grey]
-        ends = (
-            interpolate_positions(at, positions) / f for at in track_points(cv2, params, images)
-        )
-        begin, end = (np.concatenate([at, np.ones((len(at), 1))], 1) for at in ends)
-        far = np.linalg.norm(end - begin, axis=1) > 6 / f
-        lines = np.cross(begin[far], end[far])
-        lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-        weight = np.ones(len(lines))
-        for _ in range(20):
-            T = np.linalg.eigh((lines * weight[:, None]).T @ lines)[1][:, 0]
-            off = np.abs(lines @ T)
-            weight = 1 / (1 + (off / (3 * 1.48 * np.median(off))) ** 2) ** 2
-        found.append(T * np.sign(T[0]))
-    mean, spread = np.mean(found, 0), np.std(found, 0)
-    return [
-        {
-            "recording": "slider, axis",
-            "ways": len(found),
-            "T": " ".join(f"{value:.4f}" for value in mean),
-            "of one, standard deviation": " ".join(f"{value:.4f}" for value in spread),
-        }
-    ]
-
-
-def table(rows: Rows) -> str:
-    names = list(dict.fromkeys(name for row in rows for name in row))
-
-    def text(value: Any) -> str:
-        return f"{value:.3g}" if isinstance(value, float | np.floating) else str(value)
-
-    lines = [names, ["---"] * len(names)]
-    lines += [[text(row.get(name, "-")) for name in names] for row in rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 FITTED = "evbench", "slider", "stop"  # by `batch`, which takes frames
 PARTS: dict[str, Callable[..., Rows]] = {
     "disk": disk,
@@ -321,24 +269,19 @@ PARTS: dict[str, Callable[..., Rows]] = {
     "evbench": evbench,
     "slider": slider,
     "stop": stop,
-    "axis": axis,
 }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument("--out", type=Path, required=True, help="folder for tables")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser = command_line(__doc__, out=True, data=True, parts=PARTS)
     parser.add_argument("--without-frames", action="store_true")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only:
         more = {"frames": False} if arguments.without_frames and name in FITTED else {}
-        text = table(PARTS[name](arguments.data, **more))
+        text = table_of_rows(PARTS[name](arguments.data, **more))
         print(f"\n## {name}\n\n{text}", flush=True)
         (arguments.out / f"{name}.md").write_text(text)
-    print(f"\n{platform.machine()}, Python {platform.python_version()}")
+    print(f"\n{machine()}")
 
 
 if __name__ == "__main__":

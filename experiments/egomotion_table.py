@@ -4,10 +4,10 @@
 
 Simulated: an ideal camera of 240x180 pixels, f = 200 px, 25 frames/s, 0.6 s: planar motion,
 rotation and general motion, with motions that nothing was chosen on; and fast rotations, 0.06 s of
-160x120 pixels, of which all times count. With --data FOLDER, which
-holds slider_depth.zip and tubrip_*_rotation.npz, real ones: slider_depth from 1 to 2 s, as planar
-motion (against its poses at the one depth that fits the estimate best) and as general motion (a
-pure translation to the right), and two cuts of 13 and 99 ms of rotation, without frames.
+160x120 pixels, of which all times count. With --data FOLDER, which holds slider_depth.zip and
+tubrip_*_rotation.npz, real ones: slider_depth from 1 to 2 s, as planar motion (against its poses at
+the one depth that fits the estimate best) and as general motion (a pure translation to the right),
+and two cuts of 13 and 99 ms of rotation, without frames.
 
 Parameters are those that suit the recording by themselves, those of `literal` are the thesis'
 (`Params.presets`). Every estimate counts for the time that what it saw shows (`centred`). Errors
@@ -18,7 +18,6 @@ the means.
 is not computed again.
 """
 
-import argparse
 import dataclasses
 import functools
 import os
@@ -29,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from common import machine
+from common import command_line, machine, markdown_table, write_text
 
 import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
@@ -188,10 +187,7 @@ def markdown(model: str, rows: list[dict[str, Any]]) -> str:
     columns = [*SHOWN[model], "lost", "failed", "CPU"]
     units = {**UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
     heads = [f"{name} {units[name]}".strip() for name in columns]
-    lines = [
-        "| sequence | method | " + " | ".join(heads) + " |",
-        "|---|---|" + "---:|" * len(columns),
-    ]
+    lines = []
     rows = [row for row in rows if row["model"] == model]
     for name, method in dict.fromkeys((row["sequence"], row["method"]) for row in rows):
         part = [row for row in rows if (row["sequence"], row["method"]) == (name, method)]
@@ -199,18 +195,16 @@ def markdown(model: str, rows: list[dict[str, Any]]) -> str:
         texts = [shown(values[~np.isnan(values)].mean()) if (~np.isnan(values)).any() else "-"
                  for values in each.values()]  # fmt: skip
         texts[columns.index("failed")] = f"{int(each['failed'].sum())} of {len(part)}"
-        lines.append(f"| {name} | {method} | " + " | ".join(texts) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([name, method, *texts])
+    return markdown_table(["sequence", "method", *heads], lines, 2) + "\n"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[500, 501])
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--data", type=Path, help="folder of real recordings")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[500, 501])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     stored, warm = arguments.out / "table.csv", set()
     rows: list[dict[str, Any]] = []
     if stored.exists():
@@ -234,8 +228,7 @@ def main() -> None:
                 pd.DataFrame(rows).to_csv(path, index=False)
     parts = [markdown(model, rows) for model in SHOWN]
     text = "\n".join([*parts, f"{machine()}; {cpu():.0f} CPU s in all"]) + "\n"
-    with complete(arguments.out / "table.md") as path:
-        path.write_text(text)
+    write_text(arguments.out / "table.md", text)
     print(text)
 
 
