@@ -1,4 +1,4 @@
-"""Points that follow a known flow."""
+"""Points that follow a known flow, events without order, and a search of candidates by loops."""
 
 import numpy as np
 
@@ -39,3 +39,27 @@ def turning(omega, f=100, centre=(59.5, 44.5)):
         return f * (V[:, :2] - P[:, :2] * V[:, 2:])
 
     return flow
+
+
+def scattered(number, span, width, height, step, seed=0, camera=None):
+    """Random events, many at the same time, all over a small sensor."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, span, number)) // step * step
+    x, y, p = (rng.integers(0, n, number) for n in (width, height, 2))
+    return recorded(t, x, y, p, width, height, camera)
+
+
+def search_candidates(recording, row, radius, per_pixel, youngest, oldest):
+    """(dx, dy, age in us) of an event's candidates, among all earlier events."""
+    e = recording.events
+    found, at_pixel = [], {}
+    for i in reversed(range(row)):
+        pixel = int(e.x[i]), int(e.y[i])
+        dx, dy = int(e.x[row]) - pixel[0], int(e.y[row]) - pixel[1]
+        if e.p[i] != e.p[row] or max(abs(dx), abs(dy)) > radius:
+            continue
+        at_pixel[pixel] = at_pixel.get(pixel, 0) + 1
+        age = int(e.t[row] - e.t[i])
+        if at_pixel[pixel] <= per_pixel and age > 0 and youngest <= age <= oldest:
+            found.append((dx, dy, age))
+    return sorted(found)

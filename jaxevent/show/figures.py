@@ -181,7 +181,7 @@ def plot_motion(
     Args:
         motion: A motion.
         times: Times, us or s; None for times spread over the estimates.
-        truth: The true motion (`egomotion.known`), whose errors are drawn too.
+        truth: The true motion (`egomotion.known_motion`), whose errors are drawn too.
         centred: Whether estimates count for the middle of the events that they use.
 
     Returns:

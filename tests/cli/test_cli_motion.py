@@ -92,7 +92,7 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsy
         asked.append(speed)
         return AdaptedParams(params, found, "the image moves at 9: px/s", "window = 2 s")
 
-    monkeypatch.setattr(MotionEstimator, "suit", suit)
+    monkeypatch.setattr(MotionEstimator, "adapt_params", suit)
     words = ["motion", str(folder / "planar.h5"), "--model", "planar", "--out", str(folder / "out")]
     assert cli.main(words) == 0
     printed = capsys.readouterr().out
@@ -128,7 +128,7 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
     monkeypatch.setattr(command, "_told", told)
     monkeypatch.setattr(Planar, "fallback_method", "planes")
     suited = AdaptedParams(voting.Params(), None, "", "")
-    monkeypatch.setattr(MotionEstimator, "suit", lambda *_, **__: suited)
+    monkeypatch.setattr(MotionEstimator, "adapt_params", lambda *_, **__: suited)
     used, seen, _ = command.estimated(voting, recording, None, {"model": Planar}, None, True)
     assert used.name == taken and seen.valid.any() == (first is not None)
     late = " before the recording's middle" if first else ""

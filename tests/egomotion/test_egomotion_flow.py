@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 import pytest
+from points import recorded, scattered, search_candidates
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import flow as module
@@ -12,7 +13,7 @@ from jaxevent.egomotion.flow import Params, RigidFlow, flow, iterate_flow
 from jaxevent.egomotion.models import find_model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events
 from jaxevent.simulate import motion_scene
 
 pytestmark = pytest.mark.slow
@@ -83,7 +84,7 @@ def test_field_of_a_scene_is_the_true_one(optimised):
 def test_field_of_a_rotation_is_that_of_turned_rays():
     camera = PinholeCamera(40.0, 55.0, 8.3, 6.1, (-0.2, 0.05, 0.01, -0.005, 0.0))
     Omega, h = np.array([0.7, -0.4, 1.5]), 1e-5
-    recording = dataclasses.replace(scattered(), camera=camera)
+    recording = dataclasses.replace(events_without_order(), camera=camera)
     moving = RigidFlow(recording, known("rotation", Omega))
     found = moving.flow(np.array([30_000, 40_000]))
     y, x = np.mgrid[:13, :17].astype(float)
@@ -99,27 +100,15 @@ def test_field_of_a_rotation_is_that_of_turned_rays():
         RigidFlow(bare, known("rotation", Omega)).flow(np.array([30_000]))
 
 
-def scattered(number=500, span=60_000, seed=0):
-    rng = np.random.default_rng(seed)
-    t = np.sort(rng.integers(0, span, number)) // 50 * 50
-    x, y, p = (rng.integers(0, n, number) for n in (17, 13, 2))
-    events = Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(bool))
-    return Recording("scattered", 17, 13, events, camera=PinholeCamera(20.0, 20.0, 7.3, 6.1))
+def events_without_order(number=500, span=60_000, seed=0):
+    return scattered(number, span, 17, 13, 50, seed, PinholeCamera(20.0, 20.0, 7.3, 6.1))
 
 
 def estimate_by_loops(recording, row, base, a, params):
     """Flow and residual of an event by looking at all earlier ones, one after another."""
-    e, sigma, b = recording.events, float(params.sigma_x), float(params.baseline)
-    found, seen = [], {}
-    for i in reversed(range(row)):
-        d = np.array([float(e.x[row]) - float(e.x[i]), float(e.y[row]) - float(e.y[i])])
-        age = (e.t[row] - e.t[i]) * 1e-6
-        if e.p[i] != e.p[row] or np.abs(d).max() > params.radius:
-            continue
-        place = (e.x[i], e.y[i])
-        seen[place] = seen.get(place, 0) + 1
-        if seen[place] <= params.per_pixel and 0 < age <= float(params.tau_max):
-            found.append((d, age))
+    sigma, b, oldest = float(params.sigma_x), float(params.baseline), 1e6 * float(params.tau_max)
+    near = search_candidates(recording, row, params.radius, params.per_pixel, 1, oldest)
+    found = [(np.array([dx, dy], float), age * 1e-6) for dx, dy, age in near]
 
     def inside(rho, age):
         return b / 2 <= age * np.linalg.norm(base + rho * a) <= b
@@ -150,7 +139,7 @@ def estimate_by_loops(recording, row, base, a, params):
 # Rotations differ from general motion in the half-line alone.
 @pytest.mark.parametrize("model", ["planar", "general"])
 def test_flow_equals_a_loop(model):
-    recording = scattered()
+    recording = events_without_order()
     params = Params.of({"candidates": 256, "radius": 4, "baseline": 3.1, "speeds": 7, "limit": 0.7})
     mean = [180.0, -60.0] if model == "planar" else [0.6, 0.0, 0.8, 3.0, -4.0, 9.0]
     told = flow(recording, known(model, mean), params)
@@ -189,7 +178,7 @@ def test_pieces_are_the_whole(monkeypatch):
 
 
 def test_where_the_motion_is_lost_there_is_no_flow():
-    recording = scattered()
+    recording = events_without_order()
     motion = known("planar", [100.0, 50.0], t=(0, 20_000, 40_000), valid=np.array([1, 0, 1], bool))
     told = flow(recording, motion)
     between = (recording.events.t > 0) & (recording.events.t < 40_000)
@@ -206,26 +195,21 @@ def test_where_the_motion_is_lost_there_is_no_flow():
 def test_noise_is_an_outlier(optimised):
     recording, source = textured()
     rng = np.random.default_rng(0)
-    noise = scattered(2000, 100_000, 1).events
-    noise = dataclasses.replace(noise, t=noise.t + 50_000)
-    x = rng.integers(0, WIDTH, 2000).astype(np.uint16)
-    y = rng.integers(0, HEIGHT, 2000).astype(np.uint16)
-    e = recording.events
-    order = np.argsort(np.r_[e.t, noise.t], kind="stable")
-    events = Events(
-        np.r_[e.t, noise.t][order], np.r_[e.x, x][order], np.r_[e.y, y][order],
-        np.r_[e.p, noise.p][order],
-    )  # fmt: skip
-    drawn = (order >= len(e)) & (events.t > 100_000)
-    real = (order < len(e)) & (events.t > 100_000)
-    told = flow(dataclasses.replace(recording, events=events), true_motion(source))
+    n, e = 2000, recording.events
+    t = np.r_[e.t, np.sort(rng.integers(50_000, 150_000, n))]
+    x, y = np.r_[e.x, rng.integers(0, WIDTH, n)], np.r_[e.y, rng.integers(0, HEIGHT, n)]
+    order = np.argsort(t, kind="stable")
+    noisy = recorded(t, x, y, np.r_[e.p, rng.random(n) < 0.5], WIDTH, HEIGHT, recording.camera)
+    drawn = (order >= len(e)) & (noisy.events.t > 100_000)
+    real = (order < len(e)) & (noisy.events.t > 100_000)
+    told = flow(noisy, true_motion(source))
     outlier = told.residual > 1
     assert outlier[drawn].mean() > 2 * outlier[real].mean()
 
 
 def test_bad_input():
-    recording = dataclasses.replace(scattered(), camera=None)
-    with pytest.raises(InputError, match="scattered: has no calibration, which the flow of rot"):
+    recording = dataclasses.replace(events_without_order(), camera=None)
+    with pytest.raises(InputError, match="made: has no calibration, which the flow of rot"):
         flow(recording, known("rotation", [1.0, 2.0, 3.0]))
     assert flow(recording, known("planar", [1.0, 2.0])).valid.all()
     empty = dataclasses.replace(recording, events=Events.empty())

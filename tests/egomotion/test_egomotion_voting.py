@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from points import HEIGHT, WIDTH, moved, recorded, turning
+from points import HEIGHT, WIDTH, moved, recorded, scattered, search_candidates, turning
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import candidates, voting
@@ -25,33 +25,13 @@ pytestmark = pytest.mark.slow
 CAMERA = PinholeCamera(100.0, 100.0, 59.5, 44.5)
 
 
-def scattered(number=400, seed=0, width=9, height=7, span=4000):
-    """Random events, many at the same time, all over a small sensor."""
-    rng = np.random.default_rng(seed)
-    t = np.sort(rng.integers(0, span, number)) // 20 * 20
-    x, y, p = (rng.integers(0, n, number) for n in (width, height, 2))
-    return recorded(t, x, y, p, width, height)
-
-
-def search_candidates(recording, row, radius, per_pixel, youngest, oldest):
-    """(dx, dy, age in us) of an event's candidates, looked for among all earlier events."""
-    e = recording.events
-    found, at_pixel = [], {}
-    for i in reversed(range(row)):
-        place = int(e.x[i]), int(e.y[i])
-        dx, dy = int(e.x[row]) - place[0], int(e.y[row]) - place[1]
-        if e.p[i] != e.p[row] or max(abs(dx), abs(dy)) > radius:
-            continue
-        at_pixel[place] = at_pixel.get(place, 0) + 1
-        age = int(e.t[row] - e.t[i])
-        if at_pixel[place] <= per_pixel and age > 0 and youngest <= age <= oldest:
-            found.append((dx, dy, age))
-    return sorted(found)
+SCATTER = {"span": 4000, "width": 9, "height": 7, "step": 20}
 
 
 @pytest.mark.parametrize("every, batch, pieces, per_pixel", [(1, 7, 3, 3), (3, 16, 64, 8)])
 def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
-    recording = scattered()
+    recording = scattered(400, **SCATTER)
+    e, number = recording.events, 0
     sampler = CandidateSampler(
         recording, radius=2, per_pixel=per_pixel, most=200, every=every, batch=batch, longest=1e9
     )
@@ -59,29 +39,25 @@ def test_candidates_are_the_recent_neighbours(every, batch, pieces, per_pixel):
     while not sampler.is_exhausted:
         made = sampler.sample(pieces, 40e-6, 2000e-6)
         c = made.candidates
+        np.testing.assert_array_equal(c.mask, c.age > 0)
         for b, k in zip(*np.nonzero(made.row >= 0), strict=True):
-            rows.append(made.row[b, k])
-            np.testing.assert_array_equal(c.mask[b, k], c.age[b, k] > 0)
-            expected = search_candidates(recording, rows[-1], 2, per_pixel, 40, 2000)
-            assert listed(c, b, k) == expected
-            assert c.scale[b, k] == 1
-            since = recording.events.t[rows[-1]] - recording.start
-            ages = 1e-6 * (min(2000, since) - 40)
+            row = made.row[b, k]
+            expected = search_candidates(recording, row, 2, per_pixel, 40, 2000)
+            assert listed(c, b, k) == expected and c.scale[b, k] == 1
+            ages = 1e-6 * (min(2000, e.t[row] - recording.start) - 40)
             np.testing.assert_allclose(c.rate[b, k], len(expected) / ages if ages > 0 else 0)
-            np.testing.assert_allclose(
-                c.xi[b, k],
-                [int(recording.events.x[rows[-1]]) - 4, int(recording.events.y[rows[-1]]) - 3],
-            )
+            np.testing.assert_allclose(c.xi[b, k], [int(e.x[row]) - 4, int(e.y[row]) - 3])
+            rows.append(row)
+            number += len(expected)
         filled = (made.row >= 0).any(1)
         ends += made.t[filled].tolist()
-        np.testing.assert_array_equal(made.t[filled], recording.events.t[made.row.max(1)[filled]])
-    np.testing.assert_array_equal(rows, np.arange(0, len(recording.events), every))
-    assert sum(len(search_candidates(recording, r, 2, per_pixel, 40, 2000)) for r in rows) > 500
-    assert len(ends) == -(-len(rows) // batch)
+        np.testing.assert_array_equal(made.t[filled], e.t[made.row.max(1)[filled]])
+    np.testing.assert_array_equal(rows, np.arange(0, len(e), every))
+    assert number > 500 and len(ends) == -(-len(rows) // batch)
 
 
 def test_too_many_candidates_are_thinned_evenly():
-    recording = scattered(number=3000)
+    recording = scattered(3000, **SCATTER)
     few, all_ = (
         CandidateSampler(recording, radius=2, per_pixel=4, most=most, every=1, batch=50)
         .sample_all(1e-6, 1e-2)
@@ -99,7 +75,7 @@ def test_too_many_candidates_are_thinned_evenly():
 
 
 def test_candidates_about_an_expected_flow():
-    recording = scattered(number=1500)
+    recording = scattered(1500, **SCATTER)
     rng = np.random.default_rng(0)
     youngest, oldest = rng.uniform([[100]], 500, (7, 9)), rng.uniform(1000, 3000, (7, 9))
     U, slack = rng.uniform(-1000, 1000, (2, 7, 9)), rng.uniform(0, 300, (7, 9))
@@ -132,7 +108,7 @@ def listed(c, b, k):
 
 
 def test_chunks_end_in_time_and_lose_nothing():
-    recording = scattered()
+    recording = scattered(400, **SCATTER)
     rows, sampler = [], CandidateSampler(recording, radius=2, every=3, batch=7)
     while not sampler.is_exhausted:
         made = sampler.sample(40, 0.0, 1.0, span=5e-4)

@@ -48,17 +48,13 @@ class Params(Parameters):
     candidates = Count(128, "", "most candidates of an event; of more, these many in even steps")
     every = Count(4, "", "one event in so many is scored; neighbours are correlated")
     batch = Count(64, "", "scored events per update of the weights; 1: one by one, as the thesis")
-    longest = Positive(
-        0.01, "s", "longest duration of a batch, which may hold fewer events", gradient=False
-    )
+    longest = Positive(0.01, "s", "longest duration of a batch", gradient=False)
     particles = Count(200, "", "100 are enough for planar motion, 500 for general motion")
 
     baseline = Positive(
         6.5, "px", "b: distance that a point moves within the range of ages", gradient=False
     )
-    youngest = UnitInterval(
-        0.7, "", "least age of candidates, as a fraction of the largest", gradient=False
-    )
+    youngest = UnitInterval(0.7, "", "least age of candidates per largest age", gradient=False)
     tau_max = Positive(0.1, "s", "oldest candidates; 2 b / (expected speed)", gradient=False)
     sigma_x = Positive(0.6, "px", "spread of a candidate; from 0.5 the pixel grid does not show")
     s0 = Positive(10.0, "", "score from which an event's vote grows like its logarithm")
@@ -76,9 +72,7 @@ class Params(Parameters):
     omega_max = Positive(
         4.0, "rad/s", "largest component of the first angular velocities", gradient=False
     )
-    tau_general = Positive(
-        0.02, "s", "general: oldest candidates, as depth is not known", gradient=False
-    )
+    tau_general = Positive(0.02, "s", "general: oldest candidates", gradient=False)
     rho_max = Positive(150.0, "px/s", "general: fastest flow due to translation", gradient=False)
     found = Positive(
         0.12, "", "spread of the particles at which a search ends, relative to the mean",
@@ -92,12 +86,9 @@ class Params(Parameters):
     )
     drop = UnitInterval(0.25, "", "votes, relative to their mean so far, for that", gradient=False)
     off = Positive(
-        0.03,
-        "",
-        "kernels: error of particles' weights, relative to the largest, where log-likelihoods are "
-        "interpolated between motions; 0: they are not",
+        0.03, "", "kernels: relative error of interpolated weights; 0: no interpolation",
         gradient=False,
-    )
+    )  # fmt: skip
     memory = Positive(6.0, "", "batches over which votes are averaged for that", gradient=False)
 
     alpha_literal = Positive(2.0, "1/px", "literal: decay of the likelihood (alpha_p)")
@@ -112,8 +103,8 @@ class Params(Parameters):
     edge = Number(
         0.0,
         "s",
-        "literal: candidates so young, whose pixel's event before was as near to the one before at "
-        "the event's pixel, are of one edge with it and do not count (6.6.5); 0: all do",
+        "literal: leave out candidates so young, if events before at both pixels are as near in "
+        "time: these are of one edge (6.6.5); 0: none",
         gradient=False,
     )
 
