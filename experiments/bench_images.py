@@ -4,8 +4,8 @@
 
 A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
 read, filtered and shown. Beside it run, on one core: the whole filter as a plain numba program
-over events, which is what a C++ program does; its recursion with and without the look-up of
-neighbours; and, where it is installed, the Accumulator of dv-processing.
+over events, which is what a C++ program does; and, where it is installed, the Accumulator of
+dv-processing.
 """
 
 import functools
@@ -122,48 +122,11 @@ def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
     return L, P
 
 
-@numba.njit
-def event_loop(t, x, y, p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search):
-    """The recursion alone, event after event, what the frames say given; near given or searched."""
-    height, width = L.shape
-    for i in range(len(t)):
-        a, b = np.int64(y[i]), np.int64(x[i])
-        dt = (t[i] - last[a, b]) * np.float32(1e-6)
-        gap = near[i]
-        if search:
-            latest = np.int64(0)
-            for row in range(max(a - 1, 0), min(a + 2, height)):
-                for column in range(max(b - 1, 0), min(b + 2, width)):
-                    latest = max(latest, last[row, column])
-            gap = (t[i] - latest) * np.float32(1e-6)
-        gain = 1 / (1 + P[a, b] * dt * rate[i])
-        L[a, b] = (L[a, b] - u[i]) * gain + u[i] + (c if p[i] else -c)
-        P[a, b] = P[a, b] * gain + Q_proc * dt + Q_iso * gap + (Q_ref if dt <= rho else 0.0)
-        last[a, b] = t[i]
-
-
-class Given(FrameModel):
-    """Observations that are already there, carried in place of the points' weights."""
+class KnownFrames(FrameModel):
+    """Observations known beforehand, carried in place of the points' weights."""
 
     def __call__(self, points):
         return Observation(points.weight, points.blend)
-
-
-def loop_seconds(recording: Recording, search: bool) -> float:
-    e = recording.events
-    assert isinstance(e, Events)
-    n = len(e)
-    u, rate, near = (np.full(n, v, np.float32) for v in (0.4, 1e5, 1e-3))
-
-    def run():
-        L, P = np.zeros((HEIGHT, WIDTH), np.float32), np.full((HEIGHT, WIDTH), 0.09, np.float32)
-        last = np.zeros((HEIGHT, WIDTH), np.int64)
-        c, Q_proc, Q_iso, Q_ref, rho = (np.float32(v) for v in (0.1, 5e-4, 0.03, 0.01, 0.01))
-        event_loop(
-            e.t, e.x, e.y, e.p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search
-        )
-
-    return cpu_seconds(run, 20)
 
 
 def filter_seconds(recording: Recording) -> float:
@@ -182,8 +145,8 @@ def filter_seconds(recording: Recording) -> float:
 
     @jax.jit
     def scan(params, tiles, last, state):
-        path = jaxevent.akf.scan(params, Given(), tiles, state)
-        return Trajectory(Given(), state, path).at(last), path
+        path = jaxevent.akf.scan(params, KnownFrames(), tiles, state)
+        return Trajectory(KnownFrames(), state, path).at(last), path
 
     pixels = WIDTH * HEIGHT
     first = PixelState(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
@@ -320,17 +283,13 @@ def xla_bench() -> tuple[dict[str, float], dict[str, float]]:
     assert isinstance(e, Events) and frames is not None
     grey, n = frames.intensity.astype(np.float64), len(e) / 1e6
     whole = n / cpu_seconds(lambda: program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS))
-    loop, given = (n / loop_seconds(recording, search) for search in (True, False))
     filtering, preparing = n / filter_seconds(recording), n / prepare_seconds(recording)
     speed = {
-        "numba loop, recursion and neighbour look-up": loop,
-        "numba loop, recursion alone": given,
         "filter alone, by XLA": filtering,
         "features and packing": preparing,
     }
     ratio = {
         "filter by XLA / numba program": filtering / whole,
-        "filter by XLA / numba loop with neighbour look-up": filtering / loop,
         "features and packing / numba program": preparing / whole,
         "compilations for a second recording": compilations(),
     }
