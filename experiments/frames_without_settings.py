@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 from common import command_line
-from compensated_choice import noise_of
-from motion_compensated import Row, Store, evenly, table
+from motion_compensated import Row, Store, evenly, noise_of, table
 from numpy.typing import NDArray
 
 import jaxevent

@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 from common import command_line, markdown_table
-from compensated_choice import noise_of
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -46,6 +45,7 @@ from jaxevent.simulate import SENSORS, Objects, Pan, Source, scene, simulate
 METHODS = ("blend", "flow", "edi", "akf", "aks", "mc")
 LIKELIHOOD = "aks, likelihood"  # the label of the smoother in a fit to slider_depth
 SHARED = ("c_on", "c_off", "I0", "clock_offset", "rho_ref")  # what every method takes from it
+NOISE_BLOCK = 8  # px, over which the noise of frames is averaged
 CHOOSING, SCORING = (1, 2, 3), (101, 102, 103)  # seeds
 RATES = (25.0, 100.0)  # Hz
 IMAGES = {2: 10, 4: 10, 8: 10, 16: 8}  # by gap
@@ -207,6 +207,20 @@ def scored(
     for name, rows in (parts or {}).items():
         row[name] = float(np.mean([scores[k]["mse"] for k in rows]))
     return {**row, "seconds": seconds, "images": len(times)}
+
+
+def noise_of(frames: Frames) -> float:
+    """Return the variance of a frame's pixel, as a part of white squared.
+
+    It is half of the squared difference of the two consecutive frames that are most alike; of that
+    the median of blocks, as most of them do not move.
+    """
+    changes = np.diff(frames.intensity.astype(np.float64), axis=0) ** 2 / 2
+    count, h, w = changes.shape
+    n = NOISE_BLOCK
+    h, w = h // n, w // n
+    blocks = changes[:, : h * n, : w * n].reshape(count, h, n, w, n).mean((2, 4))
+    return float(np.median(blocks.reshape(count, -1), axis=1).min())
 
 
 def evenly(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
