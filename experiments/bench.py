@@ -3,8 +3,8 @@
     python experiments/bench.py [PART ...] [--gate | --bless] [--json FILE]
 
 Parts: images (the complete path from a file to images, losses, gradients), xla (the scan, where
-there is no kernel), smoother, tracker and blob (bench_blob.py), voting and motion
-(bench_motion.py), memory (streaming.py). Without any, all but blob and motion, which take minutes.
+there is no kernel), smoother, tracker (bench_blob.py), voting and motion
+(bench_motion.py), memory (streaming.py). Without any, all but motion, which takes minutes.
 CPU seconds of this process are compared, so other programs on the machine change little: `--gate`
 compares the ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance;
 `--bless` writes those of the parts that ran. Two parts have no gate: `gpu` times a GPU against the
@@ -42,9 +42,6 @@ GATED = {
     "tracker, M = 32, loop over packed events / numba loop": ("higher", 0.3),
     "tracker, M = 1, `estimate` by numba / numba loop": ("higher", 0.3),
     "tracker, M = 32, `estimate` by numba / numba loop": ("higher", 0.4),
-    "blob filter, 32 events per step / numba loop": ("higher", 0.5),
-    "blob filter, 64 blobs vmapped / numba loop": ("higher", 0.5),
-    "blob: RMSE of 32 events per step / event by event": ("lower", 0.02),
     "planar voting, N = 200 / numba loop": ("higher", 0.4),
     "rotation voting, N = 200 / numba loop": ("higher", 0.4),
     "general voting, N = 500 / numba loop": ("higher", 0.4),
@@ -58,13 +55,12 @@ PARTS = {
     "xla": "bench_images.xla_bench",
     "smoother": "bench_images.smoother_bench",
     "tracker": "bench_blob.tracker_bench",
-    "blob": "bench_blob.blob_bench",
     "voting": "bench_motion.voting_bench",
     "motion": "bench_motion.motion_bench",
     "memory": "streaming.memory_bench",
 }
 TABLES = {"gpu": "bench_images.gpu_bench", "start": "bench_images.start_bench"}  # no gate
-USUAL = [name for name in PARTS if name not in ("blob", "motion")]
+USUAL = [name for name in PARTS if name != "motion"]
 
 
 def run_part(name: str) -> Any:

@@ -76,15 +76,7 @@ Chosen = Mapping[str, tuple[Any, Parameters]]  # method and parameters by name
 Row = dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True)
-class Compensated:
-    """Where the parameters of `mc` are: a fit's file or folder, and its label there."""
-
-    file: Path | None
-    label: str
-
-
-def chosen(names: Iterable[str], fitted: Path, compensated: Compensated) -> Chosen:
+def chosen(names: Iterable[str], fitted: Path) -> Chosen:
     """Methods and their parameters, from a fit's folder.
 
     The smoother is that fitted to the likelihood, if there is one. What the fit does not have has
@@ -106,10 +98,6 @@ def chosen(names: Iterable[str], fitted: Path, compensated: Compensated) -> Chos
             params = method.Params.load(file, name)
         elif name == "mc":
             params = method.Params()
-            if compensated.file is not None:
-                own = compensated.file
-                own = own / "params.toml" if own.is_dir() else own
-                params = method.Params.load(own, compensated.label)
             known = method.Params.settings()
             params = params.replace(**{k: v for k, v in values.items() if k in known})
         else:
@@ -408,18 +396,15 @@ def main() -> None:
     tables = ("slider", "street", "objects", "blur")
     parser.add_argument("--params", type=Path, help="folder of a fit to slider_depth")
     parser.add_argument("--street-params", type=Path, help="of one to davis346_street; or the same")
-    parser.add_argument("--mc-params", type=Path, help="file or folder with the parameters of mc")
-    parser.add_argument("--mc-label", default="mc", help="their label; default: %(default)s")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
     parser.add_argument("--tables", nargs="+", default=tables, choices=tables)
     arguments = parser.parse_args()
     if arguments.params is None and {"slider", "street"} & set(arguments.tables):
         parser.error("the tables slider and street need --params")
     out = arguments.out.absolute()
-    names, compensated = arguments.methods, Compensated(arguments.mc_params, arguments.mc_label)
 
     def fits(folder: Path) -> Chosen:
-        return chosen(names, folder, compensated)
+        return chosen(arguments.methods, folder)
 
     for title, text in _tables(arguments, out, fits):
         (out / f"{title}.md").write_text(text)
