@@ -2,8 +2,7 @@
 
     python experiments/blob_real.py --data DIR --out blob_real
 
-DIR holds spinning_dot.npz and davis346_street.npz; by default $JAXEVENT_DATA/data. Makes
-table.md and results.json. No reference uses the tracker, and all are made with
+DIR holds spinning_dot.npz and davis346_street.npz; by default $JAXEVENT_DATA/data. Makes table.md. No reference uses the tracker, and all are made with
 hindsight: the dot's path is a circle fitted to centroids, the cars are found in the frames, the
 sky's drift is the one motion that makes the events sharpest. The cars'
 settings were chosen on the first second and the sky's on 2.5 to 5 s; what is reported comes after.
@@ -11,7 +10,6 @@ The dot has the preset "fast"; that detection needs the prefilter (hot pixels) a
 dot's tail) was seen on all of its 50 ms.
 """
 
-import json
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +21,7 @@ from jaxevent.blob import Tracker, Tracks, chi2, chi2_split, constant_velocity, 
 from jaxevent.recording import Recording
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
-DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}
+DOT_SPAN = 0.015, 0.05  # s
 DOT_ROWS: dict[str, tuple[Tracker, dict[str, Any]]] = {
     "moment": (moment, {"gate_shape": "ellipse"}),
     "moment, circular gate": (moment, {"gate_shape": "circle"}),
@@ -136,46 +134,17 @@ def score_dot(tracks: Tracks, path: Circling, span: tuple[float, float]) -> dict
     }
 
 
-def spinning_dot(recording: Recording) -> tuple[dict, str]:
+def spinning_dot(recording: Recording) -> list[dict[str, Any]]:
+    """Track the dot by each filter, and score the tracks."""
     path = fit_circling(recording)
     start, _ = path(np.zeros(1))
-    speed = np.hypot(*path(np.arange(0, 0.05, 1e-4))[1].T)
-    seeds = [(*start[0], 20.0)]
-    results: dict[str, Any] = {}
-    lines = [
-        f"Reference: {path.omega / 2 / np.pi:.2f} Hz, {speed.mean():.0f} px/s, lambda "
-        f"{path.size[0]:.2f} and {path.size[1]:.2f} px, turned {np.degrees(path.turned):.2f} deg.",
-        "",
-        "| filter | tracked | position rms (px) | velocity along path | speed / circle | direction "
-        "(deg) | velocity rms | lambda1 | lambda2 | theta rms (deg) |",
-        "|---|" + "---:|" * 9,
-    ]  # fmt: skip
-    shown = None
+    rows = []
     for label, (tracker, values) in {**DOT_ROWS, "detected, M = 32": (moment, DOT_FOUND)}.items():
-        params, detected = tracker.Params(preset="fast", **values), values is DOT_FOUND
-        tracks = tracker.estimate(
-            recording, params, seeds=None if detected else seeds, smooth=False
-        )
-        row: dict[str, Any] = {n: score_dot(tracks, path, s) for n, s in DOT_PARTS.items()}
-        row["tracks"] = len(tracks)
-        results[label] = row
-        if detected:
-            shown = tracks
-        r = row["reported"]
-        cells = [f"{100 * r['tracked']:.0f} %"]
-        if "rmse" in r:
-            cells += [f"{r['rmse']:.2f}", f"{100 * r['velocity']:+.2f} %"]
-            cells += [f"{100 * r['velocity_circle']:+.2f} %", f"{r['direction']:+.1f}"]
-            cells += [f"{100 * r['velocity_rms']:.1f} %"]
-            shape = [f"{100 * r[name]:+.1f} %" for name in ("lambda1", "lambda2")]
-            shape += [f"{r['theta']:.1f}"]
-            cells += ["-"] * 3 if tracker is constant_velocity else shape
-        else:
-            cells += ["-"] * 8
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    assert shown is not None
-    lines += ["", f"Detection: {len(shown)} confirmed track(s), {', '.join(shown.ended)}."]
-    return results, "\n".join(lines)
+        seeds = None if values is DOT_FOUND else [(*start[0], 20.0)]
+        params = tracker.Params(preset="fast", **values)
+        tracks = tracker.estimate(recording, params, seeds=seeds, smooth=False)
+        rows.append({"filter": label, "tracks": len(tracks), **score_dot(tracks, path, DOT_SPAN)})
+    return rows
 
 
 class Car(NamedTuple):
@@ -276,37 +245,18 @@ def score_cars(
     }
 
 
-def street(recording: Recording) -> tuple[dict, str]:
+def street(recording: Recording) -> list[dict[str, Any]]:
+    """Track cars, and score the tracks in the part that settings were chosen on and in the rest."""
     assert recording.frames is not None
     cars = find_cars(np.asarray(recording.frames.images))
-    times = recording.frames.t
-    lines = [
-        "| settings | part (s) | cars | covered | median distance (px) | of the car's length | "
-        "tracks | switches | strays | each car (px) |",
-        "|---|---|" + "---:|" * 7 + "---|",
-    ]
-    results: dict[str, Any] = {}
-    rows: dict[str, dict[str, Any]] = {
-        "detection, from t = 0": {},
-        "without prefilter": {"prefilter": False},
-    }
-    shown = None
-    for label, values in rows.items():
-        params = moment.Params(**{**STREET, **values})
-        tracks = moment.estimate(recording.with_frames(slice(0)), params, smooth=False)
-        shown = shown or tracks
-        for part, span in STREET_PARTS.items():
-            row = score_cars(tracks, cars, times, span)
-            results[f"{label}, {part}"] = row
-            each = ", ".join(str(car["median"]) for car in row["cars"])
-            lines.append(
-                f"| {label} | {part} {span[0]:g} to {span[1]:g} | {len(row['cars'])} | "
-                f"{100 * row['coverage']:.0f} % of {row['instants']} | {row['median']:.2f} | "
-                f"{100 * row['median_of_length']:.1f} % | {row['tracks']} | {row['switches']} | "
-                f"{row['strays']} | {each} |"
-            )
-    assert shown is not None
-    return results, "\n".join(lines)
+    params = moment.Params(**STREET)
+    tracks = moment.estimate(recording.with_frames(slice(0)), params, smooth=False)
+    rows = []
+    for part, span in STREET_PARTS.items():
+        row = score_cars(tracks, cars, recording.frames.t, span)
+        each = ", ".join(str(car["median"]) for car in row.pop("cars"))
+        rows.append({"part": part, **row, "median of each car": each})
+    return rows
 
 
 def away(xy: NDArray) -> NDArray[np.bool_]:
@@ -381,31 +331,21 @@ def find_stars(recording: Recording, drift: NDArray, rate: float = 12.0) -> NDAr
 
 
 PARTS = {
-    "spinning_dot": ("spinning_dot.npz", "A spinning dot", spinning_dot),
-    "street": ("davis346_street.npz", "Cars on a street", street),
+    "spinning_dot": ("spinning_dot.npz", spinning_dot),
+    "street": ("davis346_street.npz", street),
 }
 
 
 def main() -> None:
-    from common import command_line, write_text
+    from common import command_line, table_of_rows, write_text
 
-    parser = command_line(__doc__, out=True, data=True, parts=PARTS)
-    arguments = parser.parse_args()
-    out = arguments.out
-    stored = out / "results.json"
-    results = json.loads(stored.read_text()) if stored.exists() else {}
+    arguments = command_line(__doc__, out=True, data=True, parts=PARTS).parse_args()
+    text = ""
     for name in arguments.only:
-        file, title, part = PARTS[name]
-        values, text = part(jaxevent.load(arguments.data / file))
-        results[name] = {"title": f"{title} ({file})", "values": values, "table": text}
-        print(f"{title}\n\n{text}\n", flush=True)
-        write_text(stored, json.dumps(results, indent=1))
-    text = "\n".join(
-        f"## {results[name]['title']}\n\n{results[name]['table']}\n"
-        for name in PARTS
-        if name in results
-    )
-    write_text(out / "table.md", text)
+        file, part = PARTS[name]
+        text += f"## {file}\n\n{table_of_rows(part(jaxevent.load(arguments.data / file)))}\n\n"
+    print(text)
+    write_text(arguments.out / "table.md", text)
 
 
 if __name__ == "__main__":
