@@ -34,19 +34,10 @@ from jaxevent.simulate.scenes import Speed
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fit_ahdr.toml"
 SECONDS: dict[Speed, float] = {"slow": 1.0, "fast": 0.5}
-METHODS = {  # by label
-    "last-frame": "last-frame",
-    "blend": "blend",
-    "flow": "flow",
-    "edi": "edi",
-    "augmented": "augmented",
-    "cf": "cf",
-    "cf-augmented": "cf-augmented",
-    "akf, the paper's constants": "akf",
-    "akf": "akf",
-    "aks": "aks",
-    "mc": "mc",
-}
+LABELS = (
+    "last-frame", "blend", "flow", "edi", "augmented", "cf", "cf-augmented",
+    "akf, the paper's constants", "akf", "aks", "mc",
+)  # fmt: skip
 
 
 def record(folder: Path, scenes: tuple[str, ...], seeds: range, sensor: str) -> list[Path]:
@@ -66,7 +57,7 @@ def record(folder: Path, scenes: tuple[str, ...], seeds: range, sensor: str) -> 
 
 
 def quality(recording: jaxevent.Recording, method, params) -> float | None:
-    """The mean quality of images in JOD, 10 at best; None without ColorVideoVDP."""
+    """Return the mean quality of images in JOD, 10 at best; None without ColorVideoVDP."""
     if importlib.util.find_spec("pycvvdp") is None:
         return None
     given, reference = PROTOCOLS["reference"](recording)
@@ -78,14 +69,14 @@ def quality(recording: jaxevent.Recording, method, params) -> float | None:
 
 
 def choose(labels: list[str], fitted: Path) -> list[tuple]:
-    """Labels, methods and their parameters: those fitted, or else as they are.
+    """Return labels, methods and their parameters, fitted ones where there are any.
 
     mc is not fitted: it has the smoother's numbers. A method whose extra is missing is left out.
     """
     known = read_toml(fitted) if fitted.exists() else {}
     methods = []
     for label in labels:
-        name = METHODS[label]
+        name = label.partition(",")[0]
         if name == "flow" and importlib.util.find_spec("cv2") is None:
             print("flow is left out: it needs pip install '.[vision]'", file=sys.stderr)
             continue
@@ -171,7 +162,7 @@ def calibration(rows: list[dict]) -> str:
 
 
 def scenes_apart(rows: list[dict]) -> str:
-    """The table of z2, scene by scene."""
+    """Return the table of z2, scene by scene."""
     labels = dict.fromkeys(row["method"] for row in rows)
     lines = []
     for label in labels:
@@ -186,9 +177,7 @@ def main() -> None:
     parser = command_line(__doc__, out=True)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sensor", choices=list(SENSORS), default="davis")
-    parser.add_argument(
-        "--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="LABEL"
-    )
+    parser.add_argument("--methods", nargs="+", choices=LABELS, default=LABELS, metavar="LABEL")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
     paths = record(out / "test", TESTING, range(2, 2 + arguments.seeds), arguments.sensor)

@@ -21,7 +21,7 @@ from jaxevent.simulate import Line, Target, blob_scene, simulate_blobs
 
 @numba.njit
 def blob_loop(t, x, y, start, size, Q, P0, kappa, fourth, limits):
-    """The `moment` filter of jaxevent.blob event by event, double precision: the state after each.
+    """Run the `moment` filter event by event in double precision; return the state after each.
 
     Q and P0 are of (p, v, lambda, theta, q), P0 of log lambda; limits are lambda_min, lambda_max
     and P_theta_max.
@@ -121,7 +121,7 @@ def blob_loop(t, x, y, start, size, Q, P0, kappa, fourth, limits):
 
 
 def blob_numbers() -> tuple:
-    """What `blob_loop` takes of the parameters of `moment`."""
+    """Return the arguments of `blob_loop` for the default parameters of `moment`."""
     p = moment.Params()
     numbers = ("p", "v", "lambda", "theta", "q")
     Q = np.array([float(getattr(p, f"Q_{name}")) for name in numbers])
@@ -133,7 +133,7 @@ def blob_numbers() -> tuple:
 
 
 def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """The tracker by both compilers, in CPU seconds, which other work on the machine spares.
+    """Measure the tracker by both compilers, in CPU seconds.
 
     One target, from a seed. The loop over packed events, and `estimate` in all. Interleaved, the
     least of each, beside `blob_loop`, which neither gates nor tells of births and deaths.

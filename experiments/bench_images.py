@@ -43,7 +43,7 @@ OF_AKF = ("c_on", "c_off", "I0", "kappa", "w_min", "sigma_proc", "sigma_iso", "s
 def stream(
     events: int, seconds: float, seed: int, size: tuple[int, int] = (WIDTH, HEIGHT)
 ) -> Recording:
-    """Events at gamma-distributed rates per pixel, frames of noise at 25 per second."""
+    """Draw events at gamma-distributed rates per pixel, and frames of noise at 25 per second."""
     rng = np.random.default_rng(seed)
     width, height = size
     rate = rng.gamma(2.0, 1.0, width * height)
@@ -66,7 +66,7 @@ def stream(
 
 @numba.njit
 def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
-    """The whole AKF as an event-by-event program: calibration per frame, then event after event.
+    """Run the whole AKF event by event: calibration per frame, then event after event.
 
     Double precision, one core, exposures not known; the arithmetic of the library's filter.
     """
@@ -130,7 +130,7 @@ class KnownFrames(FrameModel):
 
 
 def filter_seconds(recording: Recording) -> float:
-    """All windows' filters, with what the frames say and the features already on the device."""
+    """Return the CPU seconds of all windows' filters, with their features on the device."""
     params = jaxevent.akf.Params()
     look = jax.jit(lambda frame_model, tiles: frame_model(tiles.points))
     windows = []
@@ -175,7 +175,7 @@ def losses(
     names: tuple[str, ...] = OF_AKF,
     compilers: tuple[str, ...] = ("numba", "xla"),
 ) -> dict[str, Callable[[], object]]:
-    """The mean squared error at 8 images, and it with its gradient by these parameters.
+    """Return tasks of the mean squared error at 8 images, alone and with its gradient.
 
     Keys are those of a compiler, "numba" or "xla", and "loss" or "gradient".
     """
@@ -202,13 +202,13 @@ def losses(
 
 
 def read(path: Path, in_memory: bool) -> Recording:
-    """As a process that reads the file for the first time."""
+    """Load a file like a process that reads it for the first time."""
     search_heaps.cache_clear()
     return load(path, in_memory=in_memory)
 
 
 def images(given: Recording | Path, compiler: Any, rate: int, method: Any = jaxevent.akf) -> None:
-    """The complete path of a recording in memory, or in a file."""
+    """Run the complete path of a recording in memory, or in a file."""
     given = read(given, in_memory=False) if isinstance(given, Path) else given
     times = np.arange(given.start, given.stop, 1_000_000 // rate)
     for _ in method.estimate(given, compiler=compiler).batches(times):
@@ -216,7 +216,7 @@ def images(given: Recording | Path, compiler: Any, rate: int, method: Any = jaxe
 
 
 def measure_images(recording: Recording, path: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """The complete path by both compilers, losses and gradients.
+    """Measure the complete path by both compilers, losses and gradients.
 
     The numba program makes no images. Beside it: 100 and 500 images per second, read from the file
     as `jaxevent reconstruct` does; and 5 M events of a sensor of 1280x720 in 2 s with 25 images per
@@ -267,7 +267,7 @@ def measure_images(recording: Recording, path: Path) -> tuple[dict[str, float], 
 
 
 def check_program(recording: Recording, grey: np.ndarray) -> None:
-    """The program is the same filter: at the last event of a pixel both must agree."""
+    """Check that the program and the library agree at the last event of each pixel."""
     e, frames = recording.events, recording.frames
     assert isinstance(e, Events) and frames is not None
     L, _ = program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS)
@@ -314,7 +314,7 @@ def images_bench() -> tuple[dict[str, float], dict[str, float]]:
 
 
 def accumulator_seconds(recording: Recording) -> float:
-    """dv-processing's Accumulator at 100 Hz on the same events, which it has in memory."""
+    """Return the CPU seconds of dv-processing's Accumulator at 100 Hz, events in memory."""
     import dv_processing as dv
 
     e = recording.events
@@ -337,7 +337,7 @@ def accumulator_seconds(recording: Recording) -> float:
 
 
 def compilations() -> int:
-    """How often XLA compiles for a second recording of the same sensor."""
+    """Count the compilations by XLA for a second recording of the same sensor."""
     heard = []
 
     def listen(event: str, duration_secs: float, **_: str | int) -> None:
@@ -368,7 +368,7 @@ LOSS_NAMES = {
 
 @numba.njit
 def mix(counts, share):
-    """Event counts of which each pixel gives a part to its neighbours."""
+    """Return event counts of which each pixel gives a part to its neighbours."""
     height, width = counts.shape
     out = np.empty((height, width))
     for y in range(height):
@@ -385,7 +385,7 @@ def mix(counts, share):
 
 @numba.njit
 def smoother_program(t, x, y, p, image, certainty, mid, times, numbers):
-    """Kalman filter over frames, information filter back, and images between them."""
+    """Run a Kalman filter over frames, an information filter back, and form images between."""
     c_on, c_off, I0, sigma_event, sigma_bg, sigma_frame, floor, m0, P0, share = numbers
     frames, height, width = image.shape
     size = height, width

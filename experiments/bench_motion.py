@@ -39,7 +39,7 @@ CASES = (("planar", "planar", 200), ("rotation", "rotation", 200), ("general", "
 
 @numba.njit(cache=True, fastmath=True)
 def votes(dx, dy, age, count, xi, scale, particles, model, f, tau, exponent, rho, s0, alpha):
-    """The log-likelihood of every particle: what `likelihood.score` adds up, in float32."""
+    """Return the log-likelihood of every particle, as `likelihood.score` does, in float32."""
     total = np.zeros(len(particles), np.float32)
     one = np.float32(1)
     for e in range(len(count)):
@@ -78,7 +78,7 @@ def cpu_timed(function: Any, repeat: int = 5) -> float:
 def loop_seconds(
     made: Candidates, particles: np.ndarray, kind: Model, params: Params, tau: float
 ) -> tuple[float, np.ndarray]:
-    """Seconds of the numba loop over candidates of ages in [youngest tau, tau], and its sums."""
+    """Return seconds and sums of the numba loop over ages in [youngest tau, tau]."""
     age = np.asarray(made.age).reshape(-1, made.age.shape[2])
     d = np.moveaxis(np.asarray(made.d), -1, 0).reshape(2, *age.shape)
     keep = (age >= np.float32(float(params.youngest) * tau)) & (age <= np.float32(tau))
@@ -145,7 +145,7 @@ def voting_bench() -> tuple[dict[str, float], dict[str, float]]:
 
 
 def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """CPU seconds of one window of 300 ms with more than 100,000 events, of which 60,000 are used.
+    """Measure one window of 300 ms with more than 100,000 events, of which 60,000 are used.
 
     From nothing, all starts included, and following the window before.
     """

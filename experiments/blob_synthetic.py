@@ -58,12 +58,12 @@ Chosen = tuple[Tracker, TrackerParams]
 
 
 def choose(method: str, **values: Any) -> Chosen:
-    """A tracker and its parameters, by its name in the table."""
+    """Return a tracker and its parameters, by its name in the table."""
     tracker, settings = METHODS[method]
     return tracker, tracker.Params(**{**settings, **values})
 
 
-def followed(
+def track_targets(
     recording: Recording,
     truth: Truth,
     chosen: Chosen,
@@ -72,7 +72,7 @@ def followed(
     start: float = 0.0,
     stop: float | None = None,
 ) -> Tracks:
-    """Tracks of all targets, each from a rough seed."""
+    """Track all targets, each from a rough seed."""
     rng = np.random.default_rng([seed, 7])
     at = truth(start)[0]
     tracker, params = chosen
@@ -83,15 +83,15 @@ def followed(
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> float:
-    """Mean of e^T P^-1 e over the number of components; 1 if P is right."""
+    """Return the mean of e^T P^-1 e over the number of components; 1 if P is right."""
     if not covariance.any():  # a baseline that tells none
         return np.nan
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     return float((error * solved).sum(-1).mean() / error.shape[-1])
 
 
-def measured(states: TrackStates, true: np.ndarray, times: np.ndarray) -> dict[str, float]:
-    """How far the only track is from the truth (times, 8) after `SETTLE`."""
+def track_errors(states: TrackStates, true: np.ndarray, times: np.ndarray) -> dict[str, float]:
+    """Return errors of the only track against the truth (times, 8) after `SETTLE`."""
     late = times >= SETTLE
     mean, alive = states.mean[late, 0].astype(float), states.valid[late, 0]
     P, true = states.covariance[late, 0].astype(float), true[late]
@@ -103,16 +103,11 @@ def measured(states: TrackStates, true: np.ndarray, times: np.ndarray) -> dict[s
     size = np.sqrt(true[:, 4:6] ** 2 + 1 / 12)
     ratio = mean[:, 4:6] / size
     turn = np.mod(e[:, 6] + np.pi / 2, np.pi) - np.pi / 2
-    speed = np.maximum(np.linalg.norm(true[:, 2:4], axis=1), 1.0)
-    along = (e[:, :2] * true[:, 2:4]).sum(1) / speed
     return {
         "rmse": float(np.sqrt((e[:, :2] ** 2).sum(1).mean())),
         "velocity": float(np.sqrt((e[:, 2:4] ** 2).sum(1).mean())),
-        "lag": float(-1e6 * along.mean() / speed.mean()),
         "bias1": 100 * float(ratio[:, 0].mean() - 1),
         "bias2": 100 * float(ratio[:, 1].mean() - 1),
-        "std1": 100 * float(ratio[:, 0].std()),
-        "std2": 100 * float(ratio[:, 1].std()),
         "theta": float(np.rad2deg(np.sqrt((turn**2).mean()))),
         "nees_p": nees(e[:, :2], P[:, :2, :2]),
         "nees_l": nees(mean[:, 4:6] - size, P[:, 4:6, 4:6]),
@@ -120,7 +115,7 @@ def measured(states: TrackStates, true: np.ndarray, times: np.ndarray) -> dict[s
     }
 
 
-def settled(tracks: Tracks, truth: Truth) -> float:
+def settling_time(tracks: Tracks, truth: Truth) -> float:
     """ms until both sizes are within 20 % of the truth and stay so for 2 ms."""
     times = np.concatenate([np.arange(0, 6_000, 100), np.arange(6_000, 30_000, 500)])
     true = truth(times)[:, 0, 4:6]
@@ -131,21 +126,21 @@ def settled(tracks: Tracks, truth: Truth) -> float:
     return np.inf
 
 
-def range_of(states: TrackStates, extent: float) -> tuple[np.ndarray, np.ndarray]:
+def size_range_of(states: TrackStates, extent: float) -> tuple[np.ndarray, np.ndarray]:
     """Range of the first track, m, and its variance."""
     mean, covariance = jnp.asarray(states.mean[:, 0]), jnp.asarray(states.covariance[:, 0])
     value, variance = size_range(mean, covariance, extent, FOCAL, 0.25)
     return np.asarray(value, float), np.asarray(variance, float)
 
 
-def contact_of(states: TrackStates) -> tuple[np.ndarray, np.ndarray]:
+def inverse_contact_time(states: TrackStates) -> tuple[np.ndarray, np.ndarray]:
     """1 / TTC of the first two tracks, 1/s, and its variance."""
     told = [jnp.asarray(a[:, k]) for k in (0, 1) for a in (states.mean, states.covariance)]
     value, variance = inverse_ttc(*told)
     return np.asarray(value, float), np.asarray(variance, float)
 
 
-def averaged(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
+def average_runs(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Means over seeds, standard errors under the key + " se"; of "settled" the median."""
     row: dict[str, Any] = {"runs": len(runs)}
     for name in runs[0]:
@@ -158,7 +153,7 @@ def averaged(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
     return row
 
 
-def over_seeds(
+def score_methods(
     scene: Callable[[int], tuple[Recording, Truth]],
     methods: Sequence[str],
     seeds: Sequence[int],
@@ -167,23 +162,23 @@ def over_seeds(
     start_up: bool = False,
     **values: Any,
 ) -> dict[str, dict[str, Any]]:
-    """`averaged` measures of each method; with `start_up` also how soon the shape is right."""
+    """`average_runs` measures of each method; with `start_up` also how soon the shape is right."""
     runs: dict[str, list[dict[str, float]]] = {method: [] for method in methods}
     for seed in seeds:
         recording, truth = scene(seed)
         times = np.arange(step, truth.duration - step, step)
         true = truth(times)[:, 0]
         for method in methods:
-            tracks = followed(recording, truth, choose(method, **values), size, seed)
-            run = measured(tracks(times), true, times)
+            tracks = track_targets(recording, truth, choose(method, **values), size, seed)
+            run = track_errors(tracks(times), true, times)
             if start_up:
-                run["settled"] = settled(tracks, truth)
+                run["settled"] = settling_time(tracks, truth)
             runs[method].append(run)
-    return {method: averaged(rows) for method, rows in runs.items()}
+    return {method: average_runs(rows) for method, rows in runs.items()}
 
 
 def lissajous(seeds: Sequence[int]) -> dict[str, Any]:
-    return over_seeds(lambda s: blob_scene("lissajous", s), list(METHODS), seeds, start_up=True)
+    return score_methods(lambda s: blob_scene("lissajous", s), list(METHODS), seeds, start_up=True)
 
 
 def noise(seeds: Sequence[int]) -> dict[str, Any]:
@@ -192,7 +187,7 @@ def noise(seeds: Sequence[int]) -> dict[str, Any]:
         methods = [m for m in METHODS if m not in ("chi2, target 2n+4", "moment, M = 32")]
         scene = lambda s, ratio=ratio: blob_scene("noise", s, ratio=ratio)  # noqa: E731
         few = seeds[: 2 if ratio < 10 else 1]
-        for method, row in over_seeds(scene, methods, few, step=8e-3).items():
+        for method, row in score_methods(scene, methods, few, step=8e-3).items():
             rows[f"{ratio:g} | {method}"] = row
     return rows
 
@@ -206,17 +201,17 @@ def growing(seeds: Sequence[int]) -> dict[str, Any]:
         assert isinstance(motion, Approach)
         depth = motion.depth(times)
         for method in rows:
-            tracks = followed(recording, truth, choose(method), 8.0, seed)
+            tracks = track_targets(recording, truth, choose(method), 8.0, seed)
             states = tracks(times)
-            run = measured(states, truth(times)[:, 0], times)
-            distance, variance = range_of(states, max(motion.extent))
+            run = track_errors(states, truth(times)[:, 0], times)
+            distance, variance = size_range_of(states, max(motion.extent))
             good = (times >= SETTLE) & states.valid[:, 0]
             relative = (distance / depth - 1)[good]
             run["range bias"] = 100 * relative.mean()
             run["range rms"] = 100 * float(np.sqrt((relative**2).mean()))
             run["range nees"] = float((((distance - depth) ** 2) / variance)[good].mean())
             rows[method].append(run)
-    return {method: averaged(runs) for method, runs in rows.items()}
+    return {method: average_runs(runs) for method, runs in rows.items()}
 
 
 def contact(seeds: Sequence[int]) -> dict[str, Any]:
@@ -231,8 +226,8 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
         true = (motion.speed + motion.acceleration * times) / motion.depth(times)
         for method in rows:
             chosen = choose(method, preset="ttc")
-            states = followed(recording, truth, chosen, 10.0, seed)(times)
-            value, variance = (part[late] for part in contact_of(states))
+            states = track_targets(recording, truth, chosen, 10.0, seed)(times)
+            value, variance = (part[late] for part in inverse_contact_time(states))
             error = value - true[late]
             rows[method].append(
                 {
@@ -242,11 +237,11 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
                     "lost": float(not states.valid.all()),
                 }
             )
-    return {method: averaged(runs) for method, runs in rows.items()}
+    return {method: average_runs(runs) for method, runs in rows.items()}
 
 
 def cars(seeds: Sequence[int]) -> dict[str, Any]:
-    """1 / TTC of each car at every event of its lights: errors, and how many per second."""
+    """Measure errors of 1 / TTC of each car at every event of its lights."""
     runs: dict[str, list[dict[str, float]]] = {}
     settings = {"preset": "ttc", "lambda0": 6.0, "events_per_step": 8, "P0_p": 1.0, "P0_v": 1e4}
     for seed in seeds[:2]:
@@ -266,21 +261,21 @@ def cars(seeds: Sequence[int]) -> dict[str, Any]:
                     ("zoom", every),
                     ("whole", np.arange(300_000, 1_990_000, 5000)),
                 ):
-                    value, _ = contact_of(told(times, pair))
+                    value, _ = inverse_contact_time(told(times, pair))
                     s = times * 1e-6
                     true = (speed + acceleration * s) / (
                         distance - speed * s - acceleration * s**2 / 2
                     )
                     row[part] = float(np.sqrt(np.mean((value - true) ** 2)))
                 runs.setdefault(f"{'left middle right'.split()[car]} | {name}", []).append(row)
-    return {name: averaged(rows) for name, rows in runs.items()}
+    return {name: average_runs(rows) for name, rows in runs.items()}
 
 
 RUNS = 20  # of crossings and drop-outs
 
 
 def crossings(seeds: Sequence[int]) -> dict[str, Any]:
-    """Whether each track is near its own target after the encounter."""
+    """Count the runs after which each track is near its own target."""
     rows: dict[str, Any] = {}
     for offset in (0.0, 10.0, 20.0):
         kept: dict[str, int] = {}
@@ -290,7 +285,7 @@ def crossings(seeds: Sequence[int]) -> dict[str, Any]:
             for rule in ("nearest", "soft"):
                 for method in ("moment", "moment, M = 32") if offset == 0 else ("moment, M = 32",):
                     chosen = choose(method, association=rule)
-                    tracks = followed(recording, truth, chosen, 20.0, seed)
+                    tracks = track_targets(recording, truth, chosen, 20.0, seed)
                     d = np.linalg.norm(tracks(0.55).mean[0, :, :2] - true[:, :2], axis=1)
                     name = f"{method}, {rule}"
                     kept[name] = kept.get(name, 0) + int((d < 20).all())
@@ -299,7 +294,7 @@ def crossings(seeds: Sequence[int]) -> dict[str, Any]:
 
 
 def dropouts(seeds: Sequence[int]) -> dict[str, Any]:
-    """At a random place where the target is faster than 1900 px/s."""
+    """Drop events at a random place where the target is faster than 1900 px/s."""
     rows: dict[str, Any] = {}
     names = ("moment", "moment, M = 32", *list(METHODS)[-2:])
     for length in (0.05, 0.1):
@@ -310,7 +305,9 @@ def dropouts(seeds: Sequence[int]) -> dict[str, Any]:
             recording, truth = blob_scene("dropout", seed, length=length, at=at)
             for name in names:
                 chosen = choose(name, t_coast=0.3)
-                tracks = followed(recording, truth, chosen, 20.0, seed, at - 0.2, at + length + 0.1)
+                tracks = track_targets(
+                    recording, truth, chosen, 20.0, seed, at - 0.2, at + length + 0.1
+                )
                 times = np.array([at + length, at + length + 0.05])
                 d = np.linalg.norm(tracks(times).mean[:, 0, :2] - truth(times)[:, 0, :2], axis=1)
                 got[name] += bool(d[1] < 5)
@@ -334,7 +331,7 @@ SECTIONS: dict[str, tuple[str, Callable[[Sequence[int]], dict[str, Any]]]] = {
 }  # fmt: skip
 
 HEADER = (
-    "", "rmse px", "velocity px/s", "lag us", "bias 1, 2 %", "std 1, 2 %", "theta deg",
+    "", "rmse px", "velocity px/s", "bias 1, 2 %", "theta deg",
     "settled ms", "NEES p/2", "NEES l/2", "lost",
 )  # fmt: skip
 
@@ -345,9 +342,7 @@ def line(name: str, row: dict[str, Any]) -> tuple[str, ...]:
         name,
         f"{row['rmse']:.3f}",
         f"{row['velocity']:.0f}",
-        f"{row['lag']:.0f}",
         f"{row['bias1']:+.1f}, {row['bias2']:+.1f}",
-        f"{row['std1']:.1f}, {row['std2']:.1f}",
         f"{row['theta']:.1f}",
         "" if ms is None else f"{ms:.1f}",
         f"{row['nees_p']:.2f}",

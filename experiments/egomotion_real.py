@@ -48,7 +48,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return egomotion.scores.axis_error(np.atleast_2d(a), np.atleast_2d(b))
 
 
-def disk(data: Path) -> Rows:
+def disk_rows(data: Path) -> Rows:
     recording = jaxevent.load(data / "rotating_disk_imu.npz")
     middle = (recording.width - 1) / 2, (recording.height - 1) / 2
     camera = PinholeCamera(200.0, 200.0, *middle)
@@ -87,7 +87,7 @@ def disk(data: Path) -> Rows:
     return rows
 
 
-def tubrip(data: Path, name: str) -> Rows:
+def tubrip_rows(data: Path, name: str) -> Rows:
     recording = jaxevent.load(data / f"tubrip_{name}_rotation.npz")
     omega = np.asarray(recording.extra["omega"])
     length = (recording.stop - recording.start) * 1e-6
@@ -148,17 +148,17 @@ def nearest_rotation(
     return Omega, rms[0], rms[1]
 
 
-def fitted(recording: jaxevent.Recording, frames: bool) -> egomotion.MotionEstimate:
+def fit_general_motion(recording: jaxevent.Recording, frames: bool) -> egomotion.MotionEstimate:
     """General motion without settings, to events alone if told so."""
     params = batch.Params.of({"frames": frames})
     suited = batch.adapt_params(recording, params, camera=recording.camera).params
     return batch.estimate(recording, suited)
 
 
-def evbench(data: Path, frames: bool = True) -> Rows:
+def evbench_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "evbench_seq3_calibrated.npz")
     twist = np.asarray(recording.extra["camera_twist_pnp"])
-    motion = fitted(recording, frames)
+    motion = fit_general_motion(recording, frames)
     mean, covariance = motion.mean[motion.valid], motion.covariance[motion.valid]
     turn = np.linalg.norm(mean[:, 3:] - twist[3:], axis=1) / np.linalg.norm(twist[3:])
     heading = angle(mean[:, :3], np.broadcast_to(twist[:3], mean[:, :3].shape))
@@ -194,7 +194,7 @@ def _numbers(values: np.ndarray) -> str:
     return " ".join(f"{value:+.4f}" for value in values)
 
 
-def slider(data: Path, frames: bool = True) -> Rows:
+def slider_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
     rows: Rows = []
     motion = voting.estimate(recording, model="planar", smooth=True)
@@ -215,7 +215,7 @@ def slider(data: Path, frames: bool = True) -> Rows:
             "lost": int(lost.sum()),
         }
     )
-    motion = fitted(recording[:3.1], frames)
+    motion = fit_general_motion(recording[:3.1], frames)
     late = 1e-3 * stamp_offset(recording)
     for first, last in ((0.0, 1.0), (1.0, 2.0), (2.0, 3.1)):
         here = motion.valid & (motion.t >= 1e6 * first) & (motion.t < 1e6 * last)
@@ -242,9 +242,9 @@ def slider(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
-def stop(data: Path, frames: bool = True) -> Rows:
+def stop_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
-    motion = fitted(recording[2.9:], frames)
+    motion = fit_general_motion(recording[2.9:], frames)
     sigma = np.degrees(np.sqrt(np.trace(motion.covariance[:, :3, :3], axis1=1, axis2=2)))
     rows: Rows = []
     for name, first, last, along in (
@@ -263,12 +263,12 @@ def stop(data: Path, frames: bool = True) -> Rows:
 
 FITTED = "evbench", "slider", "stop"  # by `batch`, which takes frames
 PARTS: dict[str, Callable[..., Rows]] = {
-    "disk": disk,
-    "boxes": lambda data: tubrip(data, "boxes"),
-    "shapes": lambda data: tubrip(data, "shapes"),
-    "evbench": evbench,
-    "slider": slider,
-    "stop": stop,
+    "disk": disk_rows,
+    "boxes": lambda data: tubrip_rows(data, "boxes"),
+    "shapes": lambda data: tubrip_rows(data, "shapes"),
+    "evbench": evbench_rows,
+    "slider": slider_rows,
+    "stop": stop_rows,
 }
 
 

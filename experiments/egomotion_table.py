@@ -72,7 +72,7 @@ class Sequence(NamedTuple):
     make: Callable[[], tuple[Recording, KnownMotion | None]]
 
 
-def simulated(seed: int) -> Iterator[Sequence]:
+def simulated_sequences(seed: int) -> Iterator[Sequence]:
     kinds = [
         ("planar", "planar", "constant"),
         ("planar", "planar", "varying"),
@@ -81,14 +81,14 @@ def simulated(seed: int) -> Iterator[Sequence]:
         *(("general", scene, "varying") for scene in ("wall", "shapes", "texture")),
     ]
     for speed in FAST:
-        make = functools.partial(fast, speed, seed)
+        make = functools.partial(fast_rotation, speed, seed)
         yield Sequence(f"rotation, {speed:g} rad/s", "rotation", str(seed), make)
     for model, scene, change in kinds:
         make = functools.partial(simulate, model, scene, change, seed)
         yield Sequence(f"{scene}, {change}", model, str(seed), make)
 
 
-def fast(speed: float, seed: int) -> tuple[Recording, KnownMotion]:
+def fast_rotation(speed: float, seed: int) -> tuple[Recording, KnownMotion]:
     size: dict[str, Any] = {"size": (160, 120), "duration": 0.06, "speed": speed}
     recording, source = motion_scene("rotation", "constant", seed, **size)
     t = np.arange(0, 60_001, 1000)
@@ -102,7 +102,7 @@ def simulate(model: str, scene: str, change: str, seed: int) -> tuple[Recording,
     return recording, KnownMotion(kind, t, kind.from_scene(source, t))
 
 
-def real(data: Path) -> Iterator[Sequence]:
+def real_sequences(data: Path) -> Iterator[Sequence]:
     def slider(model: str) -> tuple[Recording, KnownMotion | None]:
         whole = jaxevent.load(data / "slider_depth.zip")
         cut = dataclasses.replace(whole[SLIDER[0] : SLIDER[1]], poses=whole.poses)
@@ -132,28 +132,28 @@ METHODS: dict[str, tuple[MotionEstimator[Any], dict[str, Any] | None]] = {
 }
 
 
-def estimated(label: str, model: str, recording: Recording) -> MotionEstimate:
+def estimate_motion(label: str, model: str, recording: Recording) -> MotionEstimate:
     method, given = METHODS[label]
     params = None if given is None else method.Params.of(given[model])
     return method.estimate(recording, params, model=model)
 
 
 def cpu() -> float:
-    """CPU seconds of this process, on all cores."""
+    """Return the CPU seconds of this process, on all cores."""
     used = os.times()
     return used.user + used.system
 
 
-def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict[str, Any]:
-    """A row of one method on one sequence."""
-    recording, known = made(sequence)
+def score_method(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict[str, Any]:
+    """Return a row of one method on one sequence."""
+    recording, known = make_sequence(sequence)
     model, length = sequence.model, (recording.stop - recording.start) * 1e-6
     METHODS[label][0].find_model_and_camera(recording, model, None)
     if (label, model) not in warm and label != "frames":
-        estimated(label, model, recording[: recording.start + round(1e6 * min(WARM, length))])
+        estimate_motion(label, model, recording[: recording.start + round(1e6 * min(WARM, length))])
         warm.add((label, model))
     began = cpu()
-    motion = estimated(label, model, recording)
+    motion = estimate_motion(label, model, recording)
     spent = cpu() - began
     known = fitted_velocity(recording, motion) if known is None else known
     # Of a cut that is shorter all times count.
@@ -175,11 +175,11 @@ def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict
 
 
 @functools.lru_cache(maxsize=1)
-def made(sequence: Sequence) -> tuple[Recording, KnownMotion | None]:
+def make_sequence(sequence: Sequence) -> tuple[Recording, KnownMotion | None]:
     return sequence.make()
 
 
-def shown(value: float) -> str:
+def format_value(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
@@ -192,8 +192,8 @@ def markdown(model: str, rows: list[dict[str, Any]]) -> str:
     for name, method in dict.fromkeys((row["sequence"], row["method"]) for row in rows):
         part = [row for row in rows if (row["sequence"], row["method"]) == (name, method)]
         each = {column: np.array([row.get(column, np.nan) for row in part]) for column in columns}
-        texts = [shown(values[~np.isnan(values)].mean()) if (~np.isnan(values)).any() else "-"
-                 for values in each.values()]  # fmt: skip
+        known = [values[~np.isnan(values)] for values in each.values()]
+        texts = [format_value(values.mean()) if len(values) else "-" for values in known]
         texts[columns.index("failed")] = f"{int(each['failed'].sum())} of {len(part)}"
         lines.append([name, method, *texts])
     return markdown_table(["sequence", "method", *heads], lines, 2) + "\n"
@@ -210,15 +210,15 @@ def main() -> None:
     if stored.exists():
         rows = pd.read_csv(stored, dtype={"seed": str}).to_dict("records")
     done = {tuple(row[name] for name in KEY) for row in rows}
-    sequences = [*real(arguments.data)] if arguments.data else []
-    sequences += [one for seed in arguments.seeds for one in simulated(seed)]
+    sequences = [*real_sequences(arguments.data)] if arguments.data else []
+    sequences += [one for seed in arguments.seeds for one in simulated_sequences(seed)]
     for sequence in sequences:
         for label in arguments.methods:
             key = (sequence.name, sequence.model, sequence.seed, label)
             if key in done or not METHODS[label][0].supports(find_model(sequence.model)):
                 continue
             try:
-                row = measured(sequence, label, warm)
+                row = score_method(sequence, label, warm)
             except InputError as error:  # no frames
                 print(error, file=sys.stderr)
                 continue

@@ -58,7 +58,7 @@ LITERAL_FRAMES: Row = {
 
 
 def planar(motion: str, seed: int, texture: str, speed: float = 200.0) -> tuple[Recording, Any]:
-    """A sequence, and its image velocity at times (s); fast ones are cut short."""
+    """Return a sequence, and its image velocity at times (s); fast ones are cut short."""
     duration = DURATION if speed < 400 else 0.35
     recording, source = motion_scene(
         "planar", motion, seed, size=SIZE, duration=duration, texture=texture, speed=speed
@@ -66,13 +66,13 @@ def planar(motion: str, seed: int, texture: str, speed: float = 200.0) -> tuple[
     return recording, (source.velocity, duration)
 
 
-def errors(
+def motion_errors(
     motion: MotionEstimate,
     params: Params,
     truth: Callable[[NDArray], NDArray],
     times: NDArray[np.floating],
 ) -> dict[str, float]:
-    """Mean relative errors, %, in three readings, and whether the run is lost."""
+    """Return mean relative errors, %, in three readings, and if the run is lost."""
     true = truth(times)
     smoothed = smooth(motion, params)
     told = {
@@ -95,8 +95,8 @@ def errors(
     return scores
 
 
-def summary(runs: Sequence[dict[str, float]], names: Iterable[str], prefix: str = "") -> Row:
-    """Means, and of all but lost runs the worst."""
+def summarise_runs(runs: Sequence[dict[str, float]], names: Iterable[str], prefix: str = "") -> Row:
+    """Return means, and the worst of the runs."""
     row: Row = {}
     for name in names:
         values = np.array([run[name] for run in runs])
@@ -112,7 +112,7 @@ FULL = ("at once", "fixed lag", "smoothed", "lost", "start-up")
 SHORT = ("at once", "smoothed", "lost")
 
 
-def both(
+def score_both(
     sequences: Sequence[tuple[Recording, Any]],
     first: int,
     soft: Row | None = SOFT,
@@ -121,7 +121,7 @@ def both(
     names: Sequence[str] = FULL,
     model: str = "planar",
 ) -> Row:
-    """Both likelihoods on the same sequences, side by side."""
+    """Score both likelihoods on the same sequences, side by side."""
     row: Row = {}
     for prefix, settings, chosen in (("", soft, names), ("literal ", literal, SHORT)):
         if settings is None:
@@ -130,8 +130,8 @@ def both(
         for k, (recording, (truth, duration)) in enumerate(sequences):
             motion = voting.estimate(recording, params, model=model, seed=first + k)
             times = np.arange(SETTLE, duration - 1e-6, 0.005)
-            runs.append(errors(motion, params, truth, times))
-        row |= summary(runs, chosen, prefix)
+            runs.append(motion_errors(motion, params, truth, times))
+        row |= summarise_runs(runs, chosen, prefix)
     return row
 
 
@@ -140,7 +140,7 @@ def part_planar(seeds: range) -> Table:
     for change in ("constant", "linear", "varying"):
         for texture in TEXTURES:
             made = [planar(change, seed, texture) for seed in seeds]
-            rows.append({"motion": change, "texture": texture, **both(made, seeds[0])})
+            rows.append({"motion": change, "texture": texture, **score_both(made, seeds[0])})
             print(f"planar {change} {texture}", file=sys.stderr)
     return "planar: relative AEE (%), 200 px/s; start-up (ms)", rows
 
@@ -162,19 +162,21 @@ def flows() -> dict[str, NDArray[np.float64]]:
 def in_frames(
     flow: NDArray[np.float64], seeds: range, settings: Row, names: Sequence[str], **made: Any
 ) -> Row:
-    """Errors in the thesis' generator; start-up in frames."""
+    """Return errors in the thesis' generator; start-up in frames."""
     params, runs, fill = Params.of(settings), [], []
     for seed in seeds:
         recording, velocity = frame_events(flow, seed=seed, **made)
         motion = voting.estimate(recording, params, seed=seed)
         frame = np.arange(SETTLE_FRAMES, len(flow) - 1)
         frame = frame[(frame + 1) * STEP <= motion.t[-1] * 1e-6]
-        scores = errors(motion, params, lambda _, v=velocity, at=frame: v[at], (frame + 1) * STEP)
+        scores = motion_errors(
+            motion, params, lambda _, v=velocity, at=frame: v[at], (frame + 1) * STEP
+        )
         scores["start-up"] /= 1e3 * STEP
         runs.append(scores)
         fill.append(len(recording.events) / (len(flow) * recording.width * recording.height))
     prefix = "literal " if params.likelihood == "literal" else ""
-    return {"fill, %": 100 * float(np.mean(fill)), **summary(runs, names, prefix)}
+    return {"fill, %": 100 * float(np.mean(fill)), **summarise_runs(runs, names, prefix)}
 
 
 def part_frames(seeds: range) -> Table:
@@ -196,7 +198,9 @@ def part_rotation(seeds: range) -> Table:
         for name, settings in ways.items():
             params = Params.of(settings)
             motion = voting.estimate(recording, params, model="rotation", seed=seed)
-            runs[name].append(errors(motion, params, lambda t, s=source: s.twist(t)[1], times))
+            runs[name].append(
+                motion_errors(motion, params, lambda t, s=source: s.twist(t)[1], times)
+            )
         print(f"rotation {seed}", file=sys.stderr)
     rows = []
     for name, scores in runs.items():
@@ -207,9 +211,9 @@ def part_rotation(seeds: range) -> Table:
                 ("AME_rel, %", f"AME_rel {reading}"),
                 ("AAE, degrees", f"AAE {reading}"),
             ):
-                told = summary(scores, [key])
+                told = summarise_runs(scores, [key])
                 row |= {title: told[key], f"{title}, worst": told[f"{key}, worst"]}
-            rows.append(row | summary(scores, ("lost", "start-up")))
+            rows.append(row | summarise_runs(scores, ("lost", "start-up")))
     return "rotation, 2 rad/s", rows
 
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from common import command_line
-from motion_compensated import Row, Store, evenly, noise_of, table
+from motion_compensated import Row, Store, choose_evenly, noise_of, table
 from numpy.typing import NDArray
 
 import jaxevent
@@ -68,7 +68,7 @@ def score(method: Any, params: Any, given: Recording, truth: Frames, noise: floa
 
 
 def between_and_after(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
-    """Cells of the table, with the recording that is given and the frames that are not."""
+    """Iterate over cells of the table, with the recording that is given and the hidden frames."""
     for gap in GAPS:
         given, hidden = held_out(recording, gap)
         assert given.frames is not None
@@ -76,11 +76,11 @@ def between_and_after(recording: Recording) -> Iterator[tuple[Row, Recording, Fr
         parts = {"between": np.arange(last), "after the last": np.arange(last, len(hidden))}
         for where, rows in parts.items():
             if len(rows):
-                yield {"gap": gap, "frames": where}, given, hidden[evenly(rows, IMAGES)]
+                yield {"gap": gap, "frames": where}, given, hidden[choose_evenly(rows, IMAGES)]
 
 
 def beyond(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
-    """The same of recordings that are cut."""
+    """Iterate over cells of recordings that are cut."""
     frames = recording.frames
     assert frames is not None
     for cut in CUTS:

@@ -13,8 +13,7 @@ Of hidden frames a few are scored, evenly chosen among those that lie between gi
 recordings are those of seeds 101 to 103; the smoother and the filter are fitted to seeds 1 to 3.
 The method `mc` is left out where there is none. Rows that the folder holds are not computed again.
 Columns are means over images; z2 is the mean squared standardised error of ln(I + I0), 1 for honest
-variances, to which that of the hidden frame's own noise is added; s is seconds per image, of
-reconstruction and reading, without compilation.
+variances, to which that of the hidden frame's own noise is added.
 """
 
 import argparse
@@ -23,7 +22,6 @@ import itertools
 import json
 import os
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,8 +74,8 @@ Chosen = Mapping[str, tuple[Any, Parameters]]  # method and parameters by name
 Row = dict[str, Any]
 
 
-def chosen(names: Iterable[str], fitted: Path) -> Chosen:
-    """Methods and their parameters, from a fit's folder.
+def choose_parameters(names: Iterable[str], fitted: Path) -> Chosen:
+    """Return methods and their parameters, from a fit's folder.
 
     The smoother is that fitted to the likelihood, if there is one. What the fit does not have has
     the smoother's thresholds, offset and dead time. `mc` has all numbers of the smoother that it
@@ -107,7 +105,7 @@ def chosen(names: Iterable[str], fitted: Path) -> Chosen:
 
 
 class Store:
-    """The rows of a table, in a file; a cell of a method is computed once."""
+    """Rows of a table, in a file; a cell of a method is computed once."""
 
     def __init__(self, file: Path):
         self.file = file
@@ -123,7 +121,7 @@ class Store:
             self.file.write_text(json.dumps(self.rows, indent=1))
 
     def means(self, by: Sequence[str], names: Sequence[str]) -> list[Row]:
-        """The rows, averaged over seeds, by the columns that tell them apart."""
+        """Return the rows, averaged over seeds, by the columns that tell them apart."""
         groups: dict[tuple, list[Row]] = {}
         for row in self.rows:
             groups.setdefault(tuple(row[k] for k in by), []).append(row)
@@ -136,7 +134,7 @@ def _place(value: Any, names: Sequence[str]) -> Any:
 
 
 def _mean(rows: Sequence[Row]) -> Row:
-    """Of every number, weighted by `images`; None where no row has it."""
+    """Return the mean of every number, weighted by `images`."""
     means: Row = {}
     for name in rows[0]:
         known = [row for row in rows if isinstance(row.get(name), int | float)]
@@ -146,18 +144,7 @@ def _mean(rows: Sequence[Row]) -> Row:
     return means
 
 
-def images_of(
-    method: Any, params: Parameters, given: Recording, times: NDArray[np.int64]
-) -> tuple[NDArray, NDArray | None, float]:
-    """Images, their variances if the method tells any, and seconds per image."""
-    method.estimate(given, params, progress=False)(times[:1], extrapolate=True)  # compiles
-    clock = time.perf_counter()
-    image, variance, _ = method.estimate(given, params, progress=False)(times, extrapolate=True)
-    seconds = (time.perf_counter() - clock) / len(times)
-    return image, variance if method.has_covariance else None, seconds
-
-
-def scored(
+def score_images(
     method: Any,
     params: Any,
     given: Recording,
@@ -166,14 +153,16 @@ def scored(
     parts: Mapping[str, NDArray[np.int64]] | None = None,
     noise: float = 0.0,
 ) -> Row:
-    """A row of means over the images at the times of `truth`.
+    """Return means over the images at the times of `truth`.
 
     `moving` is where something moves, for each image; `parts` are rows of images whose error is
     told apart; `noise` is the variance of a pixel of the truth.
     """
     times = frame_times(truth, params)
-    image, variance, seconds = images_of(method, params, given, times)
-    if variance is not None and noise:
+    image, variance, _ = method.estimate(given, params, progress=False)(times, extrapolate=True)
+    if not method.has_covariance:
+        variance = None
+    elif noise:
         variance = variance + noise / (truth.intensity + float(params.I0)) ** 2
     scores = [
         hidden_scores(
@@ -194,7 +183,7 @@ def scored(
         row["moving_share"] = float(shares.mean())
     for name, rows in (parts or {}).items():
         row[name] = float(np.mean([scores[k]["mse"] for k in rows]))
-    return {**row, "seconds": seconds, "images": len(times)}
+    return {**row, "images": len(times)}
 
 
 def noise_of(frames: Frames) -> float:
@@ -211,17 +200,17 @@ def noise_of(frames: Frames) -> float:
     return float(np.median(blocks.reshape(count, -1), axis=1).min())
 
 
-def evenly(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def choose_evenly(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
 
 
 def hidden_between(count: int, gap: int) -> NDArray[np.int64]:
-    """The frames out of `count` that are hidden and have a given one on either side."""
+    """Return the frames out of `count` that are hidden and have a given one on either side."""
     frames = np.arange((count - 1) // gap * gap)
     return frames[frames % gap > 0]
 
 
-def real(
+def score_hidden_frames(
     store: Store,
     recording: Recording,
     methods: Chosen,
@@ -239,7 +228,7 @@ def real(
         rows = hidden_between(len(frames), gap)
         if halves[half] is not None:
             rows = rows[(rows >= len(frames) // 2) == bool(halves[half])]
-        rows = evenly(rows, IMAGES[gap])
+        rows = choose_evenly(rows, IMAGES[gap])
         places = np.searchsorted(hidden.t, frames.t[rows])
         where = [moves(given, int(place), gap) for place in places] if moving else None
         score = _scorer(given, hidden[places], where, noise=noise)
@@ -253,11 +242,11 @@ def _scorer(
     parts: Mapping[str, NDArray[np.int64]] | None = None,
     noise: float = 0.0,
 ) -> Callable[..., Row]:
-    return lambda method, params: scored(method, params, given, truth, moving, parts, noise)
+    return lambda method, params: score_images(method, params, given, truth, moving, parts, noise)
 
 
 def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:
-    """A DAVIS whose frames are linear, as those of a DAVIS are."""
+    """Return a DAVIS whose frames are linear."""
     return dataclasses.replace(
         SENSORS["davis"],
         frame_rate=rate,
@@ -267,8 +256,8 @@ def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:
     )
 
 
-def recorded(file: Path, source: Source, camera: Any, seed: int) -> Recording:
-    """The recording of a source, kept in a file."""
+def load_or_simulate(file: Path, source: Source, camera: Any, seed: int) -> Recording:
+    """Return the recording of a source, kept in a file."""
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         jaxevent.save(simulate(source, camera, seed, file.stem), file)
@@ -278,11 +267,11 @@ def recorded(file: Path, source: Source, camera: Any, seed: int) -> Recording:
 def objects_at(folder: Path, rate: float, seed: int) -> tuple[Objects, Recording]:
     source = Objects(seed=seed)
     file = folder / "recordings" / f"objects_{rate:g}Hz_{seed}.h5"
-    return source, recorded(file, source, sensor(rate), seed)
+    return source, load_or_simulate(file, source, sensor(rate), seed)
 
 
 def fitted_to_objects(folder: Path) -> Path:
-    """The folder of a fit to objects of the seeds for choosing, with few frames.
+    """Return the folder of a fit to objects of the seeds for choosing, with few frames.
 
     One sensor is simulated; its parameters do not depend on how many frames it takes.
     """
@@ -299,17 +288,17 @@ def fitted_to_objects(folder: Path) -> Path:
 
 
 def truth_of(source: Source, times: NDArray[np.int64]) -> Frames:
-    """The sharp images of a source at times (us)."""
+    """Return the sharp images of a source at times (us)."""
     images = np.stack([source.intensity(float(t) * 1e-6) for t in times])
     return Frames(times, images.clip(0, 1).astype(np.float32), np.zeros_like(times))
 
 
 def halfway(recording: Recording, count: int) -> NDArray[np.int64]:
-    """Times (us) in the middle between frames, not those of the first tenth of the recording."""
+    """Return times (us) in the middle between frames, after the first tenth of the recording."""
     assert recording.frames is not None
     t = recording.frames.t
     middles = (t[1:] + t[:-1]) // 2
-    return evenly(middles[middles >= recording.start + 0.1 * (t[-1] - t[0])], count)
+    return choose_evenly(middles[middles >= recording.start + 0.1 * (t[-1] - t[0])], count)
 
 
 def objects(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
@@ -322,8 +311,8 @@ def objects(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
             store.add({"rate": rate, "seed": seed}, methods, _scorer(recording, truth))
 
 
-def panorama() -> NDArray[np.float64]:
-    """A scene whose contrast frames can show."""
+def make_panorama() -> NDArray[np.float64]:
+    """Return a scene whose contrast frames can show."""
     light = scene("mountain", decades=1.0)
     return 0.9 * light / np.quantile(light, 0.9999)
 
@@ -331,14 +320,16 @@ def panorama() -> NDArray[np.float64]:
 def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
     """Score images at the middles of long exposures, and halfway between frames."""
     methods = fits(fitted_to_objects(folder))
-    for cell, source, recording in tqdm(blurred(folder), disable=not sys.stderr.isatty()):
+    for cell, source, recording in tqdm(
+        blurred_recordings(folder), disable=not sys.stderr.isatty()
+    ):
         t, parts = at_and_between(recording)
         store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
 
 
-def blurred(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
+def blurred_recordings(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
     """Iterate over recordings of long exposures, with scene, exposure and speed."""
-    light, seed = panorama(), SCORING[0]
+    light, seed = make_panorama(), SCORING[0]
     for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
@@ -349,12 +340,12 @@ def blurred(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
             else Pan(light, size, duration, speed, seed)
         )
         name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px.h5"
-        recording = recorded(folder / "recordings" / name, source, camera, seed)
+        recording = load_or_simulate(folder / "recordings" / name, source, camera, seed)
         yield {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}, source, recording
 
 
 def at_and_between(recording: Recording) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
-    """The middles of three exposures and three times halfway, and which are which."""
+    """Return the middles of three exposures and three times halfway, and the rows of each."""
     assert recording.frames is not None
     t = np.sort(np.concatenate([recording.frames.t[2:5], halfway(recording, 3)]))
     at = np.isin(t, recording.frames.t)
@@ -365,7 +356,6 @@ IMAGE_COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4),
     ("SSIM", "ssim", 1, 3),
     ("z2", "z2", 1, 2),
-    ("s", "seconds", 1, 3),
 )
 
 
@@ -404,7 +394,7 @@ def main() -> None:
     out = arguments.out.absolute()
 
     def fits(folder: Path) -> Chosen:
-        return chosen(arguments.methods, folder)
+        return choose_parameters(arguments.methods, folder)
 
     for title, text in _tables(arguments, out, fits):
         (out / f"{title}.md").write_text(text)
@@ -420,14 +410,14 @@ def _tables(
         store = Store(out / "slider.json")
         recording = jaxevent.load(data / "slider_depth.zip")
         halves = {"1st": 0, "2nd": 1}
-        real(store, recording, fits(arguments.params), IMAGES, halves)
+        score_hidden_frames(store, recording, fits(arguments.params), IMAGES, halves)
         keys = {"gap": "gap", "half": "half", "method": "method"}
         yield "slider", table(store.means(list(keys), names), keys, IMAGE_COLUMNS)
     if "street" in wanted:
         store = Store(out / "street.json")
         recording = jaxevent.load(data / "davis346_street.npz")
         folder = arguments.street_params or arguments.params
-        real(store, recording, fits(folder), (2, 4, 8), {"all": None}, moving=True)
+        score_hidden_frames(store, recording, fits(folder), (2, 4, 8), {"all": None}, moving=True)
         keys = {"gap": "gap", "method": "method"}
         more = (("moving MSE x 1e-2", "moving_mse", 100, 4), ("share", "moving_share", 1, 4))
         rows = store.means(list(keys), names)

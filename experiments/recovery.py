@@ -84,21 +84,21 @@ def from_model(
     ).check()
 
 
-def found_by(
+def fit_with_intervals(
     loss: Any, start: Any, names: list[str], batches: Any, settings: Settings, search: Any = None
 ) -> FitIntervals:
-    """What a fit finds, with its intervals."""
+    """Fit parameters, and return them with their intervals."""
     fit = optimise(loss, start, names, batches, settings=settings, search=search)
     return confidence_intervals(loss, start, fit.params, names, batches, search, settings.forward)
 
 
-def by_frames(recording: Recording, start: Any, names: list[str], search: Any, iterations: int):
-    """By the likelihood of the frames."""
+def fit_by_frames(recording: Recording, start: Any, names: list[str], search: Any, iterations: int):
+    """Fit parameters by the likelihood of the frames."""
     assert recording.frames is not None
     part = RecordingWindow(recording, recording.frames, np.arange(0), np.arange(0))
     problem = Problem(Objective(jaxevent.aks, None), [part])
     settings = Settings(iterations=iterations, learning_rate=0.1, rounds=2)
-    return found_by(problem.objective, start, names, problem, settings, search)
+    return fit_with_intervals(problem.objective, start, names, problem, settings, search)
 
 
 Recovered = tuple[dict[str, float], FitIntervals]
@@ -107,13 +107,13 @@ Recovered = tuple[dict[str, float], FitIntervals]
 def model_recovery(
     seed: int, more: dict[str, float] | None = None, size: tuple[int, int] = (40, 32)
 ) -> Recovered:
-    """Of the smoother, from a start that is wrong by a factor of 2 or so."""
+    """Recover the smoother, from a start that is wrong by a factor of 2 or so."""
     true = {**TRUE, **(more or {})}
     start = jaxevent.aks.Params(
         c_on=0.2, c_off=0.2, I0=0.2, sigma_event=0.3, sigma_bg=0.4, sigma_frame=0.03,
         sigma_floor=1e-4, w_min=1.0, share=0.0,
     )  # fmt: skip
-    return true, by_frames(from_model(true, seed, size), start, list(true), None, 100)
+    return true, fit_by_frames(from_model(true, seed, size), start, list(true), None, 100)
 
 
 AKF = {"c_on": 0.12, "c_off": 0.09, "sigma_proc": 0.3, "sigma_iso": 0.6, "sigma_ref": 0.04}
@@ -159,7 +159,7 @@ def from_akf(seed: int, size: tuple[int, int] = (64, 48)) -> Recording:
 
 
 def akf_recovery(seed: int) -> Recovered:
-    """Of the AKF, by the likelihood of an image at the end; frames tell nothing but the start."""
+    """Recover the AKF by the likelihood of an image at the end; frames give the start alone."""
     start = jaxevent.akf.Params(
         c_on=0.2, c_off=0.2, sigma_proc=0.1, sigma_iso=0.2, sigma_ref=0.1, rho=RHO, I0=I0, P0=P0,
         kappa=1e-9, calibrate=False, deblur=False,
@@ -167,14 +167,14 @@ def akf_recovery(seed: int) -> Recovered:
     drawn = cut_windows(from_akf(seed), "reference")
     problem = Problem(Objective(jaxevent.akf, "nll", False), drawn)
     settings = Settings(iterations=80, learning_rate=0.1, rounds=2)
-    return AKF, found_by(problem.objective, start, list(AKF), problem, settings)
+    return AKF, fit_with_intervals(problem.objective, start, list(AKF), problem, settings)
 
 
 WALK = {"Q_p": 20.0, "Q_v": 1e6, "Q_lambda": 10.0, "Q_theta": 0.1}
 
 
 def blob_recovery(seed: int) -> Recovered:
-    """Of the blob filter, by the likelihood of events; process noises wrong by factors of 10."""
+    """Recover the blob filter by the likelihood of events, from noises wrong by factors of 10."""
     method = jaxevent.blob.moment
     start = method.Params(
         events_per_step=32, Q_p=200.0, Q_v=1e5, Q_lambda=100.0, Q_theta=1.0, Q_q=50.0
@@ -194,7 +194,7 @@ def blob_recovery(seed: int) -> Recovered:
     settings = Settings(
         iterations=40, learning_rate=0.3, rounds=1, every=10, patience=1000, forward=True
     )
-    return WALK, found_by(goal.loss, start, list(WALK), batches, settings)
+    return WALK, fit_with_intervals(goal.loss, start, list(WALK), batches, settings)
 
 
 NOISE = {"noise": 1.0}
@@ -247,7 +247,7 @@ def events_of_points(
 
 
 def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> Recovered:
-    """Of the soft vote, by the error of the motion; noise too small by a factor of 5."""
+    """Recover the soft vote by the error of the motion; noise too small by a factor of 5."""
     drawn = [drifting_points(k + 10 * seed, (96, 72), NOISE["noise"]) for k in range(SEQUENCES)]
     named = [dataclasses.replace(one, name=str(k)) for k, (one, _) in enumerate(drawn)]
     truths = tuple(truth for _, truth in drawn)
@@ -259,11 +259,11 @@ def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> R
     settings = Settings(
         iterations=30, learning_rate=0.2, rounds=1, every=10, patience=1000, forward=True
     )
-    return NOISE, found_by(loss, start, list(names), batches, settings)
+    return NOISE, fit_with_intervals(loss, start, list(names), batches, settings)
 
 
 def sensor_recovery(seed: int) -> Recovered:
-    """Of a simulated sensor: a slow pan, 2 s, all noise of a DAVIS.
+    """Recover a simulated sensor: a slow pan, 2 s, all noise of a DAVIS.
 
     Events lag the intensity: on average it has moved half a threshold on since the last one. The
     offset found for the frames' clock contains that lag, half the time between a pixel's events.
@@ -275,7 +275,7 @@ def sensor_recovery(seed: int) -> Recovered:
     names = ["c_on", "c_off", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor"]
     search = {"clock_offset": (-0.012, 0.012, 9), "rho_ref": (0.0, 0.003, 7)}
     true = {"c_on": 0.22, "c_off": 0.16, "clock_offset": 0.004, "rho_ref": 1e-3}
-    return true, by_frames(recording, start, names, search, 60)
+    return true, fit_by_frames(recording, start, names, search, 60)
 
 
 PARTS: dict[str, Callable[[int], Recovered]] = {
