@@ -13,7 +13,6 @@ each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have i
 every sixth image.
 """
 
-import argparse
 import importlib.util
 import json
 import os
@@ -21,6 +20,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from common import command_line, markdown_table
 from tqdm import tqdm
 
 import jaxevent
@@ -34,19 +34,10 @@ from jaxevent.simulate.scenes import Speed
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fit_ahdr.toml"
 SECONDS: dict[Speed, float] = {"slow": 1.0, "fast": 0.5}
-METHODS = {  # by label
-    "last-frame": "last-frame",
-    "blend": "blend",
-    "flow": "flow",
-    "edi": "edi",
-    "augmented": "augmented",
-    "cf": "cf",
-    "cf-augmented": "cf-augmented",
-    "akf, the paper's constants": "akf",
-    "akf": "akf",
-    "aks": "aks",
-    "mc": "mc",
-}
+LABELS = (
+    "last-frame", "blend", "flow", "edi", "augmented", "cf", "cf-augmented",
+    "akf, the paper's constants", "akf", "aks", "mc",
+)  # fmt: skip
 
 
 def record(folder: Path, scenes: tuple[str, ...], seeds: range, sensor: str) -> list[Path]:
@@ -66,7 +57,7 @@ def record(folder: Path, scenes: tuple[str, ...], seeds: range, sensor: str) -> 
 
 
 def quality(recording: jaxevent.Recording, method, params) -> float | None:
-    """The mean quality of images in JOD, 10 at best; None without ColorVideoVDP."""
+    """Return the mean quality of images in JOD, 10 at best; None without ColorVideoVDP."""
     if importlib.util.find_spec("pycvvdp") is None:
         return None
     given, reference = PROTOCOLS["reference"](recording)
@@ -78,14 +69,14 @@ def quality(recording: jaxevent.Recording, method, params) -> float | None:
 
 
 def choose(labels: list[str], fitted: Path) -> list[tuple]:
-    """Labels, methods and their parameters: those fitted, or else as they are.
+    """Return labels, methods and their parameters, fitted ones where there are any.
 
     mc is not fitted: it has the smoother's numbers. A method whose extra is missing is left out.
     """
     known = read_toml(fitted) if fitted.exists() else {}
     methods = []
     for label in labels:
-        name = METHODS[label]
+        name = label.partition(",")[0]
         if name == "flow" and importlib.util.find_spec("cv2") is None:
             print("flow is left out: it needs pip install '.[vision]'", file=sys.stderr)
             continue
@@ -139,20 +130,24 @@ def summary(rows: list[dict], measure) -> tuple[float, float]:
 
 def table(rows: list[dict]) -> str:
     labels = list(dict.fromkeys(row["method"] for row in rows))
-    lines = ["| method | " + " | ".join(MEASURES) + " |", "|---|" + "---:|" * len(MEASURES)]
+    lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label]
         cells = [
             f"{m:.3g} +- {100 * s:.0f} %" for m, s in (summary(mine, f) for f in MEASURES.values())
         ]
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    lines += ["", "| method | z2 bright, dark, well | Q |", "|---|---|---:|"]
+        lines.append([label, *cells])
+    quality_lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label]
         seen = [row["Q"] for row in mine]
         Q = "-" if None in seen else f"{np.mean(seen):.2f}"
-        lines.append(f"| {label} | {calibration(mine)} | {Q} |")
-    return "\n".join(lines) + "\n"
+        quality_lines.append([label, calibration(mine), Q])
+    tables = (
+        markdown_table(["method", *MEASURES], lines),
+        markdown_table(["method", "z2 bright, dark, well", "Q"], quality_lines, 2),
+    )
+    return "\n\n".join(tables) + "\n"
 
 
 def calibration(rows: list[dict]) -> str:
@@ -167,28 +162,22 @@ def calibration(rows: list[dict]) -> str:
 
 
 def scenes_apart(rows: list[dict]) -> str:
-    """The table of z2, scene by scene."""
+    """Return the table of z2, scene by scene."""
     labels = dict.fromkeys(row["method"] for row in rows)
-    lines = [
-        "| z2 bright, dark, well | " + " | ".join(TESTING) + " |",
-        "|---|" + "---|" * len(TESTING),
-    ]
+    lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label and row.get("z2") is not None]
         own = {n: [r for r in mine if r["recording"].startswith(f"{n}_")] for n in TESTING}
         if mine:
-            lines.append(f"| {label} | " + " | ".join(map(calibration, own.values())) + " |")
-    return "\n".join(lines) + "\n"
+            lines.append([label, *map(calibration, own.values())])
+    return markdown_table(["z2 bright, dark, well", *TESTING], lines) + "\n"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sensor", choices=list(SENSORS), default="davis")
-    parser.add_argument(
-        "--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="LABEL"
-    )
+    parser.add_argument("--methods", nargs="+", choices=LABELS, default=LABELS, metavar="LABEL")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
     paths = record(out / "test", TESTING, range(2, 2 + arguments.seeds), arguments.sensor)

@@ -1,31 +1,27 @@
 """Speed of the tracker of blobs, as part of `bench.py`.
 
-    python experiments/bench.py blob tracker
+    python experiments/bench.py tracker
 
-It runs on a simulated blob, beside the same filter as a numba loop and what its authors publish,
-0.1 M updates/s.
+It runs on a simulated blob, beside the same filter as a numba loop.
 """
 
 import functools
 
-import jax
 import numba
 import numpy as np
-from timing import cpu_seconds, least_cpu
+from common import least_cpu
 
 from jaxevent.blob import find, moment
 from jaxevent.blob.engine.runner import KernelRunner
-from jaxevent.blob.filter import EventBatch
 from jaxevent.blob.filters.motion import gated_moments
 from jaxevent.blob.lifecycle import init_state as begin_state
 from jaxevent.blob.prepare import ChunkPacker
-from jaxevent.recording import Events, Recording
 from jaxevent.simulate import Line, Target, blob_scene, simulate_blobs
 
 
 @numba.njit
 def blob_loop(t, x, y, start, size, Q, P0, kappa, fourth, limits):
-    """The `moment` filter of jaxevent.blob event by event, double precision: the state after each.
+    """Run the `moment` filter event by event in double precision; return the state after each.
 
     Q and P0 are of (p, v, lambda, theta, q), P0 of log lambda; limits are lambda_min, lambda_max
     and P_theta_max.
@@ -124,22 +120,8 @@ def blob_loop(t, x, y, start, size, Q, P0, kappa, fourth, limits):
     return out
 
 
-def blob_steps(recording: Recording, M: int) -> tuple[np.ndarray, EventBatch]:
-    """All events in steps of M: seconds between the steps, and the steps' batches."""
-    e = recording.events
-    assert isinstance(e, Events)
-    n = len(e) // M * M
-    t = e.t[:n].reshape(-1, M)
-    dt = np.diff(t[:, -1], prepend=0) * 1e-6
-    xi = np.stack([e.x[:n], e.y[:n]], 1).reshape(-1, M, 2)
-    polarity = np.where(e.p[:n], 1.0, -1.0).reshape(-1, M)
-    age = (t[:, -1:] - t) * 1e-6
-    arrays = (jax.numpy.asarray(part, np.float32) for part in (xi, age, polarity))
-    return dt.astype(np.float32), EventBatch(*arrays)
-
-
 def blob_numbers() -> tuple:
-    """What `blob_loop` takes of the parameters of `moment`."""
+    """Return the arguments of `blob_loop` for the default parameters of `moment`."""
     p = moment.Params()
     numbers = ("p", "v", "lambda", "theta", "q")
     Q = np.array([float(getattr(p, f"Q_{name}")) for name in numbers])
@@ -151,7 +133,7 @@ def blob_numbers() -> tuple:
 
 
 def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """The tracker by both compilers, in CPU seconds, which other work on the machine spares.
+    """Measure the tracker by both compilers, in CPU seconds.
 
     One target, from a seed. The loop over packed events, and `estimate` in all. Interleaved, the
     least of each, beside `blob_loop`, which neither gates nor tells of births and deaths.
@@ -193,101 +175,3 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
         f"{name} / numba loop": v / base for name, v in speed.items() if name.startswith("tracker")
     }
     return speed, ratio
-
-
-def blob_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """Filters alone and the tracker, on a blob of 100,000 events/s at up to 2014 px/s."""
-    recording, truth = blob_scene("lissajous", 0)
-    e = recording.events
-    assert isinstance(e, Events)
-    start, count, shift = truth(0.0)[0, 0, :2] + (3.0, -3.0), 6144, np.arange(64, dtype=np.float32)
-
-    def scan(length, params, start, dt, batch):
-        """Position and sizes after every step; or the last state, by loops of `length` steps.
-
-        XLA makes one function of a short loop over little data, as the tracker has it: 0.5 instead
-        of 0.25 M steps/s of one blob.
-        """
-        blob = moment.filter
-
-        def step(state, part):
-            dt, batch = part
-            weight = jax.numpy.ones(len(batch.age), dt.dtype)
-            if len(weight) == 1:  # as the tracker does
-                batch = EventBatch(batch.xi, 0 * weight, batch.polarity)
-            state = blob.update(params, blob.predict(params, state, dt), batch, weight)
-            now = blob.predicted_measurement(params, state)
-            return state, None if length else jax.numpy.concatenate([now.p, now.size])
-
-        begin = blob.init(params, start.astype(dt.dtype), jax.numpy.full((), 20.0, dt.dtype))
-        if not length:
-            return jax.lax.scan(step, begin, (dt, batch))[1]
-        parts = jax.tree.map(lambda a: a.reshape(-1, length, *a.shape[1:]), (dt, batch))
-        return jax.lax.scan(lambda s, part: jax.lax.scan(step, s, part), begin, parts)[0]
-
-    def seconds(function, given, repeat=15):
-        return cpu_seconds(lambda: jax.block_until_ready(function(*given)), repeat)
-
-    info = jax.jit(functools.partial(scan, 0))
-    targets = {
-        length: jax.jit(jax.vmap(functools.partial(scan, length), (None, 0, None, 0)))
-        for length in (64, 256)
-    }
-    speed, rmse, whole = {}, {}, {}
-    for M in (1, 32):
-        params = moment.Params(events_per_step=M)
-        given = jax.device_put((params, start, *blob_steps(recording, M)))
-        states = np.asarray(info(*given), float)
-        t = e.t[M - 1 :: M][: len(states)]
-        error = (states[:, :2] - truth(t)[:, 0, :2])[t > 100_000]
-        rmse[M] = float(np.sqrt((error**2).sum(1).mean()))
-        if M == 1:
-            by_event = states
-        dt, batch = jax.tree.map(lambda part, k=count // M: part[:k], blob_steps(recording, M))
-        # As the tracker runs it, for a batch of targets.
-        single = params, start[None], dt, jax.tree.map(lambda part: part[None], batch)
-        speed[M] = len(dt) * M / 1e6 / seconds(targets[64], single)
-    # 64 blobs whose events come at the same times, each at its own place.
-    dt, batch = blob_steps(recording, 1)
-    batch = jax.tree.map(
-        lambda part: jax.numpy.broadcast_to(part[:2048], (64, *part[:2048].shape)), batch
-    )
-    batch = EventBatch(batch.xi + shift[:, None, None, None], batch.age, batch.polarity)
-    given = jax.device_put((moment.Params(), start + shift[:, None], dt[:2048], batch))
-    many = 64 * 2048 / 1e6 / seconds(targets[256], given, 40)
-
-    arguments = start, *blob_numbers()
-    same = blob_loop(e.t, e.x, e.y, *arguments)
-    # But for rounding to single precision.
-    assert np.abs(same - by_event).max() < 0.05, "the loop is another filter"
-    part = e[: count * 4]
-    loop = count * 4 / 1e6 / cpu_seconds(lambda: blob_loop(part.t, part.x, part.y, *arguments), 15)
-
-    for M in (1, 32):
-        params = moment.Params(events_per_step=M)
-        stream, _ = blob_scene("lissajous", 0, rate=1e6 if M > 1 else 1e5)
-        run = functools.partial(moment.estimate, stream, params, seeds=[(*start, 20.0)])
-        whole[M] = len(stream.events) / 1e6 / cpu_seconds(run, 10)
-    print(
-        f"\nblob: RMSE {rmse[1]:.4f} px event by event, {rmse[32]:.4f} px in steps of 32 "
-        f"({rmse[32] - rmse[1]:+.4f})"
-    )
-    names = {
-        "blob filter, event by event": speed[1],
-        "blob filter, 32 events per step": speed[32],
-        "blob filter, 64 blobs vmapped, in all": many,
-        "blob filter as a numba loop": loop,
-        "blob.track, event by event": whole[1],
-        "blob.track, 32 events per step": whole[32],
-    }
-    ratio = {
-        "blob filter, event by event / numba loop": speed[1] / loop,
-        "blob filter, 32 events per step / numba loop": speed[32] / loop,
-        "blob filter, 64 blobs vmapped / numba loop": many / loop,
-        "blob.track, 32 events per step / numba loop": whole[32] / loop,
-        "blob filter, event by event / authors' 0.1 M": speed[1] / 0.1,
-        "blob.track, event by event / authors' 0.1 M": whole[1] / 0.1,
-        "blob.track, 32 events per step / authors' 0.1 M": whole[32] / 0.1,
-        "blob: RMSE of 32 events per step / event by event": rmse[32] / rmse[1],
-    }
-    return names, ratio

@@ -1,15 +1,20 @@
-"""Speed of images, as part of `bench.py`: filters, files, losses and gradients.
+"""Speed of images, as part of `bench.py`: filters, smoother, files, losses and gradients.
 
-    python experiments/bench.py images xla
+    python experiments/bench.py images xla smoother gpu start
 
 A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
 read, filtered and shown. Beside it run, on one core: the whole filter as a plain numba program
-over events, which is what a C++ program does; its recursion with and without the look-up of
-neighbours; and, where it is installed, the Accumulator of dv-processing.
+over events, which is what a C++ program does; and, where it is installed, the Accumulator of
+dv-processing.
 """
 
 import functools
+import os
+import resource
+import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,14 +23,17 @@ import equinox as eqx
 import jax
 import numba
 import numpy as np
-from timing import cpu_seconds, least_cpu
+from common import cpu_seconds, least_cpu, markdown_table
 
 import jaxevent
+from jaxevent.blob import moment
+from jaxevent.egomotion import voting
 from jaxevent.io import load, save
 from jaxevent.io.hdf5_files import search_heaps
 from jaxevent.reconstruction.filtering import FrameModel, Observation, PixelState, Trajectory
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.simulate import Line, Target, motion_scene, simulate_blobs
 
 WIDTH, HEIGHT = 346, 260
 NUMBERS = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)  # of the filter, as the programs take them
@@ -35,7 +43,7 @@ OF_AKF = ("c_on", "c_off", "I0", "kappa", "w_min", "sigma_proc", "sigma_iso", "s
 def stream(
     events: int, seconds: float, seed: int, size: tuple[int, int] = (WIDTH, HEIGHT)
 ) -> Recording:
-    """Events at gamma-distributed rates per pixel, frames of noise at 25 per second."""
+    """Draw events at gamma-distributed rates per pixel, and frames of noise at 25 per second."""
     rng = np.random.default_rng(seed)
     width, height = size
     rate = rng.gamma(2.0, 1.0, width * height)
@@ -58,7 +66,7 @@ def stream(
 
 @numba.njit
 def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
-    """The whole AKF as an event-by-event program: calibration per frame, then event after event.
+    """Run the whole AKF event by event: calibration per frame, then event after event.
 
     Double precision, one core, exposures not known; the arithmetic of the library's filter.
     """
@@ -114,52 +122,15 @@ def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
     return L, P
 
 
-@numba.njit
-def event_loop(t, x, y, p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search):
-    """The recursion alone, event after event, what the frames say given; near given or searched."""
-    height, width = L.shape
-    for i in range(len(t)):
-        a, b = np.int64(y[i]), np.int64(x[i])
-        dt = (t[i] - last[a, b]) * np.float32(1e-6)
-        gap = near[i]
-        if search:
-            latest = np.int64(0)
-            for row in range(max(a - 1, 0), min(a + 2, height)):
-                for column in range(max(b - 1, 0), min(b + 2, width)):
-                    latest = max(latest, last[row, column])
-            gap = (t[i] - latest) * np.float32(1e-6)
-        gain = 1 / (1 + P[a, b] * dt * rate[i])
-        L[a, b] = (L[a, b] - u[i]) * gain + u[i] + (c if p[i] else -c)
-        P[a, b] = P[a, b] * gain + Q_proc * dt + Q_iso * gap + (Q_ref if dt <= rho else 0.0)
-        last[a, b] = t[i]
-
-
-class Given(FrameModel):
-    """Observations that are already there, carried in place of the points' weights."""
+class KnownFrames(FrameModel):
+    """Observations known beforehand, carried in place of the points' weights."""
 
     def __call__(self, points):
         return Observation(points.weight, points.blend)
 
 
-def loop_seconds(recording: Recording, search: bool) -> float:
-    e = recording.events
-    assert isinstance(e, Events)
-    n = len(e)
-    u, rate, near = (np.full(n, v, np.float32) for v in (0.4, 1e5, 1e-3))
-
-    def run():
-        L, P = np.zeros((HEIGHT, WIDTH), np.float32), np.full((HEIGHT, WIDTH), 0.09, np.float32)
-        last = np.zeros((HEIGHT, WIDTH), np.int64)
-        c, Q_proc, Q_iso, Q_ref, rho = (np.float32(v) for v in (0.1, 5e-4, 0.03, 0.01, 0.01))
-        event_loop(
-            e.t, e.x, e.y, e.p, u, rate, near, L, P, last, c, Q_proc, Q_iso, Q_ref, rho, search
-        )
-
-    return cpu_seconds(run, 20)
-
-
 def filter_seconds(recording: Recording) -> float:
-    """All windows' filters, with what the frames say and the features already on the device."""
+    """Return the CPU seconds of all windows' filters, with their features on the device."""
     params = jaxevent.akf.Params()
     look = jax.jit(lambda frame_model, tiles: frame_model(tiles.points))
     windows = []
@@ -174,8 +145,8 @@ def filter_seconds(recording: Recording) -> float:
 
     @jax.jit
     def scan(params, tiles, last, state):
-        path = jaxevent.akf.scan(params, Given(), tiles, state)
-        return Trajectory(Given(), state, path).at(last), path
+        path = jaxevent.akf.scan(params, KnownFrames(), tiles, state)
+        return Trajectory(KnownFrames(), state, path).at(last), path
 
     pixels = WIDTH * HEIGHT
     first = PixelState(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
@@ -204,7 +175,7 @@ def losses(
     names: tuple[str, ...] = OF_AKF,
     compilers: tuple[str, ...] = ("numba", "xla"),
 ) -> dict[str, Callable[[], object]]:
-    """The mean squared error at 8 images, and it with its gradient by these parameters.
+    """Return tasks of the mean squared error at 8 images, alone and with its gradient.
 
     Keys are those of a compiler, "numba" or "xla", and "loss" or "gradient".
     """
@@ -231,21 +202,21 @@ def losses(
 
 
 def read(path: Path, in_memory: bool) -> Recording:
-    """As a process that reads the file for the first time."""
+    """Load a file like a process that reads it for the first time."""
     search_heaps.cache_clear()
     return load(path, in_memory=in_memory)
 
 
 def images(given: Recording | Path, compiler: Any, rate: int, method: Any = jaxevent.akf) -> None:
-    """The complete path of a recording in memory, or in a file."""
+    """Run the complete path of a recording in memory, or in a file."""
     given = read(given, in_memory=False) if isinstance(given, Path) else given
     times = np.arange(given.start, given.stop, 1_000_000 // rate)
     for _ in method.estimate(given, compiler=compiler).batches(times):
         pass
 
 
-def images_bench(recording: Recording, path: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """The complete path by both compilers, losses and gradients.
+def measure_images(recording: Recording, path: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """Measure the complete path by both compilers, losses and gradients.
 
     The numba program makes no images. Beside it: 100 and 500 images per second, read from the file
     as `jaxevent reconstruct` does; and 5 M events of a sensor of 1280x720 in 2 s with 25 images per
@@ -296,7 +267,7 @@ def images_bench(recording: Recording, path: Path) -> tuple[dict[str, float], di
 
 
 def check_program(recording: Recording, grey: np.ndarray) -> None:
-    """The program is the same filter: at the last event of a pixel both must agree."""
+    """Check that the program and the library agree at the last event of each pixel."""
     e, frames = recording.events, recording.frames
     assert isinstance(e, Events) and frames is not None
     L, _ = program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS)
@@ -305,35 +276,33 @@ def check_program(recording: Recording, grey: np.ndarray) -> None:
     assert np.abs(end.L.reshape(L.shape) - L).max() < 1e-3, "the program is another filter"
 
 
-def xla_bench(recording: Recording) -> tuple[dict[str, float], dict[str, float]]:
-    """What runs where there is no kernel: the scan alone, features, compilations."""
+def xla_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure the paths without a kernel: the scan alone, features, compilations."""
+    recording = stream(5_000_000, 2.0, 0)
     e, frames = recording.events, recording.frames
     assert isinstance(e, Events) and frames is not None
     grey, n = frames.intensity.astype(np.float64), len(e) / 1e6
     whole = n / cpu_seconds(lambda: program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS))
-    loop, given = (n / loop_seconds(recording, search) for search in (True, False))
     filtering, preparing = n / filter_seconds(recording), n / prepare_seconds(recording)
     speed = {
-        "numba loop, recursion and neighbour look-up": loop,
-        "numba loop, recursion alone": given,
         "filter alone, by XLA": filtering,
         "features and packing": preparing,
     }
     ratio = {
         "filter by XLA / numba program": filtering / whole,
-        "filter by XLA / numba loop with neighbour look-up": filtering / loop,
         "features and packing / numba program": preparing / whole,
         "compilations for a second recording": compilations(),
     }
     return speed, ratio
 
 
-def files_bench(recording: Recording) -> tuple[dict[str, float], dict[str, float]]:
-    """`images_bench` of the recording in a file; with dv-processing where it is installed."""
+def images_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure images of a recording in a file, and dv-processing where it is installed."""
+    recording = stream(5_000_000, 2.0, 0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.h5"
         save(recording, path)
-        speed, ratio = images_bench(recording, path)
+        speed, ratio = measure_images(recording, path)
     try:
         accumulator = len(recording.events) / 1e6 / accumulator_seconds(recording)
     except ImportError:
@@ -345,7 +314,7 @@ def files_bench(recording: Recording) -> tuple[dict[str, float], dict[str, float
 
 
 def accumulator_seconds(recording: Recording) -> float:
-    """dv-processing's Accumulator at 100 Hz on the same events, which it has in memory."""
+    """Return the CPU seconds of dv-processing's Accumulator at 100 Hz, events in memory."""
     import dv_processing as dv
 
     e = recording.events
@@ -368,7 +337,7 @@ def accumulator_seconds(recording: Recording) -> float:
 
 
 def compilations() -> int:
-    """How often XLA compiles for a second recording of the same sensor."""
+    """Count the compilations by XLA for a second recording of the same sensor."""
     heard = []
 
     def listen(event: str, duration_secs: float, **_: str | int) -> None:
@@ -385,3 +354,256 @@ def compilations() -> int:
     run(1, 2_500_000)
     jax.monitoring.clear_event_listeners()
     return len(heard)
+
+
+# The parameters that losses are differentiated by, and how they are called here.
+OF_AKS = ("c_on", "c_off", "I0", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor", "share")
+LOSS_NAMES = {
+    "numba loss": "loss, kernel",
+    "numba gradient": "loss and gradient, kernel",
+    "xla loss": "loss, XLA",
+    "xla gradient": "loss and gradient, XLA",
+}
+
+
+@numba.njit
+def mix(counts, share):
+    """Return event counts of which each pixel gives a part to its neighbours."""
+    height, width = counts.shape
+    out = np.empty((height, width))
+    for y in range(height):
+        for x in range(width):
+            total, number = 0.0, 0
+            for row in range(max(y - 1, 0), min(y + 2, height)):
+                for column in range(max(x - 1, 0), min(x + 2, width)):
+                    total += counts[row, column]
+                    number += 1
+            own = counts[y, x]
+            out[y, x] = own + share * ((total - own) / 8 - (number - 1) / 8 * own)
+    return out
+
+
+@numba.njit
+def smoother_program(t, x, y, p, image, certainty, mid, times, numbers):
+    """Run a Kalman filter over frames, an information filter back, and form images between."""
+    c_on, c_off, I0, sigma_event, sigma_bg, sigma_frame, floor, m0, P0, share = numbers
+    frames, height, width = image.shape
+    size = height, width
+    m, P = np.full(size, m0), np.full(size, P0)
+    past_m, past_P = np.empty(image.shape), np.empty(image.shape)
+    h, J = np.empty(image.shape), np.empty(image.shape)
+    moved = np.zeros((frames, 2, height, width))
+    i = np.searchsorted(t, mid[0])
+    for k in range(frames):
+        z = np.log(image[k] + I0)
+        said = 1 / ((sigma_frame / certainty[k] / (image[k] + I0)) ** 2 + floor**2)
+        h[k], J[k] = said * z, said
+        past_P[k] = P / (1 + P * said)
+        past_m[k] = m + past_P[k] * (h[k] - said * m)
+        if k + 1 < frames:
+            counts = np.zeros((2, height, width))
+            while i < len(t) and t[i] < mid[k + 1]:
+                counts[0 if p[i] else 1, y[i], x[i]] += 1
+                i += 1
+            for polarity in range(2):
+                moved[k, polarity] = mix(counts[polarity], share)
+            m = past_m[k] + c_on * moved[k, 0] - c_off * moved[k, 1]
+            q = sigma_event**2 * (c_on**2 * moved[k, 0] + c_off**2 * moved[k, 1])
+            P = past_P[k] + q + sigma_bg**2 * (mid[k + 1] - mid[k]) * 1e-6
+    later_h, later_J = np.zeros(size), np.zeros(size)
+    for k in range(frames - 1, -1, -1):
+        own_h, own_J = h[k].copy(), J[k].copy()
+        h[k], J[k] = later_h, later_J  # what is said at the next frame
+        if k + 1 < frames:
+            q = sigma_event**2 * (c_on**2 * moved[k, 0] + c_off**2 * moved[k, 1])
+            q += sigma_bg**2 * (mid[k + 1] - mid[k]) * 1e-6
+            fade = 1 / (1 + q * later_J)
+            own_h += (later_h - later_J * (c_on * moved[k, 0] - c_off * moved[k, 1])) * fade
+            own_J += later_J * fade
+        later_h, later_J = own_h, own_J
+    out = np.empty((2, len(times), height, width), np.float32)
+    f, i = -1, 0
+    counts = np.zeros((2, height, width))
+    for n in range(len(times)):
+        now = times[n]
+        while f + 1 < frames and mid[f + 1] <= now:
+            f += 1
+            counts[:] = 0
+            i = np.searchsorted(t, mid[f])
+        while i < len(t) and t[i] <= now:
+            counts[0 if p[i] else 1, y[i], x[i]] += 1
+            i += 1
+        on, off = mix(counts[0], share), mix(counts[1], share)
+        elapsed = (now - mid[f]) * 1e-6
+        left = (mid[f + 1] - now) * 1e-6 if f + 1 < frames else 0.0
+        for row in range(height):
+            for column in range(width):
+                a, b = on[row, column], off[row, column]
+                u, v = moved[f, 0, row, column] - a, moved[f, 1, row, column] - b
+                mean = past_m[f, row, column] + c_on * a - c_off * b
+                spread = sigma_event**2 * (c_on**2 * a + c_off**2 * b) + sigma_bg**2 * elapsed
+                q = sigma_event**2 * (c_on**2 * u + c_off**2 * v) + sigma_bg**2 * left
+                fade = 1 / (1 + q * J[f, row, column])
+                told = (h[f, row, column] - J[f, row, column] * (c_on * u - c_off * v)) * fade
+                weight = J[f, row, column] * fade
+                V = 1 / (1 / (past_P[f, row, column] + spread) + weight)
+                out[0, n, row, column] = np.exp(mean + V * (told - weight * mean)) - I0
+                out[1, n, row, column] = V
+    return out
+
+
+def program_images(recording: Recording, times: np.ndarray) -> np.ndarray:
+    frames, v = recording.frames, jaxevent.aks.Params().values()
+    assert frames is not None
+    grey = np.asarray(frames.images)
+    table = np.arange(256) / 255
+    certain = np.maximum(np.asarray(recording.response.certainty(table)), v["w_min"])
+    image = np.asarray(recording.response.intensity(table))[grey]
+    names = ("c_on", "c_off", "I0", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor")
+    numbers = [v[name] for name in names] + [np.log(v["start"] + v["I0"]), v["P_start"], v["share"]]
+    e = recording.events[:]
+    return smoother_program(e.t, e.x, e.y, e.p, image, certain[grey], frames.t, times,
+                   tuple(float(n) for n in numbers))  # fmt: skip
+
+
+def images_by(
+    recording: Recording, times: np.ndarray, compiler: str, preset: str | None = None
+) -> np.ndarray:
+    params = jaxevent.aks.Params(preset=preset)
+    made = jaxevent.aks.estimate(recording, params, compiler=compiler, progress=False)
+    return np.concatenate([np.asarray(part.mean) for _, part in made.batches(times)])
+
+
+def smoother_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure the kernel of `aks`, the scan, and a plain numba program.
+
+    The program passes forwards and backwards over whole images, in double precision on one core,
+    with the arithmetic of the smoother's defaults: exposures not known, nothing clipped. The preset
+    `hdr` spreads changes over time. The loss is that at 8 images of the prepared recording.
+    """
+    recording = stream(5_000_000, 2.0, 0)
+    frames = recording.frames
+    assert frames is not None
+    times = np.arange(frames.t[0], recording.stop, 10_000)
+    ways: dict[str, Any] = {
+        "numba program": lambda: program_images(recording, times)[0],
+        "kernel": lambda: images_by(recording, times, "numba"),
+        "compiled by XLA": lambda: images_by(recording, times, "xla"),
+        "kernel, one image": lambda: images_by(recording, times[:1], "numba"),
+        "kernel, preset hdr": lambda: images_by(recording, times, "numba", "hdr"),
+        "preset hdr, compiled by XLA": lambda: images_by(recording, times, "xla", "hdr"),
+    }
+    worst = abs(ways["kernel"]() - ways["numba program"]()).max()
+    assert worst < 1e-4, worst
+    of_losses = losses(recording, jaxevent.aks, jaxevent.aks.Params(), OF_AKS)
+    ways |= {shown: of_losses[name] for name, shown in LOSS_NAMES.items()}
+    least = least_cpu(ways)
+    speed = {f"smoother, {n}": len(recording.events) / 1e6 / cpu for n, cpu in least.items()}
+    whole, gradient = least["numba program"], "loss and gradient, kernel"
+    ratio = {
+        "smoother / numba program": whole / least["kernel"],
+        "smoother, one image / numba program": whole / least["kernel, one image"],
+        "smoother / the same compiled by XLA": least["compiled by XLA"] / least["kernel"],
+        "smoother, preset hdr / the same compiled by XLA": least["preset hdr, compiled by XLA"]
+        / least["kernel, preset hdr"],
+        "smoother: loss and 8 gradients / loss": least[gradient] / least["loss, kernel"],
+    }
+    return speed, ratio
+
+
+GPU_REPEAT = 3  # of which the first compiles
+GPU_EVENTS = 5_000_000
+
+
+def crossing_blobs() -> tuple[Any, list[tuple[float, float, float]]]:
+    """Return 64 blobs that cross an image of 1280x720, and their beginnings."""
+    places = [(100.0 + 140 * (k % 8), 60.0 + 80 * (k // 8)) for k in range(64)]
+    lines = [Line(at, (60.0, 20.0), size=(6.0, 6.0)) for at in places]
+    recording, _ = simulate_blobs([Target(line, 1e4) for line in lines], (1280, 720), 1.0, 0.0)
+    return recording, [(x, y, 12.0) for x, y in places]
+
+
+def gpu_tasks(events: int) -> dict[str, tuple[int, Callable[[str], object]]]:
+    """Return the number of events and the task, a function of the compiler, by name."""
+    recording = stream(events, 2.0, 0)
+    of_losses = losses(recording)
+    many, seeds = crossing_blobs()
+    scene, _ = motion_scene("rotation", "constant", 200, size=(160, 120), duration=0.1)
+
+    def made(method: Any) -> Callable[[str], object]:
+        return functools.partial(images, recording, rate=100, method=method)
+
+    def track(compiler: str) -> None:
+        params = moment.Params(events_per_step=32)
+        moment.estimate(many, params, seeds=seeds, compiler=compiler, progress=False)
+
+    def vote(compiler: str) -> None:
+        voting.estimate(scene, model="rotation", compiler=compiler, progress=False)
+
+    return {
+        "akf, 100 Hz images": (events, made(jaxevent.akf)),
+        "aks, 100 Hz images": (events, made(jaxevent.aks)),
+        "akf, loss and 8 gradients": (events, lambda compiler: of_losses[f"{compiler} gradient"]()),
+        "moment, 64 targets": (len(many.events), track),
+        "voting, rotation": (len(scene.events), vote),
+    }
+
+
+def gpu_bench(events: int = GPU_EVENTS) -> str:
+    """Compare images, a loss, a tracker and voting by XLA on JAX's device with the CPU's kernels.
+
+    Returns a table in M events per second by the clock, from memory.
+    """
+    device, host = jax.devices()[0], jax.devices("cpu")[0]
+    rows = [f"| M events/s | {device.device_kind} | kernel, CPU |", "|---|---:|---:|"]
+    for name, (count, task) in gpu_tasks(events).items():
+        speeds = []
+        for compiler, where in (("xla", device), ("numba", host)):
+            with jax.default_device(where):
+                seconds = []
+                for _ in range(GPU_REPEAT):
+                    start = time.perf_counter()
+                    task(compiler)
+                    seconds.append(time.perf_counter() - start)
+            speeds.append(count / 1e6 / min(seconds[1:]))
+        rows.append(f"| {name} | {speeds[0]:.2f} | {speeds[1]:.2f} |")
+        print(rows[-1], flush=True)
+    return "\n".join(rows)
+
+
+CROP = Path(jaxevent.__file__).parent / "data" / "slider_depth_crop.h5"
+PROGRAM = "import sys; from jaxevent.cli import main; sys.exit(main())"
+COMMAND = (sys.executable, "-c", PROGRAM, "reconstruct", str(CROP), "--rate", "200")
+
+
+def start_seconds(method: str, caches: Path, out: Path) -> float:
+    """Return the CPU seconds of one process."""
+    folders = {"JAXEVENT_CACHE": str(caches)}
+    kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    words = (*COMMAND, "--method", method, "--out", str(out))
+    subprocess.run(words, env={**kept, **folders}, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    out.unlink()
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def start_bench(methods: tuple[str, ...] = ("akf", "aks"), turns: int = 3) -> str:
+    """Measure a short `jaxevent reconstruct` in a fresh process, with cold and warm caches.
+
+    The packaged crop at 200 images per second, to HDF5. Cold: nothing that numba and XLA compile is
+    kept; Python's own bytecode is. Each cell is the least of the turns, in which all methods take
+    part, so that all meet the same neighbours.
+    """
+    least: dict[tuple[str, str], float] = {}
+    for _ in range(turns):
+        for method in methods:
+            with tempfile.TemporaryDirectory() as folder:
+                for state in ("cold", "warm"):
+                    found = start_seconds(method, Path(folder), Path(folder) / "images.h5")
+                    least[method, state] = min(least.get((method, state), np.inf), found)
+    rows = [
+        (f"`{method}`", *(f"{least[method, state]:.1f}" for state in ("cold", "warm")))
+        for method in methods
+    ]
+    return markdown_table(("method", "cold", "warm"), rows)

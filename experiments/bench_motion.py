@@ -7,11 +7,10 @@ Filters run over prepared candidates of simulated scenes, one event in 8, neighb
 away, by the kernel that `estimate` uses; beside them by XLA, and the same sums over candidates and
 particles as a numba loop on one core, all in CPU seconds. A third to a half of the batches are of a
 search, which asks more of an event than the loop does. The thesis publishes 100,000 events/s with
-N = 100 (GPU and CPU). Of the batch fit, seconds per window, and what most of them go into, J' W J v
-some tens of times a step, beside the same as a plain loop.
+N = 100 (GPU and CPU). Of the batch fit,
+CPU seconds per window.
 """
 
-import math
 import time
 from typing import Any
 
@@ -20,13 +19,11 @@ import jax
 import jax.numpy as jnp
 import numba
 import numpy as np
+from common import cpu_seconds
 
 from jaxevent.egomotion import voting
-from jaxevent.egomotion.bundle import photometric_ba
-from jaxevent.egomotion.bundle.hypotheses import SCORED_EVENTS, WindowFit, WindowFitter
-from jaxevent.egomotion.bundle.normal_equations import N_PATH, Unknowns, linearise
-from jaxevent.egomotion.bundle.residuals import Scene, subtract_mean
-from jaxevent.egomotion.bundle.warp import N_ROWS, Path, predict_path
+from jaxevent.egomotion.bundle.hypotheses import WindowFit, WindowFitter
+from jaxevent.egomotion.bundle.warp import predict_path
 from jaxevent.egomotion.bundle.windows import Params as BatchParams
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
@@ -42,7 +39,7 @@ CASES = (("planar", "planar", 200), ("rotation", "rotation", 200), ("general", "
 
 @numba.njit(cache=True, fastmath=True)
 def votes(dx, dy, age, count, xi, scale, particles, model, f, tau, exponent, rho, s0, alpha):
-    """The log-likelihood of every particle: what `likelihood.score` adds up, in float32."""
+    """Return the log-likelihood of every particle, as `likelihood.score` does, in float32."""
     total = np.zeros(len(particles), np.float32)
     one = np.float32(1)
     for e in range(len(count)):
@@ -73,26 +70,15 @@ def votes(dx, dy, age, count, xi, scale, particles, model, f, tau, exponent, rho
     return total
 
 
-def timed(function: Any, repeat: int = 3, clock: Any = time.perf_counter) -> float:
-    """The least of some times, after one call that compiles."""
-    jax.block_until_ready(function())
-    seconds = []
-    for _ in range(repeat):
-        begin = clock()
-        jax.block_until_ready(function())
-        seconds.append(clock() - begin)
-    return min(seconds)
-
-
 def cpu_timed(function: Any, repeat: int = 5) -> float:
-    """The same in CPU seconds, which other programs on the machine change less."""
-    return timed(function, repeat, time.process_time)
+    """Return the least CPU seconds, after one call that compiles, until results are there."""
+    return cpu_seconds(lambda: jax.block_until_ready(function()), repeat)
 
 
 def loop_seconds(
     made: Candidates, particles: np.ndarray, kind: Model, params: Params, tau: float
 ) -> tuple[float, np.ndarray]:
-    """Seconds of the numba loop over candidates of ages in [youngest tau, tau], and its sums."""
+    """Return seconds and sums of the numba loop over ages in [youngest tau, tau]."""
     age = np.asarray(made.age).reshape(-1, made.age.shape[2])
     d = np.moveaxis(np.asarray(made.d), -1, 0).reshape(2, *age.shape)
     keep = (age >= np.float32(float(params.youngest) * tau)) & (age <= np.float32(tau))
@@ -159,7 +145,7 @@ def voting_bench() -> tuple[dict[str, float], dict[str, float]]:
 
 
 def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """CPU seconds of one window of 300 ms with more than 100,000 events, of which 60,000 are used.
+    """Measure one window of 300 ms with more than 100,000 events, of which 60,000 are used.
 
     From nothing, all starts included, and following the window before.
     """
@@ -187,95 +173,9 @@ def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
     return speed, {}
 
 
-@numba.njit(cache=True, fastmath=True)
-def normal_loop(
-    v_map, v_path, v_depth, first, steps, share, node, node_steps, node_share, by_path, by_depth,
-    weight, pixel, total,
-):  # fmt: skip
-    """J' W J v, J of differences to the mean over each pixel's events, event by event."""
-    value, sums = np.zeros(len(first), np.float32), np.zeros(len(total), np.float32)
-    for e in range(len(first)):
-        one, depth = np.float32(0), np.float32(0)
-        for k in range(len(steps)):
-            one += v_map[first[e] + steps[k]] * share[e, k]
-        for k in range(len(v_path)):
-            one += v_path[k] * by_path[e, k]
-        for k in range(len(node_steps)):
-            depth += v_depth[node[e] + node_steps[k]] * node_share[e, k]
-        value[e] = one + by_depth[e] * depth
-        sums[pixel[e]] += weight[e] * value[e]
-    to_map, to_path, to_depth = np.zeros_like(v_map), np.zeros_like(v_path), np.zeros_like(v_depth)
-    for e in range(len(first)):
-        z = weight[e] * (value[e] - sums[pixel[e]] / total[pixel[e]])
-        for k in range(len(steps)):
-            to_map[first[e] + steps[k]] += z * share[e, k]
-        for k in range(len(v_path)):
-            to_path[k] += z * by_path[e, k]
-        z *= by_depth[e]
-        for k in range(len(node_steps)):
-            to_depth[node[e] + node_steps[k]] += z * node_share[e, k]
-    return to_map, to_path, to_depth
-
-
-def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
-    """One J' W J v of the batch fit, of 60,000 events where they are, beside a drawn map."""
-    recording, truth = motion_scene("texture", "varying", 200, duration=0.4)
-    assert recording.camera is not None
-    windows = WindowFitter(recording, BatchParams.of({}), recording.camera)
-    series, prior = windows.series(200_000, 0.15, SCORED_EVENTS), windows.prior(200_000, 0.15)
-    T, Omega = (part[0] for part in truth.twist(np.array([0.2])))
-    rng, real = np.random.default_rng(0), series.x.dtype
-    depths = np.full(math.prod(series.nodes), np.log(np.linalg.norm(T)), real)
-    path = Path.constant_twist(T / np.linalg.norm(T), Omega, depths)
-    scene = Scene(path, rng.normal(size=series.shape).astype(real), 0.0)
-    made = linearise(
-        *photometric_ba.init_problem(series, scene, prior, 1.0, plane=False), map_only=False
-    )
-    jacobian, weight = made.jacobian, made.evaluation.weight
-    E, n = len(weight), N_PATH + len(jacobian.more)
-    v = rng.normal(size=series.shape), rng.normal(size=n), rng.normal(size=len(depths))
-    v = v[0].astype(real), np.append(v[1], np.zeros(N_PATH + 4 - n)), v[2].astype(real)
-
-    def product() -> Unknowns:
-        value = made.jacobian_product(v)
-        subtract_mean(value, weight, series.begin)
-        value *= weight
-        return made.transpose_product(value)
-
-    powers = jacobian.tau[:, None] ** np.arange(1, N_ROWS + 1)
-    by_path = (jacobian.base.T[:, :, None] * powers[:, None]).reshape(
-        E, -1
-    ) @ made.coefficient_jacobian
-    across, down = (
-        np.stack([(0.5 - t) ** 2 / 2, 0.75 - t**2, (0.5 + t) ** 2 / 2], 1)
-        for t in (jacobian.u, jacobian.v)
-    )
-    share = (down[:, :, None] * across[:, None]).reshape(E, 9)
-    right, low = (np.stack([1 - t, t], 1) for t in (jacobian.across, jacobian.down))
-    node_share = (low[:, :, None] * right[:, None]).reshape(E, 4)
-    steps = (series.shape[1] * np.arange(3)[:, None] + np.arange(3)).ravel()
-    node_steps = (series.nodes[1] * np.arange(2)[:, None] + np.arange(2)).ravel()
-    pixel = np.repeat(np.arange(len(series.begin) - 1), np.diff(series.begin))
-    total = np.maximum(np.bincount(pixel, weight), 1e-3)
-    given = v[0].ravel(), v[1][:n], v[2], share, node_share, weight, total
-    v_map, v_path, v_depth, share, node_share, own, total = (x.astype(np.float32) for x in given)
-    by_path = np.concatenate([by_path, jacobian.more.T], 1).astype(np.float32)
-    arguments = (
-        v_map, v_path, v_depth, jacobian.first, steps, share, jacobian.node, node_steps, node_share,
-        by_path, jacobian.by_depth, own, pixel, total,
-    )  # fmt: skip
-    for ours, its in zip(product(), normal_loop(*arguments), strict=True):
-        ours = ours.ravel()[: its.size]
-        np.testing.assert_allclose(ours, its.ravel(), rtol=0, atol=1e-3 * np.abs(its).max())
-    seconds, slow = timed(product, 100), timed(lambda: normal_loop(*arguments), 100)
-    name = "batch general motion, one J' W J v"
-    speed = {name: E / seconds / 1e6, f"{name}, as a numba loop": E / slow / 1e6}
-    return speed, {f"{name} / numba loop": slow / seconds}
-
-
 def motion_bench() -> tuple[dict[str, float], dict[str, float]]:
     speed, ratio = {}, {}
-    for part in (voting_bench, normal_bench, batch_bench):
+    for part in (voting_bench, batch_bench):
         more, ratios = part()
         speed, ratio = speed | more, ratio | ratios
     return speed, ratio

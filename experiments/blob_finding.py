@@ -1,6 +1,6 @@
 """Tracking without settings: simulated scenes and what simple trackers make of them.
 
-    python experiments/blob_finding.py --out finding --first 10 [--varied] [--data DIR]
+    python experiments/blob_finding.py --out finding --first 10 [--varied]
 
 Every scene is tracked as a new user does it, `moment.estimate(recording)`, whose states rest on all
 events. Beside it: `filter`, the same tracks from the events up to each time; the targets that
@@ -12,24 +12,22 @@ the centred mean of a window's events within three sizes of the mean before, tol
 begins. All get the window and cell that `find` chose. `by hand` is `moment`, smoothed, from seeds
 at the true beginnings, with the truth's sizes, times and changes of velocity (Q_v is the rms
 acceleration times the median speed: squared, times the time in which it turns). Makes
-table.md and results.json. With --data, a folder that holds spinning_dot.npz and
-davis346_street.npz, these are tracked too.
+table.md and results.json.
 
 Scores are those of `jaxevent.blob.scores` at 200 times: a track and a target are one where they are
 nearer than 2 sizes and 3 px.
 """
 
-import argparse
 import importlib
 import importlib.util
 import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from blob_scenes import SCENES, VARIED
+from common import command_line, markdown_table
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -38,46 +36,39 @@ from jaxevent.blob.scores import score_tracks
 from jaxevent.blob.search.background import measure_background
 from jaxevent.blob.search.detection import clutter_model, detect, measure_blobs
 from jaxevent.blob.search.stream import Stream
-from jaxevent.io import load
 from jaxevent.recording import Recording
 from jaxevent.simulate.blobs import Truth
 
 NORFAIR = importlib.util.find_spec("norfair") is not None
 
+Positions = NDArray[np.float64]  # (times, tracks, 2), NaN where a track is not
 TIMES = 200
-DOT_CENTRE = (314.29, 202.35)  # px, of a circle fitted to the same events
 
 
-class Answer(NamedTuple):
-    """Positions of tracks at the times scored: (times, tracks, 2), NaN where a track is not."""
-
-    positions: NDArray[np.float64]
-
-
-def found_paths(found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
-    """Positions of what `find` gives, on straight lines between windows."""
+def found_paths(found: TargetSearchResult, times: NDArray[np.int64]) -> Positions:
+    """Return positions of the paths that `find` gives, on straight lines between windows."""
     out = np.full((len(times), len(found), 2), np.nan)
     for k, path in enumerate(found.paths):
         now = (times >= path.begin) & (times < path.end)
         out[now, k] = path.at(times[now])
-    return Answer(out)
+    return out
 
 
-def tracked(
+def track_targets(
     recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]
-) -> tuple[Answer, Answer]:
-    """Positions of what a new user gets, smoothed, and of the filter."""
+) -> tuple[Positions, ...]:
+    """Return positions of the default estimate, smoothed and filtered."""
     params = moment.Params(**found.settings())
     tracks = moment.estimate(recording, params, found=found, progress=False)
     smoothed, filtered = (
-        Answer(np.where(states.valid[..., None], states.mean[..., :2], np.nan))
+        np.where(states.valid[..., None], states.mean[..., :2], np.nan)
         for states in (tracks(times), tracks.filtered(times))
     )
     return smoothed, filtered
 
 
 def _centroids(recording: Recording, found: TargetSearchResult) -> Iterator[tuple[int, NDArray]]:
-    """Time and centroids (n, 2) of the components of each event image."""
+    """Iterate over time and centroids (n, 2) of the components of each event image."""
     if not found.passes:
         return
     scale = found.passes[0].selection.scale
@@ -97,8 +88,10 @@ class _Line(NamedTuple):
     p: list[NDArray]
 
 
-def clusters(recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
-    """Components linked to the nearest one of the image before, within 30 px."""
+def link_clusters(
+    recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]
+) -> Positions:
+    """Link components to the nearest one of the image before, within 30 px."""
     live: list[_Line] = []
     done: list[_Line] = []
     for t, p in _centroids(recording, found):
@@ -117,8 +110,10 @@ def clusters(recording: Recording, found: TargetSearchResult, times: NDArray[np.
     return _of_lines([one for one in done + live if len(one.t) >= 3], times)
 
 
-def kalman(recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
-    """Constant velocity, optimal assignment within 3 standard deviations, 3 hits, 5 misses."""
+def track_by_kalman(
+    recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]
+) -> Positions:
+    """Track by constant velocity and optimal assignment, 3 hits, 5 misses."""
     live: list[dict[str, Any]] = []
     done: list[_Line] = []
     for t, p in _centroids(recording, found):
@@ -149,8 +144,10 @@ def kalman(recording: Recording, found: TargetSearchResult, times: NDArray[np.in
     return _of_lines([one for one in lines if len(one.t) >= 3], times)
 
 
-def norfair(recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]) -> Answer:
-    """The tracker of norfair with its own filter, 30 px, 3 hits, 5 misses."""
+def track_by_norfair(
+    recording: Recording, found: TargetSearchResult, times: NDArray[np.int64]
+) -> Positions:
+    """Track by norfair with its own filter, 30 px, 3 hits, 5 misses."""
     library: Any = importlib.import_module("norfair")
     tracker = library.Tracker("euclidean", 30, hit_counter_max=5, initialization_delay=2)
     lines: dict[int, _Line] = {}
@@ -162,10 +159,10 @@ def norfair(recording: Recording, found: TargetSearchResult, times: NDArray[np.i
     return _of_lines([one for one in lines.values() if len(one.t) > 1], times)
 
 
-def means(
+def track_by_means(
     recording: Recording, found: TargetSearchResult, truth: Truth, times: NDArray[np.int64]
-) -> Answer:
-    """A centred mean for each target, from where it is at the first time."""
+) -> Positions:
+    """Follow each target by a centred mean, from its true position at the first time."""
     states = truth(times)
     states = states[:, (states[..., 4] > 0.5).any(0)]
     lines, events = [], recording.events
@@ -183,13 +180,13 @@ def means(
     return _of_lines(lines, times)
 
 
-def by_hand(recording: Recording, truth: Truth, times: NDArray[np.int64]) -> Answer:
-    """`moment` from seeds with scales of the truth; Q_v is acceleration times speed."""
+def track_by_hand(recording: Recording, truth: Truth, times: NDArray[np.int64]) -> Positions:
+    """Track by `moment` from seeds with scales of the truth; Q_v is acceleration times speed."""
     states, t = truth(times), times
     seen = truth.visible(times)
     real = np.flatnonzero((states[..., 4] > 0.5).any(0) & seen.any(0))
     if not len(real):
-        return Answer(np.full((len(times), 0, 2), np.nan))
+        return np.full((len(times), 0, 2), np.nan)
     L = float(np.median(states[:, real, 4]))
     speed = float(np.median(np.hypot(*np.moveaxis(states[:, real, 2:4], 2, 0))))
     change = np.gradient(states[:, real, 2:4], t * 1e-6, axis=0)
@@ -210,44 +207,39 @@ def by_hand(recording: Recording, truth: Truth, times: NDArray[np.int64]) -> Ans
     )  # fmt: skip
     tracks = moment.estimate(recording, params, seeds=seeds, progress=False)
     states = tracks(times)
-    return Answer(np.where(states.valid[..., None], states.mean[..., :2], np.nan))
+    return np.where(states.valid[..., None], states.mean[..., :2], np.nan)
 
 
-def _of_lines(lines: list[_Line], times: NDArray[np.int64]) -> Answer:
+def _of_lines(lines: list[_Line], times: NDArray[np.int64]) -> Positions:
     out = np.full((len(times), len(lines), 2), np.nan)
     for k, one in enumerate(lines):
         now = (times >= one.t[0]) & (times <= one.t[-1])
         for axis in range(2):
             out[now, k, axis] = np.interp(times[now], one.t, np.array(one.p)[:, axis])
-    return Answer(out)
+    return out
 
 
-def score(answer: Answer, truth: Truth, times: NDArray[np.int64], size: tuple[int, int]) -> dict:
-    """See the module's docstring."""
+def score(answer: Positions, truth: Truth, times: NDArray[np.int64], size: tuple[int, int]) -> dict:
+    """Return the scores that the module's docstring describes."""
     states = truth(times)
     states = states[:, (states[..., 4] > 0.5).any(0)]  # the others are hot pixels
     visible = truth.visible(times)[:, (truth(times)[..., 4] > 0.5).any(0)]
     inside = np.asarray(((states[..., :2] >= 0) & (states[..., :2] < size)).all(-1))
     paths = np.where(inside[..., None], states[..., :2], np.nan)
-    told = score_tracks(paths, answer.positions, 2 * states[..., 4] + 3, hidden=~visible)
+    told = score_tracks(paths, answer, 2 * states[..., 4] + 3, hidden=~visible)
     names = ("targets", "found", "tracks", "false", "covered", "rms", "idf1", "mota", "hota")
     return {name: getattr(told, name) for name in names}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, required=True)
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--scenes", nargs="+", help="default: all of SCENES")
     parser.add_argument("--search", action="store_true", help="only `find` and the baselines")
     parser.add_argument("--varied", action="store_true", help="all of VARIED instead")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--data", type=Path, help="folder of real recordings")
     args = parser.parse_args()
     rows, scenes = [], SCENES | VARIED
-    args.out.mkdir(parents=True, exist_ok=True)
     for name in args.scenes or (VARIED if args.varied else SCENES):
         for seed in range(args.first, args.first + args.seeds):
             recording, truth = scenes[name](seed)
@@ -257,17 +249,17 @@ def main() -> None:
             seconds = time.process_time() - clock
             answers = {}
             if not args.search:
-                answers["moment"], answers["filter"] = tracked(recording, found, times)
+                answers["moment"], answers["filter"] = track_targets(recording, found, times)
             answers |= {
                 "find": found_paths(found, times),
-                "clusters": clusters(recording, found, times),
-                "kalman": kalman(recording, found, times),
-                "mean": means(recording, found, truth, times),
+                "clusters": link_clusters(recording, found, times),
+                "kalman": track_by_kalman(recording, found, times),
+                "mean": track_by_means(recording, found, truth, times),
             }
             if NORFAIR:
-                answers["norfair"] = norfair(recording, found, times)
+                answers["norfair"] = track_by_norfair(recording, found, times)
             if not args.search:
-                answers["by hand"] = by_hand(recording, truth, times)
+                answers["by hand"] = track_by_hand(recording, truth, times)
             for method, answer in answers.items():
                 row = score(answer, truth, times, (recording.width, recording.height))
                 rows.append({"scene": name, "seed": seed, "method": method, "cpu": seconds} | row)
@@ -279,34 +271,12 @@ def main() -> None:
                 )
         (args.out / "results.json").write_text(json.dumps(rows, indent=1))
         (args.out / "table.md").write_text(_table(rows))
-    if args.data is not None:
-        print("\n".join(_real(args.data)))
     print(_table(rows))
-
-
-def _real(data: Path) -> list[str]:
-    """Lines about tracks of real recordings, as a new user gets them, filtered."""
-    lines = []
-    for name in ("spinning_dot", "davis346_street"):
-        recording = load(data / f"{name}.npz")
-        tracks = moment.estimate(recording, smooth=False, progress=False)
-        lives = (tracks.death - tracks.birth) * 1e-6
-        lines.append(f"{name}: tracks of {', '.join(f'{life:.3f}' for life in lives)} s")
-        if name == "spinning_dot":
-            t = np.linspace(0.003, 0.0499, 900)
-            state = tracks(t, [int(tracks.id[np.argmax(lives)])]).mean[:, 0]
-            radius = np.hypot(state[:, 0] - DOT_CENTRE[0], state[:, 1] - DOT_CENTRE[1])
-            speed = np.hypot(state[:, 2], state[:, 3])
-            lines[-1] += (
-                f"; radius {radius.mean():.2f} +- {radius.std():.2f} px, "
-                f"speed {np.median(speed):,.0f} px/s"
-            )
-    return lines
 
 
 def _table(rows: list[dict]) -> str:
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = ["| scene | " + " | ".join(methods) + " |", "|---|" + "---|" * len(methods)]
+    lines = []
     for name in [*dict.fromkeys(row["scene"] for row in rows), "all"]:
         cells = []
         for method in methods:
@@ -317,8 +287,9 @@ def _table(rows: list[dict]) -> str:
                 f"{found}/{targets}, {sum(r['false'] for r in own)}, "
                 f"{np.mean([r['idf1'] for r in own]):.2f}, {np.mean(errors or [np.nan]):.2f}"
             )
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "found, false tracks, IDF1, rms px\n\n" + "\n".join(lines) + "\n"
+        lines.append([name, *cells])
+    table = markdown_table(["scene", *methods], lines)
+    return f"found, false tracks, IDF1, rms px\n\n{table}\n"
 
 
 if __name__ == "__main__":

@@ -1,20 +1,16 @@
-"""Blob tracking on real recordings: a spinning dot, cars on a street, a night sky.
+"""Blob tracking on real recordings: a spinning dot and cars on a street.
 
     python experiments/blob_real.py --data DIR --out blob_real
 
-DIR holds spinning_dot.npz, davis346_street.npz and gen4.dat; by default $JAXEVENT_DATA/data. Makes
-table.md, results.json and a picture of each. No reference uses the tracker, and all are made with
-hindsight: the dot's path is a circle fitted to centroids, the cars are found in the frames, the
-sky's drift is the one motion that makes the events sharpest. The cars'
-settings were chosen on the first second and the sky's on 2.5 to 5 s; what is reported comes after.
+DIR holds spinning_dot.npz and davis346_street.npz; by default $JAXEVENT_DATA/data. Makes table.md.
+No reference uses the tracker, and all are made with hindsight: the dot's path is a circle fitted to
+centroids, the cars are found in the frames. The cars' settings were chosen on the first second;
+reported numbers are of the time after it. `blob_without_settings.py` has its references from here,
+and those of a night sky, whose drift is the one motion that makes the events sharpest.
 The dot has the preset "fast"; that detection needs the prefilter (hot pixels) and `surround` (the
 dot's tail) was seen on all of its 50 ms.
 """
 
-import argparse
-import json
-import os
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,21 +18,14 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 import jaxevent
-from jaxevent.blob import Tracker, Tracks, chi2, chi2_split, constant_velocity, moment
-from jaxevent.io.output import complete
+from jaxevent.blob import Tracks, moment
 from jaxevent.recording import Recording
-from jaxevent.show.track_figures import track_colour, track_frames
 
 DOT_HZ, DOT_RADIUS = 19.39, 107.66  # of the circle that data/README.md gives
-DOT_PARTS = {"begin": (0.005, 0.015), "reported": (0.015, 0.05)}
-DOT_ROWS: dict[str, tuple[Tracker, dict[str, Any]]] = {
-    "moment": (moment, {"gate_shape": "ellipse"}),
-    "moment, circular gate": (moment, {"gate_shape": "circle"}),
-    "moment, M = 32": (moment, {"gate_shape": "ellipse", "events_per_step": 32}),
-    "chi2_split": (chi2_split, {"gate_shape": "circle"}),
-    "chi2_split, M = 32": (chi2_split, {"gate_shape": "circle", "events_per_step": 32}),
-    "chi2, 2n+4": (chi2, {"gate_shape": "circle"}),
-    "constant_velocity": (constant_velocity, {"gate_shape": "circle"}),
+DOT_SPAN = 0.015, 0.05  # s
+DOT_ROWS: dict[str, dict[str, Any]] = {
+    "moment": {"gate_shape": "ellipse"},
+    "moment, M = 32": {"gate_shape": "ellipse", "events_per_step": 32},
 }
 DOT_FOUND = {"gate_shape": "ellipse", "events_per_step": 32, "prefilter": True}
 
@@ -51,7 +40,6 @@ STREET: dict[str, Any] = {
     "n_confirm": 200.0, "t_confirm": 0.05, "t_tentative": 0.1, "t_coast": 0.3, "surround": 2.0,
 }  # fmt: skip
 
-SKY_PARTS = {"chosen": (2.5, 5.0), "reported": (5.0, 10.2)}
 # The glare of a planet fills the preset's 8 px: a star is a point. Faint stars need fewer events to
 # begin and confirm a track, which the prefilter affords.
 SKY: dict[str, Any] = {
@@ -59,11 +47,10 @@ SKY: dict[str, Any] = {
     "gate": 3.0, "n_birth": 6.0, "n_confirm": 20.0,
     "prefilter": True, "prefilter_time": 0.5, "prefilter_neighbours": 1,
 }  # fmt: skip
-SKY_LIFE = 2.0  # s, of the tracks whose drift is compared
 GLARE = ((470, 300, 170), (800, 450, 130))  # x, y, radius in px of the planet and of its ghost
 
 
-class Circling(NamedTuple):
+class CircularPath(NamedTuple):
     """A path centre + a cos(omega t) + b sin(omega t), and the events about it."""
 
     omega: float  # rad/s
@@ -78,8 +65,10 @@ class Circling(NamedTuple):
         return p, self.omega * np.stack([0 * t, -s, c], 1) @ self.terms
 
 
-def fit_circling(recording: Recording, hertz: float = DOT_HZ, window: float = 2.5e-4) -> Circling:
-    """The dot's path through centroids of windows (s), and the moments of events about it.
+def fit_circular_path(
+    recording: Recording, hertz: float = DOT_HZ, window: float = 2.5e-4
+) -> CircularPath:
+    """Fit the dot's path to centroids of windows (s), and the moments of events about it.
 
     Centroids and moments are those of the events within three times the larger standard deviation
     of the path, repeated until both agree, because stray events and the dot's tail have no end.
@@ -90,7 +79,7 @@ def fit_circling(recording: Recording, hertz: float = DOT_HZ, window: float = 2.
     rows = np.searchsorted(t, edges)
     middle = (edges[:-1] + edges[1:]) / 2
     centre = np.array([np.median(xi[a:b], 0) for a, b in zip(rows, rows[1:], strict=False)])
-    path = Circling(2 * np.pi * hertz, np.zeros((3, 2)), np.array([15.0, 10.0]), 0.0)
+    path = CircularPath(2 * np.pi * hertz, np.zeros((3, 2)), np.array([15.0, 10.0]), 0.0)
 
     def terms(omega: float) -> tuple[NDArray, NDArray]:
         basis = np.stack([np.ones_like(middle), np.cos(omega * middle), np.sin(omega * middle)], 1)
@@ -113,8 +102,8 @@ def fit_circling(recording: Recording, hertz: float = DOT_HZ, window: float = 2.
     return path
 
 
-def score_dot(tracks: Tracks, path: Circling, span: tuple[float, float]) -> dict[str, float]:
-    """Errors of the longest track every 50 us of a span (s)."""
+def score_dot(tracks: Tracks, path: CircularPath, span: tuple[float, float]) -> dict[str, float]:
+    """Return errors of the longest track every 50 us of a span (s)."""
     t = np.arange(round(span[0] * 1e6), round(span[1] * 1e6), 50)
     longest = tracks.id[[np.argmax(tracks.death - tracks.birth)]]
     states = tracks(t, longest)
@@ -143,78 +132,17 @@ def score_dot(tracks: Tracks, path: Circling, span: tuple[float, float]) -> dict
     }
 
 
-def spinning_dot(recording: Recording, out: Path) -> tuple[dict, str]:
-    path = fit_circling(recording)
+def spinning_dot(recording: Recording) -> list[dict[str, Any]]:
+    """Track the dot by each filter, and score the tracks."""
+    path = fit_circular_path(recording)
     start, _ = path(np.zeros(1))
-    speed = np.hypot(*path(np.arange(0, 0.05, 1e-4))[1].T)
-    seeds = [(*start[0], 20.0)]
-    results: dict[str, Any] = {}
-    lines = [
-        f"Reference: {path.omega / 2 / np.pi:.2f} Hz, {speed.mean():.0f} px/s, lambda "
-        f"{path.size[0]:.2f} and {path.size[1]:.2f} px, turned {np.degrees(path.turned):.2f} deg.",
-        "",
-        "| filter | tracked | position rms (px) | velocity along path | speed / circle | direction "
-        "(deg) | velocity rms | lambda1 | lambda2 | theta rms (deg) |",
-        "|---|" + "---:|" * 9,
-    ]  # fmt: skip
-    shown = None
-    for label, (tracker, values) in {**DOT_ROWS, "detected, M = 32": (moment, DOT_FOUND)}.items():
-        params, detected = tracker.Params(preset="fast", **values), values is DOT_FOUND
-        tracks = tracker.estimate(
-            recording, params, seeds=None if detected else seeds, smooth=False
-        )
-        row: dict[str, Any] = {n: score_dot(tracks, path, s) for n, s in DOT_PARTS.items()}
-        row["tracks"] = len(tracks)
-        results[label] = row
-        if detected:
-            shown = tracks
-        r = row["reported"]
-        cells = [f"{100 * r['tracked']:.0f} %"]
-        if "rmse" in r:
-            cells += [f"{r['rmse']:.2f}", f"{100 * r['velocity']:+.2f} %"]
-            cells += [f"{100 * r['velocity_circle']:+.2f} %", f"{r['direction']:+.1f}"]
-            cells += [f"{100 * r['velocity_rms']:.1f} %"]
-            shape = [f"{100 * r[name]:+.1f} %" for name in ("lambda1", "lambda2")]
-            shape += [f"{r['theta']:.1f}"]
-            cells += ["-"] * 3 if tracker is constant_velocity else shape
-        else:
-            cells += ["-"] * 8
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    assert shown is not None
-    lines += ["", f"Detection: {len(shown)} confirmed track(s), {', '.join(shown.ended)}."]
-    draw_dot(out, recording, shown, path)
-    return results, "\n".join(lines)
-
-
-def draw_dot(out: Path, recording: Recording, tracks: Tracks, path: Circling) -> None:
-    times = np.arange(1000, 50_000, 100)
-    states = tracks(times)
-    arrays = recording, times, tracks.id, states.mean, states.valid
-    images = list(track_frames(*arrays, trail=0.02, window=2e-4))
-    figure = new_figure(15, 9)
-    grid = figure.add_gridspec(2, 3)
-    for column, at in enumerate((5000, 20_000, 45_000)):
-        axis = figure.add_subplot(grid[0, column])
-        axis.imshow(images[int(np.searchsorted(times, at))])
-        axis.set_title(f"{at / 1e3:g} ms; ellipses of 2 standard deviations")
-        axis.set(xlim=(150, 480), ylim=(370, 40))
-    p, v = path(times * 1e-6)
-    m, speed = states.mean[:, np.argmax(tracks.death - tracks.birth)], np.hypot(*v.T)
-    axes = [figure.add_subplot(grid[1, column]) for column in range(3)]
-    axes[0].plot(times / 1e3, m[:, 2], times / 1e3, m[:, 3])
-    axes[0].plot(times / 1e3, v, "k--", lw=0.8)
-    axes[0].set(title="vx, vy; reference dashed", ylabel="px/s")
-    axes[1].plot(times / 1e3, m[:, 4], times / 1e3, m[:, 5])
-    for size in path.size:
-        axes[1].axhspan(0.97 * size, 1.03 * size, color="k", alpha=0.2)
-    axes[1].set(title="lambda1, lambda2; reference +- 3 %", ylabel="px", ylim=(0, 25))
-    theta = m[:, 6] - np.arctan2(v[:, 1] / speed, v[:, 0] / speed) - path.turned
-    axes[2].plot(times / 1e3, np.degrees((theta + np.pi / 2) % np.pi - np.pi / 2))
-    axes[2].axhspan(-2, 2, color="k", alpha=0.2)
-    axes[2].set(title="error of theta", ylabel="deg", ylim=(-10, 10))
-    for axis in axes:
-        axis.set_xlabel("t (ms)")
-    keep(figure, out / "spinning_dot.png")
+    rows = []
+    for label, values in {**DOT_ROWS, "detected, M = 32": DOT_FOUND}.items():
+        seeds = None if values is DOT_FOUND else [(*start[0], 20.0)]
+        params = moment.Params(preset="fast", **values)
+        tracks = moment.estimate(recording, params, seeds=seeds, smooth=False)
+        rows.append({"filter": label, "tracks": len(tracks), **score_dot(tracks, path, DOT_SPAN)})
+    return rows
 
 
 class Car(NamedTuple):
@@ -226,7 +154,7 @@ class Car(NamedTuple):
 
 
 def find_cars(images: NDArray, least: int = 60, level: float = 25.0) -> list[Car]:
-    """What differs from the median of all images, linked from frame to frame.
+    """Find parts that differ from the median of all images, linked from frame to frame.
 
     A component has `least` pixels that differ by more than `level` grey values (opened by one
     pixel, closed by two); it belongs to the car whose straight way on ends within 20 px, and a car
@@ -271,7 +199,7 @@ def find_cars(images: NDArray, least: int = 60, level: float = 25.0) -> list[Car
 def score_cars(
     tracks: Tracks, cars: list[Car], times: NDArray[np.int64], span: tuple[float, float]
 ) -> dict[str, Any]:
-    """Tracks against cars at frame times (us) within a span (s).
+    """Compare tracks with cars at frame times (us) within a span (s).
 
     A car is covered where a track is within half its length; its track stays the same while that
     one covers it, and a change is a switch. A stray is a (track, frame) that covers no car.
@@ -315,68 +243,22 @@ def score_cars(
     }
 
 
-def street(recording: Recording, out: Path) -> tuple[dict, str]:
+def street(recording: Recording) -> list[dict[str, Any]]:
+    """Track cars, and score the tracks in the part that settings were chosen on and in the rest."""
     assert recording.frames is not None
     cars = find_cars(np.asarray(recording.frames.images))
-    times = recording.frames.t
-    lines = [
-        "| settings | part (s) | cars | covered | median distance (px) | of the car's length | "
-        "tracks | switches | strays | each car (px) |",
-        "|---|---|" + "---:|" * 7 + "---|",
-    ]
-    results: dict[str, Any] = {}
-    rows: dict[str, dict[str, Any]] = {
-        "detection, from t = 0": {},
-        "without prefilter": {"prefilter": False},
-    }
-    shown = None
-    for label, values in rows.items():
-        params = moment.Params(**{**STREET, **values})
-        tracks = moment.estimate(recording.with_frames(slice(0)), params, smooth=False)
-        shown = shown or tracks
-        for part, span in STREET_PARTS.items():
-            row = score_cars(tracks, cars, times, span)
-            results[f"{label}, {part}"] = row
-            each = ", ".join(str(car["median"]) for car in row["cars"])
-            lines.append(
-                f"| {label} | {part} {span[0]:g} to {span[1]:g} | {len(row['cars'])} | "
-                f"{100 * row['coverage']:.0f} % of {row['instants']} | {row['median']:.2f} | "
-                f"{100 * row['median_of_length']:.1f} % | {row['tracks']} | {row['switches']} | "
-                f"{row['strays']} | {each} |"
-            )
-    assert shown is not None
-    draw_street(out, recording, shown, cars)
-    return results, "\n".join(lines)
-
-
-def draw_street(out: Path, recording: Recording, tracks: Tracks, cars: list[Car]) -> None:
-    assert recording.frames is not None
-    times, scale = recording.frames.t[1:], 3
-    states = tracks(times, extrapolate=True)
-    settings: dict[str, Any] = {"trail": 1.0, "scale": scale, "window": 0.02}
-    frames = np.asarray(recording.frames.images)[1:]
-    arrays = recording, times, tracks.id, states.mean, states.valid
-    behind = {
-        "events": list(track_frames(*arrays, **settings)),
-        "frame": list(track_frames(*arrays, images=iter(frames), **settings)),
-    }
-    figure = new_figure(20, 11)
-    axes = figure.subplots(4, 3)
-    for column, k in enumerate((9, 29, 38, 46, 50, 57)):
-        for row, name in enumerate(behind):
-            axis = axes[row + 2 * (column // 3), column % 3]
-            axis.imshow(behind[name][k])
-            for car in cars:
-                if k + 1 in car.frame:
-                    x, y = scale * car.centre[car.frame == k + 1][0] + 1
-                    axis.plot(x, y, "r+", ms=12)
-            axis.set(ylim=(scale * 255, scale * 120), xticks=[], yticks=[])
-            axis.set_title(f"{name} at {times[k] * 1e-6:.2f} s; + frame's centroid")
-    keep(figure, out / "street.png")
+    params = moment.Params(**STREET)
+    tracks = moment.estimate(recording.with_frames(slice(0)), params, smooth=False)
+    rows = []
+    for part, span in STREET_PARTS.items():
+        row = score_cars(tracks, cars, recording.frames.t, span)
+        each = ", ".join(str(car["median"]) for car in row.pop("cars"))
+        rows.append({"part": part, **row, "median of each car": each})
+    return rows
 
 
 def away(xy: NDArray) -> NDArray[np.bool_]:
-    """Which positions (..., 2) are outside the glare."""
+    """Return a mask of the positions (..., 2) outside the glare."""
     outside = np.ones(xy.shape[:-1], bool)
     for x, y, radius in GLARE:
         outside &= np.hypot(xy[..., 0] - x, xy[..., 1] - y) > radius
@@ -395,7 +277,7 @@ def hot_pixels(recording: Recording, most: int = 15) -> NDArray[np.bool_]:
 
 
 def sharpest_drift(recording: Recording) -> NDArray[np.float64]:
-    """The one velocity (px/s) that makes the sky's events sharpest, to 0.1 px/s.
+    """Return the one velocity (px/s) that makes the sky's events sharpest, to 0.1 px/s.
 
     Sharpness is the sum of squared counts in 2 px cells of events carried back along it
     (Gallego et al., "A unifying contrast maximization framework"); glare and hot pixels left out.
@@ -419,7 +301,7 @@ def sharpest_drift(recording: Recording) -> NDArray[np.float64]:
 
 
 def find_stars(recording: Recording, drift: NDArray, rate: float = 12.0) -> NDArray[np.float64]:
-    """Positions (stars, 2) at the start of what is bright once all events go along one drift.
+    """Return positions (stars, 2) at the start, bright once all events go along one drift.
 
     A star has `rate` events per second within 3 px, five times what is between 8 and 16 px around,
     outside the glare and off hot pixels; it stays on the sensor.
@@ -446,181 +328,22 @@ def find_stars(recording: Recording, drift: NDArray, rate: float = 12.0) -> NDAr
     return places[stay & away(places) & away(end)]
 
 
-def score_sky(tracks: Tracks, recording: Recording) -> dict[str, Any]:
-    """Stars found, life times, drift of long tracks, and the share of events explained."""
-    life = (tracks.death - tracks.birth) * 1e-6
-    long = life >= min(SKY_LIFE, 0.8e-6 * (tracks.stop - tracks.start))
-    last = np.maximum(tracks.death - 1, tracks.birth)
-    rows = np.arange(len(tracks))
-    end = tracks(last).mean[rows, rows].astype(np.float64)
-    # Half a life of settling, and then the way that was gone.
-    half = (tracks.birth + last) // 2
-    middle = tracks(half).mean[rows, rows].astype(np.float64)
-    gone = (end[:, :2] - middle[:, :2]) / np.maximum((last - half) * 1e-6, 1e-6)[:, None]
-    stars = long & away(end[:, :2])
-    row: dict[str, Any] = {
-        "confirmed": len(tracks),
-        "life": [float(q) for q in np.percentile(life, [25, 50, 75])] if len(life) else [],
-        "long": int(long.sum()),
-        "stars": int(stars.sum()),
-        "lambda1": float(np.median(end[stars, 4])) if stars.any() else None,
-        "ended": {why: tracks.ended.count(why) for why in sorted(set(tracks.ended))},
-        "drift": sharpest_drift(recording).tolist(),
-    }
-    drift = np.array(row["drift"])
-    stars_at = find_stars(recording, drift)
-    times = np.linspace(tracks.start + 1_000_000, tracks.stop - 1, 12).astype(np.int64)
-    states = tracks(times)
-    places = stars_at + ((times - tracks.start) * 1e-6)[:, None, None] * drift
-    far = np.linalg.norm(places[:, :, None] - states.mean[:, None, :, :2], axis=-1)
-    near = (far < 5) & states.valid[:, None]
-    follows = near.any((0, 1))
-    row["found"] = {
-        "stars": len(stars_at),
-        "covered": float(near.any(2).mean()) if len(stars_at) else None,
-        "ever": int(near.any((0, 2)).sum()),
-        "distance": float(np.median(far[near])) if near.any() else None,
-        "false": int((long & away(end[:, :2]) & ~follows).sum()),
-    }
-    for name, which in (("long", long), ("stars", stars)):
-        for what, v in (("filter", end[:, 2:4]), ("way", gone)):
-            if which.any():
-                centre = np.median(v[which], 0)
-                spread = np.median(abs(v[which] - centre), 0)
-                row[f"{name}_{what}"] = [*centre.tolist(), *spread.tolist()]
-    near = np.hypot(*(gone - row["drift"]).T) < 1.5
-    row["stars_alike"] = int((stars & near).sum())
-    row["long_alike"] = int((long & near).sum())
-    row["states"] = [
-        [int(tracks.id[i]), *end[i, :6].tolist(), *gone[i].tolist(), bool(stars[i])]
-        for i in np.flatnonzero(long)
-    ]
-    held, events = np.zeros(4), recording.events[:]
-    for part in tracks.events():
-        xi = np.stack([events.x[part.row], events.y[part.row]], 1)
-        far, mine = away(xi.astype(float)), part.id >= 0
-        held += [mine.sum(), len(mine), (mine & far).sum(), far.sum()]
-    row["explained"], row["explained_away"] = held[0] / held[1], held[2] / held[3]
-    return row
-
-
-def sky(recording: Recording, out: Path) -> tuple[dict, str]:
-    results: dict[str, Any] = {}
-    lines = [
-        f"Long: {SKY_LIFE:g} s and more; stars: long tracks away from the planet's glare and its "
-        "ghost; alike: on its way within 1.5 px/s of the drift that makes the events sharpest. "
-        "Medians, with the median absolute deviation in brackets (px/s).",
-        "",
-        "| part (s) | settings | confirmed | life, quartiles (s) | long, alike | stars, alike | "
-        "stars' v by the filter | stars' v on the way | sharpest drift | events explained, away "
-        "from the glare | stars covered | stars ever found | long tracks on no star |",
-        "|---|---|" + "---:|" * 11,
-    ]
-
-    def velocity(row: dict, name: str) -> str:
-        if name not in row:
-            return "-"
-        x, y, dx, dy = row[name]
-        return f"{x:.2f}, {y:.2f} ({dx:.2f}, {dy:.2f})"
-
-    for part, span in SKY_PARTS.items():
-        cut = recording[span[0] : span[1]]
-        plain: dict[str, Any] = {"preset": "slow", "events_per_step": 16, "max_targets": 128}
-        rows = {"for stars": SKY} | ({"slow preset": plain} if part == "reported" else {})
-        for label, values in rows.items():
-            tracks = moment.estimate(cut, moment.Params(**values), smooth=False)
-            row = results[f"{label}, {part}"] = score_sky(tracks, cut)
-            life = ", ".join(f"{one:.1f}" for one in row["life"])
-            lines.append(
-                f"| {part} {span[0]:g} to {span[1]:g} | {label} | {row['confirmed']} | {life} | "
-                f"{row['long']}, {row['long_alike']} | {row['stars']}, {row['stars_alike']} | "
-                f"{velocity(row, 'stars_filter')} | {velocity(row, 'stars_way')} | "
-                f"{row['drift'][0]:.1f}, {row['drift'][1]:.1f} | {100 * row['explained']:.0f} %, "
-                f"{100 * row['explained_away']:.0f} % | {100 * row['found']['covered']:.0f} % | "
-                f"{row['found']['ever']} of {row['found']['stars']} | {row['found']['false']} |"
-            )
-            if part == "reported" and values is SKY:
-                draw_sky(out, cut, tracks, row)
-    return results, "\n".join(lines)
-
-
-def draw_sky(out: Path, recording: Recording, tracks: Tracks, row: dict) -> None:
-    events = recording.events[:]
-    count = np.zeros((recording.height, recording.width))
-    np.add.at(count, (events.y, events.x), 1)
-    image = (255 * np.clip(np.log1p(count) / np.log(40), 0, 1)).astype(np.uint8)
-    times = np.linspace(tracks.start, tracks.stop - 1, 27).astype(np.int64)[1:]
-    long = [one[0] for one in row["states"]]
-    states = tracks(times, long)
-    last = np.array([int(np.flatnonzero(a)[-1]) for a in states.valid.T])
-    mean, alive = states.mean.copy(), states.valid.copy()
-    for i, k in enumerate(last):  # tracks that ended keep their last place in the picture
-        mean[k:, i], alive[k:, i] = mean[k, i], True
-    arrays = recording, times, np.array(long), mean, alive
-    images = iter([image] * len(times))
-    *_, picture = track_frames(*arrays, images=images, trail=100.0, sigmas=3.0, scale=2)
-    figure = new_figure(22, 10)
-    grid = figure.add_gridspec(1, 2, width_ratios=(2.4, 1))
-    axis = figure.add_subplot(grid[0])
-    axis.imshow(picture)
-    axis.set_title("all events, tracks of long life with ellipses of 3 standard deviations")
-    axis = figure.add_subplot(grid[1])
-    for number, _, _, vx, vy, _, _, gx, gy, star in row["states"]:
-        colour = np.array(track_colour(number, dark=True)) / 255
-        axis.plot([vx, gx], [vy, gy], "-", color=colour, lw=0.5)
-        axis.plot(gx, gy, "o" if star else "x", color=colour)
-        axis.annotate(str(number), (gx, gy), fontsize=8)
-    axis.plot(*row["drift"], "k*", ms=14)
-    axis.set(xlim=(-8, 3), ylim=(-2, 9), xlabel="vx (px/s)", ylabel="vy (px/s)")
-    axis.set_title("way gone (o stars, x in the glare), line to the filter's v; * sharpest drift")
-    keep(figure, out / "sky.png")
-
-
-def new_figure(width: float, height: float):
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def keep(figure, path: Path) -> None:
-    with complete(path) as partial:
-        figure.savefig(partial, format="png", dpi=75)
-
-
 PARTS = {
-    "spinning_dot": ("spinning_dot.npz", "A spinning dot", spinning_dot),
-    "street": ("davis346_street.npz", "Cars on a street", street),
-    "sky": ("gen4.dat", "A night sky", sky),
+    "spinning_dot": ("spinning_dot.npz", spinning_dot),
+    "street": ("davis346_street.npz", street),
 }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    root = os.environ.get("JAXEVENT_DATA")
-    parser.add_argument("--data", type=Path, default=Path(root) / "data" if root else None)
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
-    parser.add_argument("--only", choices=list(PARTS), nargs="+", default=list(PARTS))
-    arguments = parser.parse_args()
-    if arguments.data is None:
-        parser.error("give --data, the folder of the recordings, or set JAXEVENT_DATA")
-    out = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
-    stored = out / "results.json"
-    results = json.loads(stored.read_text()) if stored.exists() else {}
+    from common import command_line, table_of_rows, write_text
+
+    arguments = command_line(__doc__, out=True, data=True, parts=PARTS).parse_args()
+    text = ""
     for name in arguments.only:
-        file, title, part = PARTS[name]
-        values, text = part(jaxevent.load(arguments.data / file), out)
-        results[name] = {"title": f"{title} ({file})", "values": values, "table": text}
-        print(f"{title}\n\n{text}\n", flush=True)
-        with complete(stored) as partial:
-            partial.write_text(json.dumps(results, indent=1))
-    text = "\n".join(
-        f"## {results[name]['title']}\n\n{results[name]['table']}\n"
-        for name in PARTS
-        if name in results
-    )
-    with complete(out / "table.md") as partial:
-        partial.write_text(text)
+        file, part = PARTS[name]
+        text += f"## {file}\n\n{table_of_rows(part(jaxevent.load(arguments.data / file)))}\n\n"
+    print(text)
+    write_text(arguments.out / "table.md", text)
 
 
 if __name__ == "__main__":

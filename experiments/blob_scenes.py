@@ -180,7 +180,7 @@ def _passing_discs(seed: int) -> tuple[Recording, Truth]:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Meeting:
+class _MeetingMotion:
     """One of two that come from apart, touch for half a second, turning, and part again."""
 
     sign: int
@@ -204,11 +204,11 @@ class _Meeting:
 def _turning_pair(seed: int) -> tuple[Recording, Truth]:
     """Two rings that touch, turn about each other and part."""
     phase = np.random.default_rng([seed, 6]).uniform(0, 6)
-    targets = [Target(_Meeting(s, phase), 3e4, "ring") for s in (1, -1)]
+    targets = [Target(_MeetingMotion(s, phase), 3e4, "ring") for s in (1, -1)]
     return simulate_blobs(targets, VGA, 2.0, 5e3, seed)
 
 
-class _Stopping:
+class _StoppingMotion:
     """Along a line, at rest from 1 to 2 s, then back at an angle."""
 
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,7 +224,9 @@ class _Stopping:
 
 def _stop_and_go(seed: int) -> tuple[Recording, Truth]:
     """One target that stands still, without events, for a second."""
-    return simulate_blobs([Target(_Stopping(), 2e4, dropouts=((1.0, 2.0),))], VGA, 3.0, 2e4, seed)
+    return simulate_blobs(
+        [Target(_StoppingMotion(), 2e4, dropouts=((1.0, 2.0),))], VGA, 3.0, 2e4, seed
+    )
 
 
 def _hot(rng: np.random.Generator, number: int, frame: tuple[int, int]) -> list[Target]:

@@ -62,13 +62,13 @@ def recordings(
 
 
 def rmse(params: TrackerParams, raw: Mapping[str, jax.Array], batches: Sequence[Any]) -> np.ndarray:
-    """Of the position, px, for every set of unconstrained numbers (sets,) in `raw`."""
+    """Return the error of the position, px, for every set of raw numbers (sets,)."""
     one = jax.vmap(lambda r, b: position_error(moment, params.with_raw(r), b, SCALE), (0, None))
     squares = [jax.jit(one)(raw, batch) for batch in batches]
     return np.sqrt(np.mean(squares, axis=0))
 
 
-def tuned(
+def tune_scene(
     scene: str,
     starts: Mapping[str, Mapping[str, float]],
     seeds: Sequence[int],
@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=30)
     settings = dataclasses.replace(SETTINGS, iterations=parser.parse_args().iterations)
     for scene in ("lissajous", "walk"):
-        rows = tuned(scene, STARTS, (1, 2), (1001, 1002, 1003), settings=settings)
+        rows = tune_scene(scene, STARTS, (1, 2), (1001, 1002, 1003), settings=settings)
         names = [name for name in rows[0] if name not in ("", "seconds")]
         print(f"\n| {scene} | " + " | ".join(names) + " px | s |\n|---" + "|---:" * 6 + "|")
         for row in rows:

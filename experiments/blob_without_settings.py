@@ -13,9 +13,7 @@ in them goes its own way; `--cuts` looks at short parts of these instead. Makes 
 results.json.
 """
 
-import argparse
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,13 +23,14 @@ from blob_real import (
     DOT_FOUND,
     SKY,
     STREET,
-    Circling,
+    CircularPath,
     away,
     find_cars,
     find_stars,
-    fit_circling,
+    fit_circular_path,
     sharpest_drift,
 )
+from common import command_line
 from numpy.typing import NDArray
 
 from jaxevent.blob import TargetSearchResult, Tracks, find, moment
@@ -52,7 +51,7 @@ Paths = NDArray[np.float64]  # (times, targets, 2) px, NaN where it is not
 def moving_mean(
     recording: Recording, start: NDArray, times: NDArray, window: int, reach: float, lag: int
 ) -> NDArray[np.float64]:
-    """The mean of the last window's (us) events within `reach` px of the mean before.
+    """Return the mean of the last window's (us) events within `reach` px of the mean before.
 
     It is told `lag` us early: half a window makes it a mean of the events around each time.
     """
@@ -75,7 +74,7 @@ def positions(tracks: Tracks, times: NDArray[np.int64], filtered: bool = False) 
 
 
 def score(paths: Paths, truth: Paths, reach: NDArray | float) -> dict[str, Any]:
-    """Of each target the nearest track within `reach`; tracks that are nowhere near one."""
+    """Score the nearest track within `reach` of each target, and tracks near none."""
     far = np.linalg.norm(paths[:, None] - truth[:, :, None], axis=-1)  # times, targets, tracks
     far = np.where(np.isfinite(far), far, np.inf)
     limit = np.broadcast_to(np.asarray(reach, float), (truth.shape[1],))[None, :, None]
@@ -97,16 +96,16 @@ def score(paths: Paths, truth: Paths, reach: NDArray | float) -> dict[str, Any]:
     }
 
 
-def circling(recording: Recording, path: Circling, times: NDArray) -> tuple[Paths, float]:
+def circling(recording: Recording, path: CircularPath, times: NDArray) -> tuple[Paths, float]:
     return path(times * 1e-6)[0][:, None], 2 * float(path.size[0])
 
 
 def dot(recording: Recording, times: NDArray) -> tuple[Paths, NDArray | float]:
-    return circling(recording, fit_circling(recording), times)
+    return circling(recording, fit_circular_path(recording), times)
 
 
 def atis(recording: Recording, times: NDArray) -> tuple[Paths, NDArray | float]:
-    return circling(recording, fit_circling(recording, ATIS_HZ, ATIS_WINDOW), times)
+    return circling(recording, fit_circular_path(recording, ATIS_HZ, ATIS_WINDOW), times)
 
 
 def street(recording: Recording, times: NDArray) -> tuple[Paths, NDArray | float]:
@@ -136,7 +135,7 @@ KNOWN: dict[str, tuple[Callable, dict[str, Any]]] = {
 }
 
 
-def by_means(
+def track_by_means(
     recording: Recording, found: TargetSearchResult, truth: Paths, times: NDArray, centred: bool
 ) -> Paths:
     out = np.full(truth.shape, np.nan)
@@ -155,12 +154,12 @@ def by_means(
     return out
 
 
-def count(tracks: Tracks) -> dict[str, int]:
+def track_counts(tracks: Tracks) -> dict[str, int]:
     life = tracks.death - tracks.birth
     return {"tracks": len(tracks), "long": int((life > LONG * (tracks.stop - tracks.start)).sum())}
 
 
-def one(name: str, recording: Recording) -> dict[str, dict[str, Any]]:
+def score_recording(name: str, recording: Recording) -> dict[str, dict[str, Any]]:
     reference, by_hand = KNOWN[name]
     times = np.linspace(recording.start, recording.stop, TIMES + 12)[10:-2].astype(np.int64)
     truth, reach = reference(recording, times)
@@ -176,16 +175,16 @@ def one(name: str, recording: Recording) -> dict[str, dict[str, Any]]:
     tracks = moment.estimate(recording, found=found, progress=False,
         params=moment.Params(**found.settings()))  # fmt: skip
     rows: dict[str, dict[str, Any]] = {
-        "without settings": count(tracks) | scored(positions(tracks, times)),
-        "filtered": count(tracks) | scored(positions(tracks, times, filtered=True)),
+        "without settings": track_counts(tracks) | scored(positions(tracks, times)),
+        "filtered": track_counts(tracks) | scored(positions(tracks, times, filtered=True)),
     }
     if by_hand:
         chosen = moment.estimate(
             recording, moment.Params(**by_hand), detect=True, smooth=False, progress=False
         )
-        rows["by hand, filtered"] = count(chosen) | scored(positions(chosen, times))
+        rows["by hand, filtered"] = track_counts(chosen) | scored(positions(chosen, times))
     for label, centred in (("moving mean", False), ("centred mean", True)):
-        means = by_means(recording, found, truth, times, centred)
+        means = track_by_means(recording, found, truth, times, centred)
         rows[label] = {"tracks": truth.shape[1], "long": truth.shape[1]} | scored(means)
     distances = [row.pop("distance") for row in rows.values()]
     all_near = np.isfinite(distances).all(0)
@@ -194,8 +193,8 @@ def one(name: str, recording: Recording) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def cuts(data: Path) -> list[str]:
-    """Lines of how many tracks there are in parts of recordings of a camera that moves."""
+def cut_lines(data: Path) -> list[str]:
+    """Return lines with the number of tracks in parts of recordings of a camera that moves."""
     lines = ["| recording | s | parts | told that it moves | tracks |", "|---|---:|---:|---:|---:|"]
     for name in CAMERA:
         recording = load(data / name)
@@ -216,18 +215,13 @@ def cuts(data: Path) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--data", type=Path)
+    parser = command_line(__doc__, out=True, data=True)
     parser.add_argument("--only", nargs="+", default=[*KNOWN, *CAMERA])
     parser.add_argument("--cuts", action="store_true")
     args = parser.parse_args()
-    data = args.data or Path(os.environ["JAXEVENT_DATA"]) / "data"
-    args.out.mkdir(parents=True, exist_ok=True)
+    data = args.data
     if args.cuts:
-        (args.out / "table.md").write_text("\n".join(cuts(data)) + "\n")
+        (args.out / "table.md").write_text("\n".join(cut_lines(data)) + "\n")
         return
     results: dict[str, Any] = {}
     lines = [
@@ -238,7 +232,7 @@ def main() -> None:
     for name in args.only:
         recording = load(data / name)
         if name in KNOWN:
-            results[name] = one(name, recording)
+            results[name] = score_recording(name, recording)
             for tracker, r in results[name].items():
                 lines.append(
                     f"| {name} | {tracker} | {r['found']} of {r['targets']} | {r['tracks']} "

@@ -17,15 +17,13 @@ of varying motion, so long each, are estimated as a whole instead, from window t
 those of all estimates.
 """
 
-import argparse
 import dataclasses
-import platform
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from common import command_line, machine, markdown_table, write_text
 
 from jaxevent.egomotion import scores
 from jaxevent.egomotion.bundle import sequence
@@ -94,8 +92,7 @@ def whole(scene: str, seed: int, params: Params, seconds: float) -> dict[str, An
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(196, 206)))
     parser.add_argument("--scenes", nargs="+", default=["wall", "shapes", "texture"])
     parser.add_argument("--motions", nargs="+", default=["constant", "varying"])
@@ -106,7 +103,6 @@ def main() -> None:
     arguments = parser.parse_args()
     own = {"mismatch": arguments.mismatch, "jitter": arguments.jitter}
     sensor = dataclasses.replace(UNEVEN, **own) if arguments.uneven else None
-    arguments.out.mkdir(parents=True, exist_ok=True)
     params, rows = Params.of({}), []
     if arguments.seconds:
         for seed in arguments.seeds:
@@ -128,11 +124,11 @@ def main() -> None:
                 print(rows[-1], flush=True)
                 pd.DataFrame(rows).to_csv(stored, index=False)
     table = pd.DataFrame(rows)
-    lines = [
-        "| scene | windows | heading deg, mean / median / max | Omega %, the same | both "
-        "| flipped | per sigma | squared, tx to wz | CPU s | s, median / max |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
-    ]
+    header = (
+        "scene", "windows", "heading deg, mean / median / max", "Omega %, the same", "both",
+        "flipped", "per sigma", "squared, tx to wz", "CPU s", "s, median / max",
+    )  # fmt: skip
+    lines = []
     for name, part in [*table.groupby("scene", sort=False), ("all", table)]:
         three = [
             " / ".join(f"{value:.1f}" for value in (column.mean(), column.median(), column.max()))
@@ -144,13 +140,14 @@ def main() -> None:
             f"{(part[error] / part[f'{error} sigma']).median():.1f}"
             for error in ("heading", "Omega")
         )
+        squares = " ".join(f"{part[one].mean():.1f}" for one in COMPONENTS)
+        times = f"{part['s'].median():.1f} / {part['s'].max():.1f}"
+        cpu = f"{part['CPU s'].median():.1f}"
         lines.append(
-            f"| {name} | {len(part)} | {three[0]} | {three[1]} | {100 * both:.0f} % | {flipped} "
-            f"| {sigmas} | {' '.join(f'{part[name].mean():.1f}' for name in COMPONENTS)} "
-            f"| {part['CPU s'].median():.1f} | {part['s'].median():.1f} / {part['s'].max():.1f} |"
+            (name, len(part), *three, f"{100 * both:.0f} %", flipped, sigmas, squares, cpu, times)
         )
-    text = "\n".join([*lines, "", f"{platform.machine()}, Python {platform.python_version()}"])
-    (arguments.out / "general.md").write_text(text + "\n")
+    text = f"{markdown_table(header, lines)}\n\n{machine()}\n"
+    write_text(arguments.out / "general.md", text)
     print(text)
 
 

@@ -21,40 +21,34 @@ themselves, but for those named here:
   motion, 180 degrees. General motion: heading and |Omega| from window to window.
 - stop: the end of the slider's way, which slows down, stands still from 3.22 to 3.31 s and goes
   back. How far the heading is from that of the motion there, and what it tells.
-- axis: the slider's direction in the camera's axes, by corners tracked in the frames, of which it
-  is known that the camera does not turn (needs OpenCV). The stored poses have it along x, as the
-  camera's mounting was not measured. This finds (1, .0088, -.002), each good to .001 and .002.
 
 With --without-frames general motion of evbench and the slider is fitted to events alone. Prints
 tables in Markdown and writes them.
 """
 
-import argparse
-import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import command_line, machine, table_of_rows
 
 import jaxevent
 from jaxevent import egomotion
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, geometry, voting
-from jaxevent.egomotion.baselines.points import Params, interpolate_positions, track_points
 from jaxevent.egomotion.bundle.windows import stamp_offset
 from jaxevent.egomotion.candidates import pixel_coordinates
-from jaxevent.errors import require
 
 Rows = list[dict[str, Any]]
-AXIS = np.array([1.0, 0.0088, 0.0]) / np.hypot(1.0, 0.0088)  # of the slider, by `axis`
+AXIS = np.array([1.0, 0.0088, 0.0]) / np.hypot(1.0, 0.0088)  # of the slider
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return egomotion.scores.axis_error(np.atleast_2d(a), np.atleast_2d(b))
 
 
-def disk(data: Path) -> Rows:
+def disk_rows(data: Path) -> Rows:
     recording = jaxevent.load(data / "rotating_disk_imu.npz")
     middle = (recording.width - 1) / 2, (recording.height - 1) / 2
     camera = PinholeCamera(200.0, 200.0, *middle)
@@ -93,7 +87,7 @@ def disk(data: Path) -> Rows:
     return rows
 
 
-def tubrip(data: Path, name: str) -> Rows:
+def tubrip_rows(data: Path, name: str) -> Rows:
     recording = jaxevent.load(data / f"tubrip_{name}_rotation.npz")
     omega = np.asarray(recording.extra["omega"])
     length = (recording.stop - recording.start) * 1e-6
@@ -154,17 +148,17 @@ def nearest_rotation(
     return Omega, rms[0], rms[1]
 
 
-def fitted(recording: jaxevent.Recording, frames: bool) -> egomotion.MotionEstimate:
+def fit_general_motion(recording: jaxevent.Recording, frames: bool) -> egomotion.MotionEstimate:
     """General motion without settings, to events alone if told so."""
     params = batch.Params.of({"frames": frames})
     suited = batch.adapt_params(recording, params, camera=recording.camera).params
     return batch.estimate(recording, suited)
 
 
-def evbench(data: Path, frames: bool = True) -> Rows:
+def evbench_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "evbench_seq3_calibrated.npz")
     twist = np.asarray(recording.extra["camera_twist_pnp"])
-    motion = fitted(recording, frames)
+    motion = fit_general_motion(recording, frames)
     mean, covariance = motion.mean[motion.valid], motion.covariance[motion.valid]
     turn = np.linalg.norm(mean[:, 3:] - twist[3:], axis=1) / np.linalg.norm(twist[3:])
     heading = angle(mean[:, :3], np.broadcast_to(twist[:3], mean[:, :3].shape))
@@ -200,7 +194,7 @@ def _numbers(values: np.ndarray) -> str:
     return " ".join(f"{value:+.4f}" for value in values)
 
 
-def slider(data: Path, frames: bool = True) -> Rows:
+def slider_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
     rows: Rows = []
     motion = voting.estimate(recording, model="planar", smooth=True)
@@ -221,7 +215,7 @@ def slider(data: Path, frames: bool = True) -> Rows:
             "lost": int(lost.sum()),
         }
     )
-    motion = fitted(recording[:3.1], frames)
+    motion = fit_general_motion(recording[:3.1], frames)
     late = 1e-3 * stamp_offset(recording)
     for first, last in ((0.0, 1.0), (1.0, 2.0), (2.0, 3.1)):
         here = motion.valid & (motion.t >= 1e6 * first) & (motion.t < 1e6 * last)
@@ -248,9 +242,9 @@ def slider(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
-def stop(data: Path, frames: bool = True) -> Rows:
+def stop_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
-    motion = fitted(recording[2.9:], frames)
+    motion = fit_general_motion(recording[2.9:], frames)
     sigma = np.degrees(np.sqrt(np.trace(motion.covariance[:, :3, :3], axis1=1, axis2=2)))
     rows: Rows = []
     for name, first, last, along in (
@@ -267,78 +261,27 @@ def stop(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
-def axis(data: Path) -> Rows:
-    """Of ways of ten frames each: what all epipolar lines through tracked corners meet in."""
-    cv2 = require("cv2", "vision")
-    recording = jaxevent.load(data / "slider_depth.zip")
-    frames, camera, params = recording.frames, recording.camera, Params.of({})
-    assert frames is not None and camera is not None
-    positions, f = pixel_coordinates(recording.width, recording.height, camera)
-    found = []
-    for first in range(2, len(frames) - 10, 8):
-        grey = frames[first : first + 11].intensity
-        images = [np.rint(255 * image).astype(np.uint8) for image in grey]
-        ends = (
-            interpolate_positions(at, positions) / f for at in track_points(cv2, params, images)
-        )
-        begin, end = (np.concatenate([at, np.ones((len(at), 1))], 1) for at in ends)
-        far = np.linalg.norm(end - begin, axis=1) > 6 / f
-        lines = np.cross(begin[far], end[far])
-        lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-        weight = np.ones(len(lines))
-        for _ in range(20):
-            T = np.linalg.eigh((lines * weight[:, None]).T @ lines)[1][:, 0]
-            off = np.abs(lines @ T)
-            weight = 1 / (1 + (off / (3 * 1.48 * np.median(off))) ** 2) ** 2
-        found.append(T * np.sign(T[0]))
-    mean, spread = np.mean(found, 0), np.std(found, 0)
-    return [
-        {
-            "recording": "slider, axis",
-            "ways": len(found),
-            "T": " ".join(f"{value:.4f}" for value in mean),
-            "of one, standard deviation": " ".join(f"{value:.4f}" for value in spread),
-        }
-    ]
-
-
-def table(rows: Rows) -> str:
-    names = list(dict.fromkeys(name for row in rows for name in row))
-
-    def text(value: Any) -> str:
-        return f"{value:.3g}" if isinstance(value, float | np.floating) else str(value)
-
-    lines = [names, ["---"] * len(names)]
-    lines += [[text(row.get(name, "-")) for name in names] for row in rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 FITTED = "evbench", "slider", "stop"  # by `batch`, which takes frames
 PARTS: dict[str, Callable[..., Rows]] = {
-    "disk": disk,
-    "boxes": lambda data: tubrip(data, "boxes"),
-    "shapes": lambda data: tubrip(data, "shapes"),
-    "evbench": evbench,
-    "slider": slider,
-    "stop": stop,
-    "axis": axis,
+    "disk": disk_rows,
+    "boxes": lambda data: tubrip_rows(data, "boxes"),
+    "shapes": lambda data: tubrip_rows(data, "shapes"),
+    "evbench": evbench_rows,
+    "slider": slider_rows,
+    "stop": stop_rows,
 }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument("--out", type=Path, required=True, help="folder for tables")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser = command_line(__doc__, out=True, data=True, parts=PARTS)
     parser.add_argument("--without-frames", action="store_true")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only:
         more = {"frames": False} if arguments.without_frames and name in FITTED else {}
-        text = table(PARTS[name](arguments.data, **more))
+        text = table_of_rows(PARTS[name](arguments.data, **more))
         print(f"\n## {name}\n\n{text}", flush=True)
         (arguments.out / f"{name}.md").write_text(text)
-    print(f"\n{platform.machine()}, Python {platform.python_version()}")
+    print(f"\n{machine()}")
 
 
 if __name__ == "__main__":

@@ -4,10 +4,10 @@
 
 Simulated: an ideal camera of 240x180 pixels, f = 200 px, 25 frames/s, 0.6 s: planar motion,
 rotation and general motion, with motions that nothing was chosen on; and fast rotations, 0.06 s of
-160x120 pixels, of which all times count. With --data FOLDER, which
-holds slider_depth.zip and tubrip_*_rotation.npz, real ones: slider_depth from 1 to 2 s, as planar
-motion (against its poses at the one depth that fits the estimate best) and as general motion (a
-pure translation to the right), and two cuts of 13 and 99 ms of rotation, without frames.
+160x120 pixels, of which all times count. With --data FOLDER, which holds slider_depth.zip and
+tubrip_*_rotation.npz, real ones: slider_depth from 1 to 2 s, as planar motion (against its poses at
+the one depth that fits the estimate best) and as general motion (a pure translation to the right),
+and two cuts of 13 and 99 ms of rotation, without frames.
 
 Parameters are those that suit the recording by themselves, those of `literal` are the thesis'
 (`Params.presets`). Every estimate counts for the time that what it saw shows (`centred`). Errors
@@ -18,7 +18,6 @@ the means.
 is not computed again.
 """
 
-import argparse
 import dataclasses
 import functools
 import os
@@ -29,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from bench import machine
+from common import command_line, machine, markdown_table, write_text
 
 import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
@@ -73,7 +72,7 @@ class Sequence(NamedTuple):
     make: Callable[[], tuple[Recording, KnownMotion | None]]
 
 
-def simulated(seed: int) -> Iterator[Sequence]:
+def simulated_sequences(seed: int) -> Iterator[Sequence]:
     kinds = [
         ("planar", "planar", "constant"),
         ("planar", "planar", "varying"),
@@ -82,14 +81,14 @@ def simulated(seed: int) -> Iterator[Sequence]:
         *(("general", scene, "varying") for scene in ("wall", "shapes", "texture")),
     ]
     for speed in FAST:
-        make = functools.partial(fast, speed, seed)
+        make = functools.partial(fast_rotation, speed, seed)
         yield Sequence(f"rotation, {speed:g} rad/s", "rotation", str(seed), make)
     for model, scene, change in kinds:
         make = functools.partial(simulate, model, scene, change, seed)
         yield Sequence(f"{scene}, {change}", model, str(seed), make)
 
 
-def fast(speed: float, seed: int) -> tuple[Recording, KnownMotion]:
+def fast_rotation(speed: float, seed: int) -> tuple[Recording, KnownMotion]:
     size: dict[str, Any] = {"size": (160, 120), "duration": 0.06, "speed": speed}
     recording, source = motion_scene("rotation", "constant", seed, **size)
     t = np.arange(0, 60_001, 1000)
@@ -103,7 +102,7 @@ def simulate(model: str, scene: str, change: str, seed: int) -> tuple[Recording,
     return recording, KnownMotion(kind, t, kind.from_scene(source, t))
 
 
-def real(data: Path) -> Iterator[Sequence]:
+def real_sequences(data: Path) -> Iterator[Sequence]:
     def slider(model: str) -> tuple[Recording, KnownMotion | None]:
         whole = jaxevent.load(data / "slider_depth.zip")
         cut = dataclasses.replace(whole[SLIDER[0] : SLIDER[1]], poses=whole.poses)
@@ -133,28 +132,28 @@ METHODS: dict[str, tuple[MotionEstimator[Any], dict[str, Any] | None]] = {
 }
 
 
-def estimated(label: str, model: str, recording: Recording) -> MotionEstimate:
+def estimate_motion(label: str, model: str, recording: Recording) -> MotionEstimate:
     method, given = METHODS[label]
     params = None if given is None else method.Params.of(given[model])
     return method.estimate(recording, params, model=model)
 
 
 def cpu() -> float:
-    """CPU seconds of this process, on all cores."""
+    """Return the CPU seconds of this process, on all cores."""
     used = os.times()
     return used.user + used.system
 
 
-def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict[str, Any]:
-    """A row of one method on one sequence."""
-    recording, known = made(sequence)
+def score_method(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict[str, Any]:
+    """Return a row of one method on one sequence."""
+    recording, known = make_sequence(sequence)
     model, length = sequence.model, (recording.stop - recording.start) * 1e-6
     METHODS[label][0].find_model_and_camera(recording, model, None)
     if (label, model) not in warm and label != "frames":
-        estimated(label, model, recording[: recording.start + round(1e6 * min(WARM, length))])
+        estimate_motion(label, model, recording[: recording.start + round(1e6 * min(WARM, length))])
         warm.add((label, model))
     began = cpu()
-    motion = estimated(label, model, recording)
+    motion = estimate_motion(label, model, recording)
     spent = cpu() - began
     known = fitted_velocity(recording, motion) if known is None else known
     # Of a cut that is shorter all times count.
@@ -176,11 +175,11 @@ def measured(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> dict
 
 
 @functools.lru_cache(maxsize=1)
-def made(sequence: Sequence) -> tuple[Recording, KnownMotion | None]:
+def make_sequence(sequence: Sequence) -> tuple[Recording, KnownMotion | None]:
     return sequence.make()
 
 
-def shown(value: float) -> str:
+def format_value(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
@@ -188,43 +187,38 @@ def markdown(model: str, rows: list[dict[str, Any]]) -> str:
     columns = [*SHOWN[model], "lost", "failed", "CPU"]
     units = {**UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
     heads = [f"{name} {units[name]}".strip() for name in columns]
-    lines = [
-        "| sequence | method | " + " | ".join(heads) + " |",
-        "|---|---|" + "---:|" * len(columns),
-    ]
+    lines = []
     rows = [row for row in rows if row["model"] == model]
     for name, method in dict.fromkeys((row["sequence"], row["method"]) for row in rows):
         part = [row for row in rows if (row["sequence"], row["method"]) == (name, method)]
         each = {column: np.array([row.get(column, np.nan) for row in part]) for column in columns}
-        texts = [shown(values[~np.isnan(values)].mean()) if (~np.isnan(values)).any() else "-"
-                 for values in each.values()]  # fmt: skip
+        known = [values[~np.isnan(values)] for values in each.values()]
+        texts = [format_value(values.mean()) if len(values) else "-" for values in known]
         texts[columns.index("failed")] = f"{int(each['failed'].sum())} of {len(part)}"
-        lines.append(f"| {name} | {method} | " + " | ".join(texts) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([name, method, *texts])
+    return markdown_table(["sequence", "method", *heads], lines, 2) + "\n"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the tables")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[500, 501])
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--data", type=Path, help="folder of real recordings")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[500, 501])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     stored, warm = arguments.out / "table.csv", set()
     rows: list[dict[str, Any]] = []
     if stored.exists():
         rows = pd.read_csv(stored, dtype={"seed": str}).to_dict("records")
     done = {tuple(row[name] for name in KEY) for row in rows}
-    sequences = [*real(arguments.data)] if arguments.data else []
-    sequences += [one for seed in arguments.seeds for one in simulated(seed)]
+    sequences = [*real_sequences(arguments.data)] if arguments.data else []
+    sequences += [one for seed in arguments.seeds for one in simulated_sequences(seed)]
     for sequence in sequences:
         for label in arguments.methods:
             key = (sequence.name, sequence.model, sequence.seed, label)
             if key in done or not METHODS[label][0].supports(find_model(sequence.model)):
                 continue
             try:
-                row = measured(sequence, label, warm)
+                row = score_method(sequence, label, warm)
             except InputError as error:  # no frames
                 print(error, file=sys.stderr)
                 continue
@@ -234,8 +228,7 @@ def main() -> None:
                 pd.DataFrame(rows).to_csv(path, index=False)
     parts = [markdown(model, rows) for model in SHOWN]
     text = "\n".join([*parts, f"{machine()}; {cpu():.0f} CPU s in all"]) + "\n"
-    with complete(arguments.out / "table.md") as path:
-        path.write_text(text)
+    write_text(arguments.out / "table.md", text)
     print(text)
 
 

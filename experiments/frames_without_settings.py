@@ -2,7 +2,7 @@
 
     python experiments/frames_without_settings.py --out hidden [--data DIR]
 
-DIR/data holds the recordings; by default DIR is $JAXEVENT_DATA. Of each every 2nd, 4th or 8th
+DIR holds the recordings, by default $JAXEVENT_DATA/data. Of each every 2nd, 4th or 8th
 frame is given, as `jaxevent evaluate` does it; methods have their default parameters. A few of the
 hidden frames are scored, evenly chosen: those between given frames, and apart from these those
 after the last one. MSE; MSE after the brightness of each image is fitted to the hidden frame
@@ -16,16 +16,13 @@ given, and as far before the first: the recording is cut there at three places, 
 Makes beyond.md; a line is of all places, and its gap is how far away the frame is.
 """
 
-import argparse
 import functools
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compensated_choice import noise_of
-from motion_compensated import Row, Store, evenly, markdown
+from common import command_line
+from motion_compensated import Row, Store, choose_evenly, noise_of, table
 from numpy.typing import NDArray
 
 import jaxevent
@@ -71,7 +68,7 @@ def score(method: Any, params: Any, given: Recording, truth: Frames, noise: floa
 
 
 def between_and_after(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
-    """Cells of the table, with the recording that is given and the frames that are not."""
+    """Iterate over cells of the table, with the recording that is given and the hidden frames."""
     for gap in GAPS:
         given, hidden = held_out(recording, gap)
         assert given.frames is not None
@@ -79,11 +76,11 @@ def between_and_after(recording: Recording) -> Iterator[tuple[Row, Recording, Fr
         parts = {"between": np.arange(last), "after the last": np.arange(last, len(hidden))}
         for where, rows in parts.items():
             if len(rows):
-                yield {"gap": gap, "frames": where}, given, hidden[evenly(rows, IMAGES)]
+                yield {"gap": gap, "frames": where}, given, hidden[choose_evenly(rows, IMAGES)]
 
 
 def beyond(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
-    """The same of recordings that are cut."""
+    """Iterate over cells of recordings that are cut."""
     frames = recording.frames
     assert frames is not None
     for cut in CUTS:
@@ -98,20 +95,17 @@ def beyond(recording: Recording) -> Iterator[tuple[Row, Recording, Frames]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("JAXEVENT_DATA", ".")))
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
+    parser = command_line(__doc__, out=True, data=True)
     parser.add_argument("--recordings", nargs="+", default=RECORDINGS, metavar="NAME")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
     parser.add_argument("--beyond", action="store_true", help="frames after the last, or before")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
     kind, cells = ("beyond", beyond) if arguments.beyond else ("table", between_and_after)
     store = Store(out / ("beyond.json" if arguments.beyond else "rows.json"))
     methods = {n: (jaxevent.METHODS[n], jaxevent.METHODS[n].Params()) for n in arguments.methods}
     for name in arguments.recordings:
-        recording = jaxevent.load(arguments.data / "data" / name)
+        recording = jaxevent.load(arguments.data / name)
         assert recording.frames is not None
         noise = noise_of(recording.frames)
         for cell, given, truth in cells(recording):
@@ -124,7 +118,7 @@ def main() -> None:
         least = min((r["mse"] for r in same if r["method"] in INGREDIENTS), default=np.nan)
         if row["method"] == "mc":
             row["ratio"] = row["mse"] / least
-    text = markdown(rows, {key: key for key in keys}, COLUMNS)
+    text = table(rows, {key: key for key in keys}, COLUMNS)
     (out / f"{kind}.md").write_text(text)
     print(text)
 

@@ -149,19 +149,19 @@ FORMATS = {
 _WHOLE: dict[str, bytes] = {}
 
 
-def whole(name: str) -> bytes:
-    """The undamaged file of a format, made once."""
+def make_whole(name: str) -> bytes:
+    """Return the undamaged file of a format, made once."""
     if name not in _WHOLE:
         _WHOLE[name] = FORMATS[name]()
     return _WHOLE[name]
 
 
-def damaged(name: str, seed: int) -> tuple[str, bytes]:
-    """What was done to the file, and its bytes, from a seed alone."""
+def damage(name: str, seed: int) -> tuple[str, bytes]:
+    """Return the kind of damage and the bytes of a file, from a seed alone."""
     random = np.random.default_rng([seed, list(FORMATS).index(name)])
     if name in malformed.BUILDERS:
         return malformed.BUILDERS[name](random)
-    data = bytearray(whole(name))
+    data = bytearray(make_whole(name))
     kind = ("cut", "bits", "bytes", "header", "numbers", "moved", "random")[random.integers(7)]
 
     def place(most: int | None = None) -> int:
@@ -197,13 +197,13 @@ def damaged(name: str, seed: int) -> tuple[str, bytes]:
     return kind, bytes(data)
 
 
-def outcome(name: str, seed: int, path: Path) -> str:
-    """Read one damaged file both ways; what came of it. Raises AssertionError for a fault.
+def read_damaged(name: str, seed: int, path: Path) -> str:
+    """Read one damaged file both ways; return the outcome. Raises AssertionError for a fault.
 
     A file that could be read in memory gives the same events when it is left on disk; one that
     lost its end gives those that came before, and none of them changed.
     """
-    kind, data = damaged(name, seed)
+    kind, data = damage(name, seed)
     path.write_bytes(data)
     # AEDAT 2 tells the chip, which has more pixels than these events' sensor.
     size = None if name == "dvs128" else SIZE if seed % 4 or name == "aedat2" else None
@@ -233,7 +233,7 @@ def outcome(name: str, seed: int, path: Path) -> str:
 
 
 def _read_from_disk(path: Path, size: tuple[int, int] | None) -> bool:
-    """Whether all of a file can be read that is left on disk; bad events are refused when read."""
+    """Return True if a file left on disk can be read whole; bad events are refused when read."""
     with contextlib.suppress(InputError):
         left = io.load(path, size, in_memory=False)
         left.events[:]
@@ -248,7 +248,7 @@ def _one_format(name: str, inputs: int, seed: int, memory: int) -> None:
     warnings.simplefilter("error")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.bin"
-        path.write_bytes(whole(name))
+        path.write_bytes(make_whole(name))
         io.load(path, None if name == "dvs128" else SIZE)
         used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         counts: Counter[str] = Counter()
@@ -257,7 +257,7 @@ def _one_format(name: str, inputs: int, seed: int, memory: int) -> None:
             print(number, file=sys.stderr)
             faulthandler.dump_traceback_later(60, exit=True)
             start = time.perf_counter()
-            counts[outcome(name, number, path)] += 1
+            counts[read_damaged(name, number, path)] += 1
             slowest = max(slowest, time.perf_counter() - start)
             faulthandler.cancel_dump_traceback_later()
             more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - used) // 1000

@@ -50,42 +50,42 @@ def receive(receiver: socket.socket):
 
 
 class Images:
-    """The image of now, by the AKF."""
+    """Current image, by the AKF."""
 
     def __init__(self, recording: Recording, arguments: argparse.Namespace):
         size = recording.width, recording.height
         self.recording, self.window = recording, arguments.window
         self.live = jaxevent.akf.live(size, frames=False, window_events=arguments.window)
 
-    def warm(self) -> None:
+    def compile_programs(self) -> None:
         self.live.add(self.recording.events[: 3 * self.window])
         self.live(self.live.stop)
 
-    def held(self) -> int:
+    def n_held(self) -> int:
         return len(self.live._events.retained())
 
-    def compare(self) -> str:
+    def compare_with_whole(self) -> str:
         image = self.live(self.live.stop).mean
         whole = jaxevent.akf.estimate(self.recording)(self.live.stop).mean
         return f"the last image is within {np.abs(image - whole).max():.1e} of the whole's"
 
 
 class Targets:
-    """The targets of now, by the moment filter."""
+    """Current targets, by the moment filter."""
 
     def __init__(self, recording: Recording, arguments: argparse.Namespace):
         self.recording = recording
         self.params = jaxevent.blob.moment.Params(preset=arguments.preset)
         self.live = jaxevent.blob.moment.live((recording.width, recording.height), self.params)
 
-    def warm(self) -> None:
+    def compile_programs(self) -> None:
         self.live.add(self.recording.events[:10_000])
         self.live(self.live.stop)
 
-    def held(self) -> int:
+    def n_held(self) -> int:
         return len(self.live._tail.retained())
 
-    def compare(self) -> str:
+    def compare_with_whole(self) -> str:
         t = self.live.stop
         now = self.live(t)
         tracks = jaxevent.blob.moment.estimate(self.recording, self.params, smooth=False)
@@ -114,28 +114,28 @@ def main() -> None:
     receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
     receiver.bind(("127.0.0.1", 0))
     made = Targets if arguments.track else Images
-    made(recording, arguments).warm()  # programs are compiled before the first event comes
+    made(recording, arguments).compile_programs()  # before events come
     estimate = made(recording, arguments)
     live = estimate.live
     port = receiver.getsockname()[1]
     threading.Thread(target=send, args=(recording, port, arguments.speed), daemon=True).start()
-    count, held, due, late, spent = 0, 0, recording.start, [], time.process_time()
+    count, n_held, due, late, spent = 0, 0, recording.start, [], time.process_time()
     for events in receive(receiver):
         live.add(events)
         count += len(events)
-        held = max(held, estimate.held())
+        n_held = max(n_held, estimate.n_held())
         if live.stop >= due:
             clock = time.perf_counter()
             live(live.stop)
             late.append(time.perf_counter() - clock)
             due = live.stop + EVERY
     spent = time.process_time() - spent
-    print(f"{count:,} of {len(recording.events):,} events came, at most {held:,} were held")
+    print(f"{count:,} of {len(recording.events):,} events came, at most {n_held:,} were held")
     middle, worst = 1e3 * np.median(late), 1e3 * max(late)
     print(
         f"{len(late)} answers, median {middle:.1f} ms, worst {worst:.1f} ms; {spent:.1f} s of CPU"
     )
-    print(estimate.compare())
+    print(estimate.compare_with_whole())
 
 
 if __name__ == "__main__":

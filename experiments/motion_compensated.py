@@ -1,4 +1,4 @@
-"""Methods that follow motion against those that do not: hidden frames, moving objects, blur, flow.
+"""Methods that follow motion against those that do not: hidden frames, moving objects, blur.
 
     JAXEVENT_DATA=FOLDER python experiments/motion_compensated.py --params fitted --out compared
 
@@ -8,41 +8,32 @@
     street   davis346_street, every 2nd, 4th, 8th; all pixels, and where something moves
     objects  simulated objects, frames at 25 and 100 Hz, halfway between frames
     blur     pans and objects, long exposures: at the frames' middles, and halfway between them
-    exposures  the same of `mc`, not fitted, with and without exposures along trajectories
-    flow     the optical flow of objects, against the true one
-    video    seconds of all cores per image of `mc` on slider_depth, 100 images per second and far
-             apart, of the smoother's images at the same times, and the error of hidden frames: as
-             it is, and with an anchor for every target
 
 Of hidden frames a few are scored, evenly chosen among those that lie between given ones. Simulated
 recordings are those of seeds 101 to 103; the smoother and the filter are fitted to seeds 1 to 3.
 The method `mc` is left out where there is none. Rows that the folder holds are not computed again.
 Columns are means over images; z2 is the mean squared standardised error of ln(I + I0), 1 for honest
-variances, to which that of the hidden frame's own noise is added; s is seconds per image, of
-reconstruction and reading, without compilation.
+variances, to which that of the hidden frame's own noise is added.
 """
 
 import argparse
 import dataclasses
-import functools
 import itertools
 import json
 import os
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compensated_choice import noise_of
+from common import command_line, markdown_table
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 import jaxevent
 from jaxevent.camera import UnknownResponse
 from jaxevent.parameters import Parameters, read_toml
-from jaxevent.reconstruction.compensated import estimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import frame_times, held_out
@@ -52,11 +43,11 @@ from jaxevent.simulate import SENSORS, Objects, Pan, Source, scene, simulate
 METHODS = ("blend", "flow", "edi", "akf", "aks", "mc")
 LIKELIHOOD = "aks, likelihood"  # the label of the smoother in a fit to slider_depth
 SHARED = ("c_on", "c_off", "I0", "clock_offset", "rho_ref")  # what every method takes from it
+NOISE_BLOCK = 8  # px, over which the noise of frames is averaged
 CHOOSING, SCORING = (1, 2, 3), (101, 102, 103)  # seeds
 RATES = (25.0, 100.0)  # Hz
 IMAGES = {2: 10, 4: 10, 8: 10, 16: 8}  # by gap
 BLURS = ((0.02, 0.05, 0.1), (25.0, 100.0, 300.0))  # s; px/s
-FAR = 3.0  # px, errors of the flow that count as wrong
 
 FIT = """
 recordings = [{recordings}]
@@ -83,16 +74,8 @@ Chosen = Mapping[str, tuple[Any, Parameters]]  # method and parameters by name
 Row = dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True)
-class Compensated:
-    """Where the parameters of `mc` are: a fit's file or folder, and its label there."""
-
-    file: Path | None
-    label: str
-
-
-def chosen(names: Iterable[str], fitted: Path, compensated: Compensated) -> Chosen:
-    """Methods and their parameters, from a fit's folder.
+def choose_parameters(names: Iterable[str], fitted: Path) -> Chosen:
+    """Return methods and their parameters, from a fit's folder.
 
     The smoother is that fitted to the likelihood, if there is one. What the fit does not have has
     the smoother's thresholds, offset and dead time. `mc` has all numbers of the smoother that it
@@ -113,10 +96,6 @@ def chosen(names: Iterable[str], fitted: Path, compensated: Compensated) -> Chos
             params = method.Params.load(file, name)
         elif name == "mc":
             params = method.Params()
-            if compensated.file is not None:
-                own = compensated.file
-                own = own / "params.toml" if own.is_dir() else own
-                params = method.Params.load(own, compensated.label)
             known = method.Params.settings()
             params = params.replace(**{k: v for k, v in values.items() if k in known})
         else:
@@ -126,7 +105,7 @@ def chosen(names: Iterable[str], fitted: Path, compensated: Compensated) -> Chos
 
 
 class Store:
-    """The rows of a table, in a file; a cell of a method is computed once."""
+    """Rows of a table, in a file; a cell of a method is computed once."""
 
     def __init__(self, file: Path):
         self.file = file
@@ -142,7 +121,7 @@ class Store:
             self.file.write_text(json.dumps(self.rows, indent=1))
 
     def means(self, by: Sequence[str], names: Sequence[str]) -> list[Row]:
-        """The rows, averaged over seeds, by the columns that tell them apart."""
+        """Return the rows, averaged over seeds, by the columns that tell them apart."""
         groups: dict[tuple, list[Row]] = {}
         for row in self.rows:
             groups.setdefault(tuple(row[k] for k in by), []).append(row)
@@ -155,7 +134,7 @@ def _place(value: Any, names: Sequence[str]) -> Any:
 
 
 def _mean(rows: Sequence[Row]) -> Row:
-    """Of every number, weighted by `images`; None where no row has it."""
+    """Return the mean of every number, weighted by `images`."""
     means: Row = {}
     for name in rows[0]:
         known = [row for row in rows if isinstance(row.get(name), int | float)]
@@ -165,18 +144,7 @@ def _mean(rows: Sequence[Row]) -> Row:
     return means
 
 
-def images_of(
-    method: Any, params: Parameters, given: Recording, times: NDArray[np.int64]
-) -> tuple[NDArray, NDArray | None, float]:
-    """Images, their variances if the method tells any, and seconds per image."""
-    method.estimate(given, params, progress=False)(times[:1], extrapolate=True)  # compiles
-    clock = time.perf_counter()
-    image, variance, _ = method.estimate(given, params, progress=False)(times, extrapolate=True)
-    seconds = (time.perf_counter() - clock) / len(times)
-    return image, variance if method.has_covariance else None, seconds
-
-
-def scored(
+def score_images(
     method: Any,
     params: Any,
     given: Recording,
@@ -185,14 +153,16 @@ def scored(
     parts: Mapping[str, NDArray[np.int64]] | None = None,
     noise: float = 0.0,
 ) -> Row:
-    """A row of means over the images at the times of `truth`.
+    """Return means over the images at the times of `truth`.
 
     `moving` is where something moves, for each image; `parts` are rows of images whose error is
     told apart; `noise` is the variance of a pixel of the truth.
     """
     times = frame_times(truth, params)
-    image, variance, seconds = images_of(method, params, given, times)
-    if variance is not None and noise:
+    image, variance, _ = method.estimate(given, params, progress=False)(times, extrapolate=True)
+    if not method.has_covariance:
+        variance = None
+    elif noise:
         variance = variance + noise / (truth.intensity + float(params.I0)) ** 2
     scores = [
         hidden_scores(
@@ -213,20 +183,34 @@ def scored(
         row["moving_share"] = float(shares.mean())
     for name, rows in (parts or {}).items():
         row[name] = float(np.mean([scores[k]["mse"] for k in rows]))
-    return {**row, "seconds": seconds, "images": len(times)}
+    return {**row, "images": len(times)}
 
 
-def evenly(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def noise_of(frames: Frames) -> float:
+    """Return the variance of a frame's pixel, as a part of white squared.
+
+    It is half of the squared difference of the two consecutive frames that are most alike; of that
+    the median of blocks, as most of them do not move.
+    """
+    changes = np.diff(frames.intensity.astype(np.float64), axis=0) ** 2 / 2
+    count, h, w = changes.shape
+    n = NOISE_BLOCK
+    h, w = h // n, w // n
+    blocks = changes[:, : h * n, : w * n].reshape(count, h, n, w, n).mean((2, 4))
+    return float(np.median(blocks.reshape(count, -1), axis=1).min())
+
+
+def choose_evenly(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
 
 
 def hidden_between(count: int, gap: int) -> NDArray[np.int64]:
-    """The frames out of `count` that are hidden and have a given one on either side."""
+    """Return the frames out of `count` that are hidden and have a given one on either side."""
     frames = np.arange((count - 1) // gap * gap)
     return frames[frames % gap > 0]
 
 
-def real(
+def score_hidden_frames(
     store: Store,
     recording: Recording,
     methods: Chosen,
@@ -244,7 +228,7 @@ def real(
         rows = hidden_between(len(frames), gap)
         if halves[half] is not None:
             rows = rows[(rows >= len(frames) // 2) == bool(halves[half])]
-        rows = evenly(rows, IMAGES[gap])
+        rows = choose_evenly(rows, IMAGES[gap])
         places = np.searchsorted(hidden.t, frames.t[rows])
         where = [moves(given, int(place), gap) for place in places] if moving else None
         score = _scorer(given, hidden[places], where, noise=noise)
@@ -258,11 +242,11 @@ def _scorer(
     parts: Mapping[str, NDArray[np.int64]] | None = None,
     noise: float = 0.0,
 ) -> Callable[..., Row]:
-    return lambda method, params: scored(method, params, given, truth, moving, parts, noise)
+    return lambda method, params: score_images(method, params, given, truth, moving, parts, noise)
 
 
 def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:
-    """A DAVIS whose frames are linear, as those of a DAVIS are."""
+    """Return a DAVIS whose frames are linear."""
     return dataclasses.replace(
         SENSORS["davis"],
         frame_rate=rate,
@@ -272,8 +256,8 @@ def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:
     )
 
 
-def recorded(file: Path, source: Source, camera: Any, seed: int) -> Recording:
-    """The recording of a source, kept in a file."""
+def load_or_simulate(file: Path, source: Source, camera: Any, seed: int) -> Recording:
+    """Return the recording of a source, kept in a file."""
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         jaxevent.save(simulate(source, camera, seed, file.stem), file)
@@ -283,11 +267,11 @@ def recorded(file: Path, source: Source, camera: Any, seed: int) -> Recording:
 def objects_at(folder: Path, rate: float, seed: int) -> tuple[Objects, Recording]:
     source = Objects(seed=seed)
     file = folder / "recordings" / f"objects_{rate:g}Hz_{seed}.h5"
-    return source, recorded(file, source, sensor(rate), seed)
+    return source, load_or_simulate(file, source, sensor(rate), seed)
 
 
 def fitted_to_objects(folder: Path) -> Path:
-    """The folder of a fit to objects of the seeds for choosing, with few frames.
+    """Return the folder of a fit to objects of the seeds for choosing, with few frames.
 
     One sensor is simulated; its parameters do not depend on how many frames it takes.
     """
@@ -304,17 +288,17 @@ def fitted_to_objects(folder: Path) -> Path:
 
 
 def truth_of(source: Source, times: NDArray[np.int64]) -> Frames:
-    """The sharp images of a source at times (us)."""
+    """Return the sharp images of a source at times (us)."""
     images = np.stack([source.intensity(float(t) * 1e-6) for t in times])
     return Frames(times, images.clip(0, 1).astype(np.float32), np.zeros_like(times))
 
 
 def halfway(recording: Recording, count: int) -> NDArray[np.int64]:
-    """Times (us) in the middle between frames, not those of the first tenth of the recording."""
+    """Return times (us) in the middle between frames, after the first tenth of the recording."""
     assert recording.frames is not None
     t = recording.frames.t
     middles = (t[1:] + t[:-1]) // 2
-    return evenly(middles[middles >= recording.start + 0.1 * (t[-1] - t[0])], count)
+    return choose_evenly(middles[middles >= recording.start + 0.1 * (t[-1] - t[0])], count)
 
 
 def objects(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
@@ -327,8 +311,8 @@ def objects(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
             store.add({"rate": rate, "seed": seed}, methods, _scorer(recording, truth))
 
 
-def panorama() -> NDArray[np.float64]:
-    """A scene whose contrast frames can show."""
+def make_panorama() -> NDArray[np.float64]:
+    """Return a scene whose contrast frames can show."""
     light = scene("mountain", decades=1.0)
     return 0.9 * light / np.quantile(light, 0.9999)
 
@@ -336,201 +320,81 @@ def panorama() -> NDArray[np.float64]:
 def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
     """Score images at the middles of long exposures, and halfway between frames."""
     methods = fits(fitted_to_objects(folder))
-    for cell, source, recording in tqdm(blurred(folder), disable=not sys.stderr.isatty()):
+    for cell, source, recording in tqdm(
+        blurred_recordings(folder), disable=not sys.stderr.isatty()
+    ):
         t, parts = at_and_between(recording)
         store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
 
 
-def exposures(store: Store, folder: Path) -> None:
-    """Score `mc` on the same images, with and without exposures integrated along trajectories."""
-    mc = jaxevent.METHODS["mc"]
-    params = mc.Params.of({"c_on": 0.2, "c_off": 0.18, "I0": 0.1, "rho_ref": 5e-4})
-    both = {"mc": (mc, params), "mc, per pixel": (mc, params.replace(integrate=False))}
-    for cell, source, recording in tqdm(blurred(folder), disable=not sys.stderr.isatty()):
-        t, parts = at_and_between(recording)
-        store.add(cell, both, _scorer(recording, truth_of(source, t), None, parts))
-
-
-def blurred(
-    folder: Path,
-    blurs: tuple[tuple[float, ...], tuple[float, ...]] = BLURS,
-    label: str = "",
-    **other: Any,
-) -> Iterator[tuple[Row, Source, Recording]]:
-    """Recordings of long exposures, with what tells them apart: exposures (s), speeds (px/s).
-
-    The label is of the sensor's `other` settings, in the names of files.
-    """
-    light, seed = panorama(), SCORING[0]
-    for kind, exposure, speed in itertools.product(("pan", "objects"), *blurs):
+def blurred_recordings(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
+    """Iterate over recordings of long exposures, with scene, exposure and speed."""
+    light, seed = make_panorama(), SCORING[0]
+    for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
-        camera = dataclasses.replace(camera, **other)
         size, duration = (160, 120), 7 / rate + exposure
         source: Source = (
             Objects(size, duration, speed, seed=seed)
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )
-        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px{label}.h5"
-        recording = recorded(folder / "recordings" / name, source, camera, seed)
+        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px.h5"
+        recording = load_or_simulate(folder / "recordings" / name, source, camera, seed)
         yield {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}, source, recording
 
 
 def at_and_between(recording: Recording) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
-    """The middles of three exposures and three times halfway, and which are which."""
+    """Return the middles of three exposures and three times halfway, and the rows of each."""
     assert recording.frames is not None
     t = np.sort(np.concatenate([recording.frames.t[2:5], halfway(recording, 3)]))
     at = np.isin(t, recording.frames.t)
     return t, {"at_frames": np.flatnonzero(at), "between": np.flatnonzero(~at)}
 
 
-def flow_errors(
-    found: NDArray, true: NDArray, where: NDArray[np.bool_] | None = None
-) -> tuple[float, float]:
-    """Mean end-point error in px, and per cent of pixels where it is above `FAR`."""
-    error = np.linalg.norm(found - true, axis=-1)
-    error = error if where is None else error[where]
-    return float(np.nanmean(error)), float(100 * np.mean(~(error <= FAR)))
-
-
-def dense_flow(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
-    """Score flows, in px per frame: halfway between frames, and from each to the next."""
-    methods = fits(fitted_to_objects(folder))
-    methods = {n: (m, p) for n, (m, p) in methods.items() if n in ("flow", "mc")}
-    for rate in RATES:
-        for seed in tqdm(SCORING, desc=f"flow, {rate:g} Hz", disable=not sys.stderr.isatty()):
-            source, recording = objects_at(folder, rate, seed)
-            score = _flow_scorer(source, recording, halfway(recording, 6), 1 / rate)
-            store.add({"rate": rate, "seed": seed}, methods, score)
-
-
-def _flow_scorer(
-    source: Objects, recording: Recording, middles: NDArray[np.int64], step: float
-) -> Callable[..., Row]:
-    def score(method: Any, params: Any) -> Row:
-        late = round(1e6 * float(params.clock_offset))
-        video = method.estimate(recording, params, progress=False)
-        video(middles[:1] + late)  # compiles
-        clock = time.perf_counter()
-        now = video.flow(middles + late) * step
-        seconds = (time.perf_counter() - clock) / len(middles)
-        begins = middles - round(0.5e6 * step)
-        ahead = video.flow(begins + late, extrapolate=True) * step
-        columns: dict[str, list[float]] = {}
-        for k, (middle, begin) in enumerate(zip(middles, begins, strict=True)):
-            t, t0 = float(middle) * 1e-6, float(begin) * 1e-6
-            moved, hidden = source.displacement(t0, t0 + step)
-            for name, pair in (
-                ("now", flow_errors(now[k], source.flow(t) * step)),
-                ("next", flow_errors(ahead[k], moved, ~hidden)),
-                ("all", flow_errors(ahead[k], moved)),
-            ):
-                for what, value in zip(("epe", "far"), pair, strict=True):
-                    columns.setdefault(f"{what}_{name}", []).append(value)
-        row: Row = {name: float(np.mean(values)) for name, values in columns.items()}
-        return {**row, "seconds": seconds, "images": len(middles)}
-
-    return score
-
-
-def video(store: Store, recording: Recording, fits: Chosen) -> None:
-    """Time evenly spaced images, with the motion of anchors and with every target's own."""
-    frames = recording.frames
-    assert frames is not None
-    for gap, apart in itertools.product((2, 8), (estimator.ANCHOR_STEPS, 1)):
-        given, hidden = held_out(recording, gap)
-        rows = evenly(hidden_between(len(frames), gap), IMAGES[gap])
-        truth = hidden[np.searchsorted(hidden.t, frames.t[rows])]
-        smoother = functools.partial(jaxevent.METHODS["aks"].estimate, given, fits["aks"][1])
-        score = functools.partial(_paced, smoother=smoother, given=given, truth=truth, apart=apart)
-        store.add({"gap": gap, "apart": apart}, {"mc": fits["mc"]}, score)
-
-
-def _paced(
-    method: Any,
-    params: Any,
-    smoother: Callable[..., Any],
-    given: Recording,
-    truth: Frames,
-    apart: int,
-) -> Row:
-    kept, estimator.ANCHOR_STEPS = estimator.ANCHOR_STEPS, apart
-    times = frame_times(truth, params)
-    evenly_spaced = times[len(times) // 2] + np.arange(16) * 10_000
-
-    def seconds(made: Any, wanted: NDArray[np.int64]) -> float:
-        """CPU time per image."""
-        made(wanted[-1:])  # the smoother has gone through the recording
-        clock = time.process_time()
-        made(wanted)
-        return (time.process_time() - clock) / len(wanted)
-
-    try:
-        image = method.estimate(given, params, progress=False)(times).mean
-        paces = {"seconds": evenly_spaced, "alone": times[:-1]}
-        row: Row = {
-            name: seconds(method.estimate(given, params, progress=False), wanted)
-            for name, wanted in paces.items()
-        }
-        row["smoother"] = seconds(smoother(progress=False), evenly_spaced)
-    finally:
-        estimator.ANCHOR_STEPS = kept
-    errors = (np.clip(image, 0, 1) - truth.intensity) ** 2
-    return {**row, "mse": float(errors.mean()), "images": len(times)}
-
-
 IMAGE_COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4),
     ("SSIM", "ssim", 1, 3),
     ("z2", "z2", 1, 2),
-    ("s", "seconds", 1, 3),
-)
-FLOW_COLUMNS = tuple(
-    (f"{title}{ending}", f"{name}_{what}", 1, 2)
-    for what, ending in (("now", ", halfway"), ("next", ", to the next"), ("all", ", hidden too"))
-    for title, name in (("EPE px", "epe"), (f"% > {FAR:g} px", "far"))
 )
 
 
-def markdown(
+def table(
     rows: Sequence[Row], keys: Mapping[str, str], columns: Iterable[tuple[str, str, int, int]]
 ) -> str:
-    """A Markdown table."""
+    """Return a Markdown table of rows.
+
+    Args:
+        rows: Rows by column.
+        keys: Titles of the columns that tell rows apart.
+        columns: Title, name, factor and digits of each column of numbers.
+    """
     columns = list(columns)
-    head = [*keys.values(), *(title for title, *_ in columns)]
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(keys) + "---:|" * len(columns)]
+    lines = []
     for row in rows:
         cells = [f"{row[k]:g}" if isinstance(row[k], float) else str(row[k]) for k in keys]
         for _, name, factor, digits in columns:
             value = row.get(name)
-            if value is None or not np.isfinite(value):
-                cells.append("-")
-            else:
-                cells.append(f"{factor * value:.{digits}f}")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            missing = value is None or not np.isfinite(value)
+            cells.append("-" if missing else f"{factor * value:.{digits}f}")
+        lines.append(cells)
+    return markdown_table([*keys.values(), *(title for title, *_ in columns)], lines, len(keys))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    tables = ("slider", "street", "objects", "blur", "exposures", "flow", "video")
+    parser = command_line(__doc__, out=True)
+    tables = ("slider", "street", "objects", "blur")
     parser.add_argument("--params", type=Path, help="folder of a fit to slider_depth")
     parser.add_argument("--street-params", type=Path, help="of one to davis346_street; or the same")
-    parser.add_argument("--mc-params", type=Path, help="file or folder with the parameters of mc")
-    parser.add_argument("--mc-label", default="mc", help="their label; default: %(default)s")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
     parser.add_argument("--tables", nargs="+", default=tables, choices=tables)
-    parser.add_argument("--out", type=Path, required=True, help="folder for everything made")
     arguments = parser.parse_args()
-    if arguments.params is None and {"slider", "street", "video"} & set(arguments.tables):
-        parser.error("the tables slider, street and video need --params")
+    if arguments.params is None and {"slider", "street"} & set(arguments.tables):
+        parser.error("the tables slider and street need --params")
     out = arguments.out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
-    names, compensated = arguments.methods, Compensated(arguments.mc_params, arguments.mc_label)
 
     def fits(folder: Path) -> Chosen:
-        return chosen(names, folder, compensated)
+        return choose_parameters(arguments.methods, folder)
 
     for title, text in _tables(arguments, out, fits):
         (out / f"{title}.md").write_text(text)
@@ -546,51 +410,32 @@ def _tables(
         store = Store(out / "slider.json")
         recording = jaxevent.load(data / "slider_depth.zip")
         halves = {"1st": 0, "2nd": 1}
-        real(store, recording, fits(arguments.params), IMAGES, halves)
+        score_hidden_frames(store, recording, fits(arguments.params), IMAGES, halves)
         keys = {"gap": "gap", "half": "half", "method": "method"}
-        yield "slider", markdown(store.means(list(keys), names), keys, IMAGE_COLUMNS)
+        yield "slider", table(store.means(list(keys), names), keys, IMAGE_COLUMNS)
     if "street" in wanted:
         store = Store(out / "street.json")
         recording = jaxevent.load(data / "davis346_street.npz")
         folder = arguments.street_params or arguments.params
-        real(store, recording, fits(folder), (2, 4, 8), {"all": None}, moving=True)
+        score_hidden_frames(store, recording, fits(folder), (2, 4, 8), {"all": None}, moving=True)
         keys = {"gap": "gap", "method": "method"}
         more = (("moving MSE x 1e-2", "moving_mse", 100, 4), ("share", "moving_share", 1, 4))
         rows = store.means(list(keys), names)
-        yield "street", markdown(rows, keys, (*IMAGE_COLUMNS, *more))
+        yield "street", table(rows, keys, (*IMAGE_COLUMNS, *more))
     keys = {"rate": "frames (Hz)", "method": "method"}
     if "objects" in wanted:
         store = Store(out / "objects.json")
         objects(store, out, fits)
-        yield "objects", markdown(store.means(list(keys), names), keys, IMAGE_COLUMNS)
-    for name in ("blur", "exposures"):
-        if name not in wanted:
-            continue
-        store = Store(out / f"{name}.json")
-        if name == "blur":
-            blur(store, out, fits)
-        else:
-            exposures(store, out)
+        yield "objects", table(store.means(list(keys), names), keys, IMAGE_COLUMNS)
+    if "blur" in wanted:
+        store = Store(out / "blur.json")
+        blur(store, out, fits)
         parts = (("at frames", "at_frames", 100, 4), ("between", "between", 100, 4))
         how = {
             "scene": "scene", "exposure_ms": "exposure (ms)", "speed": "px/s", "method": "method",
         }  # fmt: skip
         rows = store.means(list(how), names)
-        yield name, markdown(rows, how, (*IMAGE_COLUMNS, *parts))
-    if "flow" in wanted:
-        store = Store(out / "flow.json")
-        dense_flow(store, out, fits)
-        columns = (*FLOW_COLUMNS, ("s", "seconds", 1, 3))
-        yield "flow", markdown(store.means(list(keys), names), keys, columns)
-    if "video" in wanted and "mc" in names:
-        store = Store(out / "video.json")
-        video(store, jaxevent.load(data / "slider_depth.zip"), fits(arguments.params))
-        columns = (
-            ("MSE x 1e-2", "mse", 100, 4), ("s", "seconds", 1, 3), ("s, far apart", "alone", 1, 3),
-            ("s, smoother", "smoother", 1, 4),
-        )  # fmt: skip
-        keys = {"gap": "gap", "apart": "steps between anchors"}
-        yield "video", markdown(store.means(list(keys), names), keys, columns)
+        yield "blur", table(rows, how, (*IMAGE_COLUMNS, *parts))
 
 
 if __name__ == "__main__":

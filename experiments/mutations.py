@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 
 class Mutation(NamedTuple):
-    """A fault: the text in a file, what replaces it, the tests (pytest's words) that catch it."""
+    """Fault: the text in a file, its replacement, the tests (pytest's words) that catch it."""
 
     fault: str
     file: str
@@ -180,8 +180,8 @@ MUTATIONS = (
 )
 
 
-def caught(mutation: Mutation, folder: Path) -> bool:
-    """Whether the tests fail in a copy of the tree that has the fault."""
+def is_caught(mutation: Mutation, folder: Path) -> bool:
+    """Return True if the tests fail in a copy of the tree that has the fault."""
     tree = folder / "tree"
     shutil.rmtree(tree, ignore_errors=True)
     leave_out = shutil.ignore_patterns(".git", ".venv", "__pycache__", "site", ".*_cache")
@@ -217,7 +217,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for mutation in MUTATIONS:
             if given.only in mutation.fault + mutation.file:
-                found = caught(mutation, Path(folder))
+                found = is_caught(mutation, Path(folder))
                 rows.append((mutation, found))
                 print("caught" if found else "MISSED", mutation.fault, flush=True)
     if given.page:

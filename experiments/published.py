@@ -55,7 +55,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def artificial(path: Path, cut: float = 80) -> Recording:
-    """A recording of a camera that crops, of colour images and events in a .mat file."""
+    """Return a recording of a camera that crops, of colour images and events in a .mat file."""
     recording = jaxevent.load(path, size=image_size(path))
     extra = dict(recording.extra)
     if "img_color" not in extra or "time_image" not in extra:
@@ -81,13 +81,13 @@ def artificial(path: Path, cut: float = 80) -> Recording:
 
 
 def beside(folder: Path, name: str) -> Path | None:
-    """The file or folder NAME or NAME.* in a folder, but timestamps."""
+    """Return the file or folder NAME or NAME.* in a folder, but timestamps."""
     found = sorted(one for one in folder.iterdir() if one.stem == name)
     return found[0] if found else None
 
 
 def rig(folder: Path, triggers: bool) -> tuple[Recording, bool]:
-    """The registered recording of a rig, and whether it has a reference."""
+    """Return the registered recording of a rig, and True if it has a reference."""
     events, frames = beside(folder, "events"), beside(folder, "frames")
     if events is None or frames is None:
         raise InputError(f"{folder}: holds no events.* or no frames; add both")

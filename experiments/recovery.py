@@ -21,9 +21,11 @@ import numpy as np
 
 import jaxevent
 from jaxevent.confidence import FitIntervals, confidence_intervals
+from jaxevent.egomotion.models import Planar
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.blob import FAMILY as BLOBS
-from jaxevent.runs.egomotion import MotionLoss
+from jaxevent.runs.egomotion import MotionGoal, MotionLoss
 from jaxevent.runs.reconstruction import Objective, Problem, RecordingWindow, cut_windows
 from jaxevent.simulate import Pan, Sensor, blob_scene, scene, simulate
 from jaxevent.tuning import Settings, optimise
@@ -82,21 +84,21 @@ def from_model(
     ).check()
 
 
-def found_by(
+def fit_with_intervals(
     loss: Any, start: Any, names: list[str], batches: Any, settings: Settings, search: Any = None
 ) -> FitIntervals:
-    """What a fit finds, with its intervals."""
+    """Fit parameters, and return them with their intervals."""
     fit = optimise(loss, start, names, batches, settings=settings, search=search)
     return confidence_intervals(loss, start, fit.params, names, batches, search, settings.forward)
 
 
-def by_frames(recording: Recording, start: Any, names: list[str], search: Any, iterations: int):
-    """By the likelihood of the frames."""
+def fit_by_frames(recording: Recording, start: Any, names: list[str], search: Any, iterations: int):
+    """Fit parameters by the likelihood of the frames."""
     assert recording.frames is not None
     part = RecordingWindow(recording, recording.frames, np.arange(0), np.arange(0))
     problem = Problem(Objective(jaxevent.aks, None), [part])
     settings = Settings(iterations=iterations, learning_rate=0.1, rounds=2)
-    return found_by(problem.objective, start, names, problem, settings, search)
+    return fit_with_intervals(problem.objective, start, names, problem, settings, search)
 
 
 Recovered = tuple[dict[str, float], FitIntervals]
@@ -105,13 +107,13 @@ Recovered = tuple[dict[str, float], FitIntervals]
 def model_recovery(
     seed: int, more: dict[str, float] | None = None, size: tuple[int, int] = (40, 32)
 ) -> Recovered:
-    """Of the smoother, from a start that is wrong by a factor of 2 or so."""
+    """Recover the smoother, from a start that is wrong by a factor of 2 or so."""
     true = {**TRUE, **(more or {})}
     start = jaxevent.aks.Params(
         c_on=0.2, c_off=0.2, I0=0.2, sigma_event=0.3, sigma_bg=0.4, sigma_frame=0.03,
         sigma_floor=1e-4, w_min=1.0, share=0.0,
     )  # fmt: skip
-    return true, by_frames(from_model(true, seed, size), start, list(true), None, 100)
+    return true, fit_by_frames(from_model(true, seed, size), start, list(true), None, 100)
 
 
 AKF = {"c_on": 0.12, "c_off": 0.09, "sigma_proc": 0.3, "sigma_iso": 0.6, "sigma_ref": 0.04}
@@ -157,7 +159,7 @@ def from_akf(seed: int, size: tuple[int, int] = (64, 48)) -> Recording:
 
 
 def akf_recovery(seed: int) -> Recovered:
-    """Of the AKF, by the likelihood of an image at the end; frames tell nothing but the start."""
+    """Recover the AKF by the likelihood of an image at the end; frames give the start alone."""
     start = jaxevent.akf.Params(
         c_on=0.2, c_off=0.2, sigma_proc=0.1, sigma_iso=0.2, sigma_ref=0.1, rho=RHO, I0=I0, P0=P0,
         kappa=1e-9, calibrate=False, deblur=False,
@@ -165,14 +167,14 @@ def akf_recovery(seed: int) -> Recovered:
     drawn = cut_windows(from_akf(seed), "reference")
     problem = Problem(Objective(jaxevent.akf, "nll", False), drawn)
     settings = Settings(iterations=80, learning_rate=0.1, rounds=2)
-    return AKF, found_by(problem.objective, start, list(AKF), problem, settings)
+    return AKF, fit_with_intervals(problem.objective, start, list(AKF), problem, settings)
 
 
 WALK = {"Q_p": 20.0, "Q_v": 1e6, "Q_lambda": 10.0, "Q_theta": 0.1}
 
 
 def blob_recovery(seed: int) -> Recovered:
-    """Of the blob filter, by the likelihood of events; process noises wrong by factors of 10."""
+    """Recover the blob filter by the likelihood of events, from noises wrong by factors of 10."""
     method = jaxevent.blob.moment
     start = method.Params(
         events_per_step=32, Q_p=200.0, Q_v=1e5, Q_lambda=100.0, Q_theta=1.0, Q_q=50.0
@@ -192,30 +194,76 @@ def blob_recovery(seed: int) -> Recovered:
     settings = Settings(
         iterations=40, learning_rate=0.3, rounds=1, every=10, patience=1000, forward=True
     )
-    return WALK, found_by(goal.loss, start, list(WALK), batches, settings)
+    return WALK, fit_with_intervals(goal.loss, start, list(WALK), batches, settings)
 
 
 NOISE = {"noise": 1.0}
+STEP = 2e-4  # s, of points that move
+SEQUENCES, RUNS, SETTLE = 6, 2, 0.05  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedGoal(MotionGoal):
+    """Goal of recordings whose true motion is given, not read from a file."""
+
+    truths: tuple[KnownMotion, ...] = ()
+
+    def known(self, recording: Recording) -> KnownMotion:
+        return self.truths[int(recording.name)]
+
+
+def drifting_points(
+    seed: int, size: tuple[int, int], noise: float, seconds: float = 0.4
+) -> tuple[Recording, KnownMotion]:
+    """Draw points whose velocity wanders by `noise` of its speed per square root of a second."""
+    rng = np.random.default_rng([seed, 5])
+    angle = rng.uniform(0, 2 * np.pi)
+    path = [200.0 * np.array([np.cos(angle), np.sin(angle)])]
+    for step in rng.normal(size=(round(seconds / STEP) - 1, 2)):
+        path.append(path[-1] + noise * np.linalg.norm(path[-1]) * np.sqrt(STEP) * step)
+    return events_of_points(seed, size, np.array(path))
+
+
+def events_of_points(
+    seed: int, size: tuple[int, int], path: np.ndarray, number: int = 60
+) -> tuple[Recording, KnownMotion]:
+    """Draw points that move by a path of velocities (times, 2), `STEP` apart, px/s."""
+    rng = np.random.default_rng([seed, 1])
+    at, sign = rng.uniform([0, 0], size, (number, 2)), rng.random(number) < 0.5
+    cell, rows = np.floor(at), []
+    times = STEP * np.arange(len(path))
+    for t, U in zip(times, path, strict=True):
+        at = at + U * STEP
+        left = ((at < 0) | (at >= size)).any(1)
+        at = np.where(left[:, None], np.mod(at, size), at)
+        new = np.flatnonzero((np.floor(at) != cell).any(1) & ~left)
+        cell = np.floor(at)
+        rows.append(np.c_[1e6 * (t + STEP * rng.random(len(new))), cell[new], sign[new]])
+    table = np.concatenate(rows)
+    t, x, y, p = table[np.argsort(table[:, 0], kind="stable")].T
+    events = Events(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p > 0)
+    grid = np.rint(1e6 * times).astype(np.int64)
+    return Recording("points", *size, events), KnownMotion(Planar, grid, path)
 
 
 def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> Recovered:
-    """Of the soft vote, by the error of the motion; noise too small by a factor of 5."""
-    from egomotion_tuning import Problem as Sequences
-    from egomotion_tuning import drifting
-
-    def make(number: int, size: tuple[int, int]):
-        return drifting(number + 10 * seed, size, NOISE["noise"])
-
-    start = jaxevent.egomotion.voting.Params(particles=100, batch=32, noise=0.2)
-    _, batches, _ = Sequences(make, 6, (96, 72))(start)
+    """Recover the soft vote by the error of the motion; noise too small by a factor of 5."""
+    drawn = [drifting_points(k + 10 * seed, (96, 72), NOISE["noise"]) for k in range(SEQUENCES)]
+    named = [dataclasses.replace(one, name=str(k)) for k, (one, _) in enumerate(drawn)]
+    truths = tuple(truth for _, truth in drawn)
+    voting, loss = jaxevent.egomotion.voting, MotionLoss()
+    goal = SimulatedGoal(voting, loss, "planar", "", RUNS, SETTLE, {}, truths)
+    start = voting.Params(particles=100, batch=32, noise=0.2)
+    sources: Any = {"fit": [(one.name, one) for one in named], "validation": [], "test": []}
+    batches, _ = goal.problem(sources, None, None)(start)
     settings = Settings(
         iterations=30, learning_rate=0.2, rounds=1, every=10, patience=1000, forward=True
     )
-    return NOISE, found_by(MotionLoss(), start, list(names), batches, settings)
+    return NOISE, fit_with_intervals(loss, start, list(names), batches, settings)
 
 
 def sensor_recovery(seed: int) -> Recovered:
-    """Of a simulated sensor: a slow pan, 2 s, all noise of a DAVIS.
+    """Recover a simulated sensor: a slow pan, 2 s, all noise of a DAVIS.
 
     Events lag the intensity: on average it has moved half a threshold on since the last one. The
     offset found for the frames' clock contains that lag, half the time between a pixel's events.
@@ -227,7 +275,7 @@ def sensor_recovery(seed: int) -> Recovered:
     names = ["c_on", "c_off", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor"]
     search = {"clock_offset": (-0.012, 0.012, 9), "rho_ref": (0.0, 0.003, 7)}
     true = {"c_on": 0.22, "c_off": 0.16, "clock_offset": 0.004, "rho_ref": 1e-3}
-    return true, by_frames(recording, start, names, search, 60)
+    return true, fit_by_frames(recording, start, names, search, 60)
 
 
 PARTS: dict[str, Callable[[int], Recovered]] = {

@@ -43,8 +43,8 @@ SCENES = (("lake", "slow"), ("room", "fast"), ("forest", "slow"), ("night", "fas
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Beside:
-    """What a camera sees of a panorama whose pixels are `homography` of those of a `Pan`."""
+class PanoramaView:
+    """View of a panorama whose pixels are `homography` of those of a `Pan`."""
 
     pan: Pan
     homography: NDArray[np.float64]
@@ -69,8 +69,8 @@ class Beside:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class View:
-    """What a camera with a distorted lens sees, at `rotation`, `translation` from a moving one."""
+class CameraView:
+    """View of a camera with a distorted lens, at `rotation`, `translation` from a moving one."""
 
     world: World
     motion: CameraMotion
@@ -95,7 +95,7 @@ class View:
 
 
 def frames_of(source: Any, sensor: Sensor, offset: float, seed: int) -> Recording:
-    """A recording of frames only, whose clock is `offset` s behind."""
+    """Return a recording of frames only, whose clock is `offset` s behind."""
     stamps = frame_times(source.duration, sensor)
     images, _ = expose(source.intensity, stamps, sensor, np.random.default_rng([seed, 7]))
     exposure = np.full(len(stamps), round(sensor.exposure * 1e6), np.int64)
@@ -113,7 +113,7 @@ def far_rig(
     duration: float = 1.5,
     sensor: Sensor = SENSORS["davis"],
 ) -> tuple[Pan, Recording, Recording, NDArray[np.float64], float]:
-    """Source, events, frames, and the true homography and offset."""
+    """Return source, events, frames, and the true homography and offset."""
     rng = np.random.default_rng([seed, 3])
     pan = Pan(scene(name, 2.5), size, duration, speed, seed)
     turn = rng.normal(0, 0.05)
@@ -129,7 +129,7 @@ def far_rig(
     homography = there @ whole @ here
     homography /= homography[2, 2]
     offset = float(rng.uniform(-0.3, 0.3))
-    seen = frames_of(Beside(pan, homography, other), sensor, offset, seed)
+    seen = frames_of(PanoramaView(pan, homography, other), sensor, offset, seed)
     recording = simulate(pan, sensor, seed)
     seen = dataclasses.replace(
         seen, extra={k: recording.extra[k] for k in ("response", "certainty")}
@@ -139,8 +139,8 @@ def far_rig(
 
 def near_rig(
     seed: int, duration: float = 1.0, shrink: float | int = 1, exposure_samples: int = 8
-) -> tuple[View, View, Recording, Recording, register.Rig, float]:
-    """What both cameras see, events, frames, the rig and the true offset; the wall is at 2 m."""
+) -> tuple[CameraView, CameraView, Recording, Recording, register.Rig, float]:
+    """Return both views, events, frames, the rig and the true offset; the wall is at 2 m."""
     rng = np.random.default_rng([seed, 5])
     one = (110.0, 111.0, 63.0, 48.5), (-0.2, 0.05, 1e-3, -5e-4, 0.0)
     two = (160.0, 160.0, 101.0, 74.0), (-0.15, 0.03, -1e-3, 1e-3, 0.0)
@@ -156,8 +156,8 @@ def near_rig(
     motion = planar_motion(
         (20, -15), 2.0, one.fx, amplitude=(60, 90), frequency=1.3, phase=float(rng.uniform(0, 6))
     )
-    source = View(world, motion, one, sizes[0], duration)
-    other = View(world, motion, two, sizes[1], duration, rotation, rig.translation)
+    source = CameraView(world, motion, one, sizes[0], duration)
+    other = CameraView(world, motion, two, sizes[1], duration, rotation, rig.translation)
     sensor = dataclasses.replace(
         SENSORS["davis"],
         response=jaxevent.camera.UnknownResponse(),
@@ -186,8 +186,8 @@ def reconstruction_error(recording: Recording, covered: NDArray[np.bool_]) -> fl
     return float(np.mean(error))
 
 
-def naive(recording: Recording, other: Recording) -> Recording:
-    """The other camera's images scaled to the sensor, clocks taken to agree."""
+def register_by_scale(recording: Recording, other: Recording) -> Recording:
+    """Return the other camera's images scaled to the sensor, clocks taken to agree."""
     scale = np.diag([other.width / recording.width, other.height / recording.height, 1.0])
     grid = register.homography_grid(
         scale, (recording.width, recording.height), (other.width, other.height)
@@ -213,7 +213,7 @@ def main() -> None:
             true = register.homography_grid(H, size, seen)
             after = register.apply_registration(recording, other, found)
             covered = after.extra["covered"]
-            before = reconstruction_error(naive(recording, other), covered)
+            before = reconstruction_error(register_by_scale(recording, other), covered)
             later = reconstruction_error(after, covered)
             print(
                 f"| {name} {speed} | {seed} | {grid_error(found.grid, true):.3f} "
@@ -230,7 +230,7 @@ def main() -> None:
         found = register.estimate(recording, other, grid)
         after = register.apply_registration(recording, other, found)
         covered = after.extra["covered"]
-        before = reconstruction_error(naive(recording, other), covered)
+        before = reconstruction_error(register_by_scale(recording, other), covered)
         later = reconstruction_error(after, covered)
         print(
             f"| wall | {seed} | {1e3 * (found.offset - offset):+.2f} | {found.agreement:.3f} "

@@ -11,7 +11,6 @@ in a process of its own. The table says its time, compilation included, and its 
 28 GB of disk for 1e9 events.
 """
 
-import argparse
 import dataclasses
 import os
 import subprocess
@@ -23,10 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import machine
+from common import command_line, machine, write_text
 
 from jaxevent.io import save
-from jaxevent.io.output import complete
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show.tables import results_table
 
@@ -103,7 +101,7 @@ def recording(count: int) -> Recording:
     )
 
 
-def rows_of_method(arguments: list[str]) -> tuple[float, float, float]:
+def run_process(arguments: list[str]) -> tuple[float, float, float]:
     """Seconds, CPU seconds and peak memory (GB) of a process; raises if it fails."""
     clock, spent, peak = time.perf_counter(), children_cpu(), 0
     process = subprocess.Popen(arguments)
@@ -141,7 +139,7 @@ def measure(count: int, disk: Path | None = None) -> dict[str, Any]:
         clock = time.perf_counter()
         save(recording(count), source, progress=sys.stderr.isatty())
         made = time.perf_counter() - clock
-        seconds, cpu, peak = rows_of_method(
+        seconds, cpu, peak = run_process(
             [
                 *(sys.executable, "-m", "jaxevent.cli", "reconstruct", str(source)),
                 *("--method", "akf", "--rate", "100", "--out", str(images)),
@@ -159,13 +157,16 @@ def measure(count: int, disk: Path | None = None) -> dict[str, Any]:
         }
 
 
+def memory_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure the peak memory of 10 M events."""
+    return {}, {"peak memory of 10 M events, GB": measure(10_000_000)["peak"]}
+
+
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = command_line(__doc__, out=True)
     parser.add_argument("--events", type=float, nargs="+", default=[1e7, 1e8, 1e9])
-    parser.add_argument("--out", type=Path, required=True, help="folder for table.md")
     parser.add_argument("--disk", type=Path, help="where recordings are made; default: temporary")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for count in map(int, arguments.events):
         rows.append(measure(count, arguments.disk))
@@ -184,8 +185,7 @@ def main() -> int:
     )
     text = f"{machine()}\n\n{table}"
     print(text)
-    with complete(arguments.out / "table.md") as path:
-        path.write_text(text)
+    write_text(arguments.out / "table.md", text)
     return 0
 
 

@@ -505,7 +505,7 @@ def deflate_shuffled(numbers: NDArray[np.floating]) -> bytes:
 
     zlib spends most of its time on the bytes of mantissas, which do not get smaller. Here a sample
     of each byte plane decides whether it is compressed or stored, and only repeated bytes are
-    searched. The result is one zlib stream (experiments/storage.py compares).
+    searched. The result is one zlib stream (experiments/studies/compression.md compares).
 
     Args:
         numbers: Floats of a chunk.

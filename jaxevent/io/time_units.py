@@ -16,7 +16,7 @@ under each unit, as a sum of log-likelihoods:
 The numbers decide only where there are at least `FEWEST_EVENTS`. A unit other than the usual one,
 or one that is hardly better than the next, is reported as an `InputWarning`; any unit that the
 layout does not state is a note of the recording. The constants were chosen on simulated recordings
-(`experiments/time_units.py`).
+(`experiments/studies/time_units.md`).
 
 Times of images, poses and IMU samples of the same file are on the clock of the events: they keep
 their usual unit unless, in it, they miss the events or their intervals cannot be, and another unit

@@ -49,7 +49,7 @@ def test_reference_finds_a_known_path(real):
     y = 202 + 107 * np.sin(angle) + np.sin(heading) * u[0] + np.cos(heading) * u[1]
     xi = np.rint([x, y]).astype(np.uint16)
     events = Events(np.rint(t * 1e6).astype(np.int64), xi[0], xi[1], t > 0)
-    path = real.fit_circling(Recording("circle", 640, 480, events))
+    path = real.fit_circular_path(Recording("circle", 640, 480, events))
     assert path.omega == pytest.approx(2 * np.pi * 19.3, rel=1e-3)
     np.testing.assert_allclose(path.terms[0], [314, 202], atol=0.2)
     # A circle of 3 lambda1 leaves out 1 % of the variance along the longer axis or more.
@@ -59,7 +59,7 @@ def test_reference_finds_a_known_path(real):
 
 @pytest.mark.slow
 def test_spinning_dot_is_found_and_followed(real, dot, float32):
-    path = real.fit_circling(dot)
+    path = real.fit_circular_path(dot)
     cut = dot[0:10_000]
     tracks = follow(cut, moment.Params(preset="fast", **real.DOT_FOUND), 64, 128)
     assert len(tracks) == 1  # not its tail, no hot pixel

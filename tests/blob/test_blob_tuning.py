@@ -20,7 +20,7 @@ def tuning():
 @pytest.mark.slow
 def test_the_likelihood_finds_the_process_noise(tuning):
     """On other recordings; the true positions of those choose the point of the grid."""
-    start, fitted, best = tuning.tuned(
+    start, fitted, best = tuning.tune_scene(
         "lissajous",
         {"stiff": {"Q_v": 0.01}},
         (1,),

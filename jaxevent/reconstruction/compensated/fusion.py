@@ -6,7 +6,7 @@ each other shows which of them is right: frames that agree along trajectories, b
 events next to the target, saw something else. The candidates are blended by a softmax whose logits
 are linear in such features of a pixel, and the logarithm of the result's variance is linear in
 them, too. The weights are parameters, fitted to images that were left out
-(`experiments/compensated_choice.py`).
+(`experiments/studies/weights_of_the_fusion.md`).
 """
 
 from typing import NamedTuple

@@ -24,9 +24,9 @@ FEATURES = (
 )
 FALLBACKS = ("smoothed", "blend")  # candidates beside the mean along trajectories
 
-# Fitted by experiments/compensated_choice.py: a weight of every feature and a constant, for each of
-# `FALLBACKS`; and the same for the logarithm of the result's variance. Those called beyond, by its
-# --beyond, are of times after the last frame and before the first.
+# A weight of every feature and a constant, for each of `FALLBACKS`; and the same for the logarithm
+# of the result's variance. Those called beyond are for times after the last frame and before the
+# first. Fitted as experiments/studies/weights_of_the_fusion.md says.
 # fmt: off
 CHOICE_WEIGHTS = (
     0.796, 0.089, 0.222, 0.939, 0.532, -3.802, -3.169, 0.234, -0.268, -0.368, 0.687, 0.136,
