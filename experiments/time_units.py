@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import ReadOptions
-from jaxevent.io.time_units import SAMPLE, SCALES, infer_unit
+from jaxevent.io.time_units import SAMPLE_EVENTS, US_PER_UNIT, infer_unit
 
 SENSORS = [(64, 48), (128, 128), (240, 180), (346, 260), (640, 480), (1280, 720)]
 FILES = 200  # of each row
@@ -47,15 +47,15 @@ def simulate(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.nd
     order = np.argsort(t)
     t, pixel = t[order], pixel[order]
     if held < count:
-        t = np.append(t[:SAMPLE], span)
-        pixel = np.append(pixel[:SAMPLE], 0)
+        t = np.append(t[:SAMPLE_EVENTS], span)
+        pixel = np.append(pixel[:SAMPLE_EVENTS], 0)
     offset = random.choice([0.0, 10 ** random.uniform(0, 5), 1.6e9 + random.uniform(0, 1e8)])
     return t + offset, pixel % width, pixel // width, max(count, len(t)), (width, height)
 
 
 def stored(t: np.ndarray, unit: str, kind: str, random: np.random.Generator) -> np.ndarray:
     """Write times (s) in a unit: "whole", or "decimals" with the digits of a microsecond or all."""
-    per_second = 1e6 / SCALES[unit]
+    per_second = 1e6 / US_PER_UNIT[unit]
     if kind == "whole":
         if unit == "ns" and random.random() < 0.7:  # most sensors count microseconds
             return np.rint(t * 1e6).astype(np.int64) * 1000

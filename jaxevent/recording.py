@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Times = ArrayLike | int | float
 
-PER_FRAME = ("gain", "rgb")  # names of `Recording.extra` that hold one entry per frame
+PER_FRAME_EXTRAS = ("gain", "rgb")  # names of `Recording.extra` that hold one entry per frame
 
 
 def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
@@ -143,7 +143,7 @@ class Events:
     p: NDArray[np.bool_]
 
     def __post_init__(self):
-        source, most = "events", (arrays.MAX_PIXELS, arrays.MAX_PIXELS)
+        source, most = "events", (arrays.MAX_SIDE_PX, arrays.MAX_SIDE_PX)
         if (np.asarray(self.t).dtype if hasattr(self.t, "dtype") else np.dtype(int)).kind == "f":
             raise InputError(
                 f"{source}: t is {self.t.dtype}; give integer microseconds, or make the recording "
@@ -860,7 +860,7 @@ class Recording(HtmlRepr):
         """Return the further arrays; those with one entry per frame are cut like frames."""
         if rows is None:
             return self.extra
-        cut = {name: self.extra[name][rows] for name in PER_FRAME if name in self.extra}
+        cut = {name: self.extra[name][rows] for name in PER_FRAME_EXTRAS if name in self.extra}
         return {**self.extra, **cut}
 
     def check(self, source: str | None = None) -> "Recording":

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-SPLITS = ("fit", "validation", "test")
+SPLIT_NAMES = ("fit", "validation", "test")
 
 
 def interleave(split: Sequence[int], count: int) -> NDArray[np.int64]:

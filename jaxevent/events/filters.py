@@ -11,7 +11,7 @@ from jaxevent.events.blocks import Part, Size, parse_duration, select_events, si
 from jaxevent.events.images import count_events
 from jaxevent.recording import Events, Recording, Times, microseconds
 
-LONG_AGO = np.iinfo(np.int64).min // 2  # us
+LONG_AGO_US = np.iinfo(np.int64).min // 2  # us
 
 
 def crop_time(part: Part, start: Times | None = None, stop: Times | None = None) -> Part:
@@ -144,7 +144,7 @@ def filter_background(
     window_us = parse_duration(window, "the window of the background filter")
     if not 1 <= neighbours <= 8:
         raise InputError(f"{neighbours} of 8 neighbours are not possible; give 1 to 8")
-    last = np.full((height + 2, width + 2), LONG_AGO)
+    last = np.full((height + 2, width + 2), LONG_AGO_US)
     return select_events(part, lambda e: supported(e.t, e.x, e.y, last, window_us, neighbours))
 
 
@@ -194,7 +194,7 @@ def filter_refractory(part: Part, period: int | float, *, size: Size | None = No
     """
     width, height = size_of(part, size)
     dead_us = parse_duration(period, "the refractory period")
-    last = np.full((height, width), LONG_AGO)
+    last = np.full((height, width), LONG_AGO_US)
     return select_events(part, lambda e: _outside_dead_time(e.t, e.x, e.y, last, dead_us))
 
 

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENSES, find_model
+from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Events, ImageSource
 
-GRAVITY = 9.80665  # m/s^2, standard gravity
-_UNFOLDED_BYTES = 1 << 27  # of arrays that every file may unfold to
-_MAX_COMPRESSION = 100  # times its own bytes that a larger file may unfold to
-_COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
+GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
+_ALLOWED_UNFOLDED_BYTES = 1 << 27  # of arrays that every file may unfold to
+_MAX_COMPRESSION_RATIO = 100  # times its own bytes that a larger file may unfold to
+_COUNT_WORDS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +136,7 @@ def damaged(what: str) -> InputError:
 
 def max_unfolded(stored: int) -> int:
     """Return the number of bytes of arrays that `stored` bytes of a file may unfold to."""
-    return max(_UNFOLDED_BYTES, _MAX_COMPRESSION * stored)
+    return max(_ALLOWED_UNFOLDED_BYTES, _MAX_COMPRESSION_RATIO * stored)
 
 
 def check_unfolded(size: int, stored: int, source: object) -> None:
@@ -152,8 +152,8 @@ def check_unfolded(size: int, stored: int, source: object) -> None:
     if size > max_unfolded(stored):
         raise InputError(
             f"{source}: {stored:,} bytes of the file claim to hold {size:,}, over "
-            f"{_MAX_COMPRESSION} times as many; it is damaged or not a recording, else store it "
-            "with less compression"
+            f"{_MAX_COMPRESSION_RATIO} times as many; it is damaged or not a recording, else store "
+            "it with less compression"
         )
 
 
@@ -243,11 +243,11 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
     found = find_model(model)
     if found is None:
         raise InputError(f"{source}: {_unsupported_lens(model)}")
-    values, names = np.ravel(values), LENSES[found].coefficients
+    values, names = np.ravel(values), LENS_MODELS[found].coefficients
     count = 4 + len(names)
     if values.shape != (count,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         raise InputError(
-            f"{source}: the calibration must be {_COUNTS[count]} finite numbers, fx fy cx cy "
+            f"{source}: the calibration must be {_COUNT_WORDS[count]} finite numbers, fx fy cx cy "
             f"{' '.join(names)}"
         )
     fx, fy, cx, cy, *distortion = (float(value) for value in values)
@@ -257,7 +257,7 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
 def _unsupported_lens(model: str) -> str:
     return (
         f"the calibration has the lens model {model[:40]!r}, which is not supported; supported are "
-        f"{', '.join(LENSES)}"
+        f"{', '.join(LENS_MODELS)}"
     )
 
 
@@ -279,11 +279,11 @@ def make_supported_camera(
         InputError: The numbers are not valid.
     """
     found, k = find_model(model), np.ravel(coefficients)
-    if found == "radtan" and len(k) == len(LENSES["rational"].coefficients):
+    if found == "radtan" and len(k) == len(LENS_MODELS["rational"].coefficients):
         found = "rational"
     if found is None:
         return None, {"camera": f"{source}: {_unsupported_lens(model)}"}
-    count = len(LENSES[found].coefficients)
+    count = len(LENS_MODELS[found].coefficients)
     if np.any(k[count:]):
         return None, {
             "camera": f"{source}: the calibration has {len(k)} coefficients of the lens model "

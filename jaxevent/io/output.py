@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     import h5py
 
 CLOCK_UNIT = "us on the recording's clock"  # the unit of times
-_MAX_HASHED = 2_000_000_000  # bytes of a file that are read for its sha256
-_SAMPLE = 1024  # bytes from the middle of a plane
-_MAX_SHRUNK = 0.9  # of a sample: planes that do not get smaller are stored as they are
-_RAW_DEFLATE = -15  # without zlib's header and checksum
+_MAX_HASHED_BYTES = 2_000_000_000  # bytes of a file that are read for its sha256
+_SAMPLE_BYTES = 1024  # bytes from the middle of a plane
+_MAX_COMPRESSED_SHARE = 0.9  # of a sample: planes that do not get smaller are stored as they are
+_RAW_DEFLATE_WINDOW_BITS = -15  # without zlib's header and checksum
 
 
 def check_outputs(
@@ -246,7 +246,7 @@ def _fingerprint(path: Path) -> dict[str, Any]:
             return {"note": "neither a file nor a folder"}
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            if size > _MAX_HASHED:
+            if size > _MAX_HASHED_BYTES:
                 return {"bytes": size, "note": "no sha256: larger than 2 GB"}
             return {"bytes": size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
     except OSError as error:  # it was removed; the output is kept
@@ -526,16 +526,16 @@ def deflate_shuffled(numbers: NDArray[np.floating]) -> bytes:
 
 
 def _choose_compressor(plane: memoryview) -> Any:
-    middle = max(len(plane) // 2 - _SAMPLE // 2, 0)
-    sample = plane[middle : middle + _SAMPLE]
+    middle = max(len(plane) // 2 - _SAMPLE_BYTES // 2, 0)
+    sample = plane[middle : middle + _SAMPLE_BYTES]
     trial = _compressor(1)
     size = len(trial.compress(sample)) + len(trial.flush())
-    return _compressor(int(size < _MAX_SHRUNK * len(sample)))
+    return _compressor(int(size < _MAX_COMPRESSED_SHARE * len(sample)))
 
 
 def _compressor(level: int) -> Any:
     """Make a compressor of raw deflate; level 0 stores."""
-    return zlib.compressobj(level, zlib.DEFLATED, _RAW_DEFLATE, 9, zlib.Z_RLE)
+    return zlib.compressobj(level, zlib.DEFLATED, _RAW_DEFLATE_WINDOW_BITS, 9, zlib.Z_RLE)
 
 
 def finite(value: float | int) -> float | int | None:

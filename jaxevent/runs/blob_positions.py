@@ -26,7 +26,7 @@ def _is_seed(value: Any) -> bool:
     return numbers and all(type(n) in (int, float) and np.isfinite(n) for n in value)
 
 
-SETTINGS: Mapping[str, Check] = {
+TARGET_SETTINGS: Mapping[str, Check] = {
     "seeds": (
         lambda value: (
             isinstance(value, list)
@@ -137,7 +137,7 @@ class Targets:
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> "Targets":
-        """Make them from settings of a configuration, those named in `SETTINGS`."""
+        """Make them from settings of a configuration, those named in `TARGET_SETTINGS`."""
         seeds = given.get("seeds")
         seeds = None if seeds is None else tuple(tuple(map(float, seed)) for seed in seeds)
         return cls(seeds, given.get("positions"))

@@ -34,7 +34,7 @@ from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
 
 # Keys of rows that are no measures: no metric may have their names.
-RESERVED = (
+RESERVED_NAMES = (
     "recording", "method", "params", "error", "skipped", "split", "warning", "per_frame",
     "per_time", "own_metrics", "regions", "moving", "clip", "normalise", "gap", "model", "frames",
     "missing", "events", "times", "windows", "seconds", "t", "sample",
@@ -91,7 +91,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
                 raise InputError(f"there is no metric {one!r}; {suggest_name(one, known)}")
             continue
         metric = one if isinstance(one, Metric) else _metric(one)
-        if metric.name in known or metric.name in RESERVED:
+        if metric.name in known or metric.name in RESERVED_NAMES:
             raise InputError(
                 f"a metric of your own is called {metric.name!r}, as results call something else; "
                 "rename it"

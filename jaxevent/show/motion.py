@@ -27,7 +27,7 @@ from jaxevent.egomotion.truth import (
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.show.images import save_figure
@@ -134,7 +134,7 @@ def write_errors(folder: Path, errors: MotionScores) -> None:
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
     table = {
-        name: {"value": _plain(value), "unit": unit, "meaning": MEANINGS[name]}
+        name: {"value": _plain(value), "unit": unit, "meaning": MEASURE_MEANINGS[name]}
         for name, value, unit in rows
     }
     about = {"times": errors.count, "truth": errors.truth}

@@ -28,7 +28,7 @@ from jaxevent.show.images import new_figure, save_figure
 
 _MAX_TIMES = 4096  # times of the plot
 _MAX_PARTICLES = 30_000  # particles of a component in the plot
-_WINDOW_WAY_PX = 8.0  # px that the image moves in the window that is warped,
+_WINDOW_SHIFT_PX = 8.0  # px that the image moves in the window that is warped,
 _MIN_WINDOW_S, _DEFAULT_WINDOW_S, _MAX_WINDOW_S = 0.02, 0.05, 0.5  # whose length has bounds
 _MAX_EVENTS = 500_000  # events that are warped or coloured
 _TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
@@ -239,7 +239,7 @@ def window_of(recording: Recording, motion: MotionEstimate) -> Window:
             motion.model(f), xi, np.broadcast_to(estimated.mean, (len(xi), estimated.mean.shape[1]))
         )
         speed = float(np.median(np.hypot(*U.T)))
-        span = _WINDOW_WAY_PX / max(speed, 1e-9)
+        span = _WINDOW_SHIFT_PX / max(speed, 1e-9)
         span = min(max(span, _MIN_WINDOW_S), _MAX_WINDOW_S)
     half = round(5e5 * span)
     begin = events.index(middle - half)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxevent.io.output import complete
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 
 Column = tuple[str, str, float | int, int]
 
@@ -165,9 +165,9 @@ def _table_of_means(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def legend(columns: Sequence[Column]) -> str:
-    """Format the meanings of columns as a Markdown list, of those that `metrics.MEANINGS` has."""
-    known = [(title, place) for title, place, _, _ in columns if place in MEANINGS]
-    lines = [f"- {title}: {MEANINGS[place]}\n" for title, place in known]
+    """Format the meanings of columns that `metrics.MEASURE_MEANINGS` has as a Markdown list."""
+    known = [(title, place) for title, place, _, _ in columns if place in MEASURE_MEANINGS]
+    lines = [f"- {title}: {MEASURE_MEANINGS[place]}\n" for title, place in known]
     return "\n" * bool(lines) + "".join(lines)
 
 
