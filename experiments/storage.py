@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxevent
 from jaxevent.io.output import deflate_shuffled
-from jaxevent.show.export import evenly
+from jaxevent.show.export import evenly_spaced_times
 
 OPTIONS = {
     "none": {},
@@ -31,7 +31,7 @@ OPTIONS[OURS] = OPTIONS["gzip 1, shuffle"]
 
 def main() -> None:
     recording = jaxevent.load(Path(str(files("jaxevent") / "data/slider_depth_crop.h5")))
-    told = jaxevent.akf.estimate(recording, progress=False)(evenly(recording, 200))
+    told = jaxevent.akf.estimate(recording, progress=False)(evenly_spaced_times(recording, 200))
     fields = [np.asarray(field, np.float32) for field in (told.mean, told.covariance)]
     print(f"{len(fields[0])} images of {recording.width}x{recording.height}, and variances")
     print("| filter | write, CPU s | read, CPU s | MB |")

@@ -169,7 +169,8 @@ def check_unit(time_unit: Any) -> None:
     """Raise `InputError` unless a unit of time is "s", "ms", "us" or "ns", or None."""
     if time_unit is not None and time_unit not in get_args(TimeUnit):
         raise InputError(
-            f"time_unit = {brief(time_unit)} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
+            f"time_unit = {shorten_value(time_unit)} is not a unit of time; "
+            "give 's', 'ms', 'us' or 'ns'"
         )
 
 
@@ -377,7 +378,7 @@ def numbers(values: NDArray, source: str, what: str) -> NDArray:
     return values
 
 
-def brief(value: Any) -> str:
+def shorten_value(value: Any) -> str:
     """Format a value on one line, cut to 60 characters, for messages."""
     return " ".join(repr(value).split())[:60]
 
@@ -403,7 +404,7 @@ def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
     for name, side in (("width", width), ("height", height)):
         if not isinstance(side, int | np.integer) or isinstance(side, bool):
             raise InputError(
-                f"{_place(source)}{name} is {brief(side)}; give a whole number of pixels"
+                f"{_place(source)}{name} is {shorten_value(side)}; give a whole number of pixels"
             )
     if min(width, height) < 1 or max(width, height) > MAX_SIDE_PX:
         raise InputError(

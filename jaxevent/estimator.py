@@ -26,7 +26,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxevent.arrays import brief
+from jaxevent.arrays import shorten_value
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
 from jaxevent.display import with_article
@@ -104,7 +104,7 @@ class OptionKind(NamedTuple):
     text: str
 
 
-def of_class(kind: type, optional: bool = True) -> OptionKind:
+def option_of_class(kind: type, optional: bool = True) -> OptionKind:
     """Make the domain of objects of a class.
 
     Args:
@@ -169,7 +169,7 @@ class Estimator(abc.ABC, Generic[P]):
     Params: type[P]
     family: ClassVar[str]
     option_kinds: ClassVar[Mapping[str, OptionKind]] = {
-        "camera": of_class(PinholeCamera),
+        "camera": option_of_class(PinholeCamera),
         "cloud": whole(0),
         "detect": OPTIONAL_FLAG,
         "devices": DEVICE_LIST,
@@ -213,7 +213,7 @@ class Estimator(abc.ABC, Generic[P]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by the place at which it is found again, and is the same object."""
-        return imported, (_place_of(self), Estimator, "method")
+        return import_object, (_place_of(self), Estimator, "method")
 
     def __copy__(self) -> "Estimator[P]":
         return self
@@ -389,7 +389,8 @@ class Estimator(abc.ABC, Generic[P]):
             kind = self.option_kinds.get(name)
             if kind is not None and not kind.fits(value):
                 raise InputError(
-                    f"the method {self.name!r} takes {name} as {kind.text}, not {brief(value)}"
+                    f"the method {self.name!r} takes {name} as {kind.text}, "
+                    f"not {shorten_value(value)}"
                 )
 
 
@@ -443,7 +444,7 @@ def _place_of(estimator: Estimator) -> str:
     )
 
 
-def imported(path: str, kind: type[T], what: str) -> T:
+def import_object(path: str, kind: type[T], what: str) -> T:
     """Import an object by "package.module:object".
 
     Args:

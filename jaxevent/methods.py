@@ -7,7 +7,7 @@ import functools
 from collections.abc import Iterator, Mapping
 
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimator, imported
+from jaxevent.estimator import Estimator, import_object
 from jaxevent.parameters import suggest_name
 
 METHOD_HOMES = {
@@ -49,7 +49,7 @@ class UnknownMethod(InputError, KeyError):
 
 @functools.cache
 def _load(path: str) -> Estimator:
-    return imported(path, Estimator, "method")
+    return import_object(path, Estimator, "method")
 
 
 def names(family: str | None = None) -> list[str]:

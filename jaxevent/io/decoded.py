@@ -366,7 +366,7 @@ class DecodedEvents(EventsInFile):
     @synchronized
     def __getitem__(self, rows: slice) -> Events:
         """Decode the events of a range of rows; the file must not have changed since."""
-        start, stop = row_range(rows, len(self))
+        start, stop = slice_bounds(rows, len(self))
         if stop <= start:
             return Events.empty()
         block = int(np.searchsorted(self._rows, start, side="right")) - 1
@@ -415,7 +415,7 @@ class DecodedEvents(EventsInFile):
         return events
 
 
-def row_range(rows: slice, count: int) -> tuple[int, int]:
+def slice_bounds(rows: slice, count: int) -> tuple[int, int]:
     """Return the first row and the one after the last of a slice of `count` events, step 1."""
     start, stop, step = rows.indices(count)
     if step != 1:

@@ -52,14 +52,14 @@ from jaxevent.io.checks import (
     whole_size,
 )
 from jaxevent.io.columns import MICROSECOND_FORMAT, ColumnFormat, infer_format, sample_ends
-from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events, row_range
+from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events, slice_bounds
 from jaxevent.io.disorder import Columns, find_disorder
 from jaxevent.io.hdf5_files import (
     array,
     attribute,
     dataset,
     describe_images,
-    filters_of,
+    filter_ids,
     open_file,
 )
 from jaxevent.io.output import CLOCK_UNIT, complete_hdf5
@@ -221,7 +221,7 @@ class StoredEvents(EventsInFile):
 
         The event before the range is read too, so that pieces read in turn are sorted as a whole.
         """
-        start, stop = row_range(rows, len(self))
+        start, stop = slice_bounds(rows, len(self))
         if stop <= start:
             return Events.empty()
         lead = min(start, 1)
@@ -485,7 +485,7 @@ def _is_dsec(file: Any) -> bool:
         stored = file.get(f"events/{name}")
         if not isinstance(stored, h5py.Dataset) or stored.dtype != kind:
             return False
-        if _BLOSC_FILTER_ID not in filters_of(stored):
+        if _BLOSC_FILTER_ID not in filter_ids(stored):
             return False
     return {"ms_to_idx", "t_offset"} <= set(file) and not len(file.attrs)
 

@@ -182,7 +182,7 @@ def _all_heaps_end(file: io.FileIO, heaps: list[int], end: int) -> bool:
     return True
 
 
-def filters_of(stored: h5py.Dataset) -> list[int]:
+def filter_ids(stored: h5py.Dataset) -> list[int]:
     """Return the numbers of the filters that the chunks of a dataset have gone through."""
     properties = stored.id.get_create_plist()
     return [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
@@ -217,7 +217,7 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
             raise InputError(
                 f"{source}: {name} is made of other data sets or files; {_COPY_REMEDY}"
             )
-        filters = filters_of(found)
+        filters = filter_ids(found)
         stored = found.id.get_storage_size()
         count = found.size or 0
         for code in filters:

@@ -44,7 +44,7 @@ from jaxevent.io.checks import (
 from jaxevent.io.columns import MICROSECOND_FORMAT, find_fields, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import Column, StoredEvents, StoredImages, infer_column_format, read_by
-from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filters_of
+from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filter_ids
 from jaxevent.io.time_units import SAMPLE_EVENTS
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
@@ -273,7 +273,7 @@ def _open_columns(file: Any, name: str, source: str) -> dict[str, Column]:
     if not isinstance(file.get(name) if name else file, h5py.Dataset):
         return {key: dataset(file, f"{name}/{fields[key]}", source) for key in "txyp"}
     whole: Any = dataset(file, name, source, undone=[ecf.HDF5_FILTER_ID])
-    if filters_of(whole) == [ecf.HDF5_FILTER_ID]:
+    if filter_ids(whole) == [ecf.HDF5_FILTER_ID]:
         whole = ecf.Records(whole, f"{source}: {name}")
     return {
         key: _Part(whole.shape[0], whole.dtype[field], whole.fields(field).__getitem__)

@@ -13,7 +13,7 @@ from jaxevent.recording import Recording
 from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.results import check_folder, open_results, write_rows
 from jaxevent.runs.scores import score
-from jaxevent.show.export import display_images, evenly
+from jaxevent.show.export import display_images, evenly_spaced_times
 from jaxevent.show.images import Kind, comparison_figure, video_writer
 from jaxevent.show.tables import markdown_table
 
@@ -112,6 +112,8 @@ def _video(recording: Recording, params: Any, path: Path, progress: bool | None)
     video = find("akf").estimate(recording, params, progress=progress)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
-        for _, image in display_images(video, evenly(recording, rate)[:longest], "linear"):
+        for _, image in display_images(
+            video, evenly_spaced_times(recording, rate)[:longest], "linear"
+        ):
             write(np.kron(image, np.ones((zoom, zoom), np.uint8)))
     return rate / fps

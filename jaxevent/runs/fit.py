@@ -274,7 +274,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             warnings.filterwarnings("ignore", ".*events contradict frames", InputWarning)
             rows = _score(plan, done, sources, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
-        gained = compute_gains(plan.tasks, unseen(rows))
+        gained = compute_gains(plan.tasks, rows_outside_fit(rows))
         fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
         if out is None or not devices.is_process_zero():
             return fits
@@ -292,7 +292,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
 
 def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
     """results.md: the scores that no fit saw, what was found, and the gain."""
-    return _results(tasks, unseen(rows)) + format_findings(found, gained)
+    return _results(tasks, rows_outside_fit(rows)) + format_findings(found, gained)
 
 
 def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
@@ -441,7 +441,7 @@ def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(filter(None, parts))
 
 
-def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def rows_outside_fit(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows of the test images; where there are none, of the validation or the fit."""
     for split in reversed(SPLIT_NAMES):
         chosen = [row for row in rows if row["split"] == split]

@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import methods
-from jaxevent.arrays import brief
+from jaxevent.arrays import shorten_value
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimate, Estimator, imported
+from jaxevent.estimator import Estimate, Estimator, import_object
 from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
 
@@ -103,7 +103,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
 
 
 def _metric(given: Any) -> Metric:
-    function = imported(given, object, "metric") if isinstance(given, str) else given
+    function = import_object(given, object, "metric") if isinstance(given, str) else given
     return named_metric(given, function)
 
 
@@ -215,7 +215,7 @@ def find_method(given: Any, family: str | None = None) -> Estimator | MethodFunc
     if isinstance(given, str):
         if ":" not in given:
             return methods.find(given, family)
-        found = imported(given, object, "method")
+        found = import_object(given, object, "method")
     else:
         found = given
     if isinstance(found, MethodFunction):
@@ -273,4 +273,4 @@ def _describe_value(thing: Any) -> str:
     shape = getattr(thing, "shape", None)
     if shape is not None and shape != ():
         return f"{getattr(thing, 'dtype', type(thing).__name__)} of shape {tuple(shape)}"
-    return brief(thing)
+    return shorten_value(thing)

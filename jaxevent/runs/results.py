@@ -25,7 +25,7 @@ import numpy as np
 from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
 from jaxevent.runs.fit_config import Plan, Task
-from jaxevent.show.tables import lay_out
+from jaxevent.show.tables import format_aligned_table
 from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import Batches, FitResult, Run, begin
 
@@ -255,7 +255,7 @@ def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping
     for row in found:
         cells = (row["method"], row["parameter"], f"{row['start']:.4g}", f"{row['found']:.4g}")
         table.append([*cells, row["interval"], row["unit"], row["remark"]])
-    lines = ["\n" + lay_out(table, (0, 1, 5, 6))]
+    lines = ["\n" + format_aligned_table(table, (0, 1, 5, 6))]
     sources: dict[str, list[str]] = {}
     for row in found:
         if row["of"] and row["method"] not in sources.setdefault(row["of"], []):

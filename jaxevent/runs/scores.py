@@ -334,9 +334,10 @@ def score(
 
     Memory does not grow with the recording's length. With "held-out" intensities are clipped to
     [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in
-    `MEASURE_FUNCTIONS`, or functions of one's own: see `jaxevent.runs.own`) are means over the images. `seconds` is the
-    time of reconstructing and reading images, with compilation but without scoring. What is not a
-    number is None. `per_frame` lists t (us, as stamped) and every measure of every image.
+    `MEASURE_FUNCTIONS`, or functions of one's own: see `jaxevent.runs.own`) are means over the
+    images. `seconds` is the time of reconstructing and reading images, with compilation but
+    without scoring. What is not a number is None. `per_frame` lists t (us, as stamped) and every
+    measure of every image.
     "authors_ssim" and "masked_mse" are what the programs of the AKF's authors compute (Wang et
     al., TPAMI 2023: the whole image as one window; pixels without reference count as right),
     "matlab_ssim" is MATLAB's `ssim`.
@@ -496,7 +497,7 @@ def score_and_sample(
                 image = fit_brightness(image, truth)
             P = variance if estimated else None
             if hdr is None:
-                where = moves(given, row, asked.gap) if asked.moving else None
+                where = moving_pixels(given, row, asked.gap) if asked.moving else None
                 scores.append(hidden_scores(image, P, frame, I0, where, **named))
             else:
                 scores.append(_hdr_measures(image, P, truth, hdr.clip, I0, **named))
@@ -527,7 +528,7 @@ def score_and_sample(
     return row, sample
 
 
-def moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
+def moving_pixels(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
     """Return a mask of pixels in which the given frames around the hidden frame `row` differ."""
     assert given.frames is not None
     around = frames_around(given.frames, row, gap)

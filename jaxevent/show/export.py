@@ -19,7 +19,7 @@ from jaxevent.recording import Recording, microseconds
 from jaxevent.show.images import display_limits, tone_map, video_writer, write_png
 
 
-def evenly(
+def evenly_spaced_times(
     recording: Recording, rate: float | int, start: float | int | None = None
 ) -> NDArray[np.int64]:
     """Return evenly spaced times of a recording.

@@ -32,12 +32,12 @@ from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.show.images import save_figure
 from jaxevent.show.motion_figures import (
-    flow_of,
     motion_figure,
+    motion_span,
     plot_flow,
     plot_warped,
-    span_of,
-    window_of,
+    representative_window,
+    window_flow,
 )
 from jaxevent.show.tables import align_cells
 
@@ -326,7 +326,7 @@ class Output:
         """
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
-        start, stop = span_of(recording)
+        start, stop = motion_span(recording)
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
         estimated = motion(times, centred=self.centred)
@@ -360,10 +360,10 @@ class Output:
 
     def _draw_window(self, folder: Path, recording: Recording, motion: MotionEstimate) -> None:
         """Draw the events of a short window before and after warping, and in colours of flow."""
-        part = window_of(recording, motion)
+        part = representative_window(recording, motion)
         flows = None
         if self.flow or motion.model.half_line:
-            flows = flow_of(recording, motion, part)
+            flows = window_flow(recording, motion, part)
         plot_warped(folder / "warped.png", recording, motion, part, flows)
         if self.flow and flows is not None:
             plot_flow(folder / "flow.png", recording, part, flows)

@@ -213,20 +213,20 @@ class Window:
     reference: int
 
 
-def span_of(recording: Recording) -> tuple[int, int]:
+def motion_span(recording: Recording) -> tuple[int, int]:
     """Return the times (us) of the first and the last event."""
     first, last = (recording.events[i : i + 1].t[0] for i in (0, len(recording.events) - 1))
     return int(first), int(last)
 
 
-def window_of(recording: Recording, motion: MotionEstimate) -> Window:
+def representative_window(recording: Recording, motion: MotionEstimate) -> Window:
     """Choose a window of 20 to 500 ms in the middle of the recording, or where motion is found.
 
     The image moves by 8 px in it, at the median speed over the sensor. Events beyond the first half
     million are left out.
     """
     events = recording.events
-    middle = sum(span_of(recording)) // 2
+    middle = sum(motion_span(recording)) // 2
     good = motion.t[motion.valid]
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])
@@ -247,7 +247,7 @@ def window_of(recording: Recording, motion: MotionEstimate) -> Window:
     return Window(begin, end, middle)
 
 
-def flow_of(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
+def window_flow(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
     """Estimate the flow of a window's events, with those of 100 ms before as candidates."""
     if part.start == part.stop:
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
@@ -328,14 +328,14 @@ def plot_warped(
         path: PNG file that is written.
         recording: Recording of the events.
         motion: A motion.
-        part: The window; None for `window_of`.
+        part: The window; None for `representative_window`.
         flows: Flow of the window's events, which motion along half-lines needs.
     """
-    part = part or window_of(recording, motion)
+    part = part or representative_window(recording, motion)
     events = recording.events[part.start : part.stop]
     moved = None
     if motion.model.half_line:
-        flows = flows or flow_of(recording, motion, part)
+        flows = flows or window_flow(recording, motion, part)
         keep = flows.valid
         events = Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep])
         xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)

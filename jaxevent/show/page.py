@@ -23,12 +23,12 @@ from jaxevent.show.images import display_limits, tone_map
 from jaxevent.show.tables import (
     COST_COLUMNS,
     Column,
+    column_mean,
     columns_of,
     format_number,
-    mean_of,
     means,
+    nested_value,
     short_names,
-    value_at,
 )
 
 PICTURE_PX = 360  # px of the longer side of a picture
@@ -257,7 +257,7 @@ def _table(
             cells.append(Cell(row["error"], "wrap", len(columns)))
         else:
             for column in columns:
-                cells.append(Cell(format_number(value_at(row, column[1]), column)))
+                cells.append(Cell(format_number(nested_value(row, column[1]), column)))
         lines.append(cells)
     return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 
@@ -352,7 +352,8 @@ def _points(
     for measure in measures:
         figure, axis = _panel(methods)
         values = [
-            mean_of([row for row in rows if row["method"] == method], measure) for method in methods
+            column_mean([row for row in rows if row["method"] == method], measure)
+            for method in methods
         ]
         places = [math.nan if value is None else value for value in values]
         colours = [_colour(i) for i in range(len(methods))]

@@ -24,7 +24,7 @@ from jaxevent.recording import Recording
 from jaxevent.show.images import video_writer
 from jaxevent.show.tables import align_cells
 from jaxevent.show.track_figures import draw_frames, write_track_plot
-from jaxevent.show.track_tables import QUANTITIES, no_rows, quantity_writer, track_writer
+from jaxevent.show.track_tables import QUANTITIES, empty_rows, quantity_writer, track_writer
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 _EXTRA_OF_SUFFIX = {".mp4": ("imageio_ffmpeg", "video")} | {
@@ -399,7 +399,7 @@ class _TrackRows:
 
     @functools.cached_property
     def _joined(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        at, _, mean, covariance = no_rows()
+        at, _, mean, covariance = empty_rows()
         parts = self._parts or [(at, at, mean, covariance)]
         at, column, mean, covariance = (np.concatenate(x) for x in zip(*parts, strict=True))
         order = np.argsort(column, kind="stable")
