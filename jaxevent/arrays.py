@@ -232,15 +232,15 @@ def time_step(t: NDArray) -> float:
     return step
 
 
-def check_resolution(t: Sequence[float], count: int, unit: str, source: str) -> str | None:
+def check_resolution(extremes: Sequence[float], count: int, unit: str, source: str) -> str | None:
     """Check that the type of float times resolves events.
 
     Times are refused where neighbouring numbers of their type are 1 ms or more apart, or where 300
     or more events span fewer than 64 of them.
 
     Args:
-        t: Distance between neighbouring numbers as of `time_step`, time from the first to the last
-            event, and largest time, all in a unit.
+        extremes: Distance between neighbouring numbers as of `time_step`, time from the first to
+            the last event, and largest time, all in a unit.
         count: Number of events.
         unit: The unit, "s", "ms", "us" or "ns".
         source: Name of the file for messages.
@@ -251,7 +251,7 @@ def check_resolution(t: Sequence[float], count: int, unit: str, source: str) -> 
     Raises:
         InputError: The type cannot resolve the times.
     """
-    step_us, span_us, largest_us = (value * US_PER_UNIT[unit] for value in t)
+    step_us, span_us, largest_us = (value * US_PER_UNIT[unit] for value in extremes)
     if step_us <= 1 or count < 2 or not largest_us < MAX_TIME_US:
         return None
     if step_us >= _MAX_STEP_US or (
@@ -272,7 +272,7 @@ def _short_time(us: float) -> str:
 
 
 def times(
-    values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
+    values: NDArray, source: str, what: str, us_per_unit: float = 1e6, first_row: int = 0
 ) -> NDArray[np.int64]:
     """Convert times of a file to int64 us: integers are us already, floats are scaled.
 
@@ -280,7 +280,7 @@ def times(
         values: (n,) times.
         source: Name of the file for messages.
         what: "event", "image" or the like.
-        scale: Microseconds in one unit of floats.
+        us_per_unit: Microseconds in one unit of floats.
         first_row: Row of the first time in the file.
 
     Returns:
@@ -292,10 +292,10 @@ def times(
     values = numbers(values, source, f"{what} times")
     is_float = values.dtype.kind == "f"
     values = values.astype(np.float64, copy=False) if is_float else values
-    check_span(values, source, what, scale if is_float else 1, first_row)
+    check_span(values, source, what, us_per_unit if is_float else 1, first_row)
     if not is_float:
         return values.astype(np.int64, copy=False)
-    return np.rint(values * scale).astype(np.int64)
+    return np.rint(values * us_per_unit).astype(np.int64)
 
 
 def to_microseconds(

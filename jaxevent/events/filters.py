@@ -149,16 +149,16 @@ def filter_background(
 
 
 @njit
-def supported(t: Any, x: Any, y: Any, last: Any, window_us: Any, neighbours: Any) -> Any:
+def supported(t: Any, x: Any, y: Any, last_t: Any, max_age_us: Any, min_neighbours: Any) -> Any:
     """Find events that pixels around them support.
 
     Args:
         t: (n,) times, us, in order.
         x: (n,) columns.
         y: (n,) rows.
-        last: (H + 2, W + 2) last time of each pixel, us, with a border; updated.
-        window_us: Longest time between an event and its support, us.
-        neighbours: Least number of supporting pixels.
+        last_t: (H + 2, W + 2) last time of each pixel, us, with a border; updated.
+        max_age_us: Longest time between an event and its support, us.
+        min_neighbours: Least number of supporting pixels.
 
     Returns:
         (n,), True for supported events.
@@ -169,9 +169,9 @@ def supported(t: Any, x: Any, y: Any, last: Any, window_us: Any, neighbours: Any
         for row in range(int(y[i]), int(y[i]) + 3):
             for column in range(int(x[i]), int(x[i]) + 3):
                 centre = row == int(y[i]) + 1 and column == int(x[i]) + 1
-                count += not centre and t[i] - last[row, column] <= window_us
-        kept[i] = count >= neighbours
-        last[int(y[i]) + 1, int(x[i]) + 1] = t[i]
+                count += not centre and t[i] - last_t[row, column] <= max_age_us
+        kept[i] = count >= min_neighbours
+        last_t[int(y[i]) + 1, int(x[i]) + 1] = t[i]
     return kept
 
 

@@ -118,7 +118,7 @@ def load(
     if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_SIDE_PX:
         raise InputError(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
-            f"{arrays.MAX_PIXELS}"
+            f"{arrays.MAX_SIDE_PX}"
         )
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE

@@ -134,45 +134,47 @@ def damaged(what: str) -> InputError:
     return InputError(f"{what}; the file was cut off or is damaged, so fetch it again")
 
 
-def max_unfolded(stored: int) -> int:
-    """Return the number of bytes of arrays that `stored` bytes of a file may unfold to."""
-    return max(_ALLOWED_UNFOLDED_BYTES, _MAX_COMPRESSION_RATIO * stored)
+def max_unfolded(stored_bytes: int) -> int:
+    """Return the number of bytes of arrays that `stored_bytes` bytes of a file may unfold to."""
+    return max(_ALLOWED_UNFOLDED_BYTES, _MAX_COMPRESSION_RATIO * stored_bytes)
 
 
-def check_unfolded(size: int, stored: int, source: object) -> None:
+def check_unfolded(unfolded_bytes: int, stored_bytes: int, source: object) -> None:
     """Raise `InputError` if a file claims to hold far more bytes of arrays than it can.
 
     Memory stays bounded by what a file holds: real events and images compress less than 20 times.
 
     Args:
-        size: Number of bytes that the arrays take in memory.
-        stored: Number of bytes of the file.
+        unfolded_bytes: Number of bytes that the arrays take in memory.
+        stored_bytes: Number of bytes of the file.
         source: Name of the file for messages.
     """
-    if size > max_unfolded(stored):
+    if unfolded_bytes > max_unfolded(stored_bytes):
         raise InputError(
-            f"{source}: {stored:,} bytes of the file claim to hold {size:,}, over "
+            f"{source}: {stored_bytes:,} bytes of the file claim to hold {unfolded_bytes:,}, over "
             f"{_MAX_COMPRESSION_RATIO} times as many; it is damaged or not a recording, else store "
             "it with less compression"
         )
 
 
-def check_whole_records(path: Path, n_bytes: int, width: int, what: str = "a record") -> None:
+def check_whole_records(
+    path: Path, n_bytes: int, record_bytes: int, what: str = "a record"
+) -> None:
     """Check that the bytes of a file are whole records.
 
     Args:
         path: The file.
         n_bytes: Number of its bytes that hold records.
-        width: Number of bytes of a record.
+        record_bytes: Number of bytes of a record.
         what: Words for a record, for the message.
 
     Raises:
         InputError: The last record is cut off.
     """
-    if rest := n_bytes % width:
+    if rest := n_bytes % record_bytes:
         raise InputError(
-            f"{path}: ends inside {what}, {rest} bytes after the last whole one of {width} bytes; "
-            "the recording was cut off, so fetch it again or drop these bytes: truncate -s "
+            f"{path}: ends inside {what}, {rest} bytes after the last whole one of {record_bytes} "
+            "bytes; the recording was cut off, so fetch it again or drop these bytes: truncate -s "
             f"-{rest} FILE"
         )
 

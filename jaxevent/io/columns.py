@@ -229,26 +229,26 @@ class ColumnFormat(NamedTuple):
 MICROSECOND_FORMAT = ColumnFormat()
 
 
-def sample_ends(fields: Fields, count: int) -> dict[str, NDArray]:
+def sample_ends(fields: Fields, n_events: int) -> dict[str, NDArray]:
     """Read the first `SAMPLE_EVENTS` events, and the last one if there are more.
 
     Args:
         fields: Columns of a range of rows.
-        count: Number of events.
+        n_events: Number of events.
 
     Returns:
         The columns by name, (n,) each.
     """
     first = dict(fields(slice(0, SAMPLE_EVENTS)))
-    if count <= SAMPLE_EVENTS:
+    if n_events <= SAMPLE_EVENTS:
         return first
-    last = fields(slice(count - 1, count))
+    last = fields(slice(n_events - 1, n_events))
     return {name: np.concatenate([first[name], last[name]]) for name in first}
 
 
 def infer_format(
     sample: Mapping[str, NDArray],
-    count: int,
+    n_events: int,
     size: tuple[int, int],
     source: str,
     options: ReadOptions,
@@ -261,7 +261,7 @@ def infer_format(
 
     Args:
         sample: Columns t, x, y and p of the first events and the last one, (n,) each.
-        count: Number of events in all.
+        n_events: Number of events in all.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
         options: Choices of the caller.
@@ -281,7 +281,7 @@ def infer_format(
     if stated is None and (unit := unit_of_name(name)) is not None:
         stated = unit, f"the name {name.strip()!r}"
     sample = {**sample, "t": t}
-    found = infer_unit(sample, count, size, source, options, stated=stated, usual=usual)
+    found = infer_unit(sample, n_events, size, source, options, stated=stated, usual=usual)
     return ColumnFormat(found, _unsigned_off(sample["p"]), t.dtype.kind == "f")
 
 

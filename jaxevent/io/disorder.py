@@ -242,17 +242,17 @@ def _period(period: float) -> str:
 
 
 def find_disorder(
-    blocks: Iterable[NDArray[np.int64]], bound: int = DEFAULT_MAX_LATE_US, source: str = ""
+    blocks: Iterable[NDArray[np.int64]], max_late_us: int = DEFAULT_MAX_LATE_US, source: str = ""
 ) -> Disorder:
     """Find the faults of event times.
 
-    A step back by more than `bound` is the wrap of a counter where it is nearly 2^k us or ns. It
-    is an outlier where the times return by a similar step within a few events, before or after it.
-    Otherwise it is a reset.
+    A step back by more than `max_late_us` is the wrap of a counter where it is nearly 2^k us or
+    ns. It is an outlier where the times return by a similar step within a few events, before or
+    after it. Otherwise it is a reset.
 
     Args:
         blocks: Event times in us, in the order of the file, (events,) each.
-        bound: Lateness in us up to which events are late, not outliers.
+        max_late_us: Lateness in us up to which events are late, not outliers.
         source: Name of the file, for the error.
 
     Returns:
@@ -261,7 +261,7 @@ def find_disorder(
     Raises:
         InputError: The times are in no order.
     """
-    found = Disorder(bound)
+    found = Disorder(max_late_us)
     scan = _Scan(found, source)
     held = np.empty(0, np.int64)
     for block in blocks:

@@ -14,7 +14,7 @@
                                 /frame (frames, H, W) uint8, /frame_ts in us, /frame_idx, the
                                 number of events before each frame, which is not needed
     others                      /events or the file itself with t, x, y and p, whole lists or
-                                records, under the names that `jaxevent.arrays.NAMES` lists
+                                records, under the names that `jaxevent.arrays.FIELD_ALIASES` lists
 
 Integers are usually us, floats seconds (`time_units`). Exposures are unknown: 0. Where a file holds
 two cameras, left or right must be chosen. M3ED's frames come from cameras beside the event camera,

@@ -358,7 +358,7 @@ def _frames(
     t = clock.read(np.ravel(arrays.pop("time_image")), source, "image", notes, usual="us")
     if "exposure" in arrays:
         source = f"{path}: exposure"
-        exposure = times(np.ravel(arrays.pop("exposure")), source, "image", scale=1.0)
+        exposure = times(np.ravel(arrays.pop("exposure")), source, "image", us_per_unit=1.0)
         if len(exposure) == 1:
             exposure = np.full_like(t, exposure[0])
     else:

@@ -133,7 +133,7 @@ def numbers_of_dates(values: NDArray) -> tuple[NDArray, str | None]:
 
 def infer_unit(
     sample: Mapping[str, NDArray],
-    count: int,
+    n_events: int,
     size: tuple[int, int],
     source: str,
     options: ReadOptions,
@@ -145,7 +145,7 @@ def infer_unit(
 
     Args:
         sample: Columns t, x and y, (n,) each: the first events, and then the last one.
-        count: Number of events in all.
+        n_events: Number of events in all.
         size: (width, height) of the sensor in pixels.
         source: Name of the file for messages.
         options: Their `time_unit`, where given, is taken.
@@ -162,11 +162,11 @@ def infer_unit(
     t = sample["t"]
     if t.dtype.kind not in "iuf" or not len(t):
         return InferredUnit(options.time_unit or (stated[0] if stated else usual or "us"))
-    numbers = _Numbers.from_sample(sample, count, size)
+    numbers = _Numbers.from_sample(sample, n_events, size)
     expected = usual or _convention(numbers)
     scores = {unit: numbers.score(unit, usual) for unit in US_PER_UNIT}
     best = max(scores, key=lambda unit: scores[unit])
-    known = count >= MIN_EVENTS and numbers.span > 0
+    known = n_events >= MIN_EVENTS and numbers.span > 0
     notes: list[str] = []
     doubt = ""
     if options.time_unit is not None:

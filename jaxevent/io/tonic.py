@@ -63,7 +63,7 @@ def from_item(item: Any, size: tuple[int, ...] | None, name: str = "tonic") -> R
         raise InputError(f"{name}: its sensor_size is None; give size=(width, height)")
     t, x, y, p = (records[field] for field in record_fields(records, name).values())
     sensor = (int(size[0]), int(size[1]))
-    events = check_events(times(t, name, "event", scale=1.0), x, y, p, sensor, name)
+    events = check_events(times(t, name, "event", us_per_unit=1.0), x, y, p, sensor, name)
     extra = {"target": np.asarray(target)} if _is_plain(target) else {}
     return Recording(name, *sensor, events, extra=extra)
 

@@ -50,7 +50,7 @@ def _match(one: NDArray, two: NDArray) -> list[tuple[int, int]]:
 
 
 def match_frames(
-    recording: Recording, other: Recording, offset: float, progress: bool | None
+    recording: Recording, other: Recording, offset_s: float, progress: bool | None
 ) -> list[NDArray[np.float64]]:
     """Return homographies that most matches of features agree on, right to a few pixels.
 
@@ -61,7 +61,7 @@ def match_frames(
     Args:
         recording: Events of the event camera.
         other: Frames of the other camera.
-        offset: Offset of the clocks, s.
+        offset_s: Offset of the clocks, s.
         progress: Whether to show progress.
 
     Returns:
@@ -73,7 +73,7 @@ def match_frames(
     """
     cv2 = require("cv2", "vision")
     assert other.frames is not None
-    t = other.frames.t + round(offset * 1e6)
+    t = other.frames.t + round(offset_s * 1e6)
     part, rows = _select_busiest_part(recording, t)
     small = min(1.0, _MAX_WIDTH_PX / recording.width)
     scales = small, min(1.0, 1.5 * small * recording.width / other.width)

@@ -528,13 +528,13 @@ def score_and_sample(
     return row, sample
 
 
-def moving_pixels(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
-    """Return a mask of pixels in which the given frames around the hidden frame `row` differ."""
-    assert given.frames is not None
-    around = frames_around(given.frames, row, gap)
+def moving_pixels(given_recording: Recording, frame_row: int, gap_frames: int) -> NDArray[np.bool_]:
+    """Return a mask of pixels in which the given frames around a hidden one differ."""
+    assert given_recording.frames is not None
+    around = frames_around(given_recording.frames, frame_row, gap_frames)
     if around is None:
-        return np.zeros((given.height, given.width), bool)
-    before, after = given.frames[around[0] : around[1] + 1].intensity
+        return np.zeros((given_recording.height, given_recording.width), bool)
+    before, after = given_recording.frames[around[0] : around[1] + 1].intensity
     return np.abs(after - before) > MIN_MOTION_CHANGE
 
 

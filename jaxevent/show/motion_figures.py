@@ -264,8 +264,8 @@ def warped_events(
     recording: Recording,
     motion: MotionEstimate,
     events: Events,
-    reference: int,
-    moved: NDArray[np.floating] | None = None,
+    reference_us: int,
+    flow_px_s: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float64]:
     """Warp events along the motion to one time, by the model's `warp` of the motion's integral.
 
@@ -273,8 +273,8 @@ def warped_events(
         recording: Recording of the events.
         motion: A motion.
         events: n events.
-        reference: Time, us.
-        moved: (n, 2) px/s, flow due to translation at each event, for motion along half-lines.
+        reference_us: Time, us.
+        flow_px_s: (n, 2) px/s, flow due to translation at each event, for motion along half-lines.
 
     Returns:
         (n, 2) px, columns and rows: pixels, or with a calibration undistorted coordinates about the
@@ -282,9 +282,9 @@ def warped_events(
     """
     xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     xy = xi[events.y, events.x]
-    since = (events.t - reference) * 1e-6
+    since = (events.t - reference_us) * 1e-6
     # The motion is smooth: its integral on a grid of 1 ms or less.
-    low, high = int(events.t.min(initial=reference)), int(events.t.max(initial=reference))
+    low, high = int(events.t.min(initial=reference_us)), int(events.t.max(initial=reference_us))
     grid = np.linspace(low, high, 2 + math.ceil((high - low) / 1000))
     mean = np.asarray(
         motion(np.rint(grid).astype(np.int64), centred=True, extrapolate=True).mean, float
@@ -293,12 +293,12 @@ def warped_events(
     steps = (mean[1:] + mean[:-1]) / 2 * np.diff(grid)[:, None] * 1e-6
     total = np.concatenate([np.zeros((1, mean.shape[1])), np.cumsum(steps, 0)])
     way = np.stack(
-        [np.interp(events.t, grid, c) - np.interp(reference, grid, c) for c in total.T], 1
+        [np.interp(events.t, grid, c) - np.interp(reference_us, grid, c) for c in total.T], 1
     )
     # In single precision a place is off by some 1e-5 px.
     xy = np.asarray(_warped(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
-    if moved is not None:
-        xy = xy - moved * since[:, None]
+    if flow_px_s is not None:
+        xy = xy - flow_px_s * since[:, None]
     centre = _centre(recording)
     return xy + centre
 

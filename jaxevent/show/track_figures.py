@@ -91,7 +91,7 @@ def track_frames(
 def draw_frames(
     recording: Recording,
     t: NDArray[np.int64],
-    number: NDArray,
+    track_ids: NDArray,
     states: Iterable[tuple[NDArray, NDArray]],
     images: Iterable[NDArray] | None,
     *,
@@ -106,7 +106,7 @@ def draw_frames(
     if window is None:
         window = float(np.median(np.diff(t))) * 1e-6 if len(t) > 1 else 0.01
     events = _event_images(recording, t, round(window * 1e6)) if images is None else images
-    colours = [track_colour(int(n)) for n in number]
+    colours = [track_colour(int(n)) for n in track_ids]
     behind, font = iter(events), ImageFont.load_default(14)
     ways: dict[int, list[tuple[int, NDArray]]] = {}  # of the tracks alive: times and places
     for k, (now, (mean, valid)) in enumerate(zip(t.tolist(), states, strict=True)):
@@ -133,13 +133,13 @@ def draw_frames(
             ellipse = outline(mean[i], sigmas)
             _line(draw, ellipse, colours[i], scale, 2)
             x, y = _large(np.array([ellipse[:, 0].max(), ellipse[:, 1].min()]), scale)
-            draw.text((x, y), str(number[i]), fill=colours[i], font=font, anchor="ls")
+            draw.text((x, y), str(track_ids[i]), fill=colours[i], font=font, anchor="ls")
         yield np.asarray(large)
 
 
-def track_colour(number: int, dark: bool = False) -> tuple[int, int, int]:
+def track_colour(track_id: int, dark: bool = False) -> tuple[int, int, int]:
     """Return red, green and blue (0 to 255) of a track; neighbouring ids differ."""
-    hue = (0.07 + number * 0.618034) % 1
+    hue = (0.07 + track_id * 0.618034) % 1
     r, g, b = colorsys.hsv_to_rgb(hue, 0.9 if dark else 0.65, 0.75 if dark else 1.0)
     return round(255 * r), round(255 * g), round(255 * b)
 
@@ -156,12 +156,12 @@ def _event_images(
         yield image
 
 
-def outline(state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
+def outline(ellipse_state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
     """Return points (49, 2) px of a state's ellipse of `sigmas` standard deviations."""
     angle = np.linspace(0, 2 * np.pi, 49)
-    u, v = sigmas * state[4] * np.cos(angle), sigmas * state[5] * np.sin(angle)
-    c, s = np.cos(state[6]), np.sin(state[6])
-    return np.stack([state[0] + c * u - s * v, state[1] + s * u + c * v], 1)
+    u, v = sigmas * ellipse_state[4] * np.cos(angle), sigmas * ellipse_state[5] * np.sin(angle)
+    c, s = np.cos(ellipse_state[6]), np.sin(ellipse_state[6])
+    return np.stack([ellipse_state[0] + c * u - s * v, ellipse_state[1] + s * u + c * v], 1)
 
 
 def _large(points: NDArray, scale: int) -> tuple[float, ...]:
