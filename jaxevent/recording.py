@@ -322,7 +322,8 @@ class CheckedEvents:
                 return row
         raise InputError(
             f"{self._name}: index({time}) of {type(self._source).__name__} is "
-            f"{arrays.shorten_value(row)}; it must be the number of events earlier than that time (us)"
+            f"{arrays.shorten_value(row)}; it must be the number of events "
+            "earlier than that time (us)"
         )
 
 
