@@ -37,7 +37,7 @@ from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import frame_times, held_out
-from jaxevent.runs.scores import hidden_scores, moves
+from jaxevent.runs.scores import hidden_scores, moving_pixels
 from jaxevent.simulate import SENSORS, Objects, Pan, Source, scene, simulate
 
 METHODS = ("blend", "flow", "edi", "akf", "aks", "mc")
@@ -230,7 +230,7 @@ def score_hidden_frames(
             rows = rows[(rows >= len(frames) // 2) == bool(halves[half])]
         rows = choose_evenly(rows, IMAGES[gap])
         places = np.searchsorted(hidden.t, frames.t[rows])
-        where = [moves(given, int(place), gap) for place in places] if moving else None
+        where = [moving_pixels(given, int(place), gap) for place in places] if moving else None
         score = _scorer(given, hidden[places], where, noise=noise)
         store.add({"gap": gap, "half": half}, methods, score)
 

@@ -96,7 +96,7 @@ MUTATIONS = (
     Mutation(
         "times outside the recording are answered",
         "jaxevent/recording.py",
-        "if len(us) and (us.min() < start or us.max() > stop):",
+        "if len(us) and (us.min() < start_us or us.max() > stop_us):",
         "if False:",
         "tests/test_notebook.py -k outside",
     ),

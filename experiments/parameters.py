@@ -7,7 +7,7 @@ from typing import Any
 
 import jaxevent
 from jaxevent.estimator import Estimator
-from jaxevent.methods import HOMES
+from jaxevent.methods import METHOD_HOMES
 from jaxevent.parameters import Choice, Parameters, UnitInterval, format_value
 
 TITLES = {"reconstruction": "Reconstruction", "blob": "Tracking", "egomotion": "Egomotion"}
@@ -56,7 +56,7 @@ def page() -> str:
         "stays 0: give it a value first. The column of gradients holds as the other parameters "
         "stand by default.",
     ]
-    for family, homes in HOMES.items():
+    for family, homes in METHOD_HOMES.items():
         parts.append(f"## {TITLES[family]}")
         for name in homes:
             method = jaxevent.METHODS[name]

@@ -35,7 +35,7 @@ import scipy.io
 
 import jaxevent
 from jaxevent import register
-from jaxevent.arrays import LUMA
+from jaxevent.arrays import LUMA_WEIGHTS
 from jaxevent.camera import SCurve
 from jaxevent.errors import InputError
 from jaxevent.recording import Frames, Recording
@@ -61,7 +61,7 @@ def artificial(path: Path, cut: float = 80) -> Recording:
     if "img_color" not in extra or "time_image" not in extra:
         raise InputError(f"{path}: has no img_color and time_image; give a file of AHDR data")
     colour = np.moveaxis(extra.pop("img_color"), -1, 0)  # [frame, y, x, channel]
-    level = np.maximum(colour @ LUMA - BLACK, 0)
+    level = np.maximum(colour @ LUMA_WEIGHTS - BLACK, 0)
     curve = SCurve(cut)
     # Intensity 1 is the level 255 - cut; what the camera resolves begins at `dark`.
     white = 255 - cut

@@ -18,23 +18,23 @@ from jaxevent.errors import InputError, InputWarning
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
-NAMES = {
+FIELD_ALIASES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps", "time_stamp"),
     "x": ("x", "xs"),
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on"),
 }
-LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R 601
-MAX_PIXELS = 1 << 16  # of a side: coordinates are uint16
+LUMA_WEIGHTS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R 601
+MAX_SIDE_PX = 1 << 16  # of a side: coordinates are uint16
 MAX_TIME_US = 1 << 62  # 146,000 years: sums and differences of two times stay in int64
-UNITS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-SCALES: dict[str, float] = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
-_LUMA_16 = (19595, 38470, 7471)  # LUMA in units of 2^-16, as Pillow computes grey
+UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+US_PER_UNIT: dict[str, float] = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
+_LUMA_WEIGHTS_2_16 = (19595, 38470, 7471)  # times 2^-16, as Pillow computes grey
 _MAX_STEP_US = 1000.0  # between neighbouring numbers of a type, from which it is refused
-_MIN_STEPS = 64  # of a type within the span of the events
-_MANY_EVENTS = 300  # from which events must span `_MIN_STEPS`
-_BLOCK = 1 << 20  # values compared together, so that a check needs no memory to speak of
-_HELD_NOT_NUMBERS = {
+_MIN_TIME_STEPS = 64  # of a type within the span of the events
+_MIN_JUDGED_EVENTS = 300  # from which events must span `_MIN_TIME_STEPS`
+_BLOCK_VALUES = 1 << 20  # values compared together, so that a check needs no memory to speak of
+_REMEDY_OF_KIND = {
     "O": "convert it to numbers",
     "U": "convert the text to numbers",
     "S": "convert the text to numbers",
@@ -48,7 +48,7 @@ _HELD_NOT_NUMBERS = {
 def find_fields(names: Sequence[str]) -> dict[str, str] | None:
     """Find the names of t, x, y and p among some; None unless each is there, once."""
     found = {}
-    for field, aliases in NAMES.items():
+    for field, aliases in FIELD_ALIASES.items():
         fitting = [name for name in names if str(name).strip().lower() in aliases]
         if len(fitting) != 1:
             return None
@@ -89,7 +89,7 @@ def as_array(values: Any, what: str) -> NDArray:
             "one on the CPU, without a gradient, whose rows are equally long"
         ) from None
     if array.dtype.kind not in "biuf":
-        remedy = _HELD_NOT_NUMBERS.get(array.dtype.kind, "convert it to numbers")
+        remedy = _REMEDY_OF_KIND.get(array.dtype.kind, "convert it to numbers")
         raise InputError(f"{what} is of type {array.dtype}, not numbers; {remedy}")
     return array
 
@@ -138,7 +138,7 @@ def as_plain(values: NDArray, dtype: Any = None) -> NDArray:
 def columns_of(events: Any) -> dict[str, Any]:
     """Return the columns t, x, y and p of a structured array, a DataFrame, a table or a dictionary.
 
-    Raises `InputError` if these are not found by their names (`NAMES`).
+    Raises `InputError` if these are not found by their names (`FIELD_ALIASES`).
     """
     names: Any = getattr(getattr(events, "dtype", None), "names", None)
     if names is None and isinstance(events, Mapping):
@@ -169,7 +169,8 @@ def check_unit(time_unit: Any) -> None:
     """Raise `InputError` unless a unit of time is "s", "ms", "us" or "ns", or None."""
     if time_unit is not None and time_unit not in get_args(TimeUnit):
         raise InputError(
-            f"time_unit = {brief(time_unit)} is not a unit of time; give 's', 'ms', 'us' or 'ns'"
+            f"time_unit = {shorten_value(time_unit)} is not a unit of time; "
+            "give 's', 'ms', 'us' or 'ns'"
         )
 
 
@@ -203,7 +204,7 @@ def as_times(values: Any, what: str, time_unit: TimeUnit | None = None) -> NDArr
         if (note := check_resolution(spread, len(t), unit, what)) is not None:
             warnings.warn(f"{what}: {note}", InputWarning, stacklevel=3)
     elif unit != "us":
-        check_span(t, what, "row", max(round(SCALES[unit]), 1))
+        check_span(t, what, "row", max(round(US_PER_UNIT[unit]), 1))
     return as_plain(to_microseconds(t, unit, what, "row") if len(t) else t, np.int64)
 
 
@@ -231,15 +232,15 @@ def time_step(t: NDArray) -> float:
     return step
 
 
-def check_resolution(t: Sequence[float], count: int, unit: str, source: str) -> str | None:
+def check_resolution(extremes: Sequence[float], count: int, unit: str, source: str) -> str | None:
     """Check that the type of float times resolves events.
 
     Times are refused where neighbouring numbers of their type are 1 ms or more apart, or where 300
     or more events span fewer than 64 of them.
 
     Args:
-        t: Distance between neighbouring numbers as of `time_step`, time from the first to the last
-            event, and largest time, all in a unit.
+        extremes: Distance between neighbouring numbers as of `time_step`, time from the first to
+            the last event, and largest time, all in a unit.
         count: Number of events.
         unit: The unit, "s", "ms", "us" or "ns".
         source: Name of the file for messages.
@@ -250,14 +251,16 @@ def check_resolution(t: Sequence[float], count: int, unit: str, source: str) -> 
     Raises:
         InputError: The type cannot resolve the times.
     """
-    step_us, span_us, largest_us = (value * SCALES[unit] for value in t)
+    step_us, span_us, largest_us = (value * US_PER_UNIT[unit] for value in extremes)
     if step_us <= 1 or count < 2 or not largest_us < MAX_TIME_US:
         return None
-    if step_us >= _MAX_STEP_US or (count >= _MANY_EVENTS and span_us < _MIN_STEPS * step_us):
+    if step_us >= _MAX_STEP_US or (
+        count >= _MIN_JUDGED_EVENTS and span_us < _MIN_TIME_STEPS * step_us
+    ):
         raise InputError(
-            f"{source}: the type of the times cannot resolve them: as {UNITS[unit]} its numbers "
-            f"near {_short_time(largest_us)} are {_short_time(step_us)} apart; store integer "
-            "microseconds or 64-bit floats, counted from the start of the recording"
+            f"{source}: the type of the times cannot resolve them: as {UNIT_NAMES[unit]} its "
+            f"numbers near {_short_time(largest_us)} are {_short_time(step_us)} apart; store "
+            "integer microseconds or 64-bit floats, counted from the start of the recording"
         )
     return f"times are rounded by their type to {_short_time(step_us)}"
 
@@ -269,7 +272,7 @@ def _short_time(us: float) -> str:
 
 
 def times(
-    values: NDArray, source: str, what: str, scale: float = 1e6, first_row: int = 0
+    values: NDArray, source: str, what: str, us_per_unit: float = 1e6, first_row: int = 0
 ) -> NDArray[np.int64]:
     """Convert times of a file to int64 us: integers are us already, floats are scaled.
 
@@ -277,7 +280,7 @@ def times(
         values: (n,) times.
         source: Name of the file for messages.
         what: "event", "image" or the like.
-        scale: Microseconds in one unit of floats.
+        us_per_unit: Microseconds in one unit of floats.
         first_row: Row of the first time in the file.
 
     Returns:
@@ -289,10 +292,10 @@ def times(
     values = numbers(values, source, f"{what} times")
     is_float = values.dtype.kind == "f"
     values = values.astype(np.float64, copy=False) if is_float else values
-    check_span(values, source, what, scale if is_float else 1, first_row)
+    check_span(values, source, what, us_per_unit if is_float else 1, first_row)
     if not is_float:
         return values.astype(np.int64, copy=False)
-    return np.rint(values * scale).astype(np.int64)
+    return np.rint(values * us_per_unit).astype(np.int64)
 
 
 def to_microseconds(
@@ -314,13 +317,13 @@ def to_microseconds(
         InputError: A time is not finite or too large for us.
     """
     if values.dtype.kind not in "iu" or unit == "us":
-        return times(values, source, what, SCALES[unit], first_row)
+        return times(values, source, what, US_PER_UNIT[unit], first_row)
     wide = values if values.dtype == np.uint64 else values.astype(np.int64)
     if unit == "ns":
         whole, rest = np.divmod(wide, wide.dtype.type(1000))
         return times(whole, source, what, first_row=first_row) + (rest >= 500)
-    times(wide * np.float64(SCALES[unit]), source, what, 1.0, first_row)  # that they fit
-    return wide.astype(np.int64) * round(SCALES[unit])
+    times(wide * np.float64(US_PER_UNIT[unit]), source, what, 1.0, first_row)  # that they fit
+    return wide.astype(np.int64) * round(US_PER_UNIT[unit])
 
 
 def check_span(
@@ -343,7 +346,9 @@ def check_span(
     most = MAX_TIME_US / scale if is_float else MAX_TIME_US // scale
     if len(values) and not -most < values.min() <= values.max() < most:
         row = int(np.argmin((values > -most) & (values < most)))
-        unit = next((UNITS[name] for name, us in SCALES.items() if us == scale), UNITS["us"])
+        unit = next(
+            (UNIT_NAMES[name] for name, us in US_PER_UNIT.items() if us == scale), UNIT_NAMES["us"]
+        )
         shown = f"{values[row]:.16g}" if is_float else str(values[row])
         raise InputError(
             f"{_place(source)}{what} {first_row + row} has the time {shown}, not finite "
@@ -373,7 +378,7 @@ def numbers(values: NDArray, source: str, what: str) -> NDArray:
     return values
 
 
-def brief(value: Any) -> str:
+def shorten_value(value: Any) -> str:
     """Format a value on one line, cut to 60 characters, for messages."""
     return " ".join(repr(value).split())[:60]
 
@@ -391,7 +396,7 @@ def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
         source: Name of the file or recording for messages.
 
     Returns:
-        (width, height), each from 1 to `MAX_PIXELS`.
+        (width, height), each from 1 to `MAX_SIDE_PX`.
 
     Raises:
         InputError: A side is no whole number, or out of this range.
@@ -399,11 +404,11 @@ def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
     for name, side in (("width", width), ("height", height)):
         if not isinstance(side, int | np.integer) or isinstance(side, bool):
             raise InputError(
-                f"{_place(source)}{name} is {brief(side)}; give a whole number of pixels"
+                f"{_place(source)}{name} is {shorten_value(side)}; give a whole number of pixels"
             )
-    if min(width, height) < 1 or max(width, height) > MAX_PIXELS:
+    if min(width, height) < 1 or max(width, height) > MAX_SIDE_PX:
         raise InputError(
-            f"{_place(source)}the sensor has {width}x{height} pixels, but at most {MAX_PIXELS} "
+            f"{_place(source)}the sensor has {width}x{height} pixels, but at most {MAX_SIDE_PX} "
             "of a side, and at least one, can be read; correct its size with size=(width, height) "
             "or --size"
         )
@@ -448,7 +453,7 @@ def coordinates(
         if low or (kind.max > last and len(values) and values.max() > last):
             bad_row = int(np.argmax((values < origin) | (values > last)))
     if bad_row is not None:
-        known = max(size) < MAX_PIXELS
+        known = max(size) < MAX_SIDE_PX
         on = f"on the {size[0]}x{size[1]} sensor " if known else ""
         remedy = "give the sensor's size or remove the event" if known else "remove the event"
         raise InputError(
@@ -525,9 +530,9 @@ def first_decrease(t: NDArray, strict: bool = False) -> int | None:
     Returns:
         The row; None if there is none.
     """
-    for begin in range(0, max(len(t) - 1, 0), _BLOCK):
+    for begin in range(0, max(len(t) - 1, 0), _BLOCK_VALUES):
         # Comparing neighbours is three times faster than np.diff, which writes differences.
-        part = t[begin : begin + _BLOCK + 1]
+        part = t[begin : begin + _BLOCK_VALUES + 1]
         bad = part[1:] <= part[:-1] if strict else part[1:] < part[:-1]
         if bad.any():
             return begin + int(np.argmax(bad)) + 1
@@ -584,8 +589,8 @@ def to_grey(image: NDArray) -> NDArray:
     if image.ndim == 2:
         return image
     if image.dtype.kind == "f":
-        return image @ LUMA.astype(image.dtype)
-    parts = (image[..., k].astype(np.uint32) * np.uint32(_LUMA_16[k]) for k in range(3))
+        return image @ LUMA_WEIGHTS.astype(image.dtype)
+    parts = (image[..., k].astype(np.uint32) * np.uint32(_LUMA_WEIGHTS_2_16[k]) for k in range(3))
     return ((sum(parts) + np.uint32(1 << 15)) >> np.uint32(16)).astype(
         image.dtype.newbyteorder("=")
     )

@@ -28,7 +28,7 @@ MIN_COMPILE_SECONDS = 0.3  # s; shorter compilations are not worth a file
 # for a recording of another shape have 500 (smoother) to 900 (mc).
 MAX_MEMORY_MAPS = 30_000
 
-KEY_BYTES = 32
+SECRET_KEY_BYTES = 32
 _OPEN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # which not every system has
 
 
@@ -103,12 +103,12 @@ def _read_key(path: Path) -> bytes | None:
     try:
         status = os.fstat(descriptor)
         private = not _foreign_access(status) and not (_HAS_USERS and status.st_mode & 0o077)
-        content = os.read(descriptor, KEY_BYTES + 1)
+        content = os.read(descriptor, SECRET_KEY_BYTES + 1)
     except OSError:
         return None
     finally:
         os.close(descriptor)
-    return content if private and len(content) == KEY_BYTES else None
+    return content if private and len(content) == SECRET_KEY_BYTES else None
 
 
 def _make_key(path: Path) -> None:
@@ -116,7 +116,7 @@ def _make_key(path: Path) -> None:
     descriptor, name = tempfile.mkstemp(dir=path.parent)  # with mode 0600
     try:
         with os.fdopen(descriptor, "wb") as file:
-            file.write(os.urandom(KEY_BYTES))
+            file.write(os.urandom(SECRET_KEY_BYTES))
         try:
             os.link(name, path)
         except FileExistsError:

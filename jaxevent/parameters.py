@@ -22,8 +22,8 @@ from jaxevent.errors import InputError
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
 
-LARGEST = 1e15  # a value must be smaller, so that its square is in the range of float32
-NO_GRADIENT = "acts when data are prepared or by comparisons, and has no gradient to follow"
+MAX_VALUE = 1e15  # a value must be smaller, so that its square is in the range of float32
+NO_GRADIENT_REASON = "acts when data are prepared or by comparisons, and has no gradient to follow"
 
 
 class Setting:
@@ -56,10 +56,10 @@ class Number(Setting):
     A default of several numbers makes an array, given as a list of as many; a default of one number
     in a tuple allows a list of any length. With `gradient=False` the number acts when data are
     prepared, or by comparisons: no derivative passes through it, and `optimise` takes it for
-    searches only. Values are from `least` to `most`, and below `LARGEST` in size.
+    searches only. Values are from `least` to `most`, and below `MAX_VALUE` in size.
     """
 
-    lower: float = -LARGEST  # of the kind, where the number has no `least` of its own
+    lower: float = -MAX_VALUE  # of the kind, where the number has no `least` of its own
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Number(Setting):
         *,
         gradient: bool = True,
         least: float | None = None,
-        most: float = LARGEST,
+        most: float = MAX_VALUE,
     ):
         super().__init__(default, unit, meaning)
         self.gradient = gradient
@@ -127,22 +127,22 @@ class Number(Setting):
     def check_one(self, value: Any) -> None:
         """Raise `InputError` for a single number outside the domain."""
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not abs(value) < LARGEST:
+        if not number or not abs(value) < MAX_VALUE:
             raise InputError(
                 f"the parameter {self.name} is {repr(value)[:40]}; give a finite number below "
-                f"{LARGEST:g} in size{', without quotes' * isinstance(value, str)}"
+                f"{MAX_VALUE:g} in size{', without quotes' * isinstance(value, str)}"
             )
         if not self.least <= value <= self.most:
             raise InputError(f"the parameter {self.name} is {value}; it must {self._bounds()}")
 
     def _bounds(self) -> str:
-        if self.most == LARGEST:
+        if self.most == MAX_VALUE:
             return f"not be below {self.least:g}" if self.least else "not be negative"
         return f"be from {self.least:g} to {self.most:g}"
 
     def allows(self, value: Array) -> Array:
         """Return whether `check` would accept all of an array, which may be traced."""
-        inside = (value >= self.least) & (value <= self.most) & (jnp.abs(value) < LARGEST)
+        inside = (value >= self.least) & (value <= self.most) & (jnp.abs(value) < MAX_VALUE)
         return inside.all()
 
 
@@ -430,7 +430,9 @@ class Parameters(_Module):
 
     def without_gradient(self) -> dict[str, str]:
         """Return the numbers that have no gradient, each with the reason."""
-        return {name: NO_GRADIENT for name, number in self.numbers.items() if not number.gradient}
+        return {
+            name: NO_GRADIENT_REASON for name, number in self.numbers.items() if not number.gradient
+        }
 
     @classmethod
     def of(cls: type[T], table: Mapping[str, Any], rest: Mapping[str, Any] | None = None) -> T:

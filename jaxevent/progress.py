@@ -18,8 +18,8 @@ from tqdm.auto import tqdm
 # when a process is killed. No two processes share a bar here.
 tqdm.set_lock(threading.RLock())
 
-DELAY_S = 2.0  # s before anything is shown
-TICK_S = 0.5  # s between looks at the time
+SHOW_DELAY_S = 2.0  # s before anything is shown
+POLL_INTERVAL_S = 0.5  # s between looks at the time
 
 _open: list[weakref.ref["Bar"]] = []  # the last one has the line
 _over = threading.Event()
@@ -100,8 +100,8 @@ def _last() -> Bar | None:
 def _tick() -> None:
     """Keep the time of the bar that has the line moving."""
     began = time.time()
-    while not _over.wait(TICK_S):
-        if time.time() - began >= DELAY_S:
+    while not _over.wait(POLL_INTERVAL_S):
+        if time.time() - began >= SHOW_DELAY_S:
             with tqdm.get_lock():
                 _show()
 
@@ -144,7 +144,7 @@ def bar(
         The bar, an iterable and a context.
     """
     return Bar(
-        items, desc=desc, unit=unit, delay=DELAY_S, leave=False, position=0,
+        items, desc=desc, unit=unit, delay=SHOW_DELAY_S, leave=False, position=0,
         disable=not is_shown(progress), **more,
     )  # fmt: skip
 

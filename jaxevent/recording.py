@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Times = ArrayLike | int | float
 
-PER_FRAME = ("gain", "rgb")  # names of `Recording.extra` that hold one entry per frame
+PER_FRAME_EXTRAS = ("gain", "rgb")  # names of `Recording.extra` that hold one entry per frame
 
 
 def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
@@ -55,13 +55,13 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     return np.asarray(scaled).astype(np.int64)
 
 
-def check_times(times: Times, start: int, stop: int, name: str) -> None:
+def check_times(times: Times, start_us: int, stop_us: int, name: str) -> None:
     """Check that times lie in the span of the data.
 
     Args:
         times: Times, integers in us or floats in s.
-        start: First time of the data in us.
-        stop: Last time of the data in us.
+        start_us: First time of the data in us.
+        stop_us: Last time of the data in us.
         name: Name of the recording for messages.
 
     Raises:
@@ -69,11 +69,11 @@ def check_times(times: Times, start: int, stop: int, name: str) -> None:
             a number of the wrong one is the usual reason.
     """
     us = np.atleast_1d(microseconds(times))
-    if len(us) and (us.min() < start or us.max() > stop):
+    if len(us) and (us.min() < start_us or us.max() > stop_us):
         raise InputError(
             f"{name}: times from {us.min()} to {us.max()} us were requested, but it lasts from "
-            f"{start} to {stop} us; give times of the recording's clock inside it (integers are "
-            "microseconds, floats seconds), or extrapolate=True"
+            f"{start_us} to {stop_us} us; give times of the recording's clock inside it (integers "
+            "are microseconds, floats seconds), or extrapolate=True"
         )
 
 
@@ -143,7 +143,7 @@ class Events:
     p: NDArray[np.bool_]
 
     def __post_init__(self):
-        source, most = "events", (arrays.MAX_PIXELS, arrays.MAX_PIXELS)
+        source, most = "events", (arrays.MAX_SIDE_PX, arrays.MAX_SIDE_PX)
         if (np.asarray(self.t).dtype if hasattr(self.t, "dtype") else np.dtype(int)).kind == "f":
             raise InputError(
                 f"{source}: t is {self.t.dtype}; give integer microseconds, or make the recording "
@@ -272,8 +272,8 @@ def _check_rows(rows: Any, what: str) -> None:
     """Raise `InputError` for rows that choose one row, or several columns, of `what`."""
     if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
         raise InputError(
-            f"{what} are chosen by a slice, a mask or a list of rows, not {arrays.brief(rows)}; "
-            f"write {what}[row : row + 1] for one of them"
+            f"{what} are chosen by a slice, a mask or a list of rows, "
+            f"not {arrays.shorten_value(rows)}; write {what}[row : row + 1] for one of them"
         )
 
 
@@ -321,8 +321,9 @@ class CheckedEvents:
             ):
                 return row
         raise InputError(
-            f"{self._name}: index({time}) of {type(self._source).__name__} is {arrays.brief(row)}; "
-            "it must be the number of events earlier than that time (us)"
+            f"{self._name}: index({time}) of {type(self._source).__name__} is "
+            f"{arrays.shorten_value(row)}; it must be the number of events "
+            "earlier than that time (us)"
         )
 
 
@@ -608,8 +609,8 @@ class Recording(HtmlRepr):
     def __post_init__(self):
         if not isinstance(self.name, str):
             raise InputError(
-                f"name is {arrays.brief(self.name)}, a {type(self.name).__name__}; give a text, "
-                "the recording's name"
+                f"name is {arrays.shorten_value(self.name)}, a {type(self.name).__name__}; give "
+                "a text, the recording's name"
             )
         size = arrays.as_size(self.width, self.height, self.name)
         for side, pixels in zip(("width", "height"), size, strict=True):
@@ -860,7 +861,7 @@ class Recording(HtmlRepr):
         """Return the further arrays; those with one entry per frame are cut like frames."""
         if rows is None:
             return self.extra
-        cut = {name: self.extra[name][rows] for name in PER_FRAME if name in self.extra}
+        cut = {name: self.extra[name][rows] for name in PER_FRAME_EXTRAS if name in self.extra}
         return {**self.extra, **cut}
 
     def check(self, source: str | None = None) -> "Recording":

@@ -5,17 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-SPLITS = ("fit", "validation", "test")
+SPLIT_NAMES = ("fit", "validation", "test")
 
 
-def interleave(split: Sequence[int], count: int) -> NDArray[np.int64]:
-    """Assign each of `count` images to one of SPLITS, with shares `split` in a fixed pattern.
+def interleave(shares: Sequence[int], n_images: int) -> NDArray[np.int64]:
+    """Assign each of `n_images` images to one of SPLITS, with shares `shares` in a fixed pattern.
 
     [2, 1, 1] repeats fit, validation, fit, test.
 
     Args:
-        split: Shares of fit, validation and test.
-        count: Number of images.
+        shares: Shares of fit, validation and test.
+        n_images: Number of images.
 
     Returns:
         (count,) index in SPLITS.
@@ -25,35 +25,42 @@ def interleave(split: Sequence[int], count: int) -> NDArray[np.int64]:
         steps = np.ceil(np.arange(of + 1) * share / max(of, 1))
         return np.diff(steps) > 0
 
-    pattern = np.zeros(sum(split), np.int64)
-    others = np.flatnonzero(~spread(split[0], sum(split)))
-    pattern[others] = np.where(spread(split[1], len(others)), 1, 2)
-    return np.resize(pattern, count)
+    pattern = np.zeros(sum(shares), np.int64)
+    others = np.flatnonzero(~spread(shares[0], sum(shares)))
+    pattern[others] = np.where(spread(shares[1], len(others)), 1, 2)
+    return np.resize(pattern, n_images)
 
 
 def windows(
-    first: int, stop: int, window: float | int | None, split: Sequence[int] | None, place: int
+    start_us: int,
+    stop_us: int,
+    window_s: float | int | None,
+    shares: Sequence[int] | None,
+    unsplit_index: int,
 ) -> list[tuple[int, int, int]]:
-    """Cut the time from `first` to `stop` into windows.
+    """Cut the time from `start_us` to `stop_us` into windows.
 
     Args:
-        first: Start of the first window, us.
-        stop: End of the last window, us.
-        window: Length of a window, s; by default an eighth of the time if `split` is given, else
+        start_us: Start of the first window, us.
+        stop_us: End of the last window, us.
+        window_s: Length of a window, s; by default an eighth of the time if `shares` is given, else
             all.
-        split: Shares of fit, validation and test; None assigns all windows to `place`.
-        place: Index in SPLITS of all windows without `split`.
+        shares: Shares of fit, validation and test; None assigns all windows to `unsplit_index`.
+        unsplit_index: Index in SPLITS of all windows without `shares`.
 
     Returns:
         Start (us), end (us) and index in SPLITS of each window.
     """
-    length = stop - first
-    if window is not None:
-        length = round(window * 1e6)
-    elif split is not None:
+    length = stop_us - start_us
+    if window_s is not None:
+        length = round(window_s * 1e6)
+    elif shares is not None:
         length = -(-length // 8)
-    begins = np.arange(first, stop, max(length, 1))
-    whose = np.full(len(begins), place) if split is None else interleave(split, len(begins))
+    begins = np.arange(start_us, stop_us, max(length, 1))
+    whose = (
+        np.full(len(begins), unsplit_index) if shares is None else interleave(shares, len(begins))
+    )
     return [
-        (b, min(b + length, stop), s) for b, s in zip(begins.tolist(), whose.tolist(), strict=True)
+        (b, min(b + length, stop_us), s)
+        for b, s in zip(begins.tolist(), whose.tolist(), strict=True)
     ]

@@ -34,7 +34,7 @@ P = TypeVar("P", bound=Parameters)
 # the AKF on slider_depth (1.08 M events, 22 images, 2 cores): the loss alone 67 ms; forwards 135 ms
 # for 1 number, 181 ms for 2; in reverse 213 ms for any. Forwards over reverse, both in turn: 0.60
 # for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
-MAX_FORWARD_NUMBERS = 2
+MAX_FORWARD_PARAMETERS = 2
 
 Loss = Callable[[Any, Any], Array]
 Batches = tuple[Sequence[Any], Sequence[Any]]
@@ -273,7 +273,7 @@ def begin(
     dtype = jnp.result_type(float)
     position = Position(
         raw,
-        jax.vmap(ADAM.init)(raw) if raw else None,
+        jax.vmap(ADAM_TRANSFORM.init)(raw) if raw else None,
         raw,
         jnp.full(settings.starts, jnp.inf, dtype),
         jnp.zeros(settings.starts, int),
@@ -307,7 +307,7 @@ def optimise(
             that much in means over batches. Or a function `prepare(params)` that gives batches to
             fit to and batches to validate on, for parameters that act when batches are made. Of
             several processes (`devices.join`) all give the same list and each computes its share;
-            a function gives `devices.REMOTE` in place of what other processes compute.
+            a function gives `devices.REMOTE_BATCH` in place of what other processes compute.
         validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
         settings: See `Settings`.
         search: By name, (from, to, number of points): parameters searched without gradients, one
@@ -346,7 +346,7 @@ def optimise(
 
 
 # A step whose gradient is not finite is left out, however many there are.
-ADAM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31 - 1)
+ADAM_TRANSFORM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31 - 1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -411,7 +411,7 @@ def loss_and_grad(
 
 @jax.jit
 def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
-    update: Any = jax.vmap(ADAM.update)
+    update: Any = jax.vmap(ADAM_TRANSFORM.update)
     direction, memory = update(slope, position.optimiser)
     raw = {name: leaf - rate * direction[name] for name, leaf in position.raw.items()}
     return dataclasses.replace(position, raw=raw, optimiser=memory)
@@ -448,14 +448,14 @@ def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[
 
     Args:
         function: A function of a batch that gives a pytree of arrays.
-        batches: All batches, those of other processes as `devices.REMOTE`.
+        batches: All batches, those of other processes as `devices.REMOTE_BATCH`.
 
     Returns:
         For each batch its weight and the function's value.
     """
     if devices.is_single_device():
         return [(_weight(batch), function(batch)) for batch in batches]
-    own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.REMOTE)
+    own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.REMOTE_BATCH)
     mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
     said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
     told = {k: v for some in devices.allgather(said) for k, v in some.items()}
@@ -545,7 +545,7 @@ class _Loop:
         self.intervals, self.run, self.save = intervals, run, save
         numbers = sum(leaf[0].size for leaf in run.position.raw.values())
         self.forward = (
-            numbers <= MAX_FORWARD_NUMBERS if settings.forward is None else settings.forward
+            numbers <= MAX_FORWARD_PARAMETERS if settings.forward is None else settings.forward
         )
 
     def leader(self) -> Any:
@@ -613,7 +613,7 @@ class _Loop:
         fit, watched = self.prepare(params)[0], self.watched(params)
         if run.iteration == 0:
             worst = jnp.full_like(position.best_loss, jnp.inf)
-            memory = jax.vmap(ADAM.init)(position.raw)
+            memory = jax.vmap(ADAM_TRANSFORM.init)(position.raw)
             position = dataclasses.replace(position, optimiser=memory, best_loss=worst)
         while True:
             i, seen = run.iteration, None

@@ -224,7 +224,7 @@ def test_few_batches_are_spread_and_many_are_shared_out(monkeypatch):
     assert devices.BatchPlacement(2)(batches) == [3] * 5  # two at a time
     assert devices.BatchPlacement(None)(batches[:2]) == [3, 3]
     assert devices.BatchPlacement(None)([0, 1]) == ["a", "b"]  # these cannot be spread
-    there = devices.REMOTE
+    there = devices.REMOTE_BATCH
     mine: list[Any] = [there, batches[0], there, batches[1], there, batches[2]]
     assert devices.BatchPlacement(None)(mine) == [there, "a", there, "b", there, "c"]
     assert devices.BatchPlacement(4)(mine) == [there, 3, there, 3, there, 3]
@@ -253,7 +253,11 @@ def test_an_error_of_one_process_is_one_of_all(monkeypatch):
             devices.on_process_zero(mine)
     monkeypatch.setattr(devices, "allgather", lambda said: [("value", 7), said])
     assert devices.on_process_zero(refuse) == 7  # what process 1 would say is not asked
-    assert devices.partition_batches([10, 11, 12]) == [devices.REMOTE, 11, devices.REMOTE]
+    assert devices.partition_batches([10, 11, 12]) == [
+        devices.REMOTE_BATCH,
+        11,
+        devices.REMOTE_BATCH,
+    ]
 
 
 class Trap:
@@ -328,7 +332,7 @@ def test_each_process_prepares_its_own_windows(monkeypatch):
     for index in range(3):
         monkeypatch.setattr(jax, "process_index", lambda index=index: index)
         for s, batches in enumerate(Problem(Objective(edi), windows)(edi.Params())):
-            owners[s] += [k for k, batch in enumerate(batches) if batch is not devices.REMOTE]
+            owners[s] += [k for k, batch in enumerate(batches) if batch is not devices.REMOTE_BATCH]
             assert len(batches) == 4
     assert [sorted(each) for each in owners] == [[0, 1, 2, 3]] * 2
     assert owners[0] == [0, 3, 1, 2]

@@ -12,7 +12,7 @@ import pytest
 from pages import run_page, shortened
 
 import jaxevent
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.show.tables import COLUMNS
 
 ROOT = Path(__file__).parents[1]
@@ -73,7 +73,7 @@ def test_every_number_is_explained_as_in_the_code():
     text = (DOCS / "fitting.md").read_text()
     told = re.findall(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$", text, re.MULTILINE)
     titles = {place: title for title, place, _, _ in COLUMNS}
-    expected = [(name, titles.get(name, ""), text) for name, text in MEANINGS.items()]
+    expected = [(name, titles.get(name, ""), text) for name, text in MEASURE_MEANINGS.items()]
     assert [(name, title, text.replace(r"\|", "|")) for name, title, text in told] == expected
 
 

@@ -107,7 +107,7 @@ def test_recordings_in_files(tmp_path, monkeypatch, kind):
     if kind == "h5":
         jaxevent.save(recording, path)
     else:
-        monkeypatch.setattr(decoded, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK_EVENTS", 500)
         path.write_bytes(formats.dat(recording.events, size))
     events = jaxevent.load(path, size, in_memory=False).events
     assert_equal([events[:1300].t], [recording.events.t[:1300]])  # on the way through the file

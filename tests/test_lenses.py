@@ -9,7 +9,7 @@ import pytest
 import jaxevent
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENSES, find_model
+from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Events, Recording
 
 SIZE = (64, 48)
@@ -58,9 +58,9 @@ def test_a_fisheye_sees_angles_as_distances():
     np.testing.assert_allclose(seen, [[61.5, 24.5], [76.5, 24.5], [31.5, 39.0]])
 
 
-@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("model", LENS_MODELS)
 def test_jacobians_are_differences(model):
-    lens, k = LENSES[model], CAMERAS[model].distortion
+    lens, k = LENS_MODELS[model], CAMERAS[model].distortion
     at = np.array([[0.0, 0.0], [0.3, -0.2], [-0.5, 0.4], [1e-3, 0.2]])
     _, jacobian = lens.distort(at, k)
     for axis, step in enumerate(np.eye(2) * 1e-6):

@@ -179,7 +179,7 @@ def test_recordings_that_are_decoded(tmp_path, monkeypatch, kind, again):
     whole = texture.moving()
     size, path = (whole.width, whole.height), tmp_path / f"a.{kind}"
     if kind == "dat":
-        monkeypatch.setattr(decoded, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK_EVENTS", 500)
         path.write_bytes(formats.dat(whole.events, size))
     else:
         frames = whole.frames

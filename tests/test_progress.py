@@ -30,8 +30,8 @@ class Line:
 @pytest.fixture
 def line(monkeypatch, capsys) -> Line:
     """Nothing is waited for before it is shown."""
-    monkeypatch.setattr(progress, "DELAY_S", 0.0)
-    monkeypatch.setattr(progress, "TICK_S", 0.01)
+    monkeypatch.setattr(progress, "SHOW_DELAY_S", 0.0)
+    monkeypatch.setattr(progress, "POLL_INTERVAL_S", 0.01)
     return Line(capsys)
 
 

@@ -21,7 +21,7 @@ def test_examples_run_in_order(tmp_path, monkeypatch, capsys, float32):
     pytest.importorskip("matplotlib").use("Agg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr("jaxevent.runs.demo.RECORDING", tmp_path / "short.h5")
+    monkeypatch.setattr("jaxevent.runs.demo.RECORDING_FILE", tmp_path / "short.h5")
     scope = run_page(shortened(README, tmp_path / "short.h5"))
     recording = scope["recording"]
     assert scope["image"].shape == (len(recording.frames), 120, 160)

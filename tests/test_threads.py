@@ -191,7 +191,7 @@ def written(tmp_path, monkeypatch, kind: str):
         frames = recording.frames
         path.write_bytes(formats.event_utils(recording.events, size, frames.images, frames.t))
     else:
-        monkeypatch.setattr(decoded, "BLOCK", 500)
+        monkeypatch.setattr(decoded, "BLOCK_EVENTS", 500)
         path.write_bytes(formats.dat(recording.events, size))
     return jaxevent.load(path, size, in_memory=False), jaxevent.load(path, size)
 

@@ -30,7 +30,7 @@ from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.blob.tracks import Tracks
 from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimator, OptionKind, of_class
+from jaxevent.estimator import Estimator, OptionKind, option_of_class
 from jaxevent.recording import Recording, Times, microseconds
 
 P = TypeVar("P", bound=TrackerParams)
@@ -49,7 +49,7 @@ class Tracker(Estimator[P]):
     family: ClassVar[str] = "blob"
     option_kinds: ClassVar[Mapping[str, OptionKind]] = {
         **Estimator.option_kinds,
-        "found": of_class(TargetSearchResult),
+        "found": option_of_class(TargetSearchResult),
     }
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),

@@ -122,7 +122,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
     elif outputs:
         from jaxevent.io.calibration import split_name
         from jaxevent.io.companions import companions
-        from jaxevent.io.output import Command, check_outputs, into_folders, running
+        from jaxevent.io.output import Command, allow_writing_into_folders, check_outputs, running
 
         named = [path for name in outputs if (path := taken[name]) is not None]
         inputs = [
@@ -136,7 +136,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
             inputs.append(split_name(camera)[0])
         check_outputs(named, inputs, force=force)
         read = [file for path in inputs for file in (path, *companions(path))]
-        with into_folders(force), running(Command(words, read)):
+        with allow_writing_into_folders(force), running(Command(words, read)):
             yield taken
     else:
         yield taken

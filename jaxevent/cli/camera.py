@@ -9,7 +9,7 @@ from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, print_stored, show_progress
 from jaxevent.errors import InputError
 
-_STACK = (
+_STACK_HELP = (
     "a folder of images of one still scene, whose exposures are in exposures.txt of lines "
     "'s name' or in their EXIF data"
 )
@@ -116,7 +116,7 @@ def _add_reference(parts: Any) -> None:
 
 
 def _add_stack(one: argparse.ArgumentParser) -> None:
-    one.add_argument("stack", metavar="FOLDER", type=Path, help=_STACK)
+    one.add_argument("stack", metavar="FOLDER", type=Path, help=_STACK_HELP)
     one.add_argument(
         "--exposures",
         metavar="S",

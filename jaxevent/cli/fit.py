@@ -77,13 +77,13 @@ def run(
     if distributed or parts != (None, None, None):
         devices.join(*parts)
 
-    from jaxevent.runs.fit import FILES, fit
+    from jaxevent.runs.fit import RESULT_FILES, fit
 
     rows = fit(config, out, recordings, resume, show_progress(), replace=force)
     if not devices.is_process_zero():
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")
-    files = [name for name in FILES if (out / name).exists()]
+    files = [name for name in RESULT_FILES if (out / name).exists()]
     missing = "" if "loss.png" in files else f"; loss.png needs {install_command('plot')}"
     print(f"\nwritten to {out}: {', '.join(files)}{missing}")
     warnings = dict.fromkeys(row["warning"] for row in rows if "warning" in row)

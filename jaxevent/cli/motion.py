@@ -10,7 +10,7 @@ from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
 from jaxevent.errors import InputError
 
-PLOTTED_PARTICLES = 64  # particles of an estimate that are kept for the plot
+N_PLOTTED_PARTICLES = 64  # particles of an estimate that are kept for the plot
 
 
 def add(commands: Any) -> None:
@@ -309,7 +309,7 @@ def estimated(
 
 def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any) -> Any:
     """The motion by a method; `gyro` tells whether the IMU helps, its bias and its axes."""
-    more = {"cloud": PLOTTED_PARTICLES} if "cloud" in estimator.options else {}
+    more = {"cloud": N_PLOTTED_PARTICLES} if "cloud" in estimator.options else {}
     helps, bias, turned = gyro
     if helps:
         more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)

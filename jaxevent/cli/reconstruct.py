@@ -118,7 +118,7 @@ def run(
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.runs.protocols import frame_times
-    from jaxevent.show.export import evenly, within, write_hdf5, writer
+    from jaxevent.show.export import evenly_spaced_times, within, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
@@ -144,7 +144,7 @@ def run(
             check_clocks(recording, values.clock_offset)
         elif compare_clocks(recording, values.clock_offset) is not None:
             spanned = dataclasses.replace(recording, frames=None)
-        asked = evenly(spanned, 100.0 if rate is None else rate, start)
+        asked = evenly_spaced_times(spanned, 100.0 if rate is None else rate, start)
     asked = within(asked, start, stop, str(path))
     if method is None:
         pixels = len(asked) * recording.width * recording.height

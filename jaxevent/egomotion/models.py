@@ -38,7 +38,7 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import full_precision
 from jaxevent.egomotion.geometry import A, rotation_basis, rotation_exp, unit
 from jaxevent.errors import InputError
-from jaxevent.estimator import imported
+from jaxevent.estimator import import_object
 from jaxevent.parameters import suggest_name
 
 if TYPE_CHECKING:
@@ -571,7 +571,7 @@ MODELS: Mapping[str, type[Model]] = {model.name: model for model in (Planar, Rot
 @functools.cache
 def _load(path: str) -> type[Model]:
     """Import the model "package.module:Class"."""
-    found = imported(path, type, "motion model")
+    found = import_object(path, type, "motion model")
     if not issubclass(found, Model):
         raise InputError(f"{path!r} is no motion model; give a subclass of egomotion.Model")
     return found

@@ -16,7 +16,7 @@ from jaxevent.egomotion.models import Model, unit_vectors
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 
 OUTLIER_ERROR = 0.05  # relative magnitude error from which a vector is an outlier in the thesis
 UNITS = {  # of `motion_errors`
@@ -207,7 +207,7 @@ class MotionScores:
         rows = [(name, f"{value:.4g}", unit) for name, value, unit in self.rows()]
         widths = [max(len(row[i]) for row in rows) for i in range(2)]
         lines = [
-            f"{name:{widths[0]}}  {value:>{widths[1]}} {unit:4}  {MEANINGS[name]}"
+            f"{name:{widths[0]}}  {value:>{widths[1]}} {unit:4}  {MEASURE_MEANINGS[name]}"
             for name, value, unit in rows[:-2]
         ]
         lines += self.notes if lines else ()

@@ -14,17 +14,17 @@ import numpy as np
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Recording
 
-FEWEST_EVENTS = 100  # whose span says anything about a clock, short of one that is far off
-LEAST_OVERLAP = 0.5  # of the shorter of the two spans
-NEAR_INTERVALS = 3  # intervals between frames that a span may miss the other by
-NEAR_US = 1_000_000  # us between disjoint spans, from which they are refused
+MIN_EVENTS = 100  # whose span says anything about a clock, short of one that is far off
+MIN_OVERLAP_SHARE = 0.5  # of the shorter of the two spans
+NEAR_FRAME_INTERVALS = 3  # intervals between frames that a span may miss the other by
+MAX_SPAN_GAP_US = 1_000_000  # us between disjoint spans, from which they are refused
 # A lone frame serves events that begin later; their distance, in spans of the events of at least
-# `NEAR_US`, is not sensitive: another clock is days off.
-LONE_FRAME_SPANS = 10
+# `MAX_SPAN_GAP_US`, is not sensitive: another clock is days off.
+MAX_LONE_FRAME_SPANS = 10
 # One span that is shorter than this part of the other shows a wrong unit of time, if no more than
 # one frame lies within the events or the frames are faster than cameras are.
-LEAST_RATIO = 0.01
-SHORTEST_INTERVAL_US = 100
+MIN_SPAN_RATIO = 0.01
+MIN_FRAME_INTERVAL_US = 100
 
 
 class ClockMismatch(NamedTuple):
@@ -63,18 +63,18 @@ def compare_clocks(recording: Recording, clock_offset: Any = 0.0) -> ClockMismat
     )
     common = min(last, end) - max(first, begin)  # us; negative: the distance between the spans
     if len(frames) == 1:
-        is_far = -common > LONE_FRAME_SPANS * max(NEAR_US, end - begin)
+        is_far = -common > MAX_LONE_FRAME_SPANS * max(MAX_SPAN_GAP_US, end - begin)
         return ClockMismatch(True, spans) if is_far else None
     interval = int(np.median(np.diff(frames.t)))
-    near, shorter = NEAR_INTERVALS * interval, min(last - first, end - begin)
-    if common < 0 and -common > max(near, NEAR_US):
+    near, shorter = NEAR_FRAME_INTERVALS * interval, min(last - first, end - begin)
+    if common < 0 and -common > max(near, MAX_SPAN_GAP_US):
         return ClockMismatch(True, spans)
-    if len(events) < FEWEST_EVENTS:
+    if len(events) < MIN_EVENTS:
         return None
-    if common < LEAST_OVERLAP * shorter and shorter - common > near:
+    if common < MIN_OVERLAP_SHARE * shorter and shorter - common > near:
         return ClockMismatch(False, spans)
-    is_slow = interval > end - begin and LEAST_RATIO * (last - first) > end - begin
-    is_fast = interval < SHORTEST_INTERVAL_US and last - first < LEAST_RATIO * (end - begin)
+    is_slow = interval > end - begin and MIN_SPAN_RATIO * (last - first) > end - begin
+    is_fast = interval < MIN_FRAME_INTERVAL_US and last - first < MIN_SPAN_RATIO * (end - begin)
     if len(frames) > 2 and (is_slow or is_fast):
         return ClockMismatch(False, f"{spans}, and the frames are {interval / 1e6:.6g} s apart")
     return None

@@ -11,7 +11,7 @@ from jaxevent.events.blocks import Part, Size, parse_duration, select_events, si
 from jaxevent.events.images import count_events
 from jaxevent.recording import Events, Recording, Times, microseconds
 
-LONG_AGO = np.iinfo(np.int64).min // 2  # us
+LONG_AGO_US = np.iinfo(np.int64).min // 2  # us
 
 
 def crop_time(part: Part, start: Times | None = None, stop: Times | None = None) -> Part:
@@ -144,21 +144,21 @@ def filter_background(
     window_us = parse_duration(window, "the window of the background filter")
     if not 1 <= neighbours <= 8:
         raise InputError(f"{neighbours} of 8 neighbours are not possible; give 1 to 8")
-    last = np.full((height + 2, width + 2), LONG_AGO)
+    last = np.full((height + 2, width + 2), LONG_AGO_US)
     return select_events(part, lambda e: supported(e.t, e.x, e.y, last, window_us, neighbours))
 
 
 @njit
-def supported(t: Any, x: Any, y: Any, last: Any, window_us: Any, neighbours: Any) -> Any:
+def supported(t: Any, x: Any, y: Any, last_t: Any, max_age_us: Any, min_neighbours: Any) -> Any:
     """Find events that pixels around them support.
 
     Args:
         t: (n,) times, us, in order.
         x: (n,) columns.
         y: (n,) rows.
-        last: (H + 2, W + 2) last time of each pixel, us, with a border; updated.
-        window_us: Longest time between an event and its support, us.
-        neighbours: Least number of supporting pixels.
+        last_t: (H + 2, W + 2) last time of each pixel, us, with a border; updated.
+        max_age_us: Longest time between an event and its support, us.
+        min_neighbours: Least number of supporting pixels.
 
     Returns:
         (n,), True for supported events.
@@ -169,9 +169,9 @@ def supported(t: Any, x: Any, y: Any, last: Any, window_us: Any, neighbours: Any
         for row in range(int(y[i]), int(y[i]) + 3):
             for column in range(int(x[i]), int(x[i]) + 3):
                 centre = row == int(y[i]) + 1 and column == int(x[i]) + 1
-                count += not centre and t[i] - last[row, column] <= window_us
-        kept[i] = count >= neighbours
-        last[int(y[i]) + 1, int(x[i]) + 1] = t[i]
+                count += not centre and t[i] - last_t[row, column] <= max_age_us
+        kept[i] = count >= min_neighbours
+        last_t[int(y[i]) + 1, int(x[i]) + 1] = t[i]
     return kept
 
 
@@ -194,7 +194,7 @@ def filter_refractory(part: Part, period: int | float, *, size: Size | None = No
     """
     width, height = size_of(part, size)
     dead_us = parse_duration(period, "the refractory period")
-    last = np.full((height, width), LONG_AGO)
+    last = np.full((height, width), LONG_AGO_US)
     return select_events(part, lambda e: _outside_dead_time(e.t, e.x, e.y, last, dead_us))
 
 

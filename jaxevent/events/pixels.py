@@ -18,7 +18,7 @@ from jaxevent.events.blocks import (
     select_events,
     size_of,
 )
-from jaxevent.events.filters import LONG_AGO
+from jaxevent.events.filters import LONG_AGO_US
 from jaxevent.recording import Events, ImageSource, Recording
 
 Change = Callable[[NDArray], NDArray]  # of images (n, H, W) or (n, H, W, 3)
@@ -158,7 +158,7 @@ def downsample(
 
     new = part if factor == 1 else map_events(part, step)
     if period_us:
-        last = np.full((2, height, width), LONG_AGO)
+        last = np.full((2, height, width), LONG_AGO_US)
         new = select_events(new, lambda e: _is_first(e.t, e.x, e.y, e.p, last, period_us))
     if not isinstance(part, Recording) or not isinstance(new, Recording) or factor == 1:
         return new

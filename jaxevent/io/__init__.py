@@ -23,21 +23,21 @@ from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.io.checks import ReadOptions, naming, open_archive, reading
 from jaxevent.io.decoded import remember_call
-from jaxevent.recording import PER_FRAME, Events, Recording
+from jaxevent.recording import PER_FRAME_EXTRAS, Events, Recording
 
 __all__ = ["load", "save", "times"]
 
 Reader = Callable[[Path, ReadOptions], Recording]
 
-_BAGS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
-_UNPACK = "unpack it and load the file inside"
-_UNREADABLE = {
-    b"\x1f\x8b": ("compressed by gzip", _UNPACK),
-    b"BZh": ("compressed by bzip2", _UNPACK),
-    b"\xfd7zXZ\0": ("compressed by xz", _UNPACK),
-    b"\x28\xb5\x2f\xfd": ("compressed by zstd", _UNPACK),
-    b"7z\xbc\xaf\x27\x1c": ("an archive of 7-Zip", _UNPACK),
-    b"Rar!": ("an archive of RAR", _UNPACK),
+_BAG_MAGICS = (b"#ROSBAG", b"\x89MCAP0\r\n", b"SQLite format 3\0")
+_UNPACK_REMEDY = "unpack it and load the file inside"
+_UNREADABLE_MAGICS = {
+    b"\x1f\x8b": ("compressed by gzip", _UNPACK_REMEDY),
+    b"BZh": ("compressed by bzip2", _UNPACK_REMEDY),
+    b"\xfd7zXZ\0": ("compressed by xz", _UNPACK_REMEDY),
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", _UNPACK_REMEDY),
+    b"7z\xbc\xaf\x27\x1c": ("an archive of 7-Zip", _UNPACK_REMEDY),
+    b"Rar!": ("an archive of RAR", _UNPACK_REMEDY),
     b"FEA1": ("Feather version 1", "write it anew as Parquet"),
     b"SIMPLE  =": ("FITS", "store events as a table of text or .npz"),
     **{
@@ -55,7 +55,7 @@ _PROPHESEE = re.compile(
 )  # lines of its headers
 _MAX_LINE_BYTES = 1 << 12
 
-_READABLE = (
+_READABLE_FORMATS = (
     "readable are a folder or zip with events.txt (Event-Camera Dataset), AEDAT 2 and 4, "
     "Prophesee RAW and DAT, Event Stream, bags of ROS 1 and ROS 2, HDF5 (jaxevent's own, DSEC, "
     "MVSEC, M3ED and others), MATLAB .mat (v5 and v7.3), N-Caltech101 .bin, folders of EVIMO2, "
@@ -115,10 +115,10 @@ def load(
             valid recording; the message names the place and the remedy.
     """
     path = Path(path)
-    if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_PIXELS:
+    if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_SIDE_PX:
         raise InputError(
             f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
-            f"{arrays.MAX_PIXELS}"
+            f"{arrays.MAX_SIDE_PX}"
         )
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE
@@ -162,7 +162,7 @@ def load(
 
 def _drop_frames(recording: Recording) -> Recording:
     """Leave out the frames of a recording, and arrays with one entry per frame."""
-    extra = {name: part for name, part in recording.extra.items() if name not in PER_FRAME}
+    extra = {name: part for name, part in recording.extra.items() if name not in PER_FRAME_EXTRAS}
     left_out = {**recording.left_out, "frames": "frames='none' or --frames none leaves them out"}
     return dataclasses.replace(recording, frames=None, extra=extra, left_out=left_out)
 
@@ -243,7 +243,7 @@ def _find_reader_of_streams(path: Path, head: bytes) -> Reader | None:
         from jaxevent.io import aedat
 
         return aedat.read_aedat4
-    if head.startswith(_BAGS) or (not head and (path / "metadata.yaml").is_file()):
+    if head.startswith(_BAG_MAGICS) or (not head and (path / "metadata.yaml").is_file()):
         from jaxevent.io import ros
 
         return ros.read
@@ -256,7 +256,7 @@ def _find_folder_reader(path: Path) -> Reader:
     if read := folders.find_reader(path):
         return read
     if not (path / "events.txt").is_file():
-        raise InputError(f"{path}: the folder holds no events.txt; {_READABLE}")
+        raise InputError(f"{path}: the folder holds no events.txt; {_READABLE_FORMATS}")
     from jaxevent.io import text
 
     return text.read
@@ -284,10 +284,10 @@ def _find_decoder(path: Path, head: bytes) -> Reader:
         return atis.read_event_stream
     if atis.is_n_caltech(path):
         return atis.read_n_caltech
-    for magic, (what, remedy) in _UNREADABLE.items():
+    for magic, (what, remedy) in _UNREADABLE_MAGICS.items():
         if head.startswith(magic):
             raise InputError(f"{path}: is {what}; {remedy}")
-    raise InputError(f"{path}: the format is not recognised; {_READABLE}")
+    raise InputError(f"{path}: the format is not recognised; {_READABLE_FORMATS}")
 
 
 def _find_table_reader(path: Path, head: bytes) -> Reader | None:
@@ -321,7 +321,9 @@ def _find_zip_reader(path: Path) -> Reader:
         return text.read
     if names and all(name.endswith(".npy") for name in names):
         return tables.read_npz
-    raise InputError(f"{path}: the zip holds neither events.txt nor .npy arrays; {_READABLE}")
+    raise InputError(
+        f"{path}: the zip holds neither events.txt nor .npy arrays; {_READABLE_FORMATS}"
+    )
 
 
 def _is_table(line: bytes) -> bool:
@@ -365,7 +367,7 @@ def _find_hdf5_reader(path: Path, options: ReadOptions) -> Reader:
         return hdf5.read
     raise InputError(
         f"{path}: the HDF5 file has neither events/t, x, y and p nor events under other known "
-        f"names; {_READABLE}"
+        f"names; {_READABLE_FORMATS}"
     )
 
 

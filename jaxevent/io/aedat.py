@@ -65,7 +65,7 @@ from jaxevent.arrays import times
 from jaxevent.errors import InputError, require
 from jaxevent.io import decoded
 from jaxevent.io.checks import (
-    GRAVITY,
+    GRAVITY_M_S2,
     ReadOptions,
     check_unfolded,
     check_whole_records,
@@ -77,8 +77,8 @@ from jaxevent.io.decoded import Columns, DecodedImages, FirstPass, gather_pieces
 from jaxevent.io.images import gather_frames
 from jaxevent.recording import Frames, Imu, Recording
 
-_MAX_HEADER = 1 << 24  # bytes
-_SIZES = (  # by the name of the chip in lower case
+_MAX_HEADER_BYTES = 1 << 24  # bytes
+_CHIP_SIZES_PX = (  # by the name of the chip in lower case
     ("davis240", (240, 180)),
     ("davis346", (346, 260)),
     ("davis640", (640, 480)),
@@ -86,7 +86,7 @@ _SIZES = (  # by the name of the chip in lower case
     ("davis208", (208, 192)),
 )
 # jAER's chips whose addresses are the DVS128's; those of two sensors have more.
-_DVS128 = {"dvs128", "tmpdiff128", "dvs128phidget", "arctds_dvs128"}
+_DVS128_CHIPS = {"dvs128", "tmpdiff128", "dvs128phidget", "arctds_dvs128"}
 _RESET, _SIGNAL, _IMU = 0, 1, 3
 
 
@@ -205,7 +205,7 @@ def _read_dvs128(path: Path, header: _Header, options: ReadOptions) -> Recording
 
 def _read_header(path: Path, size: tuple[int, int] | None) -> _Header:
     with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
+        head = file.read(_MAX_HEADER_BYTES)
     at = 0
     while head.startswith(b"#", at) and (stop := head.find(b"\n", at)) >= 0:
         at = stop + 1
@@ -214,8 +214,8 @@ def _read_header(path: Path, size: tuple[int, int] | None) -> _Header:
     text = head[:at].decode("latin-1")
     chip = re.search(r"^#\s*AEChip:\s*(\S+)", text, re.MULTILINE)
     name = chip.group(1).rpartition(".")[2] if chip else ""
-    known = next((size for key, size in _SIZES if name.lower().startswith(key)), None)
-    known = (128, 128) if name.lower() in _DVS128 else known
+    known = next((size for key, size in _CHIP_SIZES_PX if name.lower().startswith(key)), None)
+    known = (128, 128) if name.lower() in _DVS128_CHIPS else known
     if name and known is None:
         raise InputError(
             f"{path}: was recorded by the chip {name[:40]}, but only DAVIS cameras' and DVS128's "
@@ -242,9 +242,9 @@ def _read_header(path: Path, size: tuple[int, int] | None) -> _Header:
         size,
         at,
         float(np.deg2rad(1 / (16.4 * 2000 / degrees))),
-        GRAVITY * g / 32768,
+        GRAVITY_M_S2 * g / 32768,
         shutter.lower() != "false",
-        name.lower() in _DVS128,
+        name.lower() in _DVS128_CHIPS,
     )
 
 
@@ -258,7 +258,7 @@ def _records(path: Path, start: int, state: Any) -> Iterator[tuple[Any, int, NDA
     offset, before = state or (start, None)
     with path.open("rb") as file:
         file.seek(offset)
-        while len(words := np.fromfile(file, ">u4", 2 * decoded.BLOCK)):
+        while len(words := np.fromfile(file, ">u4", 2 * decoded.BLOCK_EVENTS)):
             state = (offset, before)
             a, t = words[0::2].astype(np.int64), words[1::2].astype(np.int64)
             # The counter is signed and rarely starts below 0; a fall by half its range is its end.
@@ -565,7 +565,7 @@ def _read_others(
             np.stack([rows[f"{name}_{axis}"] for axis in "xyz"], axis=1).astype(np.float64)
             for name in ("gyroscope", "accelerometer")
         )
-        imu = Imu(rows["t"].astype(np.int64), np.deg2rad(gyro), acc * GRAVITY)
+        imu = Imu(rows["t"].astype(np.int64), np.deg2rad(gyro), acc * GRAVITY_M_S2)
     return frames, imu, first_pass, extra
 
 

@@ -37,19 +37,19 @@ from jaxevent.io.checks import ReadOptions, check_whole_records, reading, sensor
 from jaxevent.io.decoded import Columns, FirstPass, read_events
 from jaxevent.recording import Recording
 
-_HEADER = 20  # bytes
-_KINDS = {0: "generic data", 1: "DVS events", 2: "ATIS events", 4: "colour events"}
+_HEADER_BYTES = 20  # bytes
+_DATA_KINDS = {0: "generic data", 1: "DVS events", 2: "ATIS events", 4: "colour events"}
 _OVERFLOW_ROW, _OVERFLOW_US = 240, 1 << 13
-_FEWEST_EVENTS = 16  # by which a file without a header is recognised
+_MIN_EVENTS = 16  # by which a file without a header is recognised
 
 
 def is_n_caltech(path: Path) -> bool:
     """Return whether a file without a header can be a .bin: its first times never go back."""
     length = path.stat().st_size
-    if length % 5 or length < 5 * _FEWEST_EVENTS:
+    if length % 5 or length < 5 * _MIN_EVENTS:
         return False
     _, (t, _, _, _) = next(_decode_bin(path, None))
-    return len(t) >= _FEWEST_EVENTS and bool((t[1:] >= t[:-1]).all())
+    return len(t) >= _MIN_EVENTS and bool((t[1:] >= t[:-1]).all())
 
 
 def read_n_caltech(path: Path, options: ReadOptions) -> Recording:
@@ -78,7 +78,7 @@ def _decode_bin(path: Path, state: tuple[int, int] | None) -> Iterator[tuple[Any
     offset, before = state or (0, 0)
     with path.open("rb") as file:
         file.seek(offset)
-        while len(data := np.fromfile(file, np.uint8, 5 * decoded.BLOCK)):
+        while len(data := np.fromfile(file, np.uint8, 5 * decoded.BLOCK_EVENTS)):
             state = (offset, before)
             x, y, *rest = data.reshape(-1, 5).T.astype(np.int64)
             overflows = before + np.cumsum(y == _OVERFLOW_ROW)
@@ -104,7 +104,7 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
         InputError: The file is damaged or of another version.
     """
     with reading(path), path.open("rb") as file:
-        head = file.read(_HEADER)
+        head = file.read(_HEADER_BYTES)
     version, kind = tuple(head[12:15]), head[15] if len(head) > 15 else None
     if version[:1] != (2,):
         raise InputError(
@@ -113,21 +113,21 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
         )
     if kind not in (1, 2):
         raise InputError(
-            f"{path}: holds {_KINDS.get(kind or 0, f'data of type {kind}')}; only change events, "
-            "of a DVS or an ATIS, can be read"
+            f"{path}: holds {_DATA_KINDS.get(kind or 0, f'data of type {kind}')}; only change "
+            "events, of a DVS or an ATIS, can be read"
         )
-    if len(head) < _HEADER:
+    if len(head) < _HEADER_BYTES:
         raise InputError(f"{path}: ends inside its header; fetch the file again")
     width, height = (int(n) for n in np.frombuffer(head, "<u2", 2, 16))
     size = options.size or (width, height)
     first_pass = FirstPass()
 
     def decode(state: tuple[int, int] | None) -> Iterator[tuple[Any, Columns]]:
-        offset, t = state or (_HEADER, 0)
+        offset, t = state or (_HEADER_BYTES, 0)
         with path.open("rb") as file:
             file.seek(offset)
             rest = b""
-            while piece := file.read(5 * decoded.BLOCK - len(rest)):
+            while piece := file.read(5 * decoded.BLOCK_EVENTS - len(rest)):
                 state = (offset, t)
                 data = np.frombuffer(rest + piece, np.uint8)
                 columns, count, crossings, used, t = _decode_stream(data, t, kind == 2)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, require
 from jaxevent.io.checks import check_unfolded, max_unfolded
 
-_PACKET = """std_msgs/Header header
+_PACKET_DEFINITION = """std_msgs/Header header
 uint32 height
 uint32 width
 uint64 seq
@@ -41,7 +41,7 @@ uint8[] events
 """
 
 # Definitions for bags that hold none, as rosbag2 wrote before 2023.
-_EVENTS = """std_msgs/Header header
+_EVENTS_DEFINITION = """std_msgs/Header header
 uint32 height
 uint32 width
 {0}/Event[] events
@@ -54,16 +54,16 @@ bool polarity
 """
 _EVENT_PACKAGES = ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs")
 
-_MAX_DEFINITION = 1 << 16  # characters of a definition that is parsed
-_MCAP_CHUNK = 6  # kind of a record
+_MAX_DEFINITION_CHARS = 1 << 16  # characters of a definition that is parsed
+_MCAP_CHUNK_KIND = 6  # kind of a record
 
-_BASES = {
+_BASE_DTYPES = {
     "bool": "u1", "byte": "u1", "octet": "u1", "char": "u1",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_MAX_FIELDS = 64  # of an element of an array
-_MAX_DEPTH = 8  # parts within parts
+_MAX_ELEMENT_FIELDS = 64  # of an element of an array
+_MAX_NESTING_DEPTH = 8  # parts within parts
 
 Fields = list[tuple[str, Any]]  # of a type of message: names, and types as rosbags parses them
 Place = tuple[int, int]  # a time of recording (ns), and the number of messages of it before
@@ -191,7 +191,7 @@ def _type_store(is_ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(_PACKET, "event_camera_msgs/msg/EventPacket"))
+    store.register(get_types_from_msg(_PACKET_DEFINITION, "event_camera_msgs/msg/EventPacket"))
     return store
 
 
@@ -204,9 +204,9 @@ def _parse(kind: str, definition: Any) -> dict[str, Fields]:
     text, is_idl = definition.data, definition.format == MessageDefinitionFormat.IDL
     if definition.format == MessageDefinitionFormat.NONE:
         is_array = package in _EVENT_PACKAGES and kind.endswith("/EventArray")
-        text = _EVENTS.format(package) if is_array else ""
+        text = _EVENTS_DEFINITION.format(package) if is_array else ""
     parsed: dict[str, Any] = {}
-    if len(text) > _MAX_DEFINITION:
+    if len(text) > _MAX_DEFINITION_CHARS:
         return parsed
     with contextlib.suppress(Exception):  # of any kind: the parser follows the text of the file
         parsed = get_types_from_idl(text) if is_idl else get_types_from_msg(text, kind)
@@ -250,7 +250,7 @@ def _check_chunks(path: Path) -> None:
         while at + 9 <= length:
             file.seek(at)
             kind, size = struct.unpack("<BQ", file.read(9))
-            if kind == _MCAP_CHUNK and len(head := file.read(24)) == 24:
+            if kind == _MCAP_CHUNK_KIND and len(head := file.read(24)) == 24:
                 unfolded += struct.unpack("<16xQ", head)[0]
             at += 9 + size
     check_unfolded(unfolded, length, str(path))
@@ -362,17 +362,19 @@ def _members(
 ) -> list[tuple[str, str]] | None:
     node, detail = type_
     if node.name == "BASE":
-        return [(name, _BASES[detail[0]])] if detail[0] in _BASES else None
+        return [(name, _BASE_DTYPES[detail[0]])] if detail[0] in _BASE_DTYPES else None
     if node.name == "ARRAY":
         inner, count = detail
-        parts = [(f"{name}[{i}]", inner) for i in range(count if count <= _MAX_FIELDS else 0)]
+        parts = [
+            (f"{name}[{i}]", inner) for i in range(count if count <= _MAX_ELEMENT_FIELDS else 0)
+        ]
     else:
-        fields = types.get(detail, ()) if node.name == "NAME" and depth < _MAX_DEPTH else ()
+        fields = types.get(detail, ()) if node.name == "NAME" and depth < _MAX_NESTING_DEPTH else ()
         parts = [(f"{name}.{field}".lstrip("."), inner) for field, inner in fields]
     found: list[tuple[str, str]] = []
     for part, inner in parts:
         more = _members(types, inner, part, depth + 1)
-        if more is None or len(found) + len(more) > _MAX_FIELDS:
+        if more is None or len(found) + len(more) > _MAX_ELEMENT_FIELDS:
             return None
         found += more
     return found or None
@@ -397,11 +399,11 @@ class _MessageReader:
         self.known = known
         self.at = 0 if is_ros1 else 4
         # Parts without fields take no bytes, so that these alone would not bound the work.
-        self.parts_left = len(data) + _MAX_FIELDS
+        self.parts_left = len(data) + _MAX_ELEMENT_FIELDS
 
     def read_part(self, kind: str, depth: int = 0) -> dict[str, Any]:
         self.parts_left -= 1
-        if kind not in self.types or depth > _MAX_DEPTH or self.parts_left < 0:
+        if kind not in self.types or depth > _MAX_NESTING_DEPTH or self.parts_left < 0:
             raise ValueError(f"a part {kind[:60]!r} without a usable definition")
         return {name: self.read_value(type_, depth) for name, type_ in self.types[kind]}
 
@@ -411,7 +413,9 @@ class _MessageReader:
             return self.read_part(detail, depth + 1)
         if node.name == "BASE":
             return (
-                self.read_text() if "string" in detail[0] else self.read_number(_BASES[detail[0]])
+                self.read_text()
+                if "string" in detail[0]
+                else self.read_number(_BASE_DTYPES[detail[0]])
             )
         inner, count = detail
         if node.name == "SEQUENCE":

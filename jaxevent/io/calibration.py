@@ -29,9 +29,9 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError, require
 from jaxevent.io.checks import make_supported_camera, reading, whole_size
 
-SUFFIXES = (".yaml", ".yml")
+CALIBRATION_SUFFIXES = (".yaml", ".yml")
 _OPENCV_WORDS = re.compile(r"\A%YAML:1\.0[^\n]*|!!opencv-matrix\b")  # no YAML by its own rules
-_MAX_BYTES = 1 << 20  # of a file of a few cameras
+_MAX_FILE_BYTES = 1 << 20  # of a file of a few cameras
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ def read_cameras(path: Path) -> dict[str, CalibratedCamera]:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; correct the path")
     with reading(path):
-        if path.stat().st_size > _MAX_BYTES:
+        if path.stat().st_size > _MAX_FILE_BYTES:
             raise InputError(f"{path}: is too large for a calibration; give the YAML of cameras")
         text = _OPENCV_WORDS.sub("", path.read_text(encoding="utf-8-sig"))
         table: Any = YAML(typ="safe", pure=True).load(text)

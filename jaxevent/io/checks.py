@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENSES, find_model
+from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Events, ImageSource
 
-GRAVITY = 9.80665  # m/s^2, standard gravity
-_UNFOLDED_BYTES = 1 << 27  # of arrays that every file may unfold to
-_MAX_COMPRESSION = 100  # times its own bytes that a larger file may unfold to
-_COUNTS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
+GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
+_ALLOWED_UNFOLDED_BYTES = 1 << 27  # of arrays that every file may unfold to
+_MAX_COMPRESSION_RATIO = 100  # times its own bytes that a larger file may unfold to
+_COUNT_WORDS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,45 +134,47 @@ def damaged(what: str) -> InputError:
     return InputError(f"{what}; the file was cut off or is damaged, so fetch it again")
 
 
-def max_unfolded(stored: int) -> int:
-    """Return the number of bytes of arrays that `stored` bytes of a file may unfold to."""
-    return max(_UNFOLDED_BYTES, _MAX_COMPRESSION * stored)
+def max_unfolded(stored_bytes: int) -> int:
+    """Return the number of bytes of arrays that `stored_bytes` bytes of a file may unfold to."""
+    return max(_ALLOWED_UNFOLDED_BYTES, _MAX_COMPRESSION_RATIO * stored_bytes)
 
 
-def check_unfolded(size: int, stored: int, source: object) -> None:
+def check_unfolded(unfolded_bytes: int, stored_bytes: int, source: object) -> None:
     """Raise `InputError` if a file claims to hold far more bytes of arrays than it can.
 
     Memory stays bounded by what a file holds: real events and images compress less than 20 times.
 
     Args:
-        size: Number of bytes that the arrays take in memory.
-        stored: Number of bytes of the file.
+        unfolded_bytes: Number of bytes that the arrays take in memory.
+        stored_bytes: Number of bytes of the file.
         source: Name of the file for messages.
     """
-    if size > max_unfolded(stored):
+    if unfolded_bytes > max_unfolded(stored_bytes):
         raise InputError(
-            f"{source}: {stored:,} bytes of the file claim to hold {size:,}, over "
-            f"{_MAX_COMPRESSION} times as many; it is damaged or not a recording, else store it "
-            "with less compression"
+            f"{source}: {stored_bytes:,} bytes of the file claim to hold {unfolded_bytes:,}, over "
+            f"{_MAX_COMPRESSION_RATIO} times as many; it is damaged or not a recording, else store "
+            "it with less compression"
         )
 
 
-def check_whole_records(path: Path, n_bytes: int, width: int, what: str = "a record") -> None:
+def check_whole_records(
+    path: Path, n_bytes: int, record_bytes: int, what: str = "a record"
+) -> None:
     """Check that the bytes of a file are whole records.
 
     Args:
         path: The file.
         n_bytes: Number of its bytes that hold records.
-        width: Number of bytes of a record.
+        record_bytes: Number of bytes of a record.
         what: Words for a record, for the message.
 
     Raises:
         InputError: The last record is cut off.
     """
-    if rest := n_bytes % width:
+    if rest := n_bytes % record_bytes:
         raise InputError(
-            f"{path}: ends inside {what}, {rest} bytes after the last whole one of {width} bytes; "
-            "the recording was cut off, so fetch it again or drop these bytes: truncate -s "
+            f"{path}: ends inside {what}, {rest} bytes after the last whole one of {record_bytes} "
+            "bytes; the recording was cut off, so fetch it again or drop these bytes: truncate -s "
             f"-{rest} FILE"
         )
 
@@ -243,11 +245,11 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
     found = find_model(model)
     if found is None:
         raise InputError(f"{source}: {_unsupported_lens(model)}")
-    values, names = np.ravel(values), LENSES[found].coefficients
+    values, names = np.ravel(values), LENS_MODELS[found].coefficients
     count = 4 + len(names)
     if values.shape != (count,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         raise InputError(
-            f"{source}: the calibration must be {_COUNTS[count]} finite numbers, fx fy cx cy "
+            f"{source}: the calibration must be {_COUNT_WORDS[count]} finite numbers, fx fy cx cy "
             f"{' '.join(names)}"
         )
     fx, fy, cx, cy, *distortion = (float(value) for value in values)
@@ -257,7 +259,7 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
 def _unsupported_lens(model: str) -> str:
     return (
         f"the calibration has the lens model {model[:40]!r}, which is not supported; supported are "
-        f"{', '.join(LENSES)}"
+        f"{', '.join(LENS_MODELS)}"
     )
 
 
@@ -279,11 +281,11 @@ def make_supported_camera(
         InputError: The numbers are not valid.
     """
     found, k = find_model(model), np.ravel(coefficients)
-    if found == "radtan" and len(k) == len(LENSES["rational"].coefficients):
+    if found == "radtan" and len(k) == len(LENS_MODELS["rational"].coefficients):
         found = "rational"
     if found is None:
         return None, {"camera": f"{source}: {_unsupported_lens(model)}"}
-    count = len(LENSES[found].coefficients)
+    count = len(LENS_MODELS[found].coefficients)
     if np.any(k[count:]):
         return None, {
             "camera": f"{source}: the calibration has {len(k)} coefficients of the lens model "

@@ -26,14 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import arrays
-from jaxevent.arrays import NAMES, to_microseconds
+from jaxevent.arrays import FIELD_ALIASES, to_microseconds
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.io import decoded
 from jaxevent.io.checks import ReadOptions
 from jaxevent.io.decoded import Columns, read_events
 from jaxevent.io.time_units import (
-    SAMPLE,
+    SAMPLE_EVENTS,
     Clock,
     InferredUnit,
     infer_unit,
@@ -42,10 +42,10 @@ from jaxevent.io.time_units import (
 )
 from jaxevent.recording import EventSource
 
-_MAX_FALLING = 0.1  # share of events before which times may fall, in an order of columns
-_ORDERS = ("txyp", "xypt", "xytp", "ptxy")
-_UNIT = re.compile(r"\s*[\[(][^\])]*[\])]$|_px$")
-_UNSIGNED = tuple((1 << bits) - 1 for bits in (8, 16, 32, 64))  # -1 without its sign
+_MAX_FALLING_SHARE = 0.1  # share of events before which times may fall, in an order of columns
+_COLUMN_ORDERS = ("txyp", "xypt", "xytp", "ptxy")
+_UNIT_SUFFIX = re.compile(r"\s*[\[(][^\])]*[\])]$|_px$")
+_UNSIGNED_MINUS_ONES = tuple((1 << bits) - 1 for bits in (8, 16, 32, 64))  # -1 without its sign
 
 Fields = Callable[[slice], Mapping[str, NDArray]]  # columns t, x, y and p of a range of rows
 
@@ -57,16 +57,18 @@ def find_fields(names: Sequence[str]) -> dict[str, str] | None:
     """
     if (found := arrays.find_fields(names)) is not None:
         return found
-    has_t = any(name.strip().lower() in NAMES["t"] for name in names)
+    has_t = any(name.strip().lower() in FIELD_ALIASES["t"] for name in names)
     timed = [] if has_t else [name for name in names if unit_of_name(name)][:1]
-    plain = {"t" if name in timed else _UNIT.sub("", name.strip().lower()): name for name in names}
+    plain = {
+        "t" if name in timed else _UNIT_SUFFIX.sub("", name.strip().lower()): name for name in names
+    }
     found = arrays.find_fields(list(plain)) if len(plain) == len(names) else None
     return None if found is None else {field: plain[name] for field, name in found.items()}
 
 
 def is_time(name: str) -> bool:
     """Return whether the name of a column is one of times, with a unit or without."""
-    return name.strip().lower() in NAMES["t"] or unit_of_name(name) is not None
+    return name.strip().lower() in FIELD_ALIASES["t"] or unit_of_name(name) is not None
 
 
 def as_rows(array: Any) -> Any:
@@ -124,11 +126,11 @@ def order_of(rows: NDArray, size: tuple[int, int] | None, source: str) -> str:
     fitting: list[str] = []
     # On a sensor too small for them the one order will do, so that the event outside is named, and
     # where no column never falls, one that seldom does, so that the fault of its times is named.
-    for falls in (0.0, _MAX_FALLING):
+    for falls in (0.0, _MAX_FALLING_SHARE):
         for sides in (size or largest, largest):
-            fitting = fitting or [order for order in _ORDERS if fits(order, *sides, falls)]
+            fitting = fitting or [order for order in _COLUMN_ORDERS if fits(order, *sides, falls)]
     if len(fitting) != 1:
-        named = " or ".join(" ".join(order) for order in (fitting or _ORDERS))
+        named = " or ".join(" ".join(order) for order in (fitting or _COLUMN_ORDERS))
         raise InputError(
             f"{source}: its four columns without names {'could' if fitting else 'cannot'} be "
             f"{named}; sort by time, or name the columns: a line 't x y p' before the events, or "
@@ -169,7 +171,7 @@ def _unsigned_off(p: NDArray) -> float | None:
         return None
     most = p.max()
     kind = p.dtype.type if p.dtype.kind == "f" else np.float64
-    is_off = any(kind(number) == kind(most) for number in _UNSIGNED)
+    is_off = any(kind(number) == kind(most) for number in _UNSIGNED_MINUS_ONES)
     return float(most) if is_off and ((p == most) | (p == 1)).all() else None
 
 
@@ -224,29 +226,29 @@ class ColumnFormat(NamedTuple):
         return Clock(self.unit.name, first, last, self.is_float)
 
 
-MICROSECONDS = ColumnFormat()
+MICROSECOND_FORMAT = ColumnFormat()
 
 
-def sample_ends(fields: Fields, count: int) -> dict[str, NDArray]:
-    """Read the first `SAMPLE` events, and the last one if there are more.
+def sample_ends(fields: Fields, n_events: int) -> dict[str, NDArray]:
+    """Read the first `SAMPLE_EVENTS` events, and the last one if there are more.
 
     Args:
         fields: Columns of a range of rows.
-        count: Number of events.
+        n_events: Number of events.
 
     Returns:
         The columns by name, (n,) each.
     """
-    first = dict(fields(slice(0, SAMPLE)))
-    if count <= SAMPLE:
+    first = dict(fields(slice(0, SAMPLE_EVENTS)))
+    if n_events <= SAMPLE_EVENTS:
         return first
-    last = fields(slice(count - 1, count))
+    last = fields(slice(n_events - 1, n_events))
     return {name: np.concatenate([first[name], last[name]]) for name in first}
 
 
 def infer_format(
     sample: Mapping[str, NDArray],
-    count: int,
+    n_events: int,
     size: tuple[int, int],
     source: str,
     options: ReadOptions,
@@ -259,7 +261,7 @@ def infer_format(
 
     Args:
         sample: Columns t, x, y and p of the first events and the last one, (n,) each.
-        count: Number of events in all.
+        n_events: Number of events in all.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
         options: Choices of the caller.
@@ -279,7 +281,7 @@ def infer_format(
     if stated is None and (unit := unit_of_name(name)) is not None:
         stated = unit, f"the name {name.strip()!r}"
     sample = {**sample, "t": t}
-    found = infer_unit(sample, count, size, source, options, stated=stated, usual=usual)
+    found = infer_unit(sample, n_events, size, source, options, stated=stated, usual=usual)
     return ColumnFormat(found, _unsigned_off(sample["p"]), t.dtype.kind == "f")
 
 
@@ -316,7 +318,7 @@ def read_columns(
         usual: Usual unit of the layout, see `infer_unit`.
         unit: Unit of the times where the layout fixes it.
         origin: Number of the first column and row of the sensor, 0 or 1.
-        block: Number of events that are read together; None takes `decoded.BLOCK`.
+        block: Number of events that are read together; None takes `decoded.BLOCK_EVENTS`.
 
     Returns:
         The events, in memory or left in the file, their clock and notes.
@@ -333,7 +335,7 @@ def read_columns(
         found = ColumnFormat(InferredUnit(unit))
 
     def decode(state: int | None) -> Iterator[tuple[int, Columns]]:
-        size_of_block = block or decoded.BLOCK
+        size_of_block = block or decoded.BLOCK_EVENTS
         for row in range(state or 0, count, size_of_block):
             held = fields(slice(row, row + size_of_block))
             yield row, found.convert(held, source, row)

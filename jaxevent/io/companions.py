@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-_TRUTH = {"_data.hdf5": ("_gt.hdf5",), "_data.h5": ("_pose_gt.h5", "_depth_gt.h5")}
+_TRUTH_ENDINGS = {"_data.hdf5": ("_gt.hdf5",), "_data.h5": ("_pose_gt.h5", "_depth_gt.h5")}
 
 
 def companions(path: Path) -> list[Path]:
@@ -17,7 +17,7 @@ def companions(path: Path) -> list[Path]:
 def truth(path: Path) -> list[Path]:
     """Find the files of ground truth that exist."""
     found = []
-    for end, others in _TRUTH.items():
+    for end, others in _TRUTH_ENDINGS.items():
         if path.name.endswith(end):
             found += [path.with_name(path.name.removesuffix(end) + other) for other in others]
     found += [folder / stamps for folder, stamps in truth_folders(path)]

@@ -26,7 +26,7 @@ from jaxevent.locks import TurnLock, synchronized
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Recording, Triggers
 
-BLOCK = 1 << 20  # events decoded together: 13 MB
+BLOCK_EVENTS = 1 << 20  # events decoded together: 13 MB
 
 Columns = disorder.Columns
 Decoder = disorder.Decoder
@@ -238,7 +238,7 @@ def _with_repair(decode: Decoder, source: str, options: ReadOptions, words: str)
 
 
 def _find_disorder(
-    decode: Decoder, source: str, bound: int = disorder.BOUND_US
+    decode: Decoder, source: str, bound: int = disorder.DEFAULT_MAX_LATE_US
 ) -> disorder.Disorder:
     with reading(source):
         return disorder.find_disorder((columns[0] for _, columns in decode(None)), bound, source)
@@ -316,7 +316,7 @@ def gather_pieces(
 
     Args:
         pieces: State of the decoder before each piece, size of the piece, and the piece.
-        count: Size of a block; None takes `BLOCK`.
+        count: Size of a block; None takes `BLOCK_EVENTS`.
 
     Yields:
         The state before each block, and its pieces.
@@ -326,7 +326,7 @@ def gather_pieces(
         first = first if held else state
         held.append(piece)
         size += number
-        if size >= (count or BLOCK):
+        if size >= (count or BLOCK_EVENTS):
             yield first, held
             held, size = [], 0
     if held:
@@ -366,7 +366,7 @@ class DecodedEvents(EventsInFile):
     @synchronized
     def __getitem__(self, rows: slice) -> Events:
         """Decode the events of a range of rows; the file must not have changed since."""
-        start, stop = row_range(rows, len(self))
+        start, stop = slice_bounds(rows, len(self))
         if stop <= start:
             return Events.empty()
         block = int(np.searchsorted(self._rows, start, side="right")) - 1
@@ -415,7 +415,7 @@ class DecodedEvents(EventsInFile):
         return events
 
 
-def row_range(rows: slice, count: int) -> tuple[int, int]:
+def slice_bounds(rows: slice, count: int) -> tuple[int, int]:
     """Return the first row and the one after the last of a slice of `count` events, step 1."""
     start, stop, step = rows.indices(count)
     if step != 1:

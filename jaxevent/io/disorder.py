@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from jaxevent.display import plural
 from jaxevent.errors import InputError, OrderError
 
-BOUND_US = 10_000  # us that an event may be late where sorting has no bound of its own
-_MAX_RUN = 1000  # events that may be outliers together
-_MAX_EDGE = 10  # events that are outliers where the stream before or after them is missing
-_MIN_BITS = {1.0: 24, 1000.0: 32}  # of counters of us and of ns, by ticks in a us
-_WRAP_TOLERANCE = 1e-3  # of a wrap's period, in which there was no event
-_MAX_FAULTS = 0.05  # share of events that begin a fault; beyond, times are in no order at all
-_MIN_FAULTS = 1000  # that are always examined
+DEFAULT_MAX_LATE_US = 10_000  # us that an event may be late where sorting has no bound of its own
+_MAX_OUTLIER_RUN = 1000  # events that may be outliers together
+_MAX_EDGE_OUTLIERS = 10  # events that are outliers where the stream before or after them is missing
+_MIN_COUNTER_BITS = {1.0: 24, 1000.0: 32}  # of counters of us and of ns, by ticks in a us
+_WRAP_TOLERANCE_SHARE = 1e-3  # of a wrap's period, in which there was no event
+_MAX_FAULT_SHARE = 0.05  # share of events that begin a fault; beyond, times are in no order at all
+_MIN_REFUSED_FAULTS = 1000  # that are always examined
 
-KINDS = ("sort", "drop", "unwrap", "part")
-_USAGE = (
+REPAIR_KINDS = ("sort", "drop", "unwrap", "part")
+_REPAIR_USAGE = (
     "sort (events late by at most 10 ms, or sort:20000 in us, sort:0.02 in s), drop (outliers), "
     "unwrap (a counter) and part (the longest part between resets, or part:2), several joined by "
     "commas"
@@ -54,7 +54,7 @@ class Repair:
     """
 
     sort: bool = False
-    bound: int = BOUND_US
+    bound: int = DEFAULT_MAX_LATE_US
     drop: bool = False
     unwrap: bool = False
     part: int | None = None
@@ -64,7 +64,7 @@ def parse_repair(text: str) -> Repair:
     """Turn an option such as "sort", "drop,sort:20000" or "part:2" into a `Repair`.
 
     Raises:
-        InputError: A word is not one of `KINDS`, or its number is not valid.
+        InputError: A word is not one of `REPAIR_KINDS`, or its number is not valid.
     """
     chosen: dict[str, Any] = {}
     for word in text.split(","):
@@ -74,8 +74,8 @@ def parse_repair(text: str) -> Repair:
 
 
 def _option(text: str, kind: str, value: str | None) -> dict[str, Any]:
-    refused = InputError(f"repair = {text!r} is not known; give {_USAGE}")
-    if kind not in KINDS or (value is not None and kind in ("drop", "unwrap")):
+    refused = InputError(f"repair = {text!r} is not known; give {_REPAIR_USAGE}")
+    if kind not in REPAIR_KINDS or (value is not None and kind in ("drop", "unwrap")):
         raise refused
     if value is None:
         return {kind: 0 if kind == "part" else True}
@@ -143,7 +143,7 @@ class Disorder:
                 f"event {self.first.row} is at {self.first.after} us, earlier than the one before "
                 f"it at {self.first.before} us: "
             )
-        if self.events <= 2 * _MAX_EDGE and (
+        if self.events <= 2 * _MAX_EDGE_OUTLIERS and (
             self.resets or self.outliers
         ):  # too few to distinguish
             return OrderError(f"{where.rstrip(': ')}; sort the events by time (stable)")
@@ -171,7 +171,7 @@ class Disorder:
             yield "drop", f"{n:,} {plural('event', n)} far from the times around {_them(n)}"
         if self.late:
             n, bound = self.late, max(self.bound, self.latest)
-            sort = "sort" if bound == BOUND_US else f"sort:{bound}"
+            sort = "sort" if bound == DEFAULT_MAX_LATE_US else f"sort:{bound}"
             yield (
                 sort,
                 f"{n:,} {plural('event', n)} late by at most {self.latest:,} us (jitter)",
@@ -242,17 +242,17 @@ def _period(period: float) -> str:
 
 
 def find_disorder(
-    blocks: Iterable[NDArray[np.int64]], bound: int = BOUND_US, source: str = ""
+    blocks: Iterable[NDArray[np.int64]], max_late_us: int = DEFAULT_MAX_LATE_US, source: str = ""
 ) -> Disorder:
     """Find the faults of event times.
 
-    A step back by more than `bound` is the wrap of a counter where it is nearly 2^k us or ns. It
-    is an outlier where the times return by a similar step within a few events, before or after it.
-    Otherwise it is a reset.
+    A step back by more than `max_late_us` is the wrap of a counter where it is nearly 2^k us or
+    ns. It is an outlier where the times return by a similar step within a few events, before or
+    after it. Otherwise it is a reset.
 
     Args:
         blocks: Event times in us, in the order of the file, (events,) each.
-        bound: Lateness in us up to which events are late, not outliers.
+        max_late_us: Lateness in us up to which events are late, not outliers.
         source: Name of the file, for the error.
 
     Returns:
@@ -261,16 +261,16 @@ def find_disorder(
     Raises:
         InputError: The times are in no order.
     """
-    found = Disorder(bound)
+    found = Disorder(max_late_us)
     scan = _Scan(found, source)
     held = np.empty(0, np.int64)
     for block in blocks:
         # The rows before a step and those after it decide what it is: they are held back.
         held = np.concatenate([held, scan.continue_wraps(np.asarray(block, np.int64))])
-        if len(held) > 4 * _MAX_RUN:
-            scan.classify_steps(held, len(held) - _MAX_RUN)
-            scan.count_late(held, len(held) - 2 * _MAX_RUN)
-            held = held[-3 * _MAX_RUN :]
+        if len(held) > 4 * _MAX_OUTLIER_RUN:
+            scan.classify_steps(held, len(held) - _MAX_OUTLIER_RUN)
+            scan.count_late(held, len(held) - 2 * _MAX_OUTLIER_RUN)
+            held = held[-3 * _MAX_OUTLIER_RUN :]
     scan.classify_steps(held, len(held))
     scan.count_late(held, len(held))
     scan.turn_edges_into_outliers()
@@ -359,17 +359,22 @@ class _Scan:
     def turn_edges_into_outliers(self) -> None:
         """Turn parts of a few events at either end into outliers."""
         found = self.found
-        while found.resets and found.resets[0].row <= _MAX_EDGE < found.events - _MAX_EDGE:
+        while (
+            found.resets
+            and found.resets[0].row <= _MAX_EDGE_OUTLIERS < found.events - _MAX_EDGE_OUTLIERS
+        ):
             found.outliers.insert(0, (0, found.resets.pop(0).row))
         while (
             found.resets
-            and found.events - found.resets[-1].row <= _MAX_EDGE < found.events - _MAX_EDGE
+            and found.events - found.resets[-1].row
+            <= _MAX_EDGE_OUTLIERS
+            < found.events - _MAX_EDGE_OUTLIERS
         ):
             found.outliers.append((found.resets.pop().row, found.events))
 
     def _count(self) -> None:
         self.faults += 1
-        if self.faults > _MIN_FAULTS and self.faults > _MAX_FAULTS * self.found.events:
+        if self.faults > _MIN_REFUSED_FAULTS and self.faults > _MAX_FAULT_SHARE * self.found.events:
             raise OrderError(
                 f"{self.source}: the event times go back at one in "
                 f"{self.found.events // self.faults} events by more than {self.found.bound:,} us, "
@@ -385,11 +390,11 @@ def _periods(steps: NDArray[np.int64], bound: int) -> NDArray[np.float64]:
     """
     sizes = np.abs(steps).astype(np.float64)
     periods = np.zeros(len(steps))
-    for scale, fewest in list(_MIN_BITS.items())[::-1]:  # microseconds win
+    for scale, fewest in list(_MIN_COUNTER_BITS.items())[::-1]:  # microseconds win
         bits = np.ceil(np.log2(np.maximum((sizes - bound) * scale, 1)))
         period = 2.0**bits / scale
         missing = period - sizes
-        near = (missing >= -bound) & (missing <= np.maximum(bound, _WRAP_TOLERANCE * period))
+        near = (missing >= -bound) & (missing <= np.maximum(bound, _WRAP_TOLERANCE_SHARE * period))
         fits = near & (bits >= fewest) & (period > 8 * bound)
         periods = np.where(fits, period, periods)
     return periods
@@ -404,17 +409,17 @@ def _run_of_outliers(
     half its size: a clock that was set back climbs there slowly.
     """
     depth = t[at - 1] - t[at]
-    ahead = t[at : at + _MAX_RUN]
+    ahead = t[at : at + _MAX_OUTLIER_RUN]
     back = np.flatnonzero(ahead >= t[at - 1] - bound)
     late = None
     if len(back) and ahead[back[0]] - ahead[back[0] - 1] >= depth // 2:
         late = (at, at + int(back[0]))
-    behind = t[max(at - _MAX_RUN, 0) : at][::-1]
+    behind = t[max(at - _MAX_OUTLIER_RUN, 0) : at][::-1]
     low = np.flatnonzero(behind <= t[at] + bound)
     early = None
     if len(low) and behind[low[0] - 1] - behind[low[0]] >= depth // 2:
         early = (at - int(low[0]), at)
-    elif not len(low) and begins and at <= _MAX_EDGE < len(t) - at:
+    elif not len(low) and begins and at <= _MAX_EDGE_OUTLIERS < len(t) - at:
         early = (0, at)
     runs = [run for run in (late, early) if run is not None]
     return min(runs, key=lambda run: run[1] - run[0], default=None)

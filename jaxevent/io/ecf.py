@@ -27,9 +27,9 @@ from jaxevent.codegen import njit, njit_inlined
 from jaxevent.deprecated import renamed_names
 from jaxevent.io.checks import damaged
 
-FILTER = 36559
-MAX_EVENTS = 65535  # of a chunk
-RECORD: np.dtype = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+HDF5_FILTER_ID = 36559
+MAX_CHUNK_EVENTS = 65535  # of a chunk
+EVENT_DTYPE: np.dtype = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
 
 
 class Records:
@@ -39,15 +39,15 @@ class Records:
     """
 
     def __init__(self, stored: h5py.Dataset, source: str):
-        if stored.dtype != RECORD or len(stored.shape) != 1:
+        if stored.dtype != EVENT_DTYPE or len(stored.shape) != 1:
             raise damaged(
                 f"{source} is compressed with Prophesee's ECF but holds {stored.dtype}, not "
                 "records x, y, p and t"
             )
         self._stored, self._source = stored, source
         self._size: int = (stored.chunks or (1,))[0]
-        self.shape, self.dtype = stored.shape, RECORD
-        self._recent = 0, 0, np.empty(0, RECORD)  # a range of rows, replaced as a whole
+        self.shape, self.dtype = stored.shape, EVENT_DTYPE
+        self._recent = 0, 0, np.empty(0, EVENT_DTYPE)  # a range of rows, replaced as a whole
 
     def fields(self, name: str) -> "_Field":
         """Return one field of the records, decoded when it is sliced."""
@@ -62,7 +62,7 @@ class Records:
             chunks = range(start // size, -(-stop // size))
             parts = [self._chunk(number) for number in chunks]
             low, high = chunks.start * size, min(chunks.stop * size, self.shape[0])
-            recent = np.concatenate(parts) if parts else np.empty(0, RECORD)
+            recent = np.concatenate(parts) if parts else np.empty(0, EVENT_DTYPE)
             self._recent = low, high, recent
         return recent[start - low : stop - low]
 
@@ -71,7 +71,7 @@ class Records:
         count = min(self._size, self.shape[0] - first)
         mask, data = self._stored.id.read_direct_chunk((first,))
         if mask:  # stored as they are
-            records = np.frombuffer(data, RECORD)
+            records = np.frombuffer(data, EVENT_DTYPE)
         else:
             records = decode(np.frombuffer(data, np.uint8))
         if records is None or len(records) < count:
@@ -94,10 +94,10 @@ class _Field:
 
 def decode(data: NDArray[np.uint8]) -> NDArray | None:
     """Decode the records of a chunk; None if it is damaged."""
-    count = int(data[:4].copy().view("<u4")[0]) >> 2 if len(data) >= 12 else MAX_EVENTS + 1
-    if count > MAX_EVENTS:
+    count = int(data[:4].copy().view("<u4")[0]) >> 2 if len(data) >= 12 else MAX_CHUNK_EVENTS + 1
+    if count > MAX_CHUNK_EVENTS:
         return None
-    records = np.zeros(count, RECORD)
+    records = np.zeros(count, EVENT_DTYPE)
     t, x, y, p = np.zeros(count, np.int64), *np.zeros((3, count), np.uint16)
     if not _decode(data, t, x, y, p):
         return None

@@ -85,15 +85,15 @@ from jaxevent.io.checks import (
 )
 from jaxevent.io.columns import ColumnFormat, Fields, find_fields, infer_format, read_columns
 from jaxevent.io.decoded import Columns, DecodedImages, read_events
-from jaxevent.io.images import SUFFIXES, read_files
-from jaxevent.io.time_units import SAMPLE
-from jaxevent.lenses import LENSES, find_model
+from jaxevent.io.images import IMAGE_SUFFIXES, read_files
+from jaxevent.io.time_units import SAMPLE_EVENTS
+from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording
 
 _TIMELENS_FOLDERS = (("events", "images"), ("events_aligned", "images_corrected"))
-_STAMPS = ("timestamp.txt", "timestamps.txt")
-_FINE_PARTS = 32  # parts of a pixel in which remapped coordinates count
-_MISPLACED = 0.5  # share of events outside the images that shows remapped coordinates
+_IMAGE_TIME_FILES = ("timestamp.txt", "timestamps.txt")
+_SUBPIXEL_PARTS = 32  # parts of a pixel in which remapped coordinates count
+_MIN_MISPLACED_SHARE = 0.5  # share of events outside the images that shows remapped coordinates
 
 
 def find_reader(folder: Path) -> Callable[[Path, ReadOptions], Recording] | None:
@@ -305,7 +305,7 @@ def _camera(
     """Return the calibration, (width, height), and the entry of `left_out`."""
     about = meta["meta"]
     model = str(about.get("dist_model"))
-    lens = LENSES.get(find_model(model) or "")
+    lens = LENS_MODELS.get(find_model(model) or "")
     names = ("fx", "fy", "cx", "cy", *(lens.coefficients if lens else ()))
     values = np.array([float(about.get(name, 0.0)) for name in names])
     camera, left_out = make_supported_camera(values[:4], model, values[4:], f"{source}: meta")
@@ -460,7 +460,8 @@ def read_timelens(path: Path, options: ReadOptions) -> Recording:
     first, last = _first_and_last(files)
     grid = _PixelGrid(size, first[1], first[2])
     sample = {
-        name: np.concatenate([first[k][:SAMPLE], last[k][-1:]]) for k, name in enumerate("txyp")
+        name: np.concatenate([first[k][:SAMPLE_EVENTS], last[k][-1:]])
+        for k, name in enumerate("txyp")
     }
     count, usual = len(first[0]) * len(files), "us" if first[0].dtype.kind in "iu" else None
     found = infer_format(sample, count, size, source, options, usual=usual)
@@ -484,7 +485,7 @@ def _event_files(folder: Path) -> list[Path]:
 
 
 def _stamps_of(folder: Path) -> str | None:
-    return next((name for name in _STAMPS if (folder / name).is_file()), None)
+    return next((name for name in _IMAGE_TIME_FILES if (folder / name).is_file()), None)
 
 
 def _find_images(
@@ -493,12 +494,12 @@ def _find_images(
     """Find the times of the images, as stored, and their files; what is left out is named."""
     files = []
     if folder.is_dir():
-        files = sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES[:-1])
+        files = sorted(one for one in folder.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES[:-1])
     name = _stamps_of(folder)
     if files and name is None:
         left_out["frames"] = (
-            f"{folder} holds {len(files):,} images without their times; add {_STAMPS[0]} with one "
-            "time for each"
+            f"{folder} holds {len(files):,} images without their times; add "
+            f"{_IMAGE_TIME_FILES[0]} with one time for each"
         )
     if not files or name is None:
         return np.empty(0), []
@@ -540,8 +541,8 @@ class _PixelGrid:
         """Infer the coordinates from those of some events, (events,) each."""
         self._size = size
         outside = (x >= size[0]) | (y >= size[1]) | (x < 0) | (y < 0)
-        is_fine = bool(len(x)) and float(outside.mean()) > _MISPLACED
-        self.parts = _FINE_PARTS if is_fine else 1
+        is_fine = bool(len(x)) and float(outside.mean()) > _MIN_MISPLACED_SHARE
+        self.parts = _SUBPIXEL_PARTS if is_fine else 1
         self.is_remapped = is_fine or any(
             values.dtype.kind == "f" and bool((values != np.rint(values)).any())
             for values in (x, y)

@@ -38,7 +38,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import UNITS, times, to_microseconds
+from jaxevent.arrays import UNIT_NAMES, times, to_microseconds
 from jaxevent.errors import InputError, OrderError
 from jaxevent.io import companions
 from jaxevent.io.checks import (
@@ -51,15 +51,15 @@ from jaxevent.io.checks import (
     whole_number,
     whole_size,
 )
-from jaxevent.io.columns import MICROSECONDS, ColumnFormat, infer_format, sample_ends
-from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events, row_range
+from jaxevent.io.columns import MICROSECOND_FORMAT, ColumnFormat, infer_format, sample_ends
+from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events, slice_bounds
 from jaxevent.io.disorder import Columns, find_disorder
 from jaxevent.io.hdf5_files import (
     array,
     attribute,
     dataset,
     describe_images,
-    filters_of,
+    filter_ids,
     open_file,
 )
 from jaxevent.io.output import CLOCK_UNIT, complete_hdf5
@@ -77,7 +77,7 @@ from jaxevent.recording import (
     Triggers,
 )
 
-VERSION = 1
+FORMAT_VERSION = 1
 _LEVELS_UNIT = "levels: 0 black, {most} white"  # of images
 # Names of datasets by their unit. The units of further arrays are not known here.
 _NAMES_OF_UNITS: dict[str, str] = {
@@ -106,11 +106,11 @@ _NAMES_OF_UNITS: dict[str, str] = {
     "levels: 0 black, 255 white": "extra/cut extra/read_noise",
     "1000 times the number of the object": "extra/mask",
 }
-_UNITS = {name: unit for unit, names in _NAMES_OF_UNITS.items() for name in names.split()}
-_BLOSC_FILTER = 32001
-_BLOCK = 1 << 20  # events copied at a time: 13 MB
-_CHUNK = 1 << 16  # values compressed together
-_MAX_TABLE = 1 << 22  # entries of ms_to_idx, 70 minutes and 33 MB, or two for each event
+_UNIT_OF_NAME = {name: unit for unit, names in _NAMES_OF_UNITS.items() for name in names.split()}
+_BLOSC_FILTER_ID = 32001
+_BLOCK_EVENTS = 1 << 20  # events copied at a time: 13 MB
+_CHUNK_VALUES = 1 << 16  # values compressed together
+_MAX_TABLE_ENTRIES = 1 << 22  # entries of ms_to_idx, 70 minutes and 33 MB, or two for each event
 
 Column = Any  # one field of the events: a dataset, or an object that is sliced like one
 
@@ -143,7 +143,7 @@ def infer_column_format(
     t = columns["t"]
     shapes = {column.shape for column in columns.values()}
     if len(shapes) > 1 or len(t.shape) != 1 or not t.shape[0]:
-        return MICROSECONDS  # `StoredEvents` names the fault
+        return MICROSECOND_FORMAT  # `StoredEvents` names the fault
     with reading(f"{source}: events"):
         sample = sample_ends(
             lambda rows: {key: np.asarray(columns[key][rows]) for key in "txyp"}, t.shape[0]
@@ -168,7 +168,7 @@ class StoredEvents(EventsInFile):
         columns: Mapping[str, Column],
         size: tuple[int, int],
         source: str,
-        found: ColumnFormat = MICROSECONDS,
+        found: ColumnFormat = MICROSECOND_FORMAT,
         *,
         offset: int = 0,
         ms_to_idx: h5py.Dataset | None = None,
@@ -221,7 +221,7 @@ class StoredEvents(EventsInFile):
 
         The event before the range is read too, so that pieces read in turn are sorted as a whole.
         """
-        start, stop = row_range(rows, len(self))
+        start, stop = slice_bounds(rows, len(self))
         if stop <= start:
             return Events.empty()
         lead = min(start, 1)
@@ -237,8 +237,8 @@ class StoredEvents(EventsInFile):
 
     def decode(self, row: int | None) -> Iterator[tuple[int, Columns]]:
         """Yield blocks of columns that are not checked, from a row on: a `Decoder`."""
-        for start in range(row or 0, len(self), _BLOCK):
-            yield start, self._read(start, min(start + _BLOCK, len(self)))
+        for start in range(row or 0, len(self), _BLOCK_EVENTS):
+            yield start, self._read(start, min(start + _BLOCK_EVENTS, len(self)))
 
     def repaired(self, options: ReadOptions) -> EventSource:
         """Return these events, with their times repaired by the options."""
@@ -269,7 +269,7 @@ class StoredEvents(EventsInFile):
             return None
         kinds = [column.dtype for column in stored]
         known = [[t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)]
-        if kinds not in known or self._format[:2] != MICROSECONDS[:2]:
+        if kinds not in known or self._format[:2] != MICROSECOND_FORMAT[:2]:
             return None
         start, stop, _ = rows.indices(len(self))
         count, previous = max(stop - start, 0), np.iinfo(np.int64).min
@@ -292,7 +292,7 @@ class StoredEvents(EventsInFile):
             low, high = self._millisecond(since // 1000)
             if 0 <= low <= high <= len(self):
                 # Without the table, or in a dense millisecond, bisect down to one chunk.
-                while high - low > _CHUNK:
+                while high - low > _CHUNK_VALUES:
                     middle = (low + high) // 2
                     if self._times(middle, middle + 1)[0] < since:
                         low = middle + 1
@@ -394,10 +394,10 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
         held = ((name, attribute(file, name)) for name in names)
         attributes: dict[str, Any] = {name: value for name, value in held if value is not None}
     is_ours = attributes.get("format") == "jaxevent"
-    if is_ours and attributes.get("version") != VERSION:
+    if is_ours and attributes.get("version") != FORMAT_VERSION:
         raise InputError(
             f"{path}: has version {attributes.get('version')} of the layout but this jaxevent "
-            f"reads version {VERSION}; update jaxevent"
+            f"reads version {FORMAT_VERSION}; update jaxevent"
         )
     extra = _read_extra(file, source)
     if size is None and "width" in attributes and "height" in attributes:
@@ -417,14 +417,14 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
     if "t_offset" in file:
         offset = whole_number(array(file, "t_offset", source), source, "t_offset")
     table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
-    found, states_unit = MICROSECONDS, is_ours or table is not None
+    found, states_unit = MICROSECOND_FORMAT, is_ours or table is not None
     if states_unit:
         options.refuse_time_unit(path)
     if not states_unit or columns["t"].dtype.kind == "f":
         found = infer_column_format(columns, size, source, options)
     if found.unit.name != "us" and offset:
         raise InputError(
-            f"{source}: events/t is in {UNITS[found.unit.name]} and t_offset in microseconds; "
+            f"{source}: events/t is in {UNIT_NAMES[found.unit.name]} and t_offset in microseconds; "
             "store all times in integer microseconds"
         )
     notes = list(found.unit.notes)
@@ -485,7 +485,7 @@ def _is_dsec(file: Any) -> bool:
         stored = file.get(f"events/{name}")
         if not isinstance(stored, h5py.Dataset) or stored.dtype != kind:
             return False
-        if _BLOSC_FILTER not in filters_of(stored):
+        if _BLOSC_FILTER_ID not in filter_ids(stored):
             return False
     return {"ms_to_idx", "t_offset"} <= set(file) and not len(file.attrs)
 
@@ -525,7 +525,7 @@ def write(
     with complete_hdf5(path) as (file, check):
         file.attrs.update(
             format="jaxevent",
-            version=VERSION,
+            version=FORMAT_VERSION,
             name=recording.name,
             width=recording.width,
             height=recording.height,
@@ -550,11 +550,11 @@ def write(
 
 
 def _write_units(file: h5py.File) -> None:
-    for name in ("frames/images", "extra/rgb", *_UNITS):
+    for name in ("frames/images", "extra/rgb", *_UNIT_OF_NAME):
         if isinstance(stored := file.get(name), h5py.Dataset):
             whole = stored.dtype.kind in "iu"
             levels = _LEVELS_UNIT.format(most=np.iinfo(stored.dtype).max if whole else 1)
-            stored.attrs["unit"] = _UNITS.get(name, levels)
+            stored.attrs["unit"] = _UNIT_OF_NAME.get(name, levels)
 
 
 def _write_events(
@@ -568,7 +568,7 @@ def _write_events(
     offset = int(events[:1].t[0]) if count else 0
     last_ms = (int(events[count - 1 :].t[0]) - offset) // 1000 if count else -1
     # Where times go back, reading the block that does so raises the error.
-    is_sparse = not -1 <= last_ms < max(_MAX_TABLE, 2 * count)
+    is_sparse = not -1 <= last_ms < max(_MAX_TABLE_ENTRIES, 2 * count)
     file["t_offset"] = np.int64(offset)
     options = _options(count, compression)
     t, x, y, p = (
@@ -581,9 +581,9 @@ def _write_events(
             "ms_to_idx", (last_ms + 1,), "u8", **_options(last_ms + 1, compression)
         )
     ms = 0
-    blocks = range(0, count, _BLOCK)
+    blocks = range(0, count, _BLOCK_EVENTS)
     for row in bar(blocks, desc="store events", unit="M events", progress=progress):
-        block = events[row : row + _BLOCK]
+        block = events[row : row + _BLOCK_EVENTS]
         since = block.t - offset
         rows = slice(row, row + len(block))
         t[rows], x[rows], y[rows], p[rows] = since, block.x, block.y, block.p
@@ -592,8 +592,8 @@ def _write_events(
             continue
         # The milliseconds that begin after the last block and not after this one's last event.
         end = min(int(since[-1]) // 1000, last_ms) + 1
-        for first in range(ms, end, _BLOCK):
-            begin = np.arange(first, min(first + _BLOCK, end))
+        for first in range(ms, end, _BLOCK_EVENTS):
+            begin = np.arange(first, min(first + _BLOCK_EVENTS, end))
             ms_to_idx[first : first + len(begin)] = row + np.searchsorted(since, 1000 * begin)
         ms = end
 
@@ -614,7 +614,7 @@ def _write(
     dtype = h5py.string_dtype() if values.dtype.kind == "U" else values.dtype
     options = _options(len(values) if values.size and values.ndim else 0, compression)
     if options:
-        rows = max(1, _CHUNK // values[0].size)
+        rows = max(1, _CHUNK_VALUES // values[0].size)
         options["chunks"] = (min(rows, len(values)), *values.shape[1:])
     try:
         file.create_dataset(name, values.shape, dtype, values.astype(dtype, copy=False), **options)
@@ -627,7 +627,7 @@ def _write(
 def _options(count: int, compression: str | None) -> dict[str, Any]:
     if compression is None or count == 0:
         return {}
-    return {"compression": compression, "shuffle": True, "chunks": (min(count, _CHUNK),)}
+    return {"compression": compression, "shuffle": True, "chunks": (min(count, _CHUNK_VALUES),)}
 
 
 def _read_strings(stored: h5py.Dataset, source: str) -> NDArray:

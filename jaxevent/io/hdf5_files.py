@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, require
 from jaxevent.io.checks import check_unfolded, damaged, max_unfolded, reading
 
-_MAX_COMPRESSION = 4096  # times smaller than in memory that any filter makes real events
-_HEAP_BYTES = 1 << 24  # at either end of a file that are searched for heaps
-_MAX_OBJECTS = 1000  # of a file that are examined for images
-_MAX_NAMES = 4  # of images in a message
-_COPY = (
+_MAX_COMPRESSION_RATIO = 4096  # times smaller than in memory that any filter makes real events
+_HEAP_SEARCH_BYTES = 1 << 24  # at either end of a file that are searched for heaps
+_MAX_EXAMINED_OBJECTS = 1000  # of a file that are examined for images
+_MAX_LISTED_NAMES = 4  # of images in a message
+_COPY_REMEDY = (
     "only what a file itself holds is read, so copy all into one file: if you trust it, by "
     "jaxevent convert --trust"
 )
@@ -42,8 +42,8 @@ _STRING = re.compile(
 )
 _HEAP = re.compile(rb"GCOL\x01\x00\x00\x00")  # `bytes.find` is slow among zeros
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_BLOCK = 1 << 18  # bytes that are searched at once
-_MAX_MATCH = 64  # bytes; more than either of the patterns has
+_BLOCK_BYTES = 1 << 18  # bytes that are searched at once
+_MAX_MATCH_BYTES = 64  # bytes; more than either of the patterns has
 
 
 @contextlib.contextmanager
@@ -68,7 +68,7 @@ def open_file(path: Path) -> h5py.File:
         )
         if link is not None and not _is_trusted.get():
             file.close()
-            raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY}")
+            raise InputError(f"{path}: {link.decode()} is a link to another file; {_COPY_REMEDY}")
         return file
 
 
@@ -91,8 +91,8 @@ def check_heaps(path: Path) -> None:
 
     HDF5 2.0 goes on by the size of each piece, and stays where that is 0 or overflows; for a heap
     that an attribute puts past the end of the file it takes gigabytes of memory first. The heaps
-    of a file's attributes lie near its start or, if written late, its end: `_HEAP_BYTES` bytes of
-    both are searched, once for a file as it is.
+    of a file's attributes lie near its start or, if written late, its end: `_HEAP_SEARCH_BYTES`
+    bytes of both are searched, once for a file as it is.
     """
     about = path.stat()
     state = about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
@@ -109,8 +109,8 @@ def search_heaps(path: Path, state: tuple[int, ...]) -> None:
         length = file.seek(0, 2)
         strings = set[bytes]()
         for begin, end in (
-            (0, min(_HEAP_BYTES, length)),
-            (max(_HEAP_BYTES, length - _HEAP_BYTES), length),
+            (0, min(_HEAP_SEARCH_BYTES, length)),
+            (max(_HEAP_SEARCH_BYTES, length - _HEAP_SEARCH_BYTES), length),
         ):
             heaps: list[int] = []
             for place, block in _blocks(file, begin, end):
@@ -131,8 +131,8 @@ def _blocks(file: io.FileIO, begin: int, end: int) -> Iterator[tuple[int, memory
 
     Blocks are overwritten: fresh memory for all of them takes longer than the search.
     """
-    scratch = memoryview(bytearray(_BLOCK))
-    for place in range(begin, end, _BLOCK - _MAX_MATCH):
+    scratch = memoryview(bytearray(_BLOCK_BYTES))
+    for place in range(begin, end, _BLOCK_BYTES - _MAX_MATCH_BYTES):
         file.seek(place)
         yield place, scratch[: file.readinto(scratch[: end - place])]
 
@@ -182,7 +182,7 @@ def _all_heaps_end(file: io.FileIO, heaps: list[int], end: int) -> bool:
     return True
 
 
-def filters_of(stored: h5py.Dataset) -> list[int]:
+def filter_ids(stored: h5py.Dataset) -> list[int]:
     """Return the numbers of the filters that the chunks of a dataset have gone through."""
     properties = stored.id.get_create_plist()
     return [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
@@ -214,8 +214,10 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
         if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
             if _is_trusted.get():
                 return found
-            raise InputError(f"{source}: {name} is made of other data sets or files; {_COPY}")
-        filters = filters_of(found)
+            raise InputError(
+                f"{source}: {name} is made of other data sets or files; {_COPY_REMEDY}"
+            )
+        filters = filter_ids(found)
         stored = found.id.get_storage_size()
         count = found.size or 0
         for code in filters:
@@ -227,7 +229,7 @@ def dataset(file: h5py.File, name: str, source: str, undone: Sequence[int] = ())
             check_unfolded(size, found.file.id.get_filesize(), f"{source}: {name}")
             if h5py.h5z.FILTER_DEFLATE in filters:
                 _check_deflated(found, f"{source}: {name}")
-        held = stored * (_MAX_COMPRESSION if filters else 1)
+        held = stored * (_MAX_COMPRESSION_RATIO if filters else 1)
         if count * found.dtype.itemsize > held:
             raise damaged(f"{source}: {name} claims {count} values but holds {stored} bytes")
     return found
@@ -249,7 +251,7 @@ def find_images(file: h5py.File) -> list[str]:
             is_virtual = item.id.get_create_plist().get_layout() == h5py.h5d.VIRTUAL
             if not is_virtual and item.dtype in (np.uint8, np.uint16) and item.ndim in (3, 4):
                 found.append(name)
-        return True if seen >= _MAX_OBJECTS else None
+        return True if seen >= _MAX_EXAMINED_OBJECTS else None
 
     file.visititems(visit)
     return found
@@ -260,7 +262,9 @@ def describe_images(file: h5py.File) -> dict[str, str]:
     names = find_images(file)
     if not names:
         return {}
-    listed = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
+    listed = ", ".join(names[:_MAX_LISTED_NAMES]) + (
+        ", ..." if len(names) > _MAX_LISTED_NAMES else ""
+    )
     return {
         "frames": (
             f"{listed} may be images, of another layout or camera; store them as images with times "

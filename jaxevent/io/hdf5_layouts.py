@@ -14,7 +14,7 @@
                                 /frame (frames, H, W) uint8, /frame_ts in us, /frame_idx, the
                                 number of events before each frame, which is not needed
     others                      /events or the file itself with t, x, y and p, whole lists or
-                                records, under the names that `jaxevent.arrays.NAMES` lists
+                                records, under the names that `jaxevent.arrays.FIELD_ALIASES` lists
 
 Integers are usually us, floats seconds (`time_units`). Exposures are unknown: 0. Where a file holds
 two cameras, left or right must be chosen. M3ED's frames come from cameras beside the event camera,
@@ -41,25 +41,25 @@ from jaxevent.io.checks import (
     sensor_size,
     whole_size,
 )
-from jaxevent.io.columns import MICROSECONDS, find_fields, order_of
+from jaxevent.io.columns import MICROSECOND_FORMAT, find_fields, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import Column, StoredEvents, StoredImages, infer_column_format, read_by
-from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filters_of
-from jaxevent.io.time_units import SAMPLE
+from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filter_ids
+from jaxevent.io.time_units import SAMPLE_EVENTS
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
 
-_GROUPS = ("events", "", "CD/events")
-_STEREO = ("prophesee", "davis")  # groups of the cameras of M3ED and MVSEC
+_EVENT_GROUPS = ("events", "", "CD/events")
+_STEREO_GROUPS = ("prophesee", "davis")  # groups of the cameras of M3ED and MVSEC
 
 
 def is_known(file: Any) -> bool:
     """Return whether an open file holds events in one of these layouts."""
-    if any(isinstance(file.get(name), h5py.Group) for name in _STEREO):
+    if any(isinstance(file.get(name), h5py.Group) for name in _STEREO_GROUPS):
         return True
     if _name_of_plain_columns(file) is not None:
         return True
-    return any(_fields(file, name) is not None for name in _GROUPS)
+    return any(_fields(file, name) is not None for name in _EVENT_GROUPS)
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
@@ -80,7 +80,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 def _read_open(file: Any, path: Path, options: ReadOptions) -> Recording:
     source = str(path)
-    for name in _STEREO:
+    for name in _STEREO_GROUPS:
         group = file.get(name)
         if isinstance(group, h5py.Group):
             sides = [side for side in ("left", "right") if isinstance(group.get(side), h5py.Group)]
@@ -95,7 +95,7 @@ def _read_open(file: Any, path: Path, options: ReadOptions) -> Recording:
     plain = _name_of_plain_columns(file)
     if plain is None:
         with reading(source):
-            name = next(name for name in _GROUPS if _fields(file, name) is not None)
+            name = next(name for name in _EVENT_GROUPS if _fields(file, name) is not None)
         name_of_t = (_fields(file, name) or {})["t"]
         columns = _open_columns(file, name, source)
     stamps, images = None, None
@@ -107,7 +107,7 @@ def _read_open(file: Any, path: Path, options: ReadOptions) -> Recording:
     stated = _stated_size(file, source) if options.size is None else None
     size = sensor_size(otherwise, options.size, stated, image_size(images))
     columns = columns if plain is None else _split_plain_columns(file, plain, size, source)
-    found = MICROSECONDS
+    found = MICROSECOND_FORMAT
     if name == "CD/events":
         options.refuse_time_unit(path)
     else:
@@ -170,9 +170,9 @@ def _split_plain_columns(
 ) -> dict[str, Column]:
     whole = dataset(file, name, source)
     if whole.shape[1] == 4:
-        order = order_of(np.asarray(whole[:SAMPLE]), size, source)
+        order = order_of(np.asarray(whole[:SAMPLE_EVENTS]), size, source)
         return _split_columns(whole, order)
-    order = order_of(np.asarray(whole[:, :SAMPLE].T), size, source)  # (4, events)
+    order = order_of(np.asarray(whole[:, :SAMPLE_EVENTS].T), size, source)  # (4, events)
     return {
         key: _Part(whole.shape[1], whole.dtype, lambda rows, row=row: whole[row, rows])
         for row, key in enumerate(order)
@@ -272,8 +272,8 @@ def _open_columns(file: Any, name: str, source: str) -> dict[str, Column]:
         raise InputError(f"{source}: {name} has no t, x, y and p; add them")
     if not isinstance(file.get(name) if name else file, h5py.Dataset):
         return {key: dataset(file, f"{name}/{fields[key]}", source) for key in "txyp"}
-    whole: Any = dataset(file, name, source, undone=[ecf.FILTER])
-    if filters_of(whole) == [ecf.FILTER]:
+    whole: Any = dataset(file, name, source, undone=[ecf.HDF5_FILTER_ID])
+    if filter_ids(whole) == [ecf.HDF5_FILTER_ID]:
         whole = ecf.Records(whole, f"{source}: {name}")
     return {
         key: _Part(whole.shape[0], whole.dtype[field], whole.fields(field).__getitem__)

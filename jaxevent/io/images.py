@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import LUMA, SCALES, UNITS, to_grey
+from jaxevent.arrays import LUMA_WEIGHTS, UNIT_NAMES, US_PER_UNIT, to_grey
 from jaxevent.camera import TableResponse
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import check_unfolded, reading
@@ -40,9 +40,9 @@ from jaxevent.io.output import complete
 from jaxevent.io.time_units import unit_of_name
 from jaxevent.recording import microseconds
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
-TIMES = ("timestamps.txt", "images.txt", "timestamp.txt")
-STACK_TIMES = "exposures.txt"
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
+TIMESTAMP_FILES = ("timestamps.txt", "images.txt", "timestamp.txt")
+STACK_EXPOSURES_FILE = "exposures.txt"
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")  # of a 2 x 2 cell, row by row
 _DSEC_EXPOSURES = "*exposure_timestamps*.txt"
 _DSEC_FOLDERS = ("rectified", "distorted")  # folders of images in DSEC's folder of a camera
@@ -113,7 +113,7 @@ class Scale:
                     f"{source}: has {intensity.shape[2]} channels; store grey or red, green, blue"
                 )
             grey = intensity.shape[2] == 1
-            intensity = intensity[..., 0] if grey else intensity[..., :3] @ LUMA
+            intensity = intensity[..., 0] if grey else intensity[..., :3] @ LUMA_WEIGHTS
         return intensity
 
 
@@ -125,7 +125,7 @@ def is_series(path: Path) -> bool:
 
     with reading(path):
         if path.is_dir():
-            images = any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+            images = any(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir())
             return images and not (path / "events.txt").is_file()
         if not path.is_file() or not h5py.is_hdf5(path):
             return False
@@ -136,7 +136,7 @@ def is_series(path: Path) -> bool:
 def read_series(
     images: Path,
     scale: Scale = Scale(),
-    timestamps: Sequence[str] = TIMES,
+    timestamps: Sequence[str] = TIMESTAMP_FILES,
     beside: Path | None = None,
 ) -> Series:
     """Read a series of images.
@@ -166,7 +166,7 @@ def read_series(
             (t, exposure), lambda row: stack[row], str(images), (images, times), scale
         )
     if names is None:
-        files = sorted(p for p in images.iterdir() if p.suffix.lower() in SUFFIXES)
+        files = sorted(p for p in images.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
         _check_count(images, len(files), times, len(t))
     else:
         files = [images / name for name in names]
@@ -187,7 +187,7 @@ def find_exposures(place: Path) -> Path | None:
 
 def _find_timestamps(place: Path, beside: Path | None, names: Sequence[str]) -> Path:
     folders = [place] if beside is None else [place, beside]
-    if names is TIMES:
+    if names is TIMESTAMP_FILES:
         if (exposures := find_exposures(place)) is not None:
             return exposures
         if place.name in _DSEC_FOLDERS:
@@ -471,7 +471,7 @@ def read_exposures(place: Path) -> NDArray[np.int64] | None:
 
     Returns None where no file of times has the starts and ends of exposures.
     """
-    path = find_exposures(place) or place / TIMES[0]
+    path = find_exposures(place) or place / TIMESTAMP_FILES[0]
     if not path.is_file():
         return None
     with contextlib.suppress(InputError):  # of a file that holds something else
@@ -531,7 +531,7 @@ def _inside(
     if share(times) >= 0.5:
         return times
     fitting = {}
-    for unit in SCALES:
+    for unit in US_PER_UNIT:
         with contextlib.suppress(InputError):
             t = _parse_times(path, words, remedy, unit)
             if share(t) == 1 and 10 * (t.max() - t.min()) >= span[1] - span[0]:
@@ -540,8 +540,8 @@ def _inside(
         return times
     unit, t = next(iter(fitting.items()))
     warnings.warn(
-        f"{path}: the times are taken as {UNITS[unit]}, since they lie in the recording then; name "
-        f"the column t_{unit} to be sure",
+        f"{path}: the times are taken as {UNIT_NAMES[unit]}, since they lie in the recording then; "
+        f"name the column t_{unit} to be sure",
         InputWarning,
         stacklevel=3,
     )
@@ -560,7 +560,7 @@ def _parse_times(
 ) -> NDArray[np.int64]:
     """Parse times in us; without a unit they are us if all are whole numbers, else seconds."""
     whole = all(re.fullmatch(r"[+-]?\d+", word) for word in words)
-    scale = Fraction(SCALES[unit or ("us" if whole else "s")]).limit_denominator(1000)
+    scale = Fraction(US_PER_UNIT[unit or ("us" if whole else "s")]).limit_denominator(1000)
     times: list[int] = []
     for number, word in enumerate(words):
         value: Any = math.nan
@@ -593,11 +593,11 @@ def read_stack(
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give the folder of the images")
     names: list[str] | None = None
-    if exposures is None and (folder / STACK_TIMES).is_file():
-        exposures, names = _read_exposure_list(folder / STACK_TIMES)
+    if exposures is None and (folder / STACK_EXPOSURES_FILE).is_file():
+        exposures, names = _read_exposure_list(folder / STACK_EXPOSURES_FILE)
     elif exposures is None and (lengths := read_exposures(folder)) is not None:
         exposures = (lengths * 1e-6).tolist()
-    files = sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES)
+    files = sorted(one for one in folder.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES)
     files = files if names is None else [folder / name for name in names]
     if not files:
         raise InputError(f"{folder}: holds no images; give those of one scene")
@@ -650,8 +650,8 @@ def _exif_exposure(file: Path) -> float:
         value = image.getexif().get_ifd(_EXIF).get(_EXPOSURE_TIME)
     if value is None:
         raise InputError(
-            f"{file}: does not state its exposure time; give --exposures, or {STACK_TIMES} of "
-            "lines 's name' beside the images"
+            f"{file}: does not state its exposure time; give --exposures, or "
+            f"{STACK_EXPOSURES_FILE} of lines 's name' beside the images"
         )
     return float(value)
 

@@ -48,15 +48,15 @@ from jaxevent.io.columns import (
     read_whole_columns,
     split_rows,
 )
-from jaxevent.io.time_units import SAMPLE, Clock
+from jaxevent.io.time_units import SAMPLE_EVENTS, Clock
 from jaxevent.recording import Events, Frames, Recording
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _FLAGS, _SIZES, _NAME = 6, 5, 1
-_NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
-_CLASSES = range(6, 16)  # of arrays: double, single and the integers
-_VARIABLES = ("image", "time_image", "exposure", "f_Q", "ct", "HDR_mat")  # but events
-_STRUCT = 2  # class of a struct
+_NUMBER_KINDS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
+_ARRAY_CLASSES = range(6, 16)  # of arrays: double, single and the integers
+_KNOWN_VARIABLES = ("image", "time_image", "exposure", "f_Q", "ct", "HDR_mat")  # but events
+_STRUCT_CLASS = 2  # class of a struct
 
 
 def read_v5(path: Path, options: ReadOptions) -> Recording:
@@ -152,15 +152,15 @@ def _numeric_parts(
     if flags is None or flags.kind != _FLAGS or len(flags.data) != 8:
         raise wrong
     (bits,) = struct.unpack_from(order + "I", flags.data)
-    is_struct = bits & 0xFF == _STRUCT
-    if bits & 0xFF not in _CLASSES and (is_field or not is_struct):
+    is_struct = bits & 0xFF == _STRUCT_CLASS
+    if bits & 0xFF not in _ARRAY_CLASSES and (is_field or not is_struct):
         return []
     kept = [flags, *elements]
     if [element.kind for element in kept[1:3]] != [_SIZES, _NAME]:
         raise wrong
     numbers = kept[3:]
     if not is_struct:
-        is_right = {element.kind for element in numbers} <= _NUMBERS
+        is_right = {element.kind for element in numbers} <= _NUMBER_KINDS
         if len(numbers) != 1 + bool(bits & 0x800) or not is_right:
             raise wrong
         return [bytes(body)]
@@ -282,7 +282,7 @@ def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
     plain = [
         name
         for name, value in arrays.items()
-        if name not in _VARIABLES and as_rows(value) is not None
+        if name not in _KNOWN_VARIABLES and as_rows(value) is not None
     ]
     return _StoredEvents({}, arrays.pop(plain[0])) if len(plain) == 1 else None
 
@@ -304,10 +304,10 @@ def _read_events(
             )
         order = "txyp"
         if not found.is_layout:
-            order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
-        elif not _has_order_of_layout(rows[:SAMPLE]):
+            order = order_of(rows[:SAMPLE_EVENTS], (size[0] + 1, size[1] + 1), source)
+        elif not _has_order_of_layout(rows[:SAMPLE_EVENTS]):
             with contextlib.suppress(InputError):  # the first bad value is named
-                order = order_of(rows[:SAMPLE], (size[0] + 1, size[1] + 1), source)
+                order = order_of(rows[:SAMPLE_EVENTS], (size[0] + 1, size[1] + 1), source)
         columns = split_rows(rows, order)
     # MATLAB counts from 1, and programs that write its files from 0.
     is_from_0 = not found.is_layout and any((columns[name] == 0).any() for name in "xy")
@@ -358,7 +358,7 @@ def _frames(
     t = clock.read(np.ravel(arrays.pop("time_image")), source, "image", notes, usual="us")
     if "exposure" in arrays:
         source = f"{path}: exposure"
-        exposure = times(np.ravel(arrays.pop("exposure")), source, "image", scale=1.0)
+        exposure = times(np.ravel(arrays.pop("exposure")), source, "image", us_per_unit=1.0)
         if len(exposure) == 1:
             exposure = np.full_like(t, exposure[0])
     else:

@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     import h5py
 
 CLOCK_UNIT = "us on the recording's clock"  # the unit of times
-_MAX_HASHED = 2_000_000_000  # bytes of a file that are read for its sha256
-_SAMPLE = 1024  # bytes from the middle of a plane
-_MAX_SHRUNK = 0.9  # of a sample: planes that do not get smaller are stored as they are
-_RAW_DEFLATE = -15  # without zlib's header and checksum
+_MAX_HASHED_BYTES = 2_000_000_000  # bytes of a file that are read for its sha256
+_SAMPLE_BYTES = 1024  # bytes from the middle of a plane
+_MAX_COMPRESSED_SHARE = 0.9  # of a sample: planes that do not get smaller are stored as they are
+_RAW_DEFLATE_WINDOW_BITS = -15  # without zlib's header and checksum
 
 
 def check_outputs(
@@ -122,13 +122,13 @@ def _same(one: Path, other: Path) -> bool:
         return os.path.realpath(one) == os.path.realpath(other)
 
 
-def partial_of(path: Path) -> Path:
+def partial_path(path: Path) -> Path:
     """Return a new name beside `path` for output that is not complete."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
 
 
 def is_partial(path: Path) -> bool:
-    """Return whether a name is one of `partial_of`, or that of a moment before."""
+    """Return whether a name is one of `partial_path`, or that of a moment before."""
     return re.fullmatch(r"\..+\.[0-9a-f]{12}\.(part|new)", path.name) is not None
 
 
@@ -142,7 +142,7 @@ def partials(path: Path) -> list[Path]:
         return []
 
 
-def abandoned(path: Path) -> list[Path]:
+def abandoned_partials(path: Path) -> list[Path]:
     """List the siblings of `path` whose writer has ended."""
     return [one for one in partials(path) if _lock_state(one) == "free"]
 
@@ -246,7 +246,7 @@ def _fingerprint(path: Path) -> dict[str, Any]:
             return {"note": "neither a file nor a folder"}
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            if size > _MAX_HASHED:
+            if size > _MAX_HASHED_BYTES:
                 return {"bytes": size, "note": "no sha256: larger than 2 GB"}
             return {"bytes": size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
     except OSError as error:  # it was removed; the output is kept
@@ -276,7 +276,7 @@ _into_folders = contextvars.ContextVar("into_folders", default=False)
 
 
 @contextlib.contextmanager
-def into_folders(allowed: bool) -> Iterator[None]:
+def allow_writing_into_folders(allowed: bool) -> Iterator[None]:
     """Set whether `complete` writes into folders that are not empty, within the block.
 
     Files of the same names are replaced then, and numbered ones of the same kind removed, as those
@@ -294,8 +294,8 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
     """Yield a temporary sibling of `path`, renamed onto `path` if the block succeeds.
 
     If the block raises, the sibling is removed and `path` is left as it was. An existing file is
-    replaced; an existing directory must be empty, but see `into_folders`. Siblings that a killed
-    process left are removed.
+    replaced; an existing directory must be empty, but see `allow_writing_into_folders`.
+    Siblings that a killed process left are removed.
 
     Args:
         path: File or folder to write.
@@ -311,12 +311,12 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
     path = Path(path)
     if not path.absolute().name:
         raise InputError(f"{path}: is a folder; give the name of something to write in it")
-    partial = partial_of(path.absolute())
+    partial = partial_path(path.absolute())
     # It has its name once it is locked: nobody shall take it for abandoned.
     unlocked = partial.with_suffix(".new")
     try:
         _refuse(path, directory)
-        for remains in abandoned(path):
+        for remains in abandoned_partials(path):
             _remove(remains)
         if directory:
             unlocked.mkdir()
@@ -526,16 +526,16 @@ def deflate_shuffled(numbers: NDArray[np.floating]) -> bytes:
 
 
 def _choose_compressor(plane: memoryview) -> Any:
-    middle = max(len(plane) // 2 - _SAMPLE // 2, 0)
-    sample = plane[middle : middle + _SAMPLE]
+    middle = max(len(plane) // 2 - _SAMPLE_BYTES // 2, 0)
+    sample = plane[middle : middle + _SAMPLE_BYTES]
     trial = _compressor(1)
     size = len(trial.compress(sample)) + len(trial.flush())
-    return _compressor(int(size < _MAX_SHRUNK * len(sample)))
+    return _compressor(int(size < _MAX_COMPRESSED_SHARE * len(sample)))
 
 
 def _compressor(level: int) -> Any:
     """Make a compressor of raw deflate; level 0 stores."""
-    return zlib.compressobj(level, zlib.DEFLATED, _RAW_DEFLATE, 9, zlib.Z_RLE)
+    return zlib.compressobj(level, zlib.DEFLATED, _RAW_DEFLATE_WINDOW_BITS, 9, zlib.Z_RLE)
 
 
 def finite(value: float | int) -> float | int | None:

@@ -44,12 +44,12 @@ from jaxevent.io.checks import ReadOptions, check_whole_records, damaged, readin
 from jaxevent.io.decoded import Columns, Decoder, FirstPass, read_events
 from jaxevent.recording import Recording
 
-_MAX_HEADER = 1 << 16  # bytes
-_TRIGGER_RECORDS = 14  # the type of a DAT file's records
+_MAX_HEADER_BYTES = 1 << 16  # bytes
+_TRIGGER_RECORD_TYPE = 14  # the type of a DAT file's records
 _EVT2_TYPES = (0, 1, 8, 10, 14, 15)
 _EVT3_TYPES = (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15)
-_MAX_RESERVED = 16  # different values of words of other types in a block
-_SIZES = (  # of sensors whose files may not state their size, by the name of Metavision's plugin
+_MAX_RESERVED_VALUES = 16  # different values of words of other types in a block
+_SENSOR_SIZES_PX = (  # where a file may not state it, by the name of Metavision's plugin
     ("gen31", (640, 480)),
     ("gen3", (640, 480)),
     ("gen41", (1280, 720)),
@@ -118,7 +118,7 @@ def _read_header(path: Path) -> tuple[dict[str, str], int]:
     a line of text.
     """
     with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
+        head = file.read(_MAX_HEADER_BYTES)
     header: dict[str, str] = {}
     at = 0
     while head.startswith(b"%", at):
@@ -147,7 +147,7 @@ def _stated_size(header: dict[str, str]) -> tuple[int, int] | None:
         if int(width) and int(height):
             return int(width), int(height)
     plugin = header.get("plugin_name", "").removeprefix("hal_plugin_")
-    return next((size for name, size in _SIZES if plugin.startswith(name)), None)
+    return next((size for name, size in _SENSOR_SIZES_PX if plugin.startswith(name)), None)
 
 
 def _words(path: Path, offset: int, dtype: str, count: int) -> Iterator[tuple[int, Any]]:
@@ -161,7 +161,7 @@ def _words(path: Path, offset: int, dtype: str, count: int) -> Iterator[tuple[in
 
 def _evt3_words(path: Path, start: int, offset: int | None) -> Iterator[tuple[int, int, NDArray]]:
     """Yield blocks of a RAW file's EVT3 words from an offset on, as `decode_evt3` takes them."""
-    for at, words in _words(path, start if offset is None else offset, "<u2", decoded.BLOCK):
+    for at, words in _words(path, start if offset is None else offset, "<u2", decoded.BLOCK_EVENTS):
         yield at, at, words
 
 
@@ -186,14 +186,14 @@ def _count_reserved(
         first_pass: Counts of the file.
 
     Raises:
-        InputError: Reserved words have more than `_MAX_RESERVED` values.
+        InputError: Reserved words have more than `_MAX_RESERVED_VALUES` values.
     """
     known = np.zeros(16, bool)
     known[list(defined)] = True
     reserved = ~known[kind]
     if not reserved.any():
         return
-    if len(np.unique(words[reserved])) > _MAX_RESERVED:
+    if len(np.unique(words[reserved])) > _MAX_RESERVED_VALUES:
         row = int(np.argmax(reserved))
         raise damaged(
             f"{source}: the word at byte {offset + row * words.itemsize} has the type "
@@ -254,7 +254,7 @@ def _evt2_words(
     path: Path, start: int, width: int, is_swapped: bool, offset: int | None
 ) -> Iterator[_Evt2Words]:
     # A word with a mask may hold 32 events.
-    count = decoded.BLOCK if width == 4 else max(1, decoded.BLOCK // 4)
+    count = decoded.BLOCK_EVENTS if width == 4 else max(1, decoded.BLOCK_EVENTS // 4)
     for at, words in _words(path, start if offset is None else offset, f"<u{width}", count):
         if width == 4:
             yield _Evt2Words(at, words, words, None)
@@ -324,7 +324,7 @@ def _open_dat(
     with path.open("rb") as file:
         file.seek(start)
         described = file.read(2)
-    if described == bytes([_TRIGGER_RECORDS, 8]):
+    if described == bytes([_TRIGGER_RECORD_TYPE, 8]):
         raise InputError(
             f"{path}: holds external triggers only; read the file of events, whose triggers these "
             "are where it is NAME_cd.dat or NAME_td.dat beside NAME_trigger.dat"
@@ -347,7 +347,7 @@ def _decode_dat(
 ) -> Iterator[tuple[Any, Columns]]:
     begin, before = state or (start, None)
     for_x, for_y = fields
-    for offset, words in _words(path, begin, "<u4", 2 * decoded.BLOCK):
+    for offset, words in _words(path, begin, "<u4", 2 * decoded.BLOCK_EVENTS):
         state = (offset, before)
         t, word = words[0::2].astype(np.int64), words[1::2]
         t = _continued(t, before, 32)
@@ -366,11 +366,11 @@ def _read_dat_triggers(path: Path, first_pass: FirstPass) -> None:
         with path.open("rb") as file:
             file.seek(start)
             described = file.read(2)
-    if described != bytes([_TRIGGER_RECORDS, 8]):
+    if described != bytes([_TRIGGER_RECORD_TYPE, 8]):
         raise InputError(f"{path}: holds no external triggers (type 0e, 8 bytes); move it away")
     check_whole_records(path, path.stat().st_size - start - 2, 8, "a word")
     before = None
-    for offset, words in _words(path, start + 2, "<u4", 2 * decoded.BLOCK):
+    for offset, words in _words(path, start + 2, "<u4", 2 * decoded.BLOCK_EVENTS):
         t, signal = _continued(words[0::2].astype(np.int64), before, 32), words[1::2]
         before = int(t[-1])
         first_pass.add_triggers(offset, t, signal & 0xF, signal >> 26)

@@ -74,18 +74,18 @@ from jaxevent.recording import Events, Frames, Imu, Poses, Recording, Triggers
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _IMU, _POSE = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_FIELDS = {_IMU: "imu", _POSE: "poses", _CAMERA_INFO: "camera"}
-_LUMA_AT = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}  # byte of a pixel's two
-_DEEP = {"mono10": 10, "mono12": 12, "mono14": 14}  # bits, of 16
-_CHANNELS = {
+_FIELD_OF_KIND = {_IMU: "imu", _POSE: "poses", _CAMERA_INFO: "camera"}
+_LUMA_BYTE = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}  # byte of a pixel's two
+_BITS_OF_ENCODING = {"mono10": 10, "mono12": 12, "mono14": 14}  # bits, of 16
+_DTYPE_AND_CHANNELS = {
     "mono8": ("u1", 1),
     "8UC1": ("u1", 1),
     "mono16": ("u2", 1),
     "16UC1": ("u2", 1),
     "8UC3": ("u1", 3),  # blue, green, red, as OpenCV has them
     "8UC4": ("u1", 4),
-    **{name: ("u2", 1) for name in _DEEP},
-    **{name: ("u1", 2) for name in _LUMA_AT},
+    **{name: ("u2", 1) for name in _BITS_OF_ENCODING},
+    **{name: ("u1", 2) for name in _LUMA_BYTE},
     **{
         f"{order}{bits}": (f"u{bits // 8}", len(order))
         for order in ("rgb", "bgr", "rgba", "bgra")
@@ -97,8 +97,8 @@ _CHANNELS = {
         for bits in (8, 16)
     },
 }
-_TIMES = ("ts", "t", "time", "stamp", "timestamp")
-_POLARITIES = ("polarity", "p", "pol", "on")
+_TIME_FIELDS = ("ts", "t", "time", "stamp", "timestamp")
+_POLARITY_FIELDS = ("polarity", "p", "pol", "on")
 
 
 class _ImageTopic(NamedTuple):
@@ -133,7 +133,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     stated = held.size if held else None
     image, left_out = _choose_frames(bag, topic, images, options, options.size or stated)
     chosen: dict[str, str | None] = {}
-    for kind, field in _FIELDS.items():
+    for kind, field in _FIELD_OF_KIND.items():
         found = bag.beside(topic, topics := bag.topics(kind))
         chosen[kind] = found[0] if len(found) == 1 else None
         if topics and chosen[kind] is None:
@@ -152,7 +152,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
         otherwise, options.size, stated, image_size(None if frames is None else frames.images)
     )
     events = read_events(held.decode, size, source, options) if held else Events.empty()
-    unread = set(images) | {one for kind in _FIELDS for one in bag.topics(kind)}
+    unread = set(images) | {one for kind in _FIELD_OF_KIND for one in bag.topics(kind)}
     unread -= {image, *chosen.values()}
     names = [*sorted(unread), *(other for other in several if other != topic)]
     extra |= {"topics_left_out": np.array(names)} if names else {}
@@ -200,7 +200,7 @@ def _find_image_topics(bag: Bag) -> dict[str, _ImageTopic]:
         is_depth = encoding in ("32FC1", "64FC1")
         is_depth |= encoding == "16UC1" and "depth" in topic.lower()
         size = (message.width, message.height)
-        found[topic] = _ImageTopic(is_depth, encoding in _CHANNELS, size)
+        found[topic] = _ImageTopic(is_depth, encoding in _DTYPE_AND_CHANNELS, size)
     return found
 
 
@@ -319,22 +319,24 @@ def _read_image(bag: Bag, topic: str, message: Any) -> NDArray:
         encoding = message.format.partition(";")[0].strip()
         return _interpolate_colours(image, encoding) if image.ndim == 2 else image
     encoding = message.encoding
-    if encoding not in _CHANNELS:
+    if encoding not in _DTYPE_AND_CHANNELS:
         raise InputError(
             f"{bag.path}: the images of {topic} are encoded as {encoding[:20]!r}, which is not "
             "read; record them as mono8, rgb8 or bayer_rggb8, or leave them out with "
             "frames='none' or --frames none"
         )
-    depth, channels = _CHANNELS[encoding]
+    depth, channels = _DTYPE_AND_CHANNELS[encoding]
     dtype = np.dtype(depth).newbyteorder(">" if message.is_bigendian else "<")
     rows = np.frombuffer(message.data.tobytes(), np.uint8).reshape(message.height, message.step)
     row = message.width * channels * dtype.itemsize
     image = np.ascontiguousarray(rows[:, :row]).view(dtype)
     image = image.reshape(message.height, message.width, channels).astype(dtype.newbyteorder("="))
-    if encoding in _LUMA_AT:
-        return np.ascontiguousarray(image[..., _LUMA_AT[encoding]])
+    if encoding in _LUMA_BYTE:
+        return np.ascontiguousarray(image[..., _LUMA_BYTE[encoding]])
     if channels == 1:
-        return _interpolate_colours(image[..., 0] << (16 - _DEEP.get(encoding, 16)), encoding)
+        return _interpolate_colours(
+            image[..., 0] << (16 - _BITS_OF_ENCODING.get(encoding, 16)), encoding
+        )
     return np.ascontiguousarray(image[..., :3] if encoding[0] == "r" else image[..., 2::-1])
 
 
@@ -414,8 +416,8 @@ def _find_event_fields(layout: MessageLayout) -> _EventFields | None:
     for field, type_ in layout.fields.items():
         members = [name for name, _ in layout.members(type_) or ()]
         lower = {name.lower(): name for name in members}
-        t = next((name for name in _TIMES if f"{name}.nanosec" in lower), None)
-        p = next((name for name in _POLARITIES if name in lower), None)
+        t = next((name for name in _TIME_FIELDS if f"{name}.nanosec" in lower), None)
+        p = next((name for name in _POLARITY_FIELDS if name in lower), None)
         if t is not None and p is not None and {"x", "y", f"{t}.sec"} <= set(lower):
             wanted = (f"{t}.sec", f"{t}.nanosec", "x", "y", p)
             return _EventFields(field, *(lower[name] for name in wanted))
@@ -601,7 +603,7 @@ class _Evt3Packets:
         pieces = (
             (here, len(content), content) for here, _, content in self._packets("evt3", 2, at)
         )
-        for first, held in gather_pieces(pieces, 2 * decoded.BLOCK):
+        for first, held in gather_pieces(pieces, 2 * decoded.BLOCK_EVENTS):
             words = np.concatenate(held).view("<u2")
             yield offset, (offset, first), words
             offset += words.nbytes

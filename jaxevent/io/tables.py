@@ -67,14 +67,21 @@ from jaxevent.io.columns import (
     split_rows,
 )
 from jaxevent.io.decoded import Columns, read_events
-from jaxevent.io.time_units import SAMPLE, numbers_of_dates, split_unit
+from jaxevent.io.time_units import SAMPLE_EVENTS, numbers_of_dates, split_unit
 from jaxevent.recording import Frames, Imu, Recording
 
 NUMPY_MAGIC = b"\x93NUMPY"
-_TEXT_BYTES = 1 << 24  # of text parsed together: about a million events
+_TEXT_BLOCK_BYTES = 1 << 24  # of text parsed together: about a million events
 _MAX_LINE_BYTES = 1 << 12
-_TEXT_SAMPLE = 16 * SAMPLE  # bytes of text from which order, unit and signs are inferred
-_OTHER_TIMES = ("frame_t", "exp_start", "exp_end", "imu_t")  # of an archive, beside the events
+_TEXT_SAMPLE_BYTES = (
+    16 * SAMPLE_EVENTS
+)  # bytes of text from which order, unit and signs are inferred
+_OTHER_TIME_ARRAYS = (
+    "frame_t",
+    "exp_start",
+    "exp_end",
+    "imu_t",
+)  # of an archive, beside the events
 _NO_SIZE = "the table does not state the sensor's size"
 
 
@@ -100,7 +107,7 @@ def read_npy(path: Path, options: ReadOptions) -> Recording:
     if rows is None:
         fields: Fields = lambda part: _record_columns(np.array(records[part]), names)  # noqa: E731
     else:
-        order = order_of(np.array(rows[:SAMPLE]), size, source)
+        order = order_of(np.array(rows[:SAMPLE_EVENTS]), size, source)
         fields = lambda part: split_rows(np.array(rows[part]), order)  # noqa: E731
     count = len(records if rows is None else rows)
     found = read_columns(fields, count, size, source, options, name=names.get("t", ""))
@@ -136,7 +143,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
     stated = {}
     for name in list(arrays):
         base, unit = split_unit(name)
-        if base in _OTHER_TIMES and unit is not None and base not in arrays:
+        if base in _OTHER_TIME_ARRAYS and unit is not None and base not in arrays:
             arrays[base], stated[base] = arrays.pop(name), unit
 
     def take(*names: str) -> list[NDArray]:
@@ -156,7 +163,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
     otherwise = f"{path}: has no width and height and no frames; add them or else"
     size = sensor_size(otherwise, options.size, stored, image_size(images))
     if rows is not None:
-        columns = split_rows(rows, order_of(rows[:SAMPLE], size, source))
+        columns = split_rows(rows, order_of(rows[:SAMPLE_EVENTS], size, source))
     events, clock, notes = read_whole_columns(columns, size, source, options, name=name_of_t)
 
     def stamps(name: str, what: str) -> NDArray[np.int64]:
@@ -255,7 +262,7 @@ def read_text(path: Path, options: ReadOptions) -> Recording:
     sample, table = _read_sample(path, table, size)
     size = sensor_size(f"{path}: {_NO_SIZE}", size)
     # The number of events is estimated from those of the first part.
-    held = (path.stat().st_size - table.start) / _TEXT_SAMPLE
+    held = (path.stat().st_size - table.start) / _TEXT_SAMPLE_BYTES
     count = round(len(sample["t"]) * max(held, 1.0))
     name = table.fields["t"] if table.has_names else ""
     found = infer_format(sample, count, size, source, options, name=name)
@@ -316,9 +323,11 @@ def _read_head(file: Any, source: str) -> _Table:
         start = file.tell()
         raw = file.readline(_MAX_LINE_BYTES)
         if len(raw) == _MAX_LINE_BYTES:
-            raise InputError(f"{source}: has a line of over {_MAX_LINE_BYTES} bytes; {_WANTED}")
+            raise InputError(
+                f"{source}: has a line of over {_MAX_LINE_BYTES} bytes; {_WANTED_LAYOUT}"
+            )
         if not raw:
-            raise InputError(f"{source}: holds no event; {_WANTED}")
+            raise InputError(f"{source}: holds no event; {_WANTED_LAYOUT}")
         line = raw.decode("utf-8-sig" if start == 0 else "utf-8", "replace").strip()
         geometry = re.match(r"[#%]\s*geometry\s*[:=]?\s*(\d{1,5})\s*[,x ]\s*(\d{1,5})\s*$", line)
         if geometry:
@@ -342,7 +351,9 @@ def _read_head(file: Any, source: str) -> _Table:
     if names is None:
         numbers = [field.replace(decimal, ".") for field in fields]
         if len(fields) != 4 or not all(_is_number(field) for field in numbers):
-            raise InputError(f"{source}: the line {line[:60]!r} comes before any names; {_WANTED}")
+            raise InputError(
+                f"{source}: the line {line[:60]!r} comes before any names; {_WANTED_LAYOUT}"
+            )
         return _Table(start, list("0123"), {}, mark, decimal, size)
     if len(fields) != len(names) or len(set(names)) != len(names):
         raise InputError(
@@ -358,9 +369,9 @@ def _read_sample(
     """Return the first events and the last one, and the table with the order of its columns."""
     with reading(str(path)), path.open("rb") as file:
         file.seek(table.start)
-        text = file.read(_TEXT_SAMPLE)
+        text = file.read(_TEXT_SAMPLE_BYTES)
         end = b""
-        if len(text) == _TEXT_SAMPLE:
+        if len(text) == _TEXT_SAMPLE_BYTES:
             text = text[: text.rfind(b"\n") + 1]
             file.seek(-min(_MAX_LINE_BYTES, path.stat().st_size - table.start), 2)
             end = file.read().rstrip()
@@ -379,7 +390,7 @@ def _read_sample(
     return sample, dataclasses.replace(table, has_decimals=sample["t"].dtype.kind == "f")
 
 
-_WANTED = (
+_WANTED_LAYOUT = (
     "a table of events begins with a line of names such as t,x,y,p, and each line after it is one "
     "event"
 )
@@ -400,13 +411,15 @@ def _decode(
     with path.open("rb") as file:
         file.seek(offset)
         rest = b""
-        while piece := file.read(_TEXT_BYTES - len(rest)):
+        while piece := file.read(_TEXT_BLOCK_BYTES - len(rest)):
             text = rest + piece
             cut = text.rfind(b"\n") + 1
-            if len(text) < _TEXT_BYTES:
+            if len(text) < _TEXT_BLOCK_BYTES:
                 cut = len(text)  # the last line may lack its end
             elif not cut:
-                raise InputError(f"{path}: has a line of over {_TEXT_BYTES} bytes; {_WANTED}")
+                raise InputError(
+                    f"{path}: has a line of over {_TEXT_BLOCK_BYTES} bytes; {_WANTED_LAYOUT}"
+                )
             columns = _parsed(path, table, text[:cut], row)
             yield (offset, row), columns
             row += len(columns[0])
@@ -451,7 +464,7 @@ def _numbers(path: Path, table: _Table, text: bytes, row: int) -> dict[str, NDAr
         except pd.errors.EmptyDataError:
             frame = pd.DataFrame({name: np.empty(0) for name in table.names})
     if not isinstance(frame.index, pd.RangeIndex):  # pandas makes surplus columns the index
-        raise InputError(f"{path}: has too many columns; {_WANTED}")
+        raise InputError(f"{path}: has too many columns; {_WANTED_LAYOUT}")
     columns = {}
     for key, name in table.fields.items():
         values = frame[name].to_numpy()
@@ -462,7 +475,7 @@ def _numbers(path: Path, table: _Table, text: bytes, row: int) -> dict[str, NDAr
                 held = str(values[bad])
                 if key != "p" or held.strip().lower() not in ("true", "false"):
                     raise InputError(
-                        f"{path}: event {row + bad} has {name} = {held[:40]}; {_WANTED}"
+                        f"{path}: event {row + bad} has {name} = {held[:40]}; {_WANTED_LAYOUT}"
                     )
                 words = [str(value).strip().lower() for value in values]
                 numbers = np.array([{"true": 1, "false": 0}.get(word, 9) for word in words])

@@ -13,7 +13,7 @@ under each unit, as a sum of log-likelihoods:
     magnitude    up to 12 days after zero, or a date between 2000 and 2050
     resolution   the largest power of ten of which all times are multiples
 
-The numbers decide only where there are at least `FEWEST_EVENTS`. A unit other than the usual one,
+The numbers decide only where there are at least `MIN_EVENTS`. A unit other than the usual one,
 or one that is hardly better than the next, is reported as an `InputWarning`; any unit that the
 layout does not state is a note of the recording. The constants were chosen on simulated recordings
 (`experiments/studies/time_units.md`).
@@ -31,39 +31,39 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import SCALES, UNITS, check_resolution, time_step, to_microseconds
+from jaxevent.arrays import UNIT_NAMES, US_PER_UNIT, check_resolution, time_step, to_microseconds
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import ReadOptions
 
-FEWEST_EVENTS = 300
-SAMPLE = 1 << 16  # events from which order, unit and signs are inferred
-_FEWEST_REPETITIONS = 100  # intervals between events of one pixel
+MIN_EVENTS = 300
+SAMPLE_EVENTS = 1 << 16  # events from which order, unit and signs are inferred
+_MIN_REPETITIONS = 100  # intervals between events of one pixel
 _BURST_FRACTION = (
     0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
 )
 _CERTAIN_NATS = 2.7  # nats by which an undoubted unit exceeds the next
 _WINNING_NATS = 1.0  # nats by which a unit must exceed the usual one
 _CONTRADICTION_NATS = 8.0  # nats by which another unit must exceed a stated one for a warning
-_LONGEST_US = 1e12  # of a recording with times that have decimals: 11.6 days
+_MAX_DECIMAL_SPAN_US = 1e12  # of a recording with times that have decimals: 11.6 days
 _GAP_RATIO = 1000.0  # times the sum of all other steps that a gap lasts
-_INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
+_PLAUSIBLE_INTERVALS_US = (150.0, 5e6)  # between images, poses and samples
 _MIN_OVERLAP, _CLEAR_OVERLAP = 0.02, 0.5  # intersection over union of the spans of two clocks
 
-_SPELLED = {
+_UNIT_SPELLINGS = {
     "s": r"s|secs?|seconds?",
     "ms": r"ms|msecs?|millis|milliseconds?",
     "us": r"us|[µμ]s|usecs?|micros|microseconds?",
     "ns": r"ns|nsecs?|nanos|nanoseconds?",
 }
-_TIME = r"(t|ts|time|times|timestamp|timestamps|time_stamp)"
-_NAMED = {
+_TIME_PATTERN = r"(t|ts|time|times|timestamp|timestamps|time_stamp)"
+_UNIT_PATTERNS = {
     unit: re.compile(
         # A lone "s" without a separator is a plural.
-        rf"{_TIME}(?:\s*[\[(]\s*(?:in )?(?:{words})\s*[\])]|[\s_./:-]+(?:in[\s_])?(?:{words})"
-        + (r")" if unit == "s" else rf"|(?:{words}))"),
+        rf"{_TIME_PATTERN}(?:\s*[\[(]\s*(?:in )?(?:{words})\s*[\])]"
+        rf"|[\s_./:-]+(?:in[\s_])?(?:{words})" + (r")" if unit == "s" else rf"|(?:{words}))"),
         re.IGNORECASE,
     )
-    for unit, words in _SPELLED.items()
+    for unit, words in _UNIT_SPELLINGS.items()
 }
 # Log-probabilities of a unit before any number but the kind is known.
 _WHOLE_NUMBER_NATS = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
@@ -91,7 +91,7 @@ class InferredUnit(NamedTuple):
 
 def unit_of_name(name: str) -> str | None:
     """Return the unit that the name of a column of times states, as in "t_ns"; else None."""
-    for unit, pattern in _NAMED.items():
+    for unit, pattern in _UNIT_PATTERNS.items():
         if pattern.fullmatch(name.strip()):
             return unit
     return None
@@ -99,7 +99,7 @@ def unit_of_name(name: str) -> str | None:
 
 def split_unit(name: str) -> tuple[str, str | None]:
     """Return a name without the unit at its end, and the unit, as of "frame_t_ns"."""
-    for unit, words in _SPELLED.items():
+    for unit, words in _UNIT_SPELLINGS.items():
         end = rf"\s*[\[(]\s*(?:{words})\s*[\])]|[\s_./:-]+(?:{words})"
         if found := re.fullmatch(rf"(.+?)(?:{end})", name.strip(), re.IGNORECASE):
             return found.group(1), unit
@@ -111,7 +111,7 @@ def unit_of_words(words: Any) -> str | None:
     if not isinstance(words, str):
         return None
     bare = words.strip().strip("[]()").lower()
-    return next((u for u, known in _SPELLED.items() if re.fullmatch(known, bare)), None)
+    return next((u for u, known in _UNIT_SPELLINGS.items() if re.fullmatch(known, bare)), None)
 
 
 def numbers_of_dates(values: NDArray) -> tuple[NDArray, str | None]:
@@ -126,14 +126,14 @@ def numbers_of_dates(values: NDArray) -> tuple[NDArray, str | None]:
     if values.dtype.kind not in "mM":
         return values, None
     unit = np.datetime_data(values.dtype)
-    if unit[0] not in SCALES or unit[1] != 1:
+    if unit[0] not in US_PER_UNIT or unit[1] != 1:
         values, unit = values.astype(f"{values.dtype.kind}8[us]"), ("us", 1)
     return values.view(np.int64), unit[0]
 
 
 def infer_unit(
     sample: Mapping[str, NDArray],
-    count: int,
+    n_events: int,
     size: tuple[int, int],
     source: str,
     options: ReadOptions,
@@ -145,7 +145,7 @@ def infer_unit(
 
     Args:
         sample: Columns t, x and y, (n,) each: the first events, and then the last one.
-        count: Number of events in all.
+        n_events: Number of events in all.
         size: (width, height) of the sensor in pixels.
         source: Name of the file for messages.
         options: Their `time_unit`, where given, is taken.
@@ -162,22 +162,22 @@ def infer_unit(
     t = sample["t"]
     if t.dtype.kind not in "iuf" or not len(t):
         return InferredUnit(options.time_unit or (stated[0] if stated else usual or "us"))
-    numbers = _Numbers.from_sample(sample, count, size)
+    numbers = _Numbers.from_sample(sample, n_events, size)
     expected = usual or _convention(numbers)
-    scores = {unit: numbers.score(unit, usual) for unit in SCALES}
+    scores = {unit: numbers.score(unit, usual) for unit in US_PER_UNIT}
     best = max(scores, key=lambda unit: scores[unit])
-    known = count >= FEWEST_EVENTS and numbers.span > 0
+    known = n_events >= MIN_EVENTS and numbers.span > 0
     notes: list[str] = []
     doubt = ""
     if options.time_unit is not None:
         unit = options.time_unit
     elif stated is not None:
         unit = stated[0]
-        notes.append(f"event times are {UNITS[unit]}, by {stated[1]}")
+        notes.append(f"event times are {UNIT_NAMES[unit]}, by {stated[1]}")
         if known and scores[best] > scores[unit] + _CONTRADICTION_NATS:
             doubt = (
-                f"{source}: event times are {UNITS[unit]} by {stated[1]}, but "
-                f"{numbers.describe(unit)}; as {UNITS[best]} {numbers.describe(best)}: if the "
+                f"{source}: event times are {UNIT_NAMES[unit]} by {stated[1]}, but "
+                f"{numbers.describe(unit)}; as {UNIT_NAMES[best]} {numbers.describe(best)}: if the "
                 f"name is wrong, give time_unit={best!r} or --time-unit {best}"
             )
     elif not known:
@@ -188,19 +188,25 @@ def infer_unit(
             and not _is_impossible(numbers.median, best)
         ):
             unit = best
-            notes.append(f"event times are taken as {UNITS[unit]}, by their magnitude")
+            notes.append(f"event times are taken as {UNIT_NAMES[unit]}, by their magnitude")
             doubt = _doubt(source, numbers, unit, expected)
     else:
         unit = best if scores[best] > scores[expected] + _WINNING_NATS else expected
         after = max((u for u in scores if u != unit), key=lambda u: scores[u])
         is_doubtful = scores[unit] < scores[after] + _CERTAIN_NATS
         if unit != expected or is_doubtful:
-            notes.append(f"event times are taken as {UNITS[unit]}, since {numbers.describe(unit)}")
+            notes.append(
+                f"event times are taken as {UNIT_NAMES[unit]}, since {numbers.describe(unit)}"
+            )
             doubt = _doubt(source, numbers, unit, expected if unit != expected else after)
-    scale = SCALES[unit]
-    if options.time_unit is None and numbers.has_decimals and numbers.span * scale > _LONGEST_US:
+    scale = US_PER_UNIT[unit]
+    if (
+        options.time_unit is None
+        and numbers.has_decimals
+        and numbers.span * scale > _MAX_DECIMAL_SPAN_US
+    ):
         raise InputError(
-            f"{source}: the times are numbers with decimals, so {UNITS[unit]}, but span "
+            f"{source}: the times are numbers with decimals, so {UNIT_NAMES[unit]}, but span "
             f"{numbers.span * scale / 86400e6:.0f} days; store them as integer microseconds, or "
             "give their unit, time_unit= or --time-unit"
         )
@@ -218,8 +224,8 @@ def _warn(text: str) -> None:
 
 def _doubt(source: str, numbers: "_Numbers", unit: str, other: str) -> str:
     return (
-        f"{source}: no unit of the event times is stated; {UNITS[unit]} are taken, since "
-        f"{numbers.describe(unit)}, while as {UNITS[other]} {numbers.describe(other)}; give "
+        f"{source}: no unit of the event times is stated; {UNIT_NAMES[unit]} are taken, since "
+        f"{numbers.describe(unit)}, while as {UNIT_NAMES[other]} {numbers.describe(other)}; give "
         f"time_unit={unit!r} or --time-unit {unit} to confirm, or the right unit"
     )
 
@@ -260,7 +266,7 @@ class _Numbers(NamedTuple):
         largest = float(np.abs(t).max())
         repetition = _repetition(stored, sample["x"][kept], sample["y"][kept])
         if repetition is not None:
-            held = float(steps[: SAMPLE - 1][steps[: SAMPLE - 1] > 0].sum())
+            held = float(steps[: SAMPLE_EVENTS - 1][steps[: SAMPLE_EVENTS - 1] > 0].sum())
             if repetition > _BURST_FRACTION * min(span * pixels / count, held):
                 repetition = None
         return cls(
@@ -282,18 +288,18 @@ class _Numbers(NamedTuple):
 
     def rate(self, unit: str) -> float:
         """Return the number of events per pixel and second."""
-        return self.count / (self.pixels * self.span * SCALES[unit] * 1e-6)
+        return self.count / (self.pixels * self.span * US_PER_UNIT[unit] * 1e-6)
 
     def describe(self, unit: str) -> str:
         """Describe the recording as it would be under a unit."""
-        seconds = self.span * SCALES[unit] * 1e-6
+        seconds = self.span * US_PER_UNIT[unit] * 1e-6
         rate = f", {self.rate(unit):.2g} events per pixel and second" if seconds else ""
         return f"they last {seconds:.3g} s{rate}"
 
     def score(self, unit: str, usual: str | None) -> float:
         """Return the log-likelihood of a unit, up to a constant, in nats."""
         score = self._prior(unit, usual)
-        seconds = SCALES[unit] * 1e-6
+        seconds = US_PER_UNIT[unit] * 1e-6
         if not self.span:
             return score + _of_magnitude(self.median * seconds)
         span = np.log10(self.span * seconds)
@@ -337,7 +343,7 @@ def _normal(value: float, mean: float, deviation: float) -> float:
 
 
 def _is_impossible(largest: float, unit: str) -> bool:
-    return _of_magnitude(largest * SCALES[unit] * 1e-6) < -10
+    return _of_magnitude(largest * US_PER_UNIT[unit] * 1e-6) < -10
 
 
 def _of_magnitude(seconds: float) -> float:
@@ -365,7 +371,7 @@ def _repetition(t: NDArray, x: NDArray, y: NDArray) -> float | None:
     order = np.lexsort((x[:-1], y[:-1]))  # the last event is not next to the others
     x, y, t = x[order], y[order], t[order]
     same = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (t[1:] > t[:-1])
-    if np.count_nonzero(same) < _FEWEST_REPETITIONS:
+    if np.count_nonzero(same) < _MIN_REPETITIONS:
         return None
     return float(np.quantile((t[1:][same] - t[:-1][same]).astype(np.float64), 0.05))
 
@@ -443,20 +449,20 @@ class Clock(NamedTuple):
             return to_microseconds(values, self.unit, source, what)
         if self._fits(values, unit):
             return in_usual
-        others = {other: self._overlap(values, other) for other in SCALES if other != unit}
+        others = {other: self._overlap(values, other) for other in US_PER_UNIT if other != unit}
         # The unit of the events first, where several would do.
         best = max(
             others, key=lambda u: (others[u] > _CLEAR_OVERLAP / 2, u == self.unit, others[u])
         )
         if others[best] <= _CLEAR_OVERLAP / 2 or not self._has_plausible_intervals(values, best):
             return in_usual
-        note = f"{what} times are taken as {UNITS[best]}, on the clock of the events"
+        note = f"{what} times are taken as {UNIT_NAMES[best]}, on the clock of the events"
         is_new = note not in notes
         notes += [note] * is_new
         if best != self.unit and is_new:
             _warn(
-                f"{source}: {note}; as {UNITS[unit]}, the usual unit, they would not fit the "
-                f"events: write whole microseconds, or {UNITS[unit]}, to be sure"
+                f"{source}: {note}; as {UNIT_NAMES[unit]}, the usual unit, they would not fit the "
+                f"events: write whole microseconds, or {UNIT_NAMES[unit]}, to be sure"
             )
         return to_microseconds(values, best, source, what)
 
@@ -478,9 +484,9 @@ class Clock(NamedTuple):
     @staticmethod
     def _has_plausible_intervals(values: NDArray, unit: str) -> bool:
         first, last = _ends(values, unit)
-        least, most = _INTERVALS_US
+        least, most = _PLAUSIBLE_INTERVALS_US
         return least <= (last - first) / (len(values) - 1) <= most
 
 
 def _ends(values: NDArray, unit: str) -> tuple[float, float]:
-    return float(values.min()) * SCALES[unit], float(values.max()) * SCALES[unit]
+    return float(values.min()) * US_PER_UNIT[unit], float(values.max()) * US_PER_UNIT[unit]

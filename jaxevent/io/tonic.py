@@ -22,7 +22,7 @@ from jaxevent.io.checks import check_events
 from jaxevent.io.columns import record_fields
 from jaxevent.recording import Recording
 
-EVENTS: np.dtype = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
+EVENT_DTYPE: np.dtype = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
 
 
 def from_dataset(dataset: Any, size: tuple[int, ...] | None = None) -> Iterator[Recording]:
@@ -63,7 +63,7 @@ def from_item(item: Any, size: tuple[int, ...] | None, name: str = "tonic") -> R
         raise InputError(f"{name}: its sensor_size is None; give size=(width, height)")
     t, x, y, p = (records[field] for field in record_fields(records, name).values())
     sensor = (int(size[0]), int(size[1]))
-    events = check_events(times(t, name, "event", scale=1.0), x, y, p, sensor, name)
+    events = check_events(times(t, name, "event", us_per_unit=1.0), x, y, p, sensor, name)
     extra = {"target": np.asarray(target)} if _is_plain(target) else {}
     return Recording(name, *sensor, events, extra=extra)
 
@@ -87,7 +87,7 @@ def to_item(recording: Recording, target: Any = None) -> tuple[NDArray, Any]:
             "coordinates that do not fit tonic's int16; crop it with jaxevent.events.crop"
         )
     events = recording.events[:]
-    records = np.empty(len(events), EVENTS)
+    records = np.empty(len(events), EVENT_DTYPE)
     for field in "xytp":
         records[field] = getattr(events, field)
     return records, recording.extra.get("target") if target is None else target

@@ -102,7 +102,7 @@ def _read_poses_m3ed(file: Path) -> Poses:
     with open_file(file) as opened:
         stamps = array(opened, "ts", str(file))
         matrices = array(opened, "Cn_T_C0", str(file))
-    t = times(stamps, str(file), "pose", scale=1.0)
+    t = times(stamps, str(file), "pose", us_per_unit=1.0)
     if matrices.shape[1:] == (4, 4):
         matrices = np.linalg.inv(matrices.astype(float))
     return _make_poses(t, matrices, f"{file}: Cn_T_C0")
@@ -150,7 +150,7 @@ def _open_depth_m3ed(file: Path, side: str) -> dict[str, Any]:
     name = f"depth/prophesee/{side}"
     if name not in opened:
         return {}
-    t = times(array(opened, "ts", str(file)), str(file), "depth", scale=1.0)
+    t = times(array(opened, "ts", str(file)), str(file), "depth", us_per_unit=1.0)
     return {"depth": _open_images(opened, name, 3, len(t), file), "depth_t": t}
 
 

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import renamed_methods
-from jaxevent.devices import AXIS, make_mesh, shard
+from jaxevent.devices import DEVICE_AXIS, make_mesh, shard
 from jaxevent.estimator import ShortRepr
 
 SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks and lanes of the three kinds of tile
@@ -133,11 +133,11 @@ class Tiles(ShortRepr):
 
     def _specs(self) -> Any:
         """Return the partition of every array; empty: whole on every device."""
-        slots = PartitionSpec(None, None, AXIS)
+        slots = PartitionSpec(None, None, DEVICE_AXIS)
         others = {
             "kind": PartitionSpec(),
             "lane": PartitionSpec(),
-            "pixel": PartitionSpec(None, AXIS),
+            "pixel": PartitionSpec(None, DEVICE_AXIS),
         }
         return jax.tree_util.tree_map_with_path(
             lambda path, _: others.get(path[0].name, slots), self
@@ -171,7 +171,7 @@ class Tiles(ShortRepr):
             run_shard,
             mesh=self.mesh,
             in_specs=(self._specs(), *[PartitionSpec()] * len(replicated)),
-            out_specs=PartitionSpec(None, None, AXIS),
+            out_specs=PartitionSpec(None, None, DEVICE_AXIS),
             check_vma=False,  # branches that skip a tile give zeros, which are the same everywhere
         )(self, *replicated)
 

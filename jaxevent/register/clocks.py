@@ -15,9 +15,9 @@ from jaxevent.register.frames import event_span, log_image
 from jaxevent.register.geometry import Registration
 from jaxevent.register.refinement import refine
 
-_CANDIDATES = 4  # offsets that are tried
-_CELLS = 64  # to the width of an image, where clocks are compared
-_BLOCK = 128  # steps of that raster held at a time
+_N_CANDIDATES = 4  # offsets that are tried
+_N_CELLS_ACROSS = 64  # to the width of an image, where clocks are compared
+_BLOCK_STEPS = 128  # steps of that raster held at a time
 
 
 def clock_offsets(
@@ -65,7 +65,7 @@ def clock_offsets(
     around = np.pad(np.where(allowed, total, -np.inf), 1, constant_values=-np.inf)
     score = around[1:-1]
     peaks = np.flatnonzero((score >= around[:-2]) & (score > around[2:]) & (score > 0))
-    peaks = peaks[np.argsort(-score[peaks], kind="stable")][:_CANDIDATES]
+    peaks = peaks[np.argsort(-score[peaks], kind="stable")][:_N_CANDIDATES]
     found = []
     for peak in peaks:
         if score[peak] < score[peaks[0]] / 2:
@@ -101,26 +101,26 @@ def _signature(change: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _cells(width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
     """Return the cell rows and columns of pixel rows and columns, and the number of cell rows."""
-    rows = max(1, round(height * _CELLS / width))
-    down = np.minimum(np.arange(height) * _CELLS // width, rows - 1)
-    return down, np.arange(width) * _CELLS // width, rows
+    rows = max(1, round(height * _N_CELLS_ACROSS / width))
+    down = np.minimum(np.arange(height) * _N_CELLS_ACROSS // width, rows - 1)
+    return down, np.arange(width) * _N_CELLS_ACROSS // width, rows
 
 
 def _frame_signatures(other: Recording) -> NDArray[np.float64]:
     """Return signatures of the change of ln intensity from each frame to the next."""
     assert other.frames is not None
     down, along, rows = _cells(other.width, other.height)
-    place = (down[:, None] * _CELLS + along).ravel()
-    count = np.maximum(np.bincount(place, minlength=rows * _CELLS), 1)
+    place = (down[:, None] * _N_CELLS_ACROSS + along).ravel()
+    count = np.maximum(np.bincount(place, minlength=rows * _N_CELLS_ACROSS), 1)
     out, before = [], log_image(other, 0)
-    for first in range(1, len(other.frames), _BLOCK):
+    for first in range(1, len(other.frames), _BLOCK_STEPS):
         changes = []
-        for row in range(first, min(first + _BLOCK, len(other.frames))):
+        for row in range(first, min(first + _BLOCK_STEPS, len(other.frames))):
             level, good = log_image(other, row)
             change = np.where(good & before[1], level - before[0], 0).ravel()
-            changes.append(np.bincount(place, change, rows * _CELLS) / count)
+            changes.append(np.bincount(place, change, rows * _N_CELLS_ACROSS) / count)
             before = level, good
-        out.append(_signature(np.stack(changes).reshape(-1, rows, _CELLS)))
+        out.append(_signature(np.stack(changes).reshape(-1, rows, _N_CELLS_ACROSS)))
     return np.concatenate(out)
 
 
@@ -129,15 +129,15 @@ def _event_signatures(recording: Recording, step: float) -> NDArray[np.float64]:
     down, along, rows = _cells(recording.width, recording.height)
     begin, end = event_span(recording)
     steps, out = int((end - begin) / step) + 1, []
-    for first in range(0, max(steps - 1, 1), _BLOCK):
-        count = min(_BLOCK + 1, steps - first)
+    for first in range(0, max(steps - 1, 1), _BLOCK_STEPS):
+        count = min(_BLOCK_STEPS + 1, steps - first)
         edges = (begin + math.ceil(k * step) for k in (first, first + count))
         events = recording.events[slice(*(recording.events.index(edge) for edge in edges))]
         when = np.clip(((events.t - begin) / step).astype(int) - first, 0, count - 1)
-        place = (when * rows + down[events.y]) * _CELLS + along[events.x]
-        sign = np.where(events.p, 0.2, -0.2) * _CELLS**2 / recording.width**2
-        net = np.bincount(place, sign, count * rows * _CELLS).astype(np.float64)
-        net = net.reshape(count, rows, _CELLS)
+        place = (when * rows + down[events.y]) * _N_CELLS_ACROSS + along[events.x]
+        sign = np.where(events.p, 0.2, -0.2) * _N_CELLS_ACROSS**2 / recording.width**2
+        net = np.bincount(place, sign, count * rows * _N_CELLS_ACROSS).astype(np.float64)
+        net = net.reshape(count, rows, _N_CELLS_ACROSS)
         out.append(_signature(net[1:] + net[:-1]))
     return np.concatenate(out)
 
@@ -165,7 +165,7 @@ def _correlate(
 
 
 Edge = Literal["auto", "rising", "falling", "exposure"]
-_MATCHED = 0.5  # of the frames that must have a trigger
+_MIN_TRIGGERED_SHARE = 0.5  # of the frames that must have a trigger
 
 
 def trigger_times(
@@ -297,7 +297,7 @@ def stamp_by_triggers(
     t, exposure = trigger_times(recording, edge, channel)
     place = match_triggers(other.frames.t, t, found.offset)
     rows = np.flatnonzero(place >= 0)
-    if len(rows) < max(3, _MATCHED * len(place)):
+    if len(rows) < max(3, _MIN_TRIGGERED_SHARE * len(place)):
         raise InputError(
             f"{other.name}: only {len(rows)} of its {len(place)} frames have a trigger, of "
             f"{len(t)}; choose other edges or another channel, or leave out --triggers"

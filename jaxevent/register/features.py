@@ -18,11 +18,11 @@ _MAX_DISTANCE_RATIO = 0.75  # of the nearest and the second descriptor; Lowe's 0
 _MIN_MATCHES = 12  # of frames and events, that agree on a homography
 _TOLERANCE_PX = 3.0  # of the other camera, between these matches and the homography
 _N_FRAMES = 16  # whose features are matched with those of events
-_MAX_WIDTH = 400  # px, to which wider images of events are shrunk for that
-_ALPHAS = (1.0, 3.0)  # rad/s, cut-off of the reconstructions that are matched
+_MAX_WIDTH_PX = 400  # px, to which wider images of events are shrunk for that
+_CUTOFFS_RAD_S = (1.0, 3.0)  # rad/s, cut-off of the reconstructions that are matched
 _FRAMES_APART = (1, 3)  # frames between which changes are matched
 _MIN_IMAGE_MATCHES = 15  # of a frame and an HDR image, that agree on a homography
-_IMAGE_TOLERANCE = 1.5  # px of the HDR image per pixel of a frame, likewise
+_IMAGE_TOLERANCE_PX = 1.5  # px of the HDR image per pixel of a frame, likewise
 
 
 def _detect(sift: Any, image: NDArray, scale: float = 1.0) -> tuple[NDArray, NDArray]:
@@ -50,7 +50,7 @@ def _match(one: NDArray, two: NDArray) -> list[tuple[int, int]]:
 
 
 def match_frames(
-    recording: Recording, other: Recording, offset: float, progress: bool | None
+    recording: Recording, other: Recording, offset_s: float, progress: bool | None
 ) -> list[NDArray[np.float64]]:
     """Return homographies that most matches of features agree on, right to a few pixels.
 
@@ -61,7 +61,7 @@ def match_frames(
     Args:
         recording: Events of the event camera.
         other: Frames of the other camera.
-        offset: Offset of the clocks, s.
+        offset_s: Offset of the clocks, s.
         progress: Whether to show progress.
 
     Returns:
@@ -73,9 +73,9 @@ def match_frames(
     """
     cv2 = require("cv2", "vision")
     assert other.frames is not None
-    t = other.frames.t + round(offset * 1e6)
+    t = other.frames.t + round(offset_s * 1e6)
     part, rows = _select_busiest_part(recording, t)
-    small = min(1.0, _MAX_WIDTH / recording.width)
+    small = min(1.0, _MAX_WIDTH_PX / recording.width)
     scales = small, min(1.0, 1.5 * small * recording.width / other.width)
     sift = cv2.SIFT_create(1000, contrastThreshold=0.02)
     begin, end = [], []
@@ -126,7 +126,7 @@ def _pair_images(
 
     if not len(rows):
         return
-    for alpha in _ALPHAS:
+    for alpha in _CUTOFFS_RAD_S:
         video = high_pass.estimate(part, high_pass.Params(alpha=alpha), progress=progress)
         images = video(t[rows], extrapolate=True).mean
         for image, row in zip(images, rows, strict=True):
@@ -223,7 +223,7 @@ def register_still(
     dark = float(np.median(image[known])) * 0.05 if known.any() else 1.0
     level = np.log(np.where(known, image, dark) + dark)
     where, described = _detect(sift, level)
-    tolerance = _IMAGE_TOLERANCE * max(1.0, image.shape[1] / recording.width)
+    tolerance = _IMAGE_TOLERANCE_PX * max(1.0, image.shape[1] / recording.width)
     homographies: list[NDArray[np.float64] | None] = []
     for row in bar(range(len(frames)), desc="register frames", unit="frame", progress=progress):
         seen, about = _detect(sift, log_image(recording, row)[0])

@@ -15,8 +15,10 @@ from jaxevent.io.images import Scale, is_series, kept_colours, read_series
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.register.geometry import Grid, Registration, pixel_scale
 
-_DARK = 0.05  # intensity, added inside logarithms against the noise of dark pixels
-_CLIPPED = 0.012  # grey, distance from either end below which pixels are clipped: 3 of 255
+_DARK_INTENSITY = 0.05  # intensity, added inside logarithms against the noise of dark pixels
+_CLIPPED_GREY_MARGIN = (
+    0.012  # grey, distance from either end below which pixels are clipped: 3 of 255
+)
 
 
 def read_frames(
@@ -120,10 +122,10 @@ def log_image(other: Recording, row: int) -> tuple[NDArray[np.float64], NDArray[
     if other.frames.images.dtype.kind == "f" and np.nanmax(grey) > 1:
         good, intensity = np.isfinite(grey), np.nan_to_num(grey)
     else:
-        good = (grey > _CLIPPED) & (grey < 1 - _CLIPPED)
+        good = (grey > _CLIPPED_GREY_MARGIN) & (grey < 1 - _CLIPPED_GREY_MARGIN)
         intensity = np.asarray(other.response.intensity(np.nan_to_num(grey)), np.float64)
         intensity = intensity / other.gain[row]
-    return np.log(np.maximum(intensity, 0) + _DARK), good
+    return np.log(np.maximum(intensity, 0) + _DARK_INTENSITY), good
 
 
 def event_span(recording: Recording) -> tuple[int, int]:

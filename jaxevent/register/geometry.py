@@ -132,9 +132,9 @@ def check_homography(values: ArrayLike) -> NDArray[np.float64]:
     return H / H[2, 2] if abs(H[2, 2]) > 1e-12 else H
 
 
-def apply_homography(H: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+def apply_homography(H: NDArray[np.float64], points_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Map positions (n, 2), px, by a homography, NaN behind its horizon."""
-    seen = at @ H[:, :2].T + H[:, 2]
+    seen = points_px @ H[:, :2].T + H[:, 2]
     w = seen[:, 2:] * np.sign(H[2, 2] if H[2, 2] else 1)
     return seen[:, :2] / np.where(w > 1e-9, seen[:, 2:], np.nan)
 
@@ -158,15 +158,17 @@ def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[
     return straight / f * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
-def undistorted_pixels(camera: PinholeCamera | None, size: tuple[int, int]) -> NDArray[np.float64]:
+def undistorted_pixels(
+    camera: PinholeCamera | None, sensor_size: tuple[int, int]
+) -> NDArray[np.float64]:
     """Return the undistorted positions (height * width, 2), px, of a camera's pixels."""
-    y, x = np.mgrid[: size[1], : size[0]].astype(np.float64)
+    y, x = np.mgrid[: sensor_size[1], : sensor_size[0]].astype(np.float64)
     return undistort(camera, np.stack([x.ravel(), y.ravel()], 1))
 
 
-def pixel_rays(camera: PinholeCamera, size: tuple[int, int]) -> NDArray[np.float64]:
+def pixel_rays(camera: PinholeCamera, sensor_size: tuple[int, int]) -> NDArray[np.float64]:
     """Return rays (height * width, 3) of depth 1 through a camera's pixels."""
-    at = (undistorted_pixels(camera, size) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    at = (undistorted_pixels(camera, sensor_size) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return np.concatenate([at, np.ones((len(at), 1))], 1)
 
 
@@ -177,17 +179,19 @@ def distort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np
     return camera.distort((at - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
 
 
-def project(camera: PinholeCamera, X: NDArray[np.float64]) -> NDArray[np.float64]:
+def project(camera: PinholeCamera, points_3d: NDArray[np.float64]) -> NDArray[np.float64]:
     """Project points (n, 3) to (n, 2), px; NaN behind the camera."""
-    Z = np.where(X[:, 2:] > 1e-9, X[:, 2:], np.nan)
-    straight = X[:, :2] / Z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    Z = np.where(points_3d[:, 2:] > 1e-9, points_3d[:, 2:], np.nan)
+    straight = points_3d[:, :2] / Z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return distort(camera, straight)
 
 
-def mask_outside(at: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+def mask_outside(
+    points_px: NDArray[np.float64], image_size: tuple[int, int]
+) -> NDArray[np.float64]:
     """Set positions (n, 2) outside an image to NaN; its outermost pixels' centres are its edge."""
-    seen = (at >= -1e-6) & (at <= np.array(size) - 1 + 1e-6)
-    return np.where(seen.all(1, keepdims=True), at, np.nan)
+    seen = (points_px >= -1e-6) & (points_px <= np.array(image_size) - 1 + 1e-6)
+    return np.where(seen.all(1, keepdims=True), points_px, np.nan)
 
 
 def pixel_scale(grid: NDArray[np.float64]) -> float:

@@ -28,9 +28,9 @@ from jaxevent.register.geometry import (
 
 _SMOOTHINGS_PX = (4.0, 2.0, 1.2)  # px of the event camera by which changes are smoothed, in turn
 _MAX_STEPS = 12  # Gauss-Newton steps of a smoothing at most
-_N_PAIRS = 32  # pairs of frames that are compared
-_MAX_PIXELS = 40_000  # of a pair that are compared
-_MIN_KNOWN = 0.75  # weight of unclipped pixels in a smoothed change that counts
+_N_FRAME_PAIRS = 32  # pairs of frames that are compared
+_MAX_PAIR_PIXELS = 40_000  # of a pair that are compared
+_MIN_KNOWN_WEIGHT = 0.75  # weight of unclipped pixels in a smoothed change that counts
 MIN_AGREEMENT = 0.25  # correlation of changes below which a registration is refused
 
 
@@ -129,7 +129,7 @@ class _Alignment:
         self.size = recording.width, recording.height
         width, height = self.size
         self.shape = other.height, other.width
-        self.finest = max(1, math.ceil(math.sqrt(width * height / _MAX_PIXELS)))
+        self.finest = max(1, math.ceil(math.sqrt(width * height / _MAX_PAIR_PIXELS)))
         self.stride = self.finest
         self.fixed = None if grid is None or homography is not None else grid
         self.corners = np.empty(0)
@@ -178,7 +178,7 @@ class _Alignment:
             clear[first], clear[first + apart]
         )
         first = first[worth >= 0.2 * worth.max()]
-        first = first[np.unique(np.linspace(0, len(first) - 1, _N_PAIRS).astype(int))]
+        first = first[np.unique(np.linspace(0, len(first) - 1, _N_FRAME_PAIRS).astype(int))]
         self.pairs = np.stack([inside[first], inside[first + apart]], 1)
         self.apart = float(np.median(t[self.pairs[:, 1]] - t[self.pairs[:, 0]]))
         self._near, self._images = None, (None, None)
@@ -262,7 +262,7 @@ class _Alignment:
                 change = (high - low).astype(np.float32) * good
                 weight = ndimage.gaussian_filter(good, blur)
                 D = ndimage.gaussian_filter(change, blur) / np.maximum(weight, 0.1)
-                known = (weight > _MIN_KNOWN).astype(np.float32)
+                known = (weight > _MIN_KNOWN_WEIGHT).astype(np.float32)
                 images += [D, np.gradient(D, axis=1), np.gradient(D, axis=0), known]
             self._images = blur, np.stack([one.ravel() for one in images], 1).astype(np.float64)
         return self._images[1]

@@ -95,7 +95,7 @@ class Rig:
             InputError: The file is missing or damaged, or does not hold both cameras.
         """
 
-        if Path(path).suffix.lower() in calibration.SUFFIXES:
+        if Path(path).suffix.lower() in calibration.CALIBRATION_SUFFIXES:
             return cls._from_camchain(Path(path), cameras, sizes)
         if cameras is not None:
             raise InputError(

@@ -55,14 +55,14 @@ from jaxevent.runs.blob_positions import (
     seed_from_positions,
 )
 from jaxevent.runs.blob_scores import TrackProtocol
-from jaxevent.runs.config import NAME
+from jaxevent.runs.config import NAME_CHECK
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
 from jaxevent.show.tables import legend, results_table
-from jaxevent.splits import SPLITS, windows
+from jaxevent.splits import SPLIT_NAMES, windows
 from jaxevent.tuning import Batches
 
-LOSSES = ("likelihood", "positions")
-EVENTS = ("all", "associated")
+LOSS_NAMES = ("likelihood", "positions")
+EVENT_CHOICES = ("all", "associated")
 
 
 class Batch(eqx.Module):
@@ -146,7 +146,7 @@ class TrackGoal(Goal):
         found = self._windows(sources, split, window)
         packed = self._packed(found, params, "likelihood")
         for place, (given, recording) in (
-            (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
+            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
         ):
             errors = self.targets.errors(recording, self.tracker, params, progress)
             of_this = [
@@ -154,7 +154,7 @@ class TrackGoal(Goal):
                 for part, batch in zip(found, packed, strict=True)
                 if part.recording is recording and (split is not None or part.split == place)
             ]
-            for k, name in enumerate(SPLITS):
+            for k, name in enumerate(SPLIT_NAMES):
                 mine = [(part, batch) for part, batch in of_this if part.split == k]
                 if not mine:
                     continue
@@ -193,7 +193,7 @@ class TrackGoal(Goal):
         """Cut all recordings into windows, and leave out those without events."""
         found = []
         for place, (_, recording) in (
-            (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
+            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
         ):
             known = self.targets.known(recording)
             first, stop = event_time_span(recording)
@@ -338,17 +338,17 @@ class Blobs(Family):
     protocols = {"tracks": TrackProtocol()}
 
     fit_settings = {
-        "loss": NAME,
-        "events": (lambda value: value in EVENTS, '"all" or "associated"'),
-        **blob_positions.SETTINGS,
+        "loss": NAME_CHECK,
+        "events": (lambda value: value in EVENT_CHOICES, '"all" or "associated"'),
+        **blob_positions.TARGET_SETTINGS,
     }
     own = ("loss", "events")
 
     def goal(self, method: Tracker, params: Parameters, settings: Mapping[str, Any]) -> TrackGoal:
         assert isinstance(params, TrackerParams)
         loss = settings.get("loss", "likelihood")
-        if loss not in LOSSES:
-            raise InputError(f"there is no loss {loss!r}; {suggest_name(loss, LOSSES)}")
+        if loss not in LOSS_NAMES:
+            raise InputError(f"there is no loss {loss!r}; {suggest_name(loss, LOSS_NAMES)}")
         if loss == "positions" and settings.get("positions") is None:
             raise InputError(
                 "the loss 'positions' needs tables of them; give their name beside the "

@@ -26,7 +26,7 @@ def _is_seed(value: Any) -> bool:
     return numbers and all(type(n) in (int, float) and np.isfinite(n) for n in value)
 
 
-SETTINGS: Mapping[str, Check] = {
+TARGET_SETTINGS: Mapping[str, Check] = {
     "seeds": (
         lambda value: (
             isinstance(value, list)
@@ -137,7 +137,7 @@ class Targets:
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> "Targets":
-        """Make them from settings of a configuration, those named in `SETTINGS`."""
+        """Make them from settings of a configuration, those named in `TARGET_SETTINGS`."""
         seeds = given.get("seeds")
         seeds = None if seeds is None else tuple(tuple(map(float, seed)) for seed in seeds)
         return cls(seeds, given.get("positions"))
@@ -215,13 +215,13 @@ def event_time_span(recording: Recording) -> tuple[int, int]:
 
 
 def seed_from_positions(
-    known: KnownPositions, target: int, begin: int, size: float
+    known: KnownPositions, target: int, begin_us: int, size_px: float
 ) -> tuple[float, float, float, int]:
     """Make the seed of a target from a time on, or from its first position; NaN after the last."""
     seen = np.isfinite(known.xi[:, target]).all(1)
     t, xi = known.t[seen], known.xi[seen, target]
-    if t[-1] < begin:
-        return np.nan, np.nan, size, begin
-    at = max(begin, int(t[0]))
+    if t[-1] < begin_us:
+        return np.nan, np.nan, size_px, begin_us
+    at = max(begin_us, int(t[0]))
     x, y = (float(np.interp(at, t, xi[:, axis])) for axis in (0, 1))
-    return x, y, size, at
+    return x, y, size_px, at

@@ -47,17 +47,17 @@ from jaxevent.blob.track import THETA_RATIO
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
-from jaxevent.runs.blob_positions import SETTINGS, KnownPositions, Targets
-from jaxevent.runs.config import METRICS, Check
+from jaxevent.runs.blob_positions import TARGET_SETTINGS, KnownPositions, Targets
+from jaxevent.runs.config import METRICS_CHECK, Check
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, find_metrics, own_names
 
 # Measures that rows have in any case.
-MEASURES = (
+MEASURE_NAMES = (
     "rmse", "median", "covered", "tracks", "missed", "false", "switches", "mota", "idf1", "hota",
     "velocity", "size", "theta", "inverse_ttc", "range",
 )  # fmt: skip
-BEGINNINGS = ("positions", "found", "born")
+TRACK_BEGINNINGS = ("positions", "found", "born")
 MATCH_DISTANCE_PX = 10.0  # px
 
 
@@ -76,10 +76,10 @@ class TrackProtocol(Protocol):
     """Tracks and known targets."""
 
     settings: Mapping[str, Check] = {
-        **SETTINGS,
-        "begin": (lambda value: value in BEGINNINGS, '"positions", "found" or "born"'),
+        **TARGET_SETTINGS,
+        "begin": (lambda value: value in TRACK_BEGINNINGS, '"positions", "found" or "born"'),
         "smooth": (lambda value: type(value) is bool, "true or false"),
-        "metrics": METRICS,
+        "metrics": METRICS_CHECK,
         "pairs": (_are_pairs, "a list of [id, id], two targets each"),
         **{
             name: (_above_0, "a number above 0")
@@ -92,7 +92,7 @@ class TrackProtocol(Protocol):
             raise InputError(
                 'the positions are not given; add positions = "*.csv", tables beside the recordings'
             )
-        find_metrics(options.get("metrics", ()), MEASURES)
+        find_metrics(options.get("metrics", ()), MEASURE_NAMES)
         if "seeds" in options and options.get("begin", "positions") != "positions":
             raise InputError(
                 f"tracks begin at the seeds or are {options['begin']}; leave out one of them"
@@ -118,7 +118,7 @@ class TrackProtocol(Protocol):
         assert known is not None
         begin = options.get("begin", "positions")
         clock = time.perf_counter()
-        metrics = find_metrics(options.get("metrics", ()), MEASURES)
+        metrics = find_metrics(options.get("metrics", ()), MEASURE_NAMES)
         noise = None
         if isinstance(method, MethodFunction):
             mean, covariance = _of_function(recording, method, known.t)

@@ -22,7 +22,7 @@ from jaxevent.runs.config import NamedRecording, TruthTables
 from jaxevent.runs.own import Metric, find_method, import_path, named_metric
 
 PathLike = str | os.PathLike
-OF_TRUTH = ("positions", "truth")  # settings that take tables
+TRUTH_SETTINGS = ("positions", "truth")  # settings that take tables
 CALL_HEADER = "# As called from Python; of objects only the names are told.\n"
 
 
@@ -193,7 +193,7 @@ def _metric(given: Any) -> str | Metric:
 def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
     """Convert settings to TOML's types, and tables of ground truth to `TruthTables`."""
     return {
-        name: TruthTables.of(value) if name in OF_TRUTH else to_toml_value(value)
+        name: TruthTables.of(value) if name in TRUTH_SETTINGS else to_toml_value(value)
         for name, value in given.items()
         if value is not None
     }

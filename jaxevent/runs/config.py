@@ -130,11 +130,11 @@ def is_natural(value: Any) -> bool:
     return type(value) is int and value > 0
 
 
-POSITIVE = (lambda value: is_number(value) and value > 0, "a positive number")
-NOT_NEGATIVE = (lambda value: is_number(value) and value >= 0, "a number, 0 or more")
-NATURAL = (is_natural, "a whole number, 1 or more")
-NAME = (is_text, "text")
-PATHS = (
+POSITIVE_CHECK = (lambda value: is_number(value) and value > 0, "a positive number")
+NOT_NEGATIVE_CHECK = (lambda value: is_number(value) and value >= 0, "a number, 0 or more")
+NATURAL_CHECK = (is_natural, "a whole number, 1 or more")
+NAME_CHECK = (is_text, "text")
+PATHS_CHECK = (
     lambda value: (
         isinstance(value, list)
         and all(is_text(one) or isinstance(one, Recording | NamedRecording) for one in value)
@@ -147,9 +147,9 @@ def is_metrics(value: Any) -> bool:
     return isinstance(value, list) and all(is_text(one) or callable(one) for one in value)
 
 
-METRICS = (is_metrics, 'a list of names, as ["lpips"], or of "package.module:function"')
-STREAM = (is_text, 'the name of a camera, as "left"')
-SIZE: Check = (
+METRICS_CHECK = (is_metrics, 'a list of names, as ["lpips"], or of "package.module:function"')
+STREAM_CHECK = (is_text, 'the name of a camera, as "left"')
+SIZE_CHECK: Check = (
     lambda value: isinstance(value, list) and len(value) == 2 and all(map(is_natural, value)),
     "[width, height] in pixels",
 )
@@ -179,7 +179,7 @@ def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recordin
     names; further ones of a name get a number. Raises `InputError` for a recording that does not
     exist.
     """
-    if not (given and PATHS[0](given)):
+    if not (given and PATHS_CHECK[0](given)):
         raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
     found: dict[Any, tuple[str, Path | Recording]] = {}
     for one in given:

@@ -13,16 +13,16 @@ from jaxevent.recording import Recording
 from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.results import check_folder, open_results, write_rows
 from jaxevent.runs.scores import score
-from jaxevent.show.export import display_images, evenly
+from jaxevent.show.export import display_images, evenly_spaced_times
 from jaxevent.show.images import Kind, comparison_figure, video_writer
 from jaxevent.show.tables import markdown_table
 
-RECORDING = resources.files("jaxevent") / "data/slider_depth_crop.h5"
+RECORDING_FILE = resources.files("jaxevent") / "data/slider_depth_crop.h5"
 # The thresholds of the demo's sensor, and the lag of its frames' clock, set by hand.
-BY_HAND = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
+HAND_TUNED_PARAMS = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
 
 
-FILES = ("comparison.png", "video.mp4", "results.md", "results.json")
+RESULT_FILES = ("comparison.png", "video.mp4", "results.md", "results.json")
 
 
 def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
@@ -32,10 +32,10 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     `InputError` if the folder cannot be written, or holds files of these names and `replace` is
     False.
     """
-    check_folder(out, FILES, replace=replace)
-    with resources.as_file(RECORDING) as path:
+    check_folder(out, RESULT_FILES, replace=replace)
+    with resources.as_file(RECORDING_FILE) as path:
         recording = load(path)
-    by_hand = {name: find(name).Params.of(BY_HAND) for name in ("akf", "augmented")}
+    by_hand = {name: find(name).Params.of(HAND_TUNED_PARAMS) for name in ("akf", "augmented")}
     runs: list[tuple[str, Any, Any]] = [
         *(
             (name, method, method.Params())
@@ -112,6 +112,8 @@ def _video(recording: Recording, params: Any, path: Path, progress: bool | None)
     video = find("akf").estimate(recording, params, progress=progress)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
-        for _, image in display_images(video, evenly(recording, rate)[:longest], "linear"):
+        for _, image in display_images(
+            video, evenly_spaced_times(recording, rate)[:longest], "linear"
+        ):
             write(np.kron(image, np.ones((zoom, zoom), np.uint8)))
     return rate / fps

@@ -57,10 +57,10 @@ from jaxevent.methods import find
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.runs import egomotion_scores as scores
-from jaxevent.runs.config import NATURAL
+from jaxevent.runs.config import NATURAL_CHECK
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
 from jaxevent.show.tables import legend, results_table
-from jaxevent.splits import SPLITS, windows
+from jaxevent.splits import SPLIT_NAMES, windows
 from jaxevent.tuning import Batches
 
 
@@ -148,7 +148,7 @@ class MotionGoal(Goal):
     ) -> Iterator[dict[str, Any]]:
         found = self._windows(sources, split, window)
         for place, (given, recording) in (
-            (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
+            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
         ):
             mine = [p for p in found if p.recording is recording]
             if not mine:
@@ -160,7 +160,7 @@ class MotionGoal(Goal):
             told = motion(t, centred=self.loss.centred) if self.loss.centred else motion(t)
             mean, _, valid = told
             truth = known(t)
-            for k, name in enumerate(SPLITS):
+            for k, name in enumerate(SPLIT_NAMES):
                 chosen = [p for p in mine if p.split == k and (split is not None or k == place)]
                 inside = np.zeros(len(t), bool)
                 for p in chosen:
@@ -194,7 +194,7 @@ class MotionGoal(Goal):
         """Cut all recordings with known truth into windows that hold events."""
         found = []
         for place, (_, recording) in (
-            (place, source) for place, name in enumerate(SPLITS) for source in sources[name]
+            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
         ):
             events, truth = recording.events, self.known(recording)
             if not len(events):
@@ -229,10 +229,10 @@ class Egomotion(Family):
     protocols = {"motion": scores.MotionProtocol()}
     fit_settings = {
         **{
-            name: scores.SETTINGS[name]
-            for name in ("model", "truth", "centred", "settle", *scores.OF_TRUTH)
+            name: scores.MOTION_SETTINGS[name]
+            for name in ("model", "truth", "centred", "settle", *scores.TRUTH_SETTINGS)
         },
-        "runs": NATURAL,
+        "runs": NATURAL_CHECK,
     }
     own = ("model", "centred")
 
@@ -248,7 +248,7 @@ class Egomotion(Family):
             settings["truth"],
             settings.get("runs", 4),
             settings.get("settle", 0.05),
-            {name: settings[name] for name in scores.OF_TRUTH if name in settings},
+            {name: settings[name] for name in scores.TRUTH_SETTINGS if name in settings},
         )
 
 

@@ -39,9 +39,9 @@ from jaxevent.estimator import Estimate
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording, Times
 from jaxevent.runs.config import (
-    METRICS,
-    NOT_NEGATIVE,
-    POSITIVE,
+    METRICS_CHECK,
+    NOT_NEGATIVE_CHECK,
+    POSITIVE_CHECK,
     Check,
     is_table,
     truth_files,
@@ -63,7 +63,7 @@ def _flag(value: Any) -> bool:
     return isinstance(value, bool)
 
 
-SETTINGS: dict[str, Check] = {
+MOTION_SETTINGS: dict[str, Check] = {
     "model": (lambda value: isinstance(value, str), 'a name, as "planar" or "rotation"'),
     "truth": (
         is_table,
@@ -74,23 +74,23 @@ SETTINGS: dict[str, Check] = {
         lambda value: isinstance(value, str),
         'the gyro\'s axes, as "camera", "y-up", or nine numbers, row by row, in a text',
     ),
-    "depth": POSITIVE,
-    "settle": (NOT_NEGATIVE[0], "a number of seconds, 0 or more"),
+    "depth": POSITIVE_CHECK,
+    "settle": (NOT_NEGATIVE_CHECK[0], "a number of seconds, 0 or more"),
     "centred": (_flag, "true or false"),
     "smooth": (_flag, "true or false"),
     "gyro": (_flag, "true or false"),
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
-    "metrics": METRICS,
+    "metrics": METRICS_CHECK,
 }
 # Measures that rows have in any case.
-MEASURES = (
+MEASURE_NAMES = (
     "AEE", "AEE_rel", "AAE_U", "AAE_T", "AAE_Omega", "AME", "AME_rel", "AME_N", "vector_error",
     "outliers", "lost", "startup",
 )  # fmt: skip
 
 
-RECORDED = ("poses", "gyro")  # truth that recordings hold themselves
-OF_TRUTH = ("gyro_bias", "imu_rotation", "depth")  # settings of the ground truth
+RECORDED_TRUTHS = ("poses", "gyro")  # truth that recordings hold themselves
+TRUTH_SETTINGS = ("gyro_bias", "imu_rotation", "depth")  # settings of the ground truth
 
 
 def model_of(options: Mapping[str, Any]) -> type[Model]:
@@ -112,7 +112,7 @@ def check(options: Mapping[str, Any]) -> None:
 def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
     """Return further files that a row of the recording depends on."""
     truth = options["truth"]
-    if isinstance(truth, str) and truth in RECORDED:
+    if isinstance(truth, str) and truth in RECORDED_TRUTHS:
         return []
     return truth_files(truth, str(path))
 
@@ -120,7 +120,7 @@ def files(path: Path, options: Mapping[str, Any]) -> list[Path]:
 def true_motion(recording: Recording, options: Mapping[str, Any]) -> KnownMotion:
     """Return the true motion of a recording, whose name is its path."""
     source = options["truth"]
-    if not (isinstance(source, str) and source in RECORDED):
+    if not (isinstance(source, str) and source in RECORDED_TRUTHS):
         source = truth_table(source, recording.name)
     return known_motion(
         recording,
@@ -144,11 +144,11 @@ def _bias(options: Mapping[str, Any]) -> NDArray[np.float64]:
 class MotionProtocol(Protocol):
     """Motion compared with a known one."""
 
-    settings = SETTINGS
+    settings = MOTION_SETTINGS
 
     def check(self, options: Mapping[str, Any]) -> None:
         check(options)
-        find_metrics(options.get("metrics", ()), MEASURES)
+        find_metrics(options.get("metrics", ()), MEASURE_NAMES)
 
     def check_method(self, method: MotionEstimator, options: Mapping[str, Any]) -> None:
         method.find_model(model_of(options))
@@ -169,7 +169,7 @@ class MotionProtocol(Protocol):
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
         truth = true_motion(recording, options)
-        metrics = find_metrics(options.get("metrics", ()), MEASURES)
+        metrics = find_metrics(options.get("metrics", ()), MEASURE_NAMES)
         first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
         begin = first + round(options.get("settle", 0.0) * 1e6)
         times = np.arange(begin, last + 1, round(1e6 / SCORE_RATE_HZ))

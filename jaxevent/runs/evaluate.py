@@ -88,9 +88,9 @@ from jaxevent.runs.calls import (
     to_toml_table,
 )
 from jaxevent.runs.config import (
-    NAME,
-    SIZE,
-    STREAM,
+    NAME_CHECK,
+    SIZE_CHECK,
+    STREAM_CHECK,
     Check,
     check,
     external_name,
@@ -108,7 +108,7 @@ from jaxevent.show.tables import write_parquet
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
 RESULTS_VERSION = 4
-FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
+RESULT_FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
 
 _opened = RecordingCache()
 
@@ -197,14 +197,14 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
         InputError: The file, an argument or a parameter cannot be used, `out` not be written or
             only over other files, the cluster not be reached; or no row could be computed.
     """
-    if FORMS.is_config(arguments, settings):
+    if CALL_FORMS.is_config(arguments, settings):
         return _evaluate_file(*arguments, **settings)
     return _evaluate_objects(*arguments, **settings)
 
 
 # Arguments of both forms that say where rows are computed, and what may be replaced.
 RESOURCE_ARGUMENTS = ("workers", "cluster", "scheduler_file", "retries", "replace")
-FORMS = Forms(
+CALL_FORMS = Forms(
     'jaxevent.evaluate(recording, ["akf"])',
     ("config", "out", "progress", "metrics", *RESOURCE_ARGUMENTS),
     ("recordings", "methods", "protocol"),
@@ -239,7 +239,9 @@ def _evaluate_objects(
     **settings: Any,
 ) -> Evaluation:
     if methods is None:
-        raise InputError(f"no method is given; give a recording and methods, as {FORMS.example}")
+        raise InputError(
+            f"no method is given; give a recording and methods, as {CALL_FORMS.example}"
+        )
     where = {name: settings.pop(name) for name in RESOURCE_ARGUMENTS if name in settings}
     table = settings_of({**settings, "protocol": protocol})
     table |= {"recordings": recordings_of(recordings), "method": methods_of(methods)}
@@ -280,7 +282,7 @@ def _evaluate(
     """Compute the rows of a plan; see `evaluate`."""
     if out is not None:
         own = (Path(out) / "tasks").is_dir()
-        check_folder(Path(out), FILES, source.files, replace=replace, own=own)
+        check_folder(Path(out), RESULT_FILES, source.files, replace=replace, own=own)
     place = ComputeResources(
         workers, cluster, None if scheduler_file is None else Path(scheduler_file)
     )
@@ -536,7 +538,12 @@ def plan_of(table: Mapping[str, Any], folder: Path, metrics: Sequence[str | Metr
     name = table.get("protocol") or _usual_protocol(table)
     protocol, family = find_protocol(name)
     anything: Check = (lambda value: True, "")
-    known = {"recordings": anything, "protocol": NAME, "size": SIZE, "stream": STREAM}
+    known = {
+        "recordings": anything,
+        "protocol": NAME_CHECK,
+        "size": SIZE_CHECK,
+        "stream": STREAM_CHECK,
+    }
     check(table, {**known, "method": anything, **protocol.settings})
     options = {key: table[key] for key in protocol.settings if key in table}
     if metrics:

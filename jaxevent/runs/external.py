@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.io.images import TIMES, Scale, Series, read_series
+from jaxevent.io.images import TIMESTAMP_FILES, Scale, Series, read_series
 from jaxevent.parameters import suggest_name
 from jaxevent.runs.family import Source
 
@@ -107,7 +107,9 @@ class ExternalImages(Source):
                 f"{images}: there are no images of {recording} here; correct images, in which "
                 "{recording} stands for its name"
             )
-        names = TIMES if self.timestamps is None else (_named(self.timestamps, recording),)
+        names = (
+            TIMESTAMP_FILES if self.timestamps is None else (_named(self.timestamps, recording),)
+        )
         return read_series(images, Scale(self.white, self.gamma), names, root)
 
     def nearest(self, series: Series, times: NDArray[np.int64]) -> Iterator[tuple[int, int]]:

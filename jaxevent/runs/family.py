@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from jaxevent.devices import partition_batches
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimator, imported
+from jaxevent.estimator import Estimator, import_object
 from jaxevent.parameters import Parameters, suggest_name
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Check
@@ -223,7 +223,7 @@ def family_of(method: Estimator) -> Family:
 
 
 def find_family(name: str) -> Family:
-    return imported(MODULE_OF_FAMILY[name], Family, "family")
+    return import_object(MODULE_OF_FAMILY[name], Family, "family")
 
 
 def find_protocol(name: Any) -> tuple[Protocol, str]:

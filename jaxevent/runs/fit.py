@@ -86,11 +86,11 @@ from jaxevent.runs.results import (
     write_rows,
 )
 from jaxevent.show import plot_losses
-from jaxevent.splits import SPLITS
+from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import FitResult, Run, optimise
 
 CHECKPOINT_FILE = "checkpoint"  # the name of the file in the folder
-FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
+RESULT_FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
 DIVERGED_WARNING = (
     "{}: the steps led away, to a greater loss than at the start or to none; the parameters are "
     "the best that were seen, so lower learning_rate or start elsewhere"
@@ -176,12 +176,12 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
         InputError: The file, a recording or a parameter cannot be used, `out` cannot be written,
             holds another run's checkpoint or is written by another process.
     """
-    if FORMS.is_config(arguments, settings):
+    if CALL_FORMS.is_config(arguments, settings):
         return _fit_file(*arguments, **settings)
     return _fit_objects(*arguments, **settings)
 
 
-FORMS = Forms(
+CALL_FORMS = Forms(
     'jaxevent.fit(recording, akf, fit=["c_on"])',
     ("config", "out", "recordings", "resume", "progress", "replace"),
     ("method", "fit", "search", "params"),
@@ -213,7 +213,7 @@ def _fit_objects(
     **settings: Any,
 ) -> Fits:
     if method is None:
-        raise InputError(f"no method is given; give a recording and one, as {FORMS.example}")
+        raise InputError(f"no method is given; give a recording and one, as {CALL_FORMS.example}")
     if isinstance(method, list | dict | type):
         raise InputError(
             f"the method is {describe_type(method)}; give one Estimator, or its name, and fit "
@@ -234,7 +234,7 @@ def _fit_objects(
     # By these lines `resume` knows the recordings of a run that had ended.
     lines = [
         f"# {toml.text(name)} holds {digest(recording)}\n"
-        for split in SPLITS
+        for split in SPLIT_NAMES
         for name, recording in plan.recordings[split]
         if isinstance(recording, Recording)
     ]
@@ -274,7 +274,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             warnings.filterwarnings("ignore", ".*events contradict frames", InputWarning)
             rows = _score(plan, done, sources, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
-        gained = compute_gains(plan.tasks, unseen(rows))
+        gained = compute_gains(plan.tasks, rows_outside_fit(rows))
         fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
         if out is None or not devices.is_process_zero():
             return fits
@@ -292,7 +292,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
 
 def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
     """results.md: the scores that no fit saw, what was found, and the gain."""
-    return _results(tasks, unseen(rows)) + format_findings(found, gained)
+    return _results(tasks, rows_outside_fit(rows)) + format_findings(found, gained)
 
 
 def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
@@ -322,7 +322,7 @@ def _ended_before(
         )
     if resume and not checkpoint.exists() and (out / "results.json").exists():
         return finished_rows(out, plan)
-    check_folder(out, FILES, plan.inputs(), replace=replace, own=checkpoint.exists())
+    check_folder(out, RESULT_FILES, plan.inputs(), replace=replace, own=checkpoint.exists())
     return None
 
 
@@ -441,9 +441,9 @@ def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(filter(None, parts))
 
 
-def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def rows_outside_fit(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows of the test images; where there are none, of the validation or the fit."""
-    for split in reversed(SPLITS):
+    for split in reversed(SPLIT_NAMES):
         chosen = [row for row in rows if row["split"] == split]
         if chosen:
             return chosen
@@ -453,7 +453,7 @@ def unseen(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def _sources(plan: Plan, progress: bool | None) -> Sources:
     return {
         split: [(given, _load(given, one, plan, progress)) for given, one in plan.recordings[split]]
-        for split in SPLITS
+        for split in SPLIT_NAMES
     }
 
 

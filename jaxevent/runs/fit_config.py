@@ -17,13 +17,13 @@ from jaxevent.recording import Recording
 from jaxevent.runs import contents
 from jaxevent.runs.calls import to_toml_table
 from jaxevent.runs.config import (
-    NAME,
-    NATURAL,
-    NOT_NEGATIVE,
-    PATHS,
-    POSITIVE,
-    SIZE,
-    STREAM,
+    NAME_CHECK,
+    NATURAL_CHECK,
+    NOT_NEGATIVE_CHECK,
+    PATHS_CHECK,
+    POSITIVE_CHECK,
+    SIZE_CHECK,
+    STREAM_CHECK,
     Check,
     absolute_path,
     check,
@@ -36,7 +36,7 @@ from jaxevent.runs.config import (
 )
 from jaxevent.runs.family import MODULE_OF_FAMILY, Goal, Shares, family_of, find_family
 from jaxevent.runs.own import MethodFunction, find_method
-from jaxevent.splits import SPLITS
+from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
 
 
@@ -73,7 +73,7 @@ class Plan:
     def inputs(self) -> list[Path]:
         """All files that are read, and can be."""
         found = [] if self.config is None else [self.config, *files_named_in(self.config)]
-        for split in SPLITS:
+        for split in SPLIT_NAMES:
             for name, path in self.recordings[split]:
                 if isinstance(path, Recording):
                     path = Path(name)
@@ -93,7 +93,7 @@ class Plan:
         digest = hashlib.sha256(self.text)
         digest.update(repr([task.params.values() for task in self.tasks]).encode())
         digest.update(str(jnp.result_type(float)).encode())
-        for split in SPLITS:
+        for split in SPLIT_NAMES:
             for given, path in self.recordings[split]:
                 digest.update(f"{split} {given}".encode())
                 files: list[Path] = []
@@ -110,22 +110,22 @@ class Plan:
 
 
 _SETTINGS: dict[str, Check] = {
-    "iterations": NATURAL,
-    "learning_rate": POSITIVE,
-    "patience": NATURAL,
-    "every": NATURAL,
-    "starts": NATURAL,
-    "spread": NOT_NEGATIVE,
-    "rounds": NATURAL,
-    "batch": NATURAL,
+    "iterations": NATURAL_CHECK,
+    "learning_rate": POSITIVE_CHECK,
+    "patience": NATURAL_CHECK,
+    "every": NATURAL_CHECK,
+    "starts": NATURAL_CHECK,
+    "spread": NOT_NEGATIVE_CHECK,
+    "rounds": NATURAL_CHECK,
+    "batch": NATURAL_CHECK,
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
 }
 _COMMON: dict[str, Check] = {
     **_SETTINGS,
-    "prior_weight": POSITIVE,
-    "recordings": PATHS,
-    "validation": PATHS,
-    "test": PATHS,
+    "prior_weight": POSITIVE_CHECK,
+    "recordings": PATHS_CHECK,
+    "validation": PATHS_CHECK,
+    "test": PATHS_CHECK,
     "split": (
         lambda value: (
             isinstance(value, list)
@@ -135,9 +135,9 @@ _COMMON: dict[str, Check] = {
         ),
         "[fit, validation, test] in whole numbers, the first not 0",
     ),
-    "size": SIZE,
-    "stream": STREAM,
-    "window": POSITIVE,
+    "size": SIZE_CHECK,
+    "stream": STREAM_CHECK,
+    "window": POSITIVE_CHECK,
     "method": (
         lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
         '[[method]] with name = "akf"',
@@ -145,7 +145,7 @@ _COMMON: dict[str, Check] = {
 }
 _METHOD: dict[str, Check] = {
     **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
-    "prior_weight": POSITIVE,
+    "prior_weight": POSITIVE_CHECK,
     "prior": (
         lambda value: (
             isinstance(value, dict)
@@ -157,7 +157,7 @@ _METHOD: dict[str, Check] = {
         "a table of name = [believed value, standard deviation of its logarithm]",
     ),
     "name": (lambda value: is_text(value) or isinstance(value, Estimator), "text"),
-    "label": NAME,
+    "label": NAME_CHECK,
     "params": (
         lambda value: isinstance(value, str | dict | Parameters),
         "a table or the path of a TOML file",
@@ -210,11 +210,11 @@ def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: b
     check(table, {**_COMMON, **further})
     found = {
         split: find_recordings(table[key], folder) if table.get(key) else []
-        for split, key in zip(SPLITS, ("recordings", "validation", "test"), strict=True)
+        for split, key in zip(SPLIT_NAMES, ("recordings", "validation", "test"), strict=True)
     }
     if not found["fit"]:
         raise InputError('no recording is given; add recordings = ["file.zip"]')
-    given = [one for split in SPLITS for one in found[split]]
+    given = [one for split in SPLIT_NAMES for one in found[split]]
     keys = [id(one) if isinstance(one, Recording) else one.resolve() for _, one in given]
     for (name, _), key in zip(given, keys, strict=True):
         if keys.count(key) > 1:

@@ -26,15 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import methods
-from jaxevent.arrays import brief
+from jaxevent.arrays import shorten_value
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimate, Estimator, imported
+from jaxevent.estimator import Estimate, Estimator, import_object
 from jaxevent.parameters import suggest_name
 from jaxevent.recording import Recording
 
 # Keys of rows that are no measures: no metric may have their names.
-RESERVED = (
+RESERVED_NAMES = (
     "recording", "method", "params", "error", "skipped", "split", "warning", "per_frame",
     "per_time", "own_metrics", "regions", "moving", "clip", "normalise", "gap", "model", "frames",
     "missing", "events", "times", "windows", "seconds", "t", "sample",
@@ -91,7 +91,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
                 raise InputError(f"there is no metric {one!r}; {suggest_name(one, known)}")
             continue
         metric = one if isinstance(one, Metric) else _metric(one)
-        if metric.name in known or metric.name in RESERVED:
+        if metric.name in known or metric.name in RESERVED_NAMES:
             raise InputError(
                 f"a metric of your own is called {metric.name!r}, as results call something else; "
                 "rename it"
@@ -103,7 +103,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
 
 
 def _metric(given: Any) -> Metric:
-    function = imported(given, object, "metric") if isinstance(given, str) else given
+    function = import_object(given, object, "metric") if isinstance(given, str) else given
     return named_metric(given, function)
 
 
@@ -215,7 +215,7 @@ def find_method(given: Any, family: str | None = None) -> Estimator | MethodFunc
     if isinstance(given, str):
         if ":" not in given:
             return methods.find(given, family)
-        found = imported(given, object, "method")
+        found = import_object(given, object, "method")
     else:
         found = given
     if isinstance(found, MethodFunction):
@@ -273,4 +273,4 @@ def _describe_value(thing: Any) -> str:
     shape = getattr(thing, "shape", None)
     if shape is not None and shape != ():
         return f"{getattr(thing, 'dtype', type(thing).__name__)} of shape {tuple(shape)}"
-    return brief(thing)
+    return shorten_value(thing)

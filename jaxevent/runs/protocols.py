@@ -30,7 +30,7 @@ from jaxevent.events.clocks import check_clocks
 from jaxevent.parameters import suggest_name
 from jaxevent.recording import Frames, Recording, microseconds
 
-DEFAULT_GAP = 2  # every second frame is given
+DEFAULT_GAP_FRAMES = 2  # every second frame is given
 GAP_DOMAIN = "a whole number of frames from one that is kept to the next, 2 or more"
 
 
@@ -39,7 +39,7 @@ def is_gap(value: Any) -> bool:
     return type(value) is int and value >= 2
 
 
-def held_out(recording: Recording, gap: int = DEFAULT_GAP) -> tuple[Recording, Frames]:
+def held_out(recording: Recording, gap: int = DEFAULT_GAP_FRAMES) -> tuple[Recording, Frames]:
     """Split a recording into the frames to give and those to hide.
 
     Args:
@@ -67,7 +67,7 @@ def held_out(recording: Recording, gap: int = DEFAULT_GAP) -> tuple[Recording, F
     return recording.with_frames(slice(0, None, gap)), frames[hidden]
 
 
-def frames_around(given: Frames, row: int, gap: int = DEFAULT_GAP) -> tuple[int, int] | None:
+def frames_around(given: Frames, row: int, gap: int = DEFAULT_GAP_FRAMES) -> tuple[int, int] | None:
     """Return the given frames before and after a hidden one.
 
     Args:
@@ -171,7 +171,9 @@ PROTOCOLS: dict[str, Callable[..., tuple[Recording, Frames]]] = {
 }
 
 
-def divide(recording: Recording, protocol: str, gap: int = DEFAULT_GAP) -> tuple[Recording, Frames]:
+def divide(
+    recording: Recording, protocol: str, gap: int = DEFAULT_GAP_FRAMES
+) -> tuple[Recording, Frames]:
     """Apply a protocol to a recording.
 
     Args:
@@ -191,7 +193,7 @@ def divide(recording: Recording, protocol: str, gap: int = DEFAULT_GAP) -> tuple
     check_clocks(recording)
     if protocol == "held-out":
         return held_out(recording, gap)
-    if gap != DEFAULT_GAP:
+    if gap != DEFAULT_GAP_FRAMES:
         raise InputError(f"the protocol {protocol!r} hides no frames; omit gap")
     return PROTOCOLS[protocol](recording)
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.devices import REMOTE
+from jaxevent.devices import REMOTE_BATCH
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.reconstruction.augment import FrameParams
@@ -27,10 +27,16 @@ from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, check_choice, is_number
+from jaxevent.runs.config import (
+    NAME_CHECK,
+    NOT_NEGATIVE_CHECK,
+    POSITIVE_CHECK,
+    check_choice,
+    is_number,
+)
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
 from jaxevent.runs.protocols import (
-    DEFAULT_GAP,
+    DEFAULT_GAP_FRAMES,
     GAP_DOMAIN,
     PROTOCOLS,
     Reference,
@@ -40,11 +46,11 @@ from jaxevent.runs.protocols import (
 )
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
 from jaxevent.show.tables import markdown_table
-from jaxevent.splits import SPLITS, interleave
+from jaxevent.splits import SPLIT_NAMES, interleave
 from jaxevent.tuning import Batches
 
-ERRORS = ("linear", "log", "nll")
-REGIONS = ("dark", "well", "bright")
+ERROR_KINDS = ("linear", "log", "nll")
+REGION_NAMES = ("dark", "well", "bright")
 
 
 class ImageBatch(eqx.Module):
@@ -204,7 +210,7 @@ def cut_windows(
     split: Sequence[int] = (1, 0, 0),
     window: float | int | None = None,
     warm_up: float | int = 0.2,
-    gap: int = DEFAULT_GAP,
+    gap: int = DEFAULT_GAP_FRAMES,
 ) -> list[RecordingWindow]:
     """Cut a recording into windows of `window` seconds (None: one part, the whole).
 
@@ -236,7 +242,7 @@ class Problem:
     """The batches of a method's fit and of its validation: `problem(params)`.
 
     Of several processes each prepares its own parts; in place of the others' batches are
-    `devices.REMOTE`.
+    `devices.REMOTE_BATCH`.
 
     They are prepared when first asked for and again for params that differ in what preparation
     fixes (`clock.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
@@ -272,7 +278,7 @@ class Problem:
             used = self._used(part, splits)
             mine = number % jax.process_count() == jax.process_index()
             made = self._batches(part, used, params) if mine and used else []
-            for s, batch in made if mine else [(s, REMOTE) for s in used]:
+            for s, batch in made if mine else [(s, REMOTE_BATCH) for s in used]:
                 batches[s].append(batch)
         return batches
 
@@ -319,7 +325,9 @@ class Problem:
             return np.ones((len(truth), 1), truth.dtype)
         low, high = part.truth.clip
         region = (truth >= low).astype(int) + (truth > high)
-        weights = [1 if self.weights is None else self.weights.get(name, 1) for name in REGIONS]
+        weights = [
+            1 if self.weights is None else self.weights.get(name, 1) for name in REGION_NAMES
+        ]
         return np.where(np.isnan(truth), 0, np.array(weights, truth.dtype)[region])
 
 
@@ -339,7 +347,7 @@ class ImageGoal(Goal):
     protocol: str
     warm_up: float | int
     weights: Mapping[str, float | int] | None
-    gap: int = DEFAULT_GAP
+    gap: int = DEFAULT_GAP_FRAMES
 
     @property
     def part_name(self) -> str:
@@ -374,7 +382,7 @@ class ImageGoal(Goal):
         params: FrameParams,
         progress: bool | None,
     ) -> Iterator[dict[str, Any]]:
-        for whole in SPLITS:
+        for whole in SPLIT_NAMES:
             for given, recording in sources[whole]:
                 row = score(
                     recording, self.method, params, self.protocol, gap=self.gap, progress=progress
@@ -385,8 +393,8 @@ class ImageGoal(Goal):
                     continue
                 shared = interleave(split, row["frames"])
                 if self.loss.error is None:  # no image was looked at
-                    shared[:] = SPLITS.index("test")
-                for place, name in enumerate(SPLITS):
+                    shared[:] = SPLIT_NAMES.index("test")
+                for place, name in enumerate(SPLIT_NAMES):
                     if (shared == place).any():
                         yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
 
@@ -400,19 +408,19 @@ class Reconstruction(Family):
     protocols = {"held-out": HeldOut("held-out"), "reference": ImageProtocol("reference")}
 
     fit_settings = {
-        "loss": NAME,
-        "protocol": NAME,
-        "error": NAME,
-        "dark_offset": POSITIVE,
+        "loss": NAME_CHECK,
+        "protocol": NAME_CHECK,
+        "error": NAME_CHECK,
+        "dark_offset": POSITIVE_CHECK,
         "weights": (
             lambda value: (
                 isinstance(value, dict)
-                and set(value) <= set(REGIONS)
+                and set(value) <= set(REGION_NAMES)
                 and all(is_number(n) and n >= 0 for n in value.values())
             ),
             "a table of numbers named dark, well, bright",
         ),
-        "warm_up": NOT_NEGATIVE,
+        "warm_up": NOT_NEGATIVE_CHECK,
         "gap": (is_gap, GAP_DOMAIN),
     }
     own = ("loss", "error")
@@ -433,8 +441,8 @@ class Reconstruction(Family):
             )
         elif settings.get("protocol", loss) != loss:
             raise InputError(f"the loss {loss!r} has the protocol of that name; omit protocol")
-        error = check_choice(settings.get("error", "linear"), "error", ERRORS)
-        weights, gap = settings.get("weights"), settings.get("gap", DEFAULT_GAP)
+        error = check_choice(settings.get("error", "linear"), "error", ERROR_KINDS)
+        weights, gap = settings.get("weights"), settings.get("gap", DEFAULT_GAP_FRAMES)
         if "gap" in settings and protocol != "held-out":
             raise InputError("gap is for frames that are hidden, the protocol 'held-out'; omit it")
         if weights is not None and protocol != "reference":

@@ -25,8 +25,8 @@ import numpy as np
 from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
 from jaxevent.runs.fit_config import Plan, Task
-from jaxevent.show.tables import lay_out
-from jaxevent.splits import SPLITS
+from jaxevent.show.tables import format_aligned_table
+from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import Batches, FitResult, Run, begin
 
 Write = Callable[[str, bytes], None]
@@ -255,7 +255,7 @@ def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping
     for row in found:
         cells = (row["method"], row["parameter"], f"{row['start']:.4g}", f"{row['found']:.4g}")
         table.append([*cells, row["interval"], row["unit"], row["remark"]])
-    lines = ["\n" + lay_out(table, (0, 1, 5, 6))]
+    lines = ["\n" + format_aligned_table(table, (0, 1, 5, 6))]
     sources: dict[str, list[str]] = {}
     for row in found:
         if row["of"] and row["method"] not in sources.setdefault(row["of"], []):
@@ -325,7 +325,7 @@ def finished_rows(out: Path, plan: Plan) -> list[dict[str, Any]]:
         rows = json.loads((out / "results.json").read_bytes())["rows"] if same else []
     except (OSError, ValueError, KeyError):
         same, rows = False, []
-    given = {name for split in SPLITS for name, _ in plan.recordings[split]}
+    given = {name for split in SPLIT_NAMES for name, _ in plan.recordings[split]}
     if not same or {row["recording"] for row in rows} != given:
         raise InputError(
             f"{out}: holds results of another run and no checkpoint; leave out --resume to replace "

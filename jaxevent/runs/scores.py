@@ -32,12 +32,12 @@ from jaxevent.metrics import (
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import METRICS, check_choice, external_name, is_texts
+from jaxevent.runs.config import METRICS_CHECK, check_choice, external_name, is_texts
 from jaxevent.runs.external import ExternalImages, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 from jaxevent.runs.protocols import (
-    DEFAULT_GAP,
+    DEFAULT_GAP_FRAMES,
     GAP_DOMAIN,
     Reference,
     divide,
@@ -49,7 +49,7 @@ from jaxevent.runs.published import PublishedResults
 
 # Further measures of an image and the truth, each a number per image; the first two need an extra.
 # Where an HDR reference has no value both images are 0, which is all that the authors' error needs.
-MEASURES: dict[str, Callable[..., NDArray[np.float64]]] = {
+MEASURE_FUNCTIONS: dict[str, Callable[..., NDArray[np.float64]]] = {
     "lpips": lpips,
     "hdr_quality": hdr_quality,
     "global_ssim": global_ssim,
@@ -67,7 +67,7 @@ DEFAULT_MEASURES = {
 
 
 class Measures(NamedTuple):
-    """Measures beyond those of `DEFAULT_MEASURES`: names in `MEASURES`, and the user's own."""
+    """Measures beyond those of `DEFAULT_MEASURES`: of `MEASURE_FUNCTIONS`, and the user's own."""
 
     names: tuple[str, ...]
     own: tuple[Metric, ...]
@@ -79,8 +79,8 @@ class Measures(NamedTuple):
         Raise `InputError` for unknown ones and missing extras.
         """
         given, always = list(given), DEFAULT_MEASURES.get(protocol, ())
-        own = find_metrics(given, [*MEASURES, *always])
-        names = [one for one in given if isinstance(one, str) and one in MEASURES]
+        own = find_metrics(given, [*MEASURE_FUNCTIONS, *always])
+        names = [one for one in given if isinstance(one, str) and one in MEASURE_FUNCTIONS]
         check_extras(names)
         return cls(tuple(dict.fromkeys(names)), tuple(own))
 
@@ -89,7 +89,7 @@ class Measures(NamedTuple):
         return {metric.name: metric(image, truth, recording) for metric in self.own}
 
 
-NONE_FURTHER = Measures((), ())
+NO_FURTHER_MEASURES = Measures((), ())
 
 
 def check_extras(names: Iterable[str]) -> None:
@@ -101,7 +101,7 @@ def check_extras(names: Iterable[str]) -> None:
             require("pycvvdp", "hdr")
 
 
-MOTION_THRESHOLD = 0.05  # of white, by which frames differ where something moves
+MIN_MOTION_CHANGE = 0.05  # of white, by which frames differ where something moves
 
 # The scores of one image; those of parts of it are nested under "regions" and "moving".
 Scores = dict[str, Any]
@@ -114,7 +114,7 @@ def hidden_scores(
     I0: float,
     moving: NDArray[np.bool_] | None,
     *,
-    measures: Measures = NONE_FURTHER,
+    measures: Measures = NO_FURTHER_MEASURES,
     recording: str = "",
 ) -> Scores:
     """Score an image in the place of a hidden frame, a `Frames` of one; see `score`.
@@ -123,7 +123,7 @@ def hidden_scores(
     leave them out; `recording` is the name for messages.
     """
     shown, true = np.clip(image, 0, 1), truth.intensity[0]
-    known = {"mse": mse, "ssim": ssim, **{name: MEASURES[name] for name in measures.names}}
+    known = {"mse": mse, "ssim": ssim, **{name: MEASURE_FUNCTIONS[name] for name in measures.names}}
     broken = not np.isfinite(shown).all()
     scores: Scores = {
         name: math.nan if broken else float(measure(shown, true)) for name, measure in known.items()
@@ -200,7 +200,7 @@ def _hdr_measures(
         pair = (shown, covered)
         if name == "lpips":  # it looks at what a display shows
             pair = tuple(np.clip(part, 0, 1) for part in log_display(shown, covered))
-        scores[name] = float(MEASURES[name](*pair))
+        scores[name] = float(MEASURE_FUNCTIONS[name](*pair))
     if not broken:
         scores |= measures.of_own(shown, covered, recording)
     else:
@@ -326,17 +326,18 @@ def score(
     *,
     metrics: Iterable[str | Metric | Callable] = (),
     normalise: Normalise = "none",
-    gap: int = DEFAULT_GAP,
+    gap: int = DEFAULT_GAP_FRAMES,
     moving: bool = False,
     progress: bool | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the images that `protocol` asks for, and compare: one row of a table of results.
 
     Memory does not grow with the recording's length. With "held-out" intensities are clipped to
-    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in `MEASURES`, or
-    functions of one's own: see `jaxevent.runs.own`) are means over the images. `seconds` is the
-    time of reconstructing and reading images, with compilation but without scoring. What is not a
-    number is None. `per_frame` lists t (us, as stamped) and every measure of every image.
+    [0, 1] before they are compared. `mse`, `ssim` and those of `metrics` (names in
+    `MEASURE_FUNCTIONS`, or functions of one's own: see `jaxevent.runs.own`) are means over the
+    images. `seconds` is the time of reconstructing and reading images, with compilation but
+    without scoring. What is not a number is None. `per_frame` lists t (us, as stamped) and every
+    measure of every image.
     "authors_ssim" and "masked_mse" are what the programs of the AKF's authors compute (Wang et
     al., TPAMI 2023: the whole image as one window; pixels without reference count as right),
     "matlab_ssim" is MATLAB's `ssim`.
@@ -374,7 +375,7 @@ class ScoringOptions:
     protocol: str = "held-out"
     metrics: tuple[str | Metric | Callable, ...] = ()
     normalise: str = "none"
-    gap: int = DEFAULT_GAP
+    gap: int = DEFAULT_GAP_FRAMES
     moving: bool = False
     measures: Measures = dataclasses.field(init=False)
 
@@ -389,7 +390,7 @@ class ImageProtocol(Protocol):
     """A protocol that asks for images; its name is a key of `protocols.PROTOCOLS`."""
 
     settings = {
-        "metrics": METRICS,
+        "metrics": METRICS_CHECK,
         "optional_metrics": (is_texts, 'a list of names, as ["lpips"]'),
     }
     own = {"normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'")}
@@ -401,7 +402,7 @@ class ImageProtocol(Protocol):
     def check(self, options: Mapping[str, Any]) -> None:
         Measures.of(options.get("metrics", ()), self.name)
         for name in options.get("optional_metrics", ()):
-            check_choice(name, "metric", list(MEASURES))
+            check_choice(name, "metric", list(MEASURE_FUNCTIONS))
 
     def available(self, options: Mapping[str, Any]) -> dict[str, Any]:
         found = dict(options)
@@ -413,8 +414,8 @@ class ImageProtocol(Protocol):
         return {**found, "metrics": list(dict.fromkeys(names))} if names else found
 
     def label(self, options: Mapping[str, Any]) -> str:
-        gap = options.get("gap", DEFAULT_GAP)
-        hidden = "" if gap == DEFAULT_GAP else f", gap {gap}"
+        gap = options.get("gap", DEFAULT_GAP_FRAMES)
+        hidden = "" if gap == DEFAULT_GAP_FRAMES else f", gap {gap}"
         fitted = "" if options.get("normalise", "none") == "none" else ", brightness fitted"
         return hidden + fitted
 
@@ -434,7 +435,7 @@ class ImageProtocol(Protocol):
                 self.name,
                 tuple(options.get("metrics", ())),
                 options.get("normalise", "none"),
-                options.get("gap", DEFAULT_GAP),
+                options.get("gap", DEFAULT_GAP_FRAMES),
                 options.get("moving", False),
             ),
             progress,
@@ -496,7 +497,7 @@ def score_and_sample(
                 image = fit_brightness(image, truth)
             P = variance if estimated else None
             if hdr is None:
-                where = moves(given, row, asked.gap) if asked.moving else None
+                where = moving_pixels(given, row, asked.gap) if asked.moving else None
                 scores.append(hidden_scores(image, P, frame, I0, where, **named))
             else:
                 scores.append(_hdr_measures(image, P, truth, hdr.clip, I0, **named))
@@ -519,7 +520,7 @@ def score_and_sample(
         "events": len(recording.events),
         "seconds": None if external else seconds,
         **({} if normalise == "none" else {"normalise": normalise}),
-        **({} if asked.gap == DEFAULT_GAP else {"gap": asked.gap}),
+        **({} if asked.gap == DEFAULT_GAP_FRAMES else {"gap": asked.gap}),
         **own_names(measures.own),
         "params": values,
         "per_frame": per_frame,
@@ -527,14 +528,14 @@ def score_and_sample(
     return row, sample
 
 
-def moves(given: Recording, row: int, gap: int) -> NDArray[np.bool_]:
-    """Return a mask of pixels in which the given frames around the hidden frame `row` differ."""
-    assert given.frames is not None
-    around = frames_around(given.frames, row, gap)
+def moving_pixels(given_recording: Recording, frame_row: int, gap_frames: int) -> NDArray[np.bool_]:
+    """Return a mask of pixels in which the given frames around a hidden one differ."""
+    assert given_recording.frames is not None
+    around = frames_around(given_recording.frames, frame_row, gap_frames)
     if around is None:
-        return np.zeros((given.height, given.width), bool)
-    before, after = given.frames[around[0] : around[1] + 1].intensity
-    return np.abs(after - before) > MOTION_THRESHOLD
+        return np.zeros((given_recording.height, given_recording.width), bool)
+    before, after = given_recording.frames[around[0] : around[1] + 1].intensity
+    return np.abs(after - before) > MIN_MOTION_CHANGE
 
 
 # The number of the first image, and some images with their variances, each (images, height, width).

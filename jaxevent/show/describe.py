@@ -12,9 +12,9 @@ from jaxevent.progress import bar
 from jaxevent.recording import EventSource, ImageSource, Recording, Triggers
 
 BLOCK_EVENTS = 1 << 20  # events read together: 13 MB
-BIN_US = 10_000  # us over which the peak rate is taken
-PARTS = 10  # of a recording, whose rates show how the rate changes
-GAP_US = 100_000  # us without an event that may be a jump of the clock
+PEAK_RATE_BIN_US = 10_000  # us over which the peak rate is taken
+N_RATE_PARTS = 10  # of a recording, whose rates show how the rate changes
+MIN_GAP_US = 100_000  # us without an event that may be a jump of the clock
 _TRUTH_NAMES = (
     "omega",
     "rvec",
@@ -156,7 +156,7 @@ def _about_events(
     on = peak = carried = gaps = 0
     last_bin = None
     first, last = int(events[:1].t[0]), int(events[count - 1 :].t[0])
-    in_part = np.zeros(PARTS, np.int64)
+    in_part = np.zeros(N_RATE_PARTS, np.int64)
     longest, longest_after, before = 0, first, first
     blocks = range(0, count, BLOCK_EVENTS)
     for row in bar(blocks, desc="look at events", unit="M events", progress=progress):
@@ -164,17 +164,17 @@ def _about_events(
         on += int(block.p.sum())
         at_pixel += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=len(at_pixel))
         # Sorted, so that only the first bin of a block can have begun in the one before it.
-        bins, counts = np.unique((block.t - first) // BIN_US, return_counts=True)
+        bins, counts = np.unique((block.t - first) // PEAK_RATE_BIN_US, return_counts=True)
         if last_bin == bins[0]:
             counts[0] += carried
         peak, last_bin, carried = max(peak, int(counts.max())), bins[-1], int(counts[-1])
         steps = np.diff(block.t, prepend=before)
-        gaps += int(np.count_nonzero(steps >= GAP_US))
+        gaps += int(np.count_nonzero(steps >= MIN_GAP_US))
         if (widest := int(np.argmax(steps))) >= 0 and steps[widest] > longest:
             longest = int(steps[widest])
             longest_after = int(block.t[widest]) - longest
         before = int(block.t[-1])
-        edges = first + (last - first) * np.arange(1, PARTS) // PARTS
+        edges = first + (last - first) * np.arange(1, N_RATE_PARTS) // N_RATE_PARTS
         in_part += np.diff(np.searchsorted(block.t, edges), prepend=0, append=len(block))
     lines = [
         ("events", f"{count:,}, from {first / 1e6:.6f} to {last / 1e6:.6f} s"),
@@ -182,21 +182,21 @@ def _about_events(
     ]
     # The last bin is rarely full, so a recording shorter than a bin has no rate.
     seconds = (last - first) / 1e6
-    if last - first >= BIN_US:
-        part = seconds / PARTS
+    if last - first >= PEAK_RATE_BIN_US:
+        part = seconds / N_RATE_PARTS
         rates = ", ".join(_short(n / part) for n in in_part)
         lines += [
             (
                 "event rate",
-                f"mean {count / seconds:,.0f} per s, peak {peak / BIN_US * 1e6:,.0f} per s in "
-                f"{BIN_US // 1000} ms",
+                f"mean {count / seconds:,.0f} per s, peak {peak / PEAK_RATE_BIN_US * 1e6:,.0f} per "
+                f"s in {PEAK_RATE_BIN_US // 1000} ms",
             ),
             ("rate over time", f"{rates} per s, in tenths of {part:.3g} s"),
         ]
     if longest:
         text = f"longest {longest / 1000:.3f} ms, after {longest_after / 1e6:.6f} s"
         if gaps:
-            text += f"; {gaps} of {GAP_US // 1000} ms and more, "
+            text += f"; {gaps} of {MIN_GAP_US // 1000} ms and more, "
             text += "each a jump of the clock or a standstill"
         lines.append(("gaps", text))
     hot = np.flatnonzero(is_hot(at_pixel.reshape(height, width)))
@@ -208,7 +208,7 @@ def _about_events(
     shown = []
     for pixel in hottest[at_pixel[hottest] > 0]:
         n = int(at_pixel[pixel])
-        rate = f", {n / seconds:,.0f} per s" if last - first >= BIN_US else ""
+        rate = f", {n / seconds:,.0f} per s" if last - first >= PEAK_RATE_BIN_US else ""
         shown.append(f"({pixel % width}, {pixel // width}) {n:,} events{rate}")
     lines.append(("hottest pixels", "; ".join(shown)))
     return lines

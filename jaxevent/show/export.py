@@ -19,7 +19,7 @@ from jaxevent.recording import Recording, microseconds
 from jaxevent.show.images import display_limits, tone_map, video_writer, write_png
 
 
-def evenly(
+def evenly_spaced_times(
     recording: Recording, rate: float | int, start: float | int | None = None
 ) -> NDArray[np.int64]:
     """Return evenly spaced times of a recording.
@@ -73,10 +73,10 @@ def within(
     return chosen
 
 
-RARE_SHARE = 1e-3  # of the pixels; rarer values do not count for the range that images use
+RARE_PIXEL_SHARE = 1e-3  # of the pixels; rarer values do not count for the range that images use
 
 # Chunks of one image, read by every HDF5 library; `deflate_shuffled` writes them faster than h5py.
-_SMALLER = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+_COMPRESSION_OPTIONS = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 Colours = Callable[[NDArray], NDArray] | None  # what `colour_video` returns; None: grey
 Writer = Callable[[ImageSequence, NDArray, Path, str, str, Colours], str]
@@ -120,7 +120,9 @@ def write_hdf5(
         file["t"] = times.astype("i8")
         file["t"].attrs["unit"] = CLOCK_UNIT
         fields = {
-            field: file.create_dataset(field, shape, "f4", chunks=(1, *shape[1:]), **_SMALLER)
+            field: file.create_dataset(
+                field, shape, "f4", chunks=(1, *shape[1:]), **_COMPRESSION_OPTIONS
+            )
             for field in units
         }
         for field, unit in units.items():
@@ -207,11 +209,11 @@ class RangeCounter:
         if self._counts is None:
             return ""
         above = self._counts[::-1].cumsum()[::-1] / max(int(self._counts.sum()), 1)
-        if above[255] > RARE_SHARE:
+        if above[255] > RARE_PIXEL_SHARE:
             share = 100 * above[255]
             return f", {share:.2g} % of the pixels at white or cut off there (--tone log shows all)"
-        if above[128] < RARE_SHARE:
-            most = int(np.flatnonzero(above >= RARE_SHARE)[-1])
+        if above[128] < RARE_PIXEL_SHARE:
+            most = int(np.flatnonzero(above >= RARE_PIXEL_SHARE)[-1])
             return f", as dark as the frames, up to grey {most} of 255 (--tone percentile spreads)"
         return ""
 

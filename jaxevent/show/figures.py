@@ -29,7 +29,7 @@ from jaxevent.tuning import FitResult
 ON_COLOUR, OFF_COLOUR = "#c8401e", "#3a78b5"
 WIDTH_INCHES = 7.0
 MAX_EVENTS_3D = 20_000  # events drawn in x, y and t
-PATH_TIMES = 400  # at which a track's path is drawn
+N_PATH_TIMES = 400  # at which a track's path is drawn
 MAX_HTML_EVENTS = 1_000_000  # events that notebooks process for a picture
 MAX_HTML_TRACKS = 12  # lines of a table of tracks
 
@@ -159,7 +159,7 @@ def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int =
     if ids is None:
         longest = np.argsort(tracks.birth - tracks.death, kind="stable")[:most]
         ids = sorted(tracks.id[longest].tolist())
-    times = np.linspace(tracks.start, tracks.stop - 1, PATH_TIMES).round().astype(np.int64)
+    times = np.linspace(tracks.start, tracks.stop - 1, N_PATH_TIMES).round().astype(np.int64)
     states = tracks(times, ids)
     draw_paths(axis, recording, times, list(ids), (states.mean, states.valid))
     span = f"{tracks.start * 1e-6:.6g} to {tracks.stop * 1e-6:.6g} s"

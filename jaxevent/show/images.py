@@ -27,7 +27,7 @@ Kind = Literal["image", "error", "uncertainty"]
 # The logarithm shows at most this many halvings below the brightest value (96 dB): pixels that are
 # dark up to rounding, say 1e-9, would otherwise take most of the grey scale.
 MAX_OCTAVES = 16
-MIN_CHANGE = 0.01  # of ln(1 + I), a tenth of a threshold; smaller ones do not count for limits
+MIN_LOG_CHANGE = 0.01  # of ln(1 + I), a tenth of a threshold; smaller ones do not count for limits
 
 
 def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float]:
@@ -53,7 +53,7 @@ def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float
         return 0.0, 1.0
     if how == "changes":
         size = np.abs(_to_tone_scale(images.astype(np.float64), how))
-        size = size[size > MIN_CHANGE]
+        size = size[size > MIN_LOG_CHANGE]
         most = float(np.percentile(size, 95)) if len(size) else 1.0
         return math.expm1(-most), math.expm1(most)
     values = images[images > 0] if logarithmic else images.ravel()

@@ -27,17 +27,17 @@ from jaxevent.egomotion.truth import (
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.show.images import save_figure
 from jaxevent.show.motion_figures import (
-    flow_of,
     motion_figure,
+    motion_span,
     plot_flow,
     plot_warped,
-    span_of,
-    window_of,
+    representative_window,
+    window_flow,
 )
 from jaxevent.show.tables import align_cells
 
@@ -134,7 +134,7 @@ def write_errors(folder: Path, errors: MotionScores) -> None:
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
     table = {
-        name: {"value": _plain(value), "unit": unit, "meaning": MEANINGS[name]}
+        name: {"value": _plain(value), "unit": unit, "meaning": MEASURE_MEANINGS[name]}
         for name, value, unit in rows
     }
     about = {"times": errors.count, "truth": errors.truth}
@@ -326,7 +326,7 @@ class Output:
         """
         if not len(recording.events):
             raise InputError(f"{recording.name}: holds no events; choose another recording")
-        start, stop = span_of(recording)
+        start, stop = motion_span(recording)
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
         estimated = motion(times, centred=self.centred)
@@ -360,10 +360,10 @@ class Output:
 
     def _draw_window(self, folder: Path, recording: Recording, motion: MotionEstimate) -> None:
         """Draw the events of a short window before and after warping, and in colours of flow."""
-        part = window_of(recording, motion)
+        part = representative_window(recording, motion)
         flows = None
         if self.flow or motion.model.half_line:
-            flows = flow_of(recording, motion, part)
+            flows = window_flow(recording, motion, part)
         plot_warped(folder / "warped.png", recording, motion, part, flows)
         if self.flow and flows is not None:
             plot_flow(folder / "flow.png", recording, part, flows)

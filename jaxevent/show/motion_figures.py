@@ -28,7 +28,7 @@ from jaxevent.show.images import new_figure, save_figure
 
 _MAX_TIMES = 4096  # times of the plot
 _MAX_PARTICLES = 30_000  # particles of a component in the plot
-_WINDOW_WAY_PX = 8.0  # px that the image moves in the window that is warped,
+_WINDOW_SHIFT_PX = 8.0  # px that the image moves in the window that is warped,
 _MIN_WINDOW_S, _DEFAULT_WINDOW_S, _MAX_WINDOW_S = 0.02, 0.05, 0.5  # whose length has bounds
 _MAX_EVENTS = 500_000  # events that are warped or coloured
 _TRUE, _ESTIMATE, _LOST, _CLOUD = "black", "#c8401e", "#bbbbbb", "#3a78b5"
@@ -213,20 +213,20 @@ class Window:
     reference: int
 
 
-def span_of(recording: Recording) -> tuple[int, int]:
+def motion_span(recording: Recording) -> tuple[int, int]:
     """Return the times (us) of the first and the last event."""
     first, last = (recording.events[i : i + 1].t[0] for i in (0, len(recording.events) - 1))
     return int(first), int(last)
 
 
-def window_of(recording: Recording, motion: MotionEstimate) -> Window:
+def representative_window(recording: Recording, motion: MotionEstimate) -> Window:
     """Choose a window of 20 to 500 ms in the middle of the recording, or where motion is found.
 
     The image moves by 8 px in it, at the median speed over the sensor. Events beyond the first half
     million are left out.
     """
     events = recording.events
-    middle = sum(span_of(recording)) // 2
+    middle = sum(motion_span(recording)) // 2
     good = motion.t[motion.valid]
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])
@@ -239,7 +239,7 @@ def window_of(recording: Recording, motion: MotionEstimate) -> Window:
             motion.model(f), xi, np.broadcast_to(estimated.mean, (len(xi), estimated.mean.shape[1]))
         )
         speed = float(np.median(np.hypot(*U.T)))
-        span = _WINDOW_WAY_PX / max(speed, 1e-9)
+        span = _WINDOW_SHIFT_PX / max(speed, 1e-9)
         span = min(max(span, _MIN_WINDOW_S), _MAX_WINDOW_S)
     half = round(5e5 * span)
     begin = events.index(middle - half)
@@ -247,7 +247,7 @@ def window_of(recording: Recording, motion: MotionEstimate) -> Window:
     return Window(begin, end, middle)
 
 
-def flow_of(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
+def window_flow(recording: Recording, motion: MotionEstimate, part: Window) -> Flow:
     """Estimate the flow of a window's events, with those of 100 ms before as candidates."""
     if part.start == part.stop:
         return Flow(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0, np.float32))
@@ -264,8 +264,8 @@ def warped_events(
     recording: Recording,
     motion: MotionEstimate,
     events: Events,
-    reference: int,
-    moved: NDArray[np.floating] | None = None,
+    reference_us: int,
+    flow_px_s: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float64]:
     """Warp events along the motion to one time, by the model's `warp` of the motion's integral.
 
@@ -273,8 +273,8 @@ def warped_events(
         recording: Recording of the events.
         motion: A motion.
         events: n events.
-        reference: Time, us.
-        moved: (n, 2) px/s, flow due to translation at each event, for motion along half-lines.
+        reference_us: Time, us.
+        flow_px_s: (n, 2) px/s, flow due to translation at each event, for motion along half-lines.
 
     Returns:
         (n, 2) px, columns and rows: pixels, or with a calibration undistorted coordinates about the
@@ -282,9 +282,9 @@ def warped_events(
     """
     xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     xy = xi[events.y, events.x]
-    since = (events.t - reference) * 1e-6
+    since = (events.t - reference_us) * 1e-6
     # The motion is smooth: its integral on a grid of 1 ms or less.
-    low, high = int(events.t.min(initial=reference)), int(events.t.max(initial=reference))
+    low, high = int(events.t.min(initial=reference_us)), int(events.t.max(initial=reference_us))
     grid = np.linspace(low, high, 2 + math.ceil((high - low) / 1000))
     mean = np.asarray(
         motion(np.rint(grid).astype(np.int64), centred=True, extrapolate=True).mean, float
@@ -293,12 +293,12 @@ def warped_events(
     steps = (mean[1:] + mean[:-1]) / 2 * np.diff(grid)[:, None] * 1e-6
     total = np.concatenate([np.zeros((1, mean.shape[1])), np.cumsum(steps, 0)])
     way = np.stack(
-        [np.interp(events.t, grid, c) - np.interp(reference, grid, c) for c in total.T], 1
+        [np.interp(events.t, grid, c) - np.interp(reference_us, grid, c) for c in total.T], 1
     )
     # In single precision a place is off by some 1e-5 px.
     xy = np.asarray(_warped(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
-    if moved is not None:
-        xy = xy - moved * since[:, None]
+    if flow_px_s is not None:
+        xy = xy - flow_px_s * since[:, None]
     centre = _centre(recording)
     return xy + centre
 
@@ -328,14 +328,14 @@ def plot_warped(
         path: PNG file that is written.
         recording: Recording of the events.
         motion: A motion.
-        part: The window; None for `window_of`.
+        part: The window; None for `representative_window`.
         flows: Flow of the window's events, which motion along half-lines needs.
     """
-    part = part or window_of(recording, motion)
+    part = part or representative_window(recording, motion)
     events = recording.events[part.start : part.stop]
     moved = None
     if motion.model.half_line:
-        flows = flows or flow_of(recording, motion, part)
+        flows = flows or window_flow(recording, motion, part)
         keep = flows.valid
         events = Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep])
         xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)

@@ -18,30 +18,30 @@ from numpy.typing import NDArray
 import jaxevent
 from jaxevent.display import plural
 from jaxevent.errors import install_command
-from jaxevent.metrics import LOG_OFFSET, MEANINGS
+from jaxevent.metrics import LOG_OFFSET, MEASURE_MEANINGS
 from jaxevent.show.images import display_limits, tone_map
 from jaxevent.show.tables import (
     COST_COLUMNS,
     Column,
+    column_mean,
     columns_of,
     format_number,
-    mean_of,
     means,
+    nested_value,
     short_names,
-    value_at,
 )
 
 PICTURE_PX = 360  # px of the longer side of a picture
-MAX_STRIPS = (
+MAX_SHOWN_RECORDINGS = (
     12  # recordings with pictures and plots over time; more would make the page slow to open
 )
-MAX_POINTS = 300  # of a curve over time, means of so many parts of it
+MAX_CURVE_POINTS = 300  # of a curve over time, means of so many parts of it
 # Standard deviations of log intensity shown black and white; between them by their logarithm.
 DEVIATION_LIMITS = 0.001, 0.1
 WIDTH_INCHES = 4.5  # inches of a plot: 27 rem of the page
-LABEL_LETTERS = 18  # letters of a line of a method's label in a plot
+LABEL_LINE_LETTERS = 18  # letters of a line of a method's label in a plot
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
-FULL_ERROR = {False: 0.1, True: 1.0}
+FULL_SCALE_ERROR = {False: 0.1, True: 1.0}
 HIGHER_IS_BETTER = {  # of these more is better
     "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
     "mota", "idf1", "hota",
@@ -94,12 +94,16 @@ def page(
         "title": title,
         "about": f"{len(recordings)} {plural('recording', len(recordings))}, {len(methods)} "
         f"{plural('method', len(methods))}, protocol {protocol}, {now}",
-        "meaning": {title: MEANINGS[place] for title, place, _, _ in columns if place in MEANINGS},
+        "meaning": {
+            title: MEASURE_MEANINGS[place]
+            for title, place, _, _ in columns
+            if place in MEASURE_MEANINGS
+        },
         "failures": _failures(rows, names),
         "means": _means(rows, columns),
         "unequal": len(counts) > 1,
         "strips": _strips(rows, pictures, recordings, names),
-        "full": f"{FULL_ERROR[hdr]:g}",
+        "full": f"{FULL_SCALE_ERROR[hdr]:g}",
         "unit": "ln(I + 0.003)" if hdr else "intensity",
         "certain": DEVIATION_LIMITS[0],
         "uncertain": DEVIATION_LIMITS[1],
@@ -108,8 +112,10 @@ def page(
         "computed": _computed(hosts),
         "config": config,
     }
-    if len(recordings) > MAX_STRIPS:
-        values["first_only"] = f"Of {len(recordings)} recordings the first {MAX_STRIPS} are shown."
+    if len(recordings) > MAX_SHOWN_RECORDINGS:
+        values["first_only"] = (
+            f"Of {len(recordings)} recordings the first {MAX_SHOWN_RECORDINGS} are shown."
+        )
     if importlib.util.find_spec("matplotlib") is None:
         values["missing_plots"] = install_command("plot")
     else:
@@ -141,7 +147,7 @@ def picture(sample: Any) -> dict[str, Any]:
         bright = float(np.percentile(truth, 99.5))
         tone, limits = "linear", (0.0, bright if 0 < bright < 0.8 else 1.0)
         error = image.clip(0, 1) - truth
-    error = np.where(known, error / FULL_ERROR[sample.hdr], 0).clip(-1, 1)
+    error = np.where(known, error / FULL_SCALE_ERROR[sample.hdr], 0).clip(-1, 1)
     shown = {
         "t": sample.t,
         "image": _grey(tone_map(image, tone, limits)),
@@ -251,7 +257,7 @@ def _table(
             cells.append(Cell(row["error"], "wrap", len(columns)))
         else:
             for column in columns:
-                cells.append(Cell(format_number(value_at(row, column[1]), column)))
+                cells.append(Cell(format_number(nested_value(row, column[1]), column)))
         lines.append(cells)
     return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 
@@ -291,7 +297,7 @@ def _strips(
 ) -> list[dict[str, Any]]:
     """Collect the truth, the frame before, and every method's pictures of each recording."""
     strips = []
-    for recording in recordings[:MAX_STRIPS]:
+    for recording in recordings[:MAX_SHOWN_RECORDINGS]:
         shown = [
             (row["method"], one)
             for row, one in zip(rows, pictures, strict=True)
@@ -313,7 +319,7 @@ def _strips(
     return strips
 
 
-NAMES = {
+MEASURE_LABELS = {
     "mse": "MSE", "ssim": "SSIM", "log_mse": "log MSE", "log_ssim": "log SSIM",
     "AEE_rel": "relative AEE (%)", "AAE_U": "AAE (degrees)", "AAE_T": "heading (degrees)",
     "vector_error": "error of Omega (%)", "AME_rel": "relative AME (%)", "error": "error (%)",
@@ -346,7 +352,8 @@ def _points(
     for measure in measures:
         figure, axis = _panel(methods)
         values = [
-            mean_of([row for row in rows if row["method"] == method], measure) for method in methods
+            column_mean([row for row in rows if row["method"] == method], measure)
+            for method in methods
         ]
         places = [math.nan if value is None else value for value in values]
         colours = [_colour(i) for i in range(len(methods))]
@@ -355,7 +362,7 @@ def _points(
         if measure not in HIGHER_IS_BETTER and all(place > 0 for place in places if place == place):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
-        axis.set_xlabel(NAMES[measure])
+        axis.set_xlabel(MEASURE_LABELS[measure])
         plots.append(_plot(figure))
     return plots
 
@@ -364,12 +371,12 @@ def _panel(methods: Sequence[str]) -> tuple[Any, Any]:
     """Make a figure and its axes with a line for each method, from above."""
     from matplotlib.figure import Figure
 
-    lines = sum(len(textwrap.wrap(method, LABEL_LETTERS)) for method in methods)
+    lines = sum(len(textwrap.wrap(method, LABEL_LINE_LETTERS)) for method in methods)
     figure = Figure(
         figsize=(WIDTH_INCHES, 0.8 + 0.14 * (lines + len(methods))), layout="constrained"
     )
     axis = figure.subplots()
-    labels = [textwrap.fill(method, LABEL_LETTERS) for method in methods]
+    labels = [textwrap.fill(method, LABEL_LINE_LETTERS) for method in methods]
     axis.set(yticks=range(len(methods)), yticklabels=labels, ylim=(len(methods) - 0.5, -0.5))
     axis.tick_params(left=False)
     axis.spines[["top", "right", "left"]].set_visible(False)
@@ -390,7 +397,9 @@ def _boxes(
     reach to the last value within 1.5 times the box's length. Further metrics have plots too.
     """
     own = {name for row in rows for name in row.get("own_metrics", ())}
-    further = [name for row in rows for name in _series(row) if name in NAMES or name in own]
+    further = [
+        name for row in rows for name in _series(row) if name in MEASURE_LABELS or name in own
+    ]
     plots = []
     for measure in dict.fromkeys([*measures, *further]):
         lists = [
@@ -412,7 +421,7 @@ def _boxes(
         if measure not in HIGHER_IS_BETTER | own and all((one > 0).all() for one in columns):
             axis.set_xscale("log")
             _label_plainly(axis.xaxis)
-        axis.set_xlabel(NAMES.get(measure, measure))
+        axis.set_xlabel(MEASURE_LABELS.get(measure, measure))
         plots.append(_plot(figure))
     return plots
 
@@ -428,7 +437,7 @@ def _curves(
     from matplotlib.figure import Figure
 
     parts = []
-    for recording in recordings[:MAX_STRIPS]:
+    for recording in recordings[:MAX_SHOWN_RECORDINGS]:
         figure = Figure(figsize=(WIDTH_INCHES, 2.8), layout="constrained")
         axis = figure.subplots()
         for row in rows:
@@ -442,8 +451,8 @@ def _curves(
             pieces = [
                 (float(np.mean(a)), float(np.mean(b)))
                 for a, b in zip(
-                    np.array_split(t, min(MAX_POINTS, len(t))),
-                    np.array_split(values, min(MAX_POINTS, len(t))),
+                    np.array_split(t, min(MAX_CURVE_POINTS, len(t))),
+                    np.array_split(values, min(MAX_CURVE_POINTS, len(t))),
                     strict=True,
                 )
             ]
@@ -461,7 +470,7 @@ def _curves(
             )
         if not axis.lines:
             continue
-        axis.set(xlabel="time (s)", ylabel=NAMES[measure])
+        axis.set(xlabel="time (s)", ylabel=MEASURE_LABELS[measure])
         if all(np.nanmin(np.asarray(line.get_ydata())) > 0 for line in axis.lines):
             axis.set_yscale("log")
             _label_plainly(axis.yaxis)

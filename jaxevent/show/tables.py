@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxevent.io.output import complete
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 
 Column = tuple[str, str, float | int, int]
 
@@ -73,16 +73,16 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
     known = [
         column
         for column in COLUMNS
-        if column[1] in always or any(value_at(row, column[1]) is not None for row in rows)
+        if column[1] in always or any(nested_value(row, column[1]) is not None for row in rows)
     ]
     own = dict.fromkeys(name for row in rows for name in row.get("own_metrics", ()))
     work = next((i for i, column in enumerate(known) if column[1] in COST_COLUMNS), len(known))
     return [*known[:work], *((name, name, 1, 4) for name in own), *known[work:]]
 
 
-def mean_of(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
+def column_mean(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
     """Compute the mean of a number over the rows that have it; None if none has."""
-    values = [value_at(row, place) for row in rows]
+    values = [nested_value(row, place) for row in rows]
     values = [float(value) for value in values if value is not None]
     return float(np.mean(values)) if values else None
 
@@ -95,7 +95,7 @@ def rows_of_method(
     return [
         row
         for row in rows
-        if row["method"] == method and any(value_at(row, place) is not None for place in places)
+        if row["method"] == method and any(nested_value(row, place) is not None for place in places)
     ]
 
 
@@ -114,7 +114,7 @@ def means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = rows_of_method(done, method, columns)
-        numbers = {place: mean_of(mine, place) for _, place, _, _ in columns}
+        numbers = {place: column_mean(mine, place) for _, place, _, _ in columns}
         found.append({"method": method, "recordings": len(mine), **numbers})
     return found
 
@@ -161,13 +161,13 @@ def _table_of_means(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in found:
         numbers = [format_number(row[column[1]], column) for column in columns]
         table.append([row["method"], str(row["recordings"]), *numbers])
-    return "\n" + lay_out(table, (0,))
+    return "\n" + format_aligned_table(table, (0,))
 
 
 def legend(columns: Sequence[Column]) -> str:
-    """Format the meanings of columns as a Markdown list, of those that `metrics.MEANINGS` has."""
-    known = [(title, place) for title, place, _, _ in columns if place in MEANINGS]
-    lines = [f"- {title}: {MEANINGS[place]}\n" for title, place in known]
+    """Format the meanings of columns that `metrics.MEASURE_MEANINGS` has as a Markdown list."""
+    known = [(title, place) for title, place, _, _ in columns if place in MEASURE_MEANINGS]
+    lines = [f"- {title}: {MEASURE_MEANINGS[place]}\n" for title, place in known]
     return "\n" * bool(lines) + "".join(lines)
 
 
@@ -192,12 +192,12 @@ def results_table(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) 
     names = short_names(row["recording"] for row in rows)
     table = [["recording", "method", *(title for title, _, _, _ in columns)]]
     for row in rows:
-        numbers = [format_number(value_at(row, column[1]), column) for column in columns]
+        numbers = [format_number(nested_value(row, column[1]), column) for column in columns]
         table.append([names[row["recording"]], row["method"], *numbers])
-    return lay_out(table, (0, 1))
+    return format_aligned_table(table, (0, 1))
 
 
-def lay_out(table: Sequence[Sequence[str]], left: Collection[int]) -> str:
+def format_aligned_table(table: Sequence[Sequence[str]], left: Collection[int]) -> str:
     """Format cells as a Markdown table, aligned as plain text too.
 
     Args:
@@ -230,7 +230,7 @@ def format_number(value: float | int | None, column: Column) -> str:
     return "-" if value is None or math.isnan(value) else f"{factor * value:.{digits}f}"
 
 
-def value_at(row: Mapping[str, Any], path: str) -> Any:
+def nested_value(row: Mapping[str, Any], path: str) -> Any:
     """Return the value of a nested row at a place such as "regions.well.mse", or None."""
     value: Any = row
     for key in path.split("."):

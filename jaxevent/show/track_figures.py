@@ -25,21 +25,23 @@ from jaxevent.show.images import new_figure, save_figure
 from jaxevent.show.track_tables import check_tracks
 
 _BACKGROUND, _ON, _OFF = (24, 24, 28), (235, 235, 235), (110, 130, 190)  # RGB of a video
-_MIN_ROWS = 480  # smaller sensors are enlarged in a video, so that lines and numbers can be seen
-_MAX_BEHIND = 1_000_000  # most events behind the paths
-_ELLIPSES = 6  # along a path
+_MIN_VIDEO_HEIGHT_PX = (
+    480  # smaller sensors are enlarged in a video, so that lines and numbers can be seen
+)
+_MAX_BACKGROUND_EVENTS = 1_000_000  # most events behind the paths
+_N_PATH_ELLIPSES = 6  # along a path
 _GROWTH_SIGMAS, _GROWTH_SHARE = 3.0, 0.2  # of a growth from 0, and share of its times
-_MIN_GROWTH = 1.2  # ratio of sizes of a target that grows
+_MIN_GROWTH_RATIO = 1.2  # ratio of sizes of a target that grows
 _MIN_AXES_RATIO = 0.5  # change of one axis, as a share of the other's
 _MONOTONE_SHARE = 0.8  # share of all changes that are growth, or shrinking
 _MIN_SIZE_PX = 2.0  # px along the shorter axis; smaller spots are as large as pixels
-_LIFE_PARTS = 8  # parts of a life, whose median sizes are compared
+_N_LIFE_PARTS = 8  # parts of a life, whose median sizes are compared
 _CHANGE_SIGMAS = 2.0  # standard deviations of the change; errors within a part are alike
 _MAX_CURVES = 6  # tracks in the panels over time
-_MAX_LEGEND = 16  # lines that a legend lists
+_MAX_LEGEND_LINES = 16  # lines that a legend lists
 _SIZE, _TTC, _RANGE = "lambda (px)", "1 / TTC (1/s)", "range (m)"
 _BAND_ALPHA = 0.2
-_PAIR_STYLES = ("-", "--", ":", "-.")  # lines of pairs
+_PAIR_LINE_STYLES = ("-", "--", ":", "-.")  # lines of pairs
 
 
 def track_frames(
@@ -89,7 +91,7 @@ def track_frames(
 def draw_frames(
     recording: Recording,
     t: NDArray[np.int64],
-    number: NDArray,
+    track_ids: NDArray,
     states: Iterable[tuple[NDArray, NDArray]],
     images: Iterable[NDArray] | None,
     *,
@@ -100,11 +102,11 @@ def draw_frames(
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw `track_frames` of `states` that come one by one: states (N, 8), and their validity."""
     if scale is None:
-        scale = max(1, math.ceil(_MIN_ROWS / recording.height))
+        scale = max(1, math.ceil(_MIN_VIDEO_HEIGHT_PX / recording.height))
     if window is None:
         window = float(np.median(np.diff(t))) * 1e-6 if len(t) > 1 else 0.01
     events = _event_images(recording, t, round(window * 1e6)) if images is None else images
-    colours = [track_colour(int(n)) for n in number]
+    colours = [track_colour(int(n)) for n in track_ids]
     behind, font = iter(events), ImageFont.load_default(14)
     ways: dict[int, list[tuple[int, NDArray]]] = {}  # of the tracks alive: times and places
     for k, (now, (mean, valid)) in enumerate(zip(t.tolist(), states, strict=True)):
@@ -131,13 +133,13 @@ def draw_frames(
             ellipse = outline(mean[i], sigmas)
             _line(draw, ellipse, colours[i], scale, 2)
             x, y = _large(np.array([ellipse[:, 0].max(), ellipse[:, 1].min()]), scale)
-            draw.text((x, y), str(number[i]), fill=colours[i], font=font, anchor="ls")
+            draw.text((x, y), str(track_ids[i]), fill=colours[i], font=font, anchor="ls")
         yield np.asarray(large)
 
 
-def track_colour(number: int, dark: bool = False) -> tuple[int, int, int]:
+def track_colour(track_id: int, dark: bool = False) -> tuple[int, int, int]:
     """Return red, green and blue (0 to 255) of a track; neighbouring ids differ."""
-    hue = (0.07 + number * 0.618034) % 1
+    hue = (0.07 + track_id * 0.618034) % 1
     r, g, b = colorsys.hsv_to_rgb(hue, 0.9 if dark else 0.65, 0.75 if dark else 1.0)
     return round(255 * r), round(255 * g), round(255 * b)
 
@@ -154,12 +156,12 @@ def _event_images(
         yield image
 
 
-def outline(state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
+def outline(ellipse_state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
     """Return points (49, 2) px of a state's ellipse of `sigmas` standard deviations."""
     angle = np.linspace(0, 2 * np.pi, 49)
-    u, v = sigmas * state[4] * np.cos(angle), sigmas * state[5] * np.sin(angle)
-    c, s = np.cos(state[6]), np.sin(state[6])
-    return np.stack([state[0] + c * u - s * v, state[1] + s * u + c * v], 1)
+    u, v = sigmas * ellipse_state[4] * np.cos(angle), sigmas * ellipse_state[5] * np.sin(angle)
+    c, s = np.cos(ellipse_state[6]), np.sin(ellipse_state[6])
+    return np.stack([ellipse_state[0] + c * u - s * v, ellipse_state[1] + s * u + c * v], 1)
 
 
 def _large(points: NDArray, scale: int) -> tuple[float, ...]:
@@ -248,7 +250,7 @@ def write_track_plot(
     if extent is not None and focal is not None:
         ranges = jax.jit(size_range)(m, P, extent, focal, size_factor)
     _draw_states(bands, known, valid, sizes, (grown, spread, grows), ranges)
-    for pair, ls in zip(pairs if names else (), itertools.cycle(_PAIR_STYLES)):
+    for pair, ls in zip(pairs if names else (), itertools.cycle(_PAIR_LINE_STYLES)):
         a, b = (known.index(one) for one in pair)
         value, variance = jax.jit(inverse_ttc)(m[:, a], P[:, a], m[:, b], P[:, b])
         line = {"color": "black", "ls": ls, "label": f"{pair[0]} and {pair[1]}"}
@@ -302,8 +304,8 @@ def _changes_scale(
     """
     alike = np.zeros(valid.shape[1], bool)
     for i, seen in enumerate(valid.T):
-        parts = np.array_split(np.log(sizes[seen, i]), _LIFE_PARTS)
-        errors = np.array_split((variances[seen, i] / sizes[seen, i] ** 2).sum(1), _LIFE_PARTS)
+        parts = np.array_split(np.log(sizes[seen, i]), _N_LIFE_PARTS)
+        errors = np.array_split((variances[seen, i] / sizes[seen, i] ** 2).sum(1), _N_LIFE_PARTS)
         if len(parts[-1]):
             medians = np.array([np.median(part, axis=0) for part in parts])
             if np.median(medians.min(1)) < np.log(_MIN_SIZE_PX):
@@ -313,7 +315,7 @@ def _changes_scale(
             change = medians[most] - medians[least]
             error = np.sqrt(np.median(errors[most]) + np.median(errors[least]))
             ratio = _MIN_AXES_RATIO
-            both = change.min() > ratio * change.max() > ratio * np.log(_MIN_GROWTH)
+            both = change.min() > ratio * change.max() > ratio * np.log(_MIN_GROWTH_RATIO)
             both = both and change.sum() > _CHANGE_SIGMAS * error
             alike[i] = both and np.ptp(mean) > _MONOTONE_SHARE * abs(np.diff(mean)).sum()
     return alike
@@ -359,7 +361,7 @@ class _Bands:
 
     def finish(self, shown: int, total: int) -> None:
         """Label the panels of tracks."""
-        legend = 0 < shown <= _MAX_LEGEND
+        legend = 0 < shown <= _MAX_LEGEND_LINES
         some = "" if shown == total else f" of the {shown} tracks seen longest"
         if not self.axes:
             return
@@ -400,8 +402,8 @@ def draw_paths(
 
     (mean, valid), seconds = states, (t - recording.start) * 1e-6
     first, last = (recording.events.index(int(at)) for at in (t[0], t[-1] + 1))
-    middle = max(first, (first + last - _MAX_BEHIND) // 2)
-    events = recording.events[middle : min(last, middle + _MAX_BEHIND)]
+    middle = max(first, (first + last - _MAX_BACKGROUND_EVENTS) // 2)
+    events = recording.events[middle : min(last, middle + _MAX_BACKGROUND_EVENTS)]
     behind = np.log1p(count_events(events, size=(recording.width, recording.height)))
     axis.imshow(behind, "Greys", vmin=0, vmax=2 * max(float(np.percentile(behind, 99.9)), 0.5))
     lines = None
@@ -415,7 +417,7 @@ def draw_paths(
         lines.set_array(seconds[seen[:-1]][np.diff(seen) == 1])
         lines.set_clim(seconds[0], max(float(seconds[-1]), float(seconds[0]) + 1e-9))
         axis.add_collection(lines)
-        for k in np.unique(np.linspace(0, len(seen) - 1, _ELLIPSES).astype(np.int64)):
+        for k in np.unique(np.linspace(0, len(seen) - 1, _N_PATH_ELLIPSES).astype(np.int64)):
             colour = lines.to_rgba(seconds[seen[k]])
             axis.plot(*outline(mean[seen[k], i], 2.0).T, color=colour, lw=0.8)
         dark = "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))

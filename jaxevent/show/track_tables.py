@@ -103,7 +103,7 @@ def _hdf5_writer(
 
         yield append
         if "t" not in file:
-            append(*no_rows())
+            append(*empty_rows())
         for name, unit in (("t", CLOCK_UNIT), ("id", "1")):
             file[name].attrs["unit"] = unit
         for name, unit in (("mean", "units"), ("covariance", "units[i] units[j]")):
@@ -150,7 +150,7 @@ def _append_rows(file: h5py.File, columns: Iterable[tuple[str, NDArray]]) -> Non
         stored[row:] = array
 
 
-def no_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def empty_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return times, ids, means and covariances of no row."""
     none = np.empty(0, np.int64)
     return none, none, np.empty((0, 8), np.float32), np.empty((0, 8, 8), np.float32)

@@ -24,17 +24,19 @@ from jaxevent.recording import Recording
 from jaxevent.show.images import video_writer
 from jaxevent.show.tables import align_cells
 from jaxevent.show.track_figures import draw_frames, write_track_plot
-from jaxevent.show.track_tables import QUANTITIES, no_rows, quantity_writer, track_writer
+from jaxevent.show.track_tables import QUANTITIES, empty_rows, quantity_writer, track_writer
 
-_PLOTS = (".png", ".pdf", ".svg")
-_EXTRAS = {".mp4": ("imageio_ffmpeg", "video")} | {kind: ("matplotlib", "plot") for kind in _PLOTS}
+_PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+_EXTRA_OF_SUFFIX = {".mp4": ("imageio_ffmpeg", "video")} | {
+    kind: ("matplotlib", "plot") for kind in _PLOT_SUFFIXES
+}
 _MAX_TIMES, _MAX_TRACKS = 4096, 64  # of the plot; times also of quantities
 _MAX_FPS, _MIN_PICTURES = 30.0, 150  # of a video: pictures per second, and in all
 _BATCH_EVENTS = 2_000_000  # events of which rows are written at a time
 
 _ranges = jax.jit(size_range)
 _closing = jax.jit(inverse_ttc)
-_MIN_ROWS = 64  # rows that a compiled function takes; more come in powers of two
+_MIN_COMPILED_ROWS = 64  # rows that a compiled function takes; more come in powers of two
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Output:
         path, suffix = self.path, self.path.suffix.lower()
         if not path.name:
             raise InputError(f"{path}: is a folder in use; give the name of a new file or folder")
-        known = ("", ".csv", ".h5", ".hdf5", ".mp4", *_PLOTS)
+        known = ("", ".csv", ".h5", ".hdf5", ".mp4", *_PLOT_SUFFIXES)
         if suffix not in known:
             raise InputError(
                 f"{path}: tracks cannot be stored as {suffix}; end the name in .csv, .h5, .mp4 or "
@@ -91,14 +93,14 @@ class Output:
         for one, other in self.pairs:
             if one == other:
                 raise InputError(f"--pair {one},{other} is one track; give two")
-        if self._has_quantities and suffix not in ("", *_PLOTS):
+        if self._has_quantities and suffix not in ("", *_PLOT_SUFFIXES):
             raise InputError(
                 f"{path}: --pair and --extent are for a folder or a plot; leave them out"
             )
         if self.background != "events" and suffix not in ("", ".mp4"):
             raise InputError(f"{path}: --background is for a video; leave it out")
-        if suffix in _EXTRAS:
-            require(*_EXTRAS[suffix])
+        if suffix in _EXTRA_OF_SUFFIX:
+            require(*_EXTRA_OF_SUFFIX[suffix])
         check_writable(path, directory=not suffix)
 
     @property
@@ -136,9 +138,9 @@ class Output:
         with complete(self.path, directory=True) as folder:
             places = {kind: folder / f"tracks{kind}" for kind in (".csv", ".h5", ".mp4", ".png")}
             left_out = []
-            for kind in set(places) & set(_EXTRAS):
+            for kind in set(places) & set(_EXTRA_OF_SUFFIX):
                 try:
-                    require(*_EXTRAS[kind])
+                    require(*_EXTRA_OF_SUFFIX[kind])
                 except MissingExtra as missing:
                     left_out.append(f"{places.pop(kind).name} is left out: {missing}")
             if self._has_quantities:
@@ -223,7 +225,7 @@ class Output:
                             put(*columns)
         if "quantities" in places:
             self._write_quantities(places["quantities"], rows, tracks)
-        for kind in set(places) & set(_PLOTS):
+        for kind in set(places) & set(_PLOT_SUFFIXES):
             chosen = rows.longest(_MAX_TRACKS, [one for pair in self.pairs for one in pair])
             mean, covariance, valid = rows.dense(chosen)
             write_track_plot(
@@ -373,7 +375,11 @@ class _EventStates(NamedTuple):
 def _evaluate(quantity: Callable[..., Any], *arrays: NDArray) -> tuple[NDArray, NDArray]:
     """Evaluate a quantity of rows and its standard deviation, compiled for few lengths."""
     count = len(arrays[0])
-    fill = max(_MIN_ROWS, 1 << (count - 1).bit_length()) - count if count else _MIN_ROWS
+    fill = (
+        max(_MIN_COMPILED_ROWS, 1 << (count - 1).bit_length()) - count
+        if count
+        else _MIN_COMPILED_ROWS
+    )
     filled = [np.pad(a, [(0, fill)] + [(0, 0)] * (a.ndim - 1), mode="empty") for a in arrays]
     value, variance = (np.asarray(part, np.float64)[:count] for part in quantity(*filled))
     return value, np.sqrt(np.maximum(variance, 0))
@@ -393,7 +399,7 @@ class _TrackRows:
 
     @functools.cached_property
     def _joined(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        at, _, mean, covariance = no_rows()
+        at, _, mean, covariance = empty_rows()
         parts = self._parts or [(at, at, mean, covariance)]
         at, column, mean, covariance = (np.concatenate(x) for x in zip(*parts, strict=True))
         order = np.argsort(column, kind="stable")

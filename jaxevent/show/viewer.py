@@ -23,7 +23,7 @@ ON_COLOUR, OFF_COLOUR = (200, 64, 30), (58, 120, 181)
 BLOCK_EVENTS = 1 << 20  # events sent at a time
 STATE_STEP_US = 5_000  # us between states of tracks and of motion
 TABLE_FILES = "tracks.csv", "motion.csv"  # of the folders that the commands write
-CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 25)
+CIRCLE_ANGLES_RAD = np.linspace(0, 2 * np.pi, 25)
 
 Result = ImageSequence | Tracks | MotionEstimate | str | Path
 
@@ -159,7 +159,7 @@ class _Sender:
             x, y, along, across, angle = (
                 rows[name].to_numpy()[:, None] for name in ("x", "y", "lambda1", "lambda2", "theta")
             )
-            u, v = 2 * along * np.cos(CIRCLE_ANGLES), 2 * across * np.sin(CIRCLE_ANGLES)
+            u, v = 2 * along * np.cos(CIRCLE_ANGLES_RAD), 2 * across * np.sin(CIRCLE_ANGLES_RAD)
             c, s = np.cos(angle), np.sin(angle)
             outline = np.stack([x + c * u - s * v, y + s * u + c * v], 2) + 0.5
             t = microseconds(rows["t"].to_numpy(np.float64))

@@ -621,7 +621,7 @@ def test_without_frames_images_show_changes(folder, capsys):
     jaxevent.save(recording, folder / "bare.h5")
     assert cli.main(f"reconstruct {folder}/bare.h5 --rate 300 --out {folder}/a".split()) == 0
     assert "frames," not in capsys.readouterr().out.partition("\n")[2]
-    times = export.evenly(recording, 300)
+    times = export.evenly_spaced_times(recording, 300)
     images = jaxevent.high_pass.estimate(recording)(times).mean
     shown = [np.asarray(Image.open(p)) for p in sorted((folder / "a").glob("*.png"))]
     np.testing.assert_array_equal(np.stack(shown), tone_map(images, "changes"))

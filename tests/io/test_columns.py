@@ -235,7 +235,7 @@ def test_parquet_is_read_by_groups_of_rows(group, tmp_path, monkeypatch):
     c = columns(9)
     parquet.write_table(table_of(c), tmp_path / "a.parquet", row_group_size=group)
     assert_read(tmp_path / "a.parquet", c)
-    monkeypatch.setattr(decoded, "BLOCK", 90)
+    monkeypatch.setattr(decoded, "BLOCK_EVENTS", 90)
     read: list[int] = []
     whole = parquet.ParquetFile.read_row_group
     monkeypatch.setattr(

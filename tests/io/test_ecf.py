@@ -16,7 +16,7 @@ SIZE = (40, 30)
 
 
 def records_of(events):
-    records = np.zeros(len(events), ecf.RECORD)
+    records = np.zeros(len(events), ecf.EVENT_DTYPE)
     for name in "xypt":
         records[name] = getattr(events, name)
     return records
@@ -110,7 +110,7 @@ events = st.integers(1, 400).flatmap(
 @pytest.mark.slow
 @given(events, st.integers(0, 2), st.integers(0, 1 << 40))
 def test_what_was_encoded_is_decoded(steps, kind, start):
-    records = np.zeros(len(steps[0]), ecf.RECORD)
+    records = np.zeros(len(steps[0]), ecf.EVENT_DTYPE)
     dt, dx, dy, dp = (np.cumsum(part) for part in steps)
     records["t"], records["x"], records["y"], records["p"] = (
         start + dt,
@@ -135,7 +135,7 @@ def write(path, records, size, kind=0, name="CD/events"):
     with h5py.File(path, "w") as file:
         plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         plist.set_chunk((size,))
-        plist.set_filter(ecf.FILTER, h5py.h5z.FLAG_OPTIONAL)
+        plist.set_filter(ecf.HDF5_FILTER_ID, h5py.h5z.FLAG_OPTIONAL)
         lcpl = h5py.h5p.create(h5py.h5p.LINK_CREATE)
         lcpl.set_create_intermediate_group(True)
         stored = h5py.h5d.create(
@@ -143,7 +143,7 @@ def write(path, records, size, kind=0, name="CD/events"):
             h5py.h5s.create_simple((len(records),)), plist, lcpl,
         )  # fmt: skip
         for first in range(0, len(records), size):
-            part = records[first : first + size].astype(ecf.RECORD)
+            part = records[first : first + size].astype(ecf.EVENT_DTYPE)
             stored.write_direct_chunk((first,), encoded(part, kind))
         triggers = [("p", "<i2"), ("t", "<i8"), ("id", "<i2")]
         file["EXT_TRIGGER/events"] = np.array([(1, 30, 0), (0, 80, 6)], triggers)

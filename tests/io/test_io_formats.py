@@ -79,8 +79,8 @@ def blocks_of(monkeypatch):
     """Blocks of so many events, so that short files consist of several."""
 
     def set_to(count):
-        monkeypatch.setattr(decoded, "BLOCK", count)
-        monkeypatch.setattr(tables, "_TEXT_BYTES", 20 * count)
+        monkeypatch.setattr(decoded, "BLOCK_EVENTS", count)
+        monkeypatch.setattr(tables, "_TEXT_BLOCK_BYTES", 20 * count)
 
     return set_to
 

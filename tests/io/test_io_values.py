@@ -325,7 +325,7 @@ def test_triggers_of_evt3_continue_over_the_clocks_end(tmp_path, monkeypatch):
     words += [0x8000, 0x6009, 0xA301, 0x2005]
     (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
     for block in (1, 2, 3, 1 << 20):
-        monkeypatch.setattr(decoded, "BLOCK", block)
+        monkeypatch.setattr(decoded, "BLOCK_EVENTS", block)
         got = load(tmp_path / "a.raw", SIZE)
         assert got.triggers.t.tolist() == [0xFFE << 12 | 5, 0xFFF << 12, 1 << 24 | 9]
         assert got.triggers.edge.tolist() == [1, 0, 1]
@@ -334,7 +334,7 @@ def test_triggers_of_evt3_continue_over_the_clocks_end(tmp_path, monkeypatch):
 
 
 def test_triggers_of_dat_lie_beside_the_events(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxevent.io.decoded.BLOCK", 2)
+    monkeypatch.setattr("jaxevent.io.decoded.BLOCK_EVENTS", 2)
     head = b"% Data file containing trigger events.\n% Version 2\n"
     # The third comes after the end of the clock.
     signals = [(0xF0000000, 1 | 6 << 26), (0xFFFFFFFE, 0), (9, 1 | 63 << 26)]

@@ -122,7 +122,7 @@ def test_inputs_of_each_kind(tmp_path, monkeypatch):
     (tmp_path / "large").write_bytes(bytes(11))
     (tmp_path / "small").write_bytes(bytes(10))
     os.mkfifo(tmp_path / "pipe")  # to open it would wait for ever
-    monkeypatch.setattr(output, "_MAX_HASHED", 10)
+    monkeypatch.setattr(output, "_MAX_HASHED_BYTES", 10)
     names = ["folder", "large", "small", "pipe", "gone", os.fsdecode(b"\xff")]
     told = tomllib.loads(
         Command(["jaxevent"], [tmp_path / name for name in names]).described_inputs

@@ -42,7 +42,7 @@ def assert_events(got, want):
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    monkeypatch.setattr(decoded, "BLOCK", 16)
+    monkeypatch.setattr(decoded, "BLOCK_EVENTS", 16)
 
 
 def stored(folder, storage):

@@ -7,7 +7,7 @@ from noise import HEIGHT, WIDTH, small
 import jaxevent
 from jaxevent.errors import InputError, MissingExtra
 from jaxevent.methods import find, names
-from jaxevent.parameters import LARGEST, Number, UnitInterval
+from jaxevent.parameters import MAX_VALUE, Number, UnitInterval
 from jaxevent.show import export
 
 TIMES = np.array([2_000, 30_000])
@@ -18,7 +18,7 @@ def ends(number: Number) -> set[float]:
     """The least and the greatest values that may be given, and 0, which some refuse."""
     if isinstance(number, UnitInterval):
         return {0.0, 0.9999999}
-    greatest = np.nextafter(min(number.most, LARGEST), 0)
+    greatest = np.nextafter(min(number.most, MAX_VALUE), 0)
     return {max(number.least, -greatest), greatest, 0.0}
 
 

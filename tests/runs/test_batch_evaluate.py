@@ -29,7 +29,7 @@ from jaxevent.methods import METHODS
 from jaxevent.reconstruction.video import BATCH
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.evaluate import evaluate
-from jaxevent.runs.scores import MEASURES, score
+from jaxevent.runs.scores import MEASURE_FUNCTIONS, score
 
 SEVERAL = """
 recordings = ["*.h5"]
@@ -202,7 +202,7 @@ def test_errors_of_other_kinds_are_rows_too(tmp_path, monkeypatch):
         raise ZeroDivisionError("by zero")
 
     jaxevent.save(small(), tmp_path / "small.h5")
-    monkeypatch.setitem(MEASURES, "global_ssim", broken)
+    monkeypatch.setitem(MEASURE_FUNCTIONS, "global_ssim", broken)
     config = write_config(tmp_path, 'metrics = ["global_ssim"]\n' + ONE)
     with pytest.raises(jaxevent.InputError, match="^ZeroDivisionError: by zero$"):
         evaluate(config, tmp_path / "out")

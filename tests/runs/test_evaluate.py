@@ -461,7 +461,7 @@ def test_further_metrics_are_those_of_each_image(folder, monkeypatch):
         seen.append((image, truth))
         return metrics.mse(image, truth)
 
-    monkeypatch.setitem(jaxevent.runs.scores.MEASURES, "lpips", fake)
+    monkeypatch.setitem(jaxevent.runs.scores.MEASURE_FUNCTIONS, "lpips", fake)
     monkeypatch.setattr(jaxevent.runs.scores, "lpips_weights", lambda: None)
     row = score(small(), METHODS["blend"], metrics=["global_ssim", "lpips"])
     truth, between = blended_by_hand()

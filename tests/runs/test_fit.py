@@ -30,7 +30,7 @@ import jaxevent.runs.fit
 import jaxevent.tuning
 from jaxevent import cli
 from jaxevent.estimator import Estimate
-from jaxevent.methods import HOMES, METHODS
+from jaxevent.methods import METHOD_HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
 from jaxevent.reconstruction.estimator import PixelEstimator, ScannedImages
 from jaxevent.reconstruction.filtering import Filter
@@ -798,7 +798,7 @@ LIKELY = Likely(**{f.name: getattr(BLEND, f.name) for f in dataclasses.fields(BL
 
 
 def test_the_likelihood_sees_given_frames_only(folder, monkeypatch):
-    monkeypatch.setitem(HOMES["reconstruction"], "likely", "test_fit:LIKELY")
+    monkeypatch.setitem(METHOD_HOMES["reconstruction"], "likely", "test_fit:LIKELY")
     seen = []
     prepare = Likely.prepare
 

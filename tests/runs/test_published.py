@@ -51,7 +51,7 @@ def as_mat(path: Path, **more: np.ndarray) -> None:
 @pytest.mark.slow
 def test_the_ijrr_table_fills_where_files_are(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("IJRR", str(tmp_path))
-    monkeypatch.setitem(jaxevent.runs.scores.MEASURES, "lpips", metrics.mse)
+    monkeypatch.setitem(jaxevent.runs.scores.MEASURE_FUNCTIONS, "lpips", metrics.mse)
     monkeypatch.setattr(jaxevent.runs.scores, "lpips_weights", lambda: None)
     as_text(tmp_path / "slider_depth.zip")
     out = tmp_path / "out"

@@ -11,7 +11,7 @@ from PIL import Image
 
 from jaxevent.egomotion.scores import UNITS
 from jaxevent.errors import InputError, install_command
-from jaxevent.metrics import MEANINGS
+from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.show.images import (
     comparison_figure,
     display_limits,
@@ -275,8 +275,8 @@ def test_markdown_table():
 
 
 def test_every_number_that_is_shown_is_explained():
-    assert {place for _, place, _, _ in COLUMNS} < MEANINGS.keys()
-    assert {*UNITS, "lost", "startup"} < MEANINGS.keys()
+    assert {place for _, place, _, _ in COLUMNS} < MEASURE_MEANINGS.keys()
+    assert {*UNITS, "lost", "startup"} < MEASURE_MEANINGS.keys()
 
 
 @pytest.mark.parametrize("how", TONES)
