@@ -23,10 +23,10 @@ import numpy as np
 
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.bundle import photometric_ba
-from jaxevent.egomotion.bundle.hypotheses import SCORED_EVENTS, WindowFit, WindowFitter
-from jaxevent.egomotion.bundle.normal_equations import N_PATH, Unknowns, linearise
+from jaxevent.egomotion.bundle.hypotheses import MAX_SCORED_EVENTS, WindowFit, WindowFitter
+from jaxevent.egomotion.bundle.normal_equations import N_PATH_UNKNOWNS, Unknowns, linearise
 from jaxevent.egomotion.bundle.residuals import Scene, subtract_mean
-from jaxevent.egomotion.bundle.warp import N_ROWS, Path, predict_path
+from jaxevent.egomotion.bundle.warp import N_COEFFICIENT_ROWS, Path, predict_path
 from jaxevent.egomotion.bundle.windows import Params as BatchParams
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
@@ -222,7 +222,7 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
     recording, truth = motion_scene("texture", "varying", 200, duration=0.4)
     assert recording.camera is not None
     windows = WindowFitter(recording, BatchParams.of({}), recording.camera)
-    series, prior = windows.series(200_000, 0.15, SCORED_EVENTS), windows.prior(200_000, 0.15)
+    series, prior = windows.series(200_000, 0.15, MAX_SCORED_EVENTS), windows.prior(200_000, 0.15)
     T, Omega = (part[0] for part in truth.twist(np.array([0.2])))
     rng, real = np.random.default_rng(0), series.x.dtype
     depths = np.full(math.prod(series.nodes), np.log(np.linalg.norm(T)), real)
@@ -232,9 +232,9 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
         *photometric_ba.init_problem(series, scene, prior, 1.0, plane=False), map_only=False
     )
     jacobian, weight = made.jacobian, made.evaluation.weight
-    E, n = len(weight), N_PATH + len(jacobian.more)
+    E, n = len(weight), N_PATH_UNKNOWNS + len(jacobian.more)
     v = rng.normal(size=series.shape), rng.normal(size=n), rng.normal(size=len(depths))
-    v = v[0].astype(real), np.append(v[1], np.zeros(N_PATH + 4 - n)), v[2].astype(real)
+    v = v[0].astype(real), np.append(v[1], np.zeros(N_PATH_UNKNOWNS + 4 - n)), v[2].astype(real)
 
     def product() -> Unknowns:
         value = made.jacobian_product(v)
@@ -242,7 +242,7 @@ def normal_bench() -> tuple[dict[str, float], dict[str, float]]:
         value *= weight
         return made.transpose_product(value)
 
-    powers = jacobian.tau[:, None] ** np.arange(1, N_ROWS + 1)
+    powers = jacobian.tau[:, None] ** np.arange(1, N_COEFFICIENT_ROWS + 1)
     by_path = (jacobian.base.T[:, :, None] * powers[:, None]).reshape(
         E, -1
     ) @ made.coefficient_jacobian

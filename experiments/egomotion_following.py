@@ -31,11 +31,11 @@ CENTRES = 700_000, 1_500_000, 2_500_000  # us
 BEFORE = 100_000
 TURNED = 500_000  # us
 USUAL = 0.43  # 1/m in units of 1/|T|, the depth there
-ALL = hypotheses.COARSE_TO_FINE, hypotheses.FINAL[:-1], hypotheses.FINAL[-1:]
+ALL = hypotheses.COARSE_TO_FINE_STAGES, hypotheses.FINAL_STAGES[:-1], hypotheses.FINAL_STAGES[-1:]
 FEW = (
-    hypotheses.PREDICTED_COARSE_TO_FINE,
-    hypotheses.PREDICTED,
-    hypotheses.PREDICTED_FINAL,
+    hypotheses.PREDICTED_COARSE_TO_FINE_STAGES,
+    hypotheses.PREDICTED_STAGES,
+    hypotheses.PREDICTED_FINAL_STAGES,
 )
 
 
@@ -96,8 +96,8 @@ def turned(windows: WindowFitter, rate: float) -> None:
 
 def use(stages: tuple[tuple[hypotheses.Stage, ...], ...]) -> None:
     """Let predicted paths pass these stages."""
-    setattr(hypotheses, "PREDICTED_COARSE_TO_FINE", stages[0])  # noqa: B010
-    setattr(hypotheses, "PREDICTED", stages[1])  # noqa: B010
+    setattr(hypotheses, "PREDICTED_COARSE_TO_FINE_STAGES", stages[0])  # noqa: B010
+    setattr(hypotheses, "PREDICTED_STAGES", stages[1])  # noqa: B010
 
 
 def main() -> None:

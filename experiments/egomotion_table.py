@@ -35,7 +35,7 @@ import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
 from jaxevent.egomotion.estimator import MotionEstimator
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.egomotion.scores import UNITS, score_motion
+from jaxevent.egomotion.scores import METRIC_UNITS, score_motion
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
@@ -186,7 +186,7 @@ def shown(value: float) -> str:
 
 def markdown(model: str, rows: list[dict[str, Any]]) -> str:
     columns = [*SHOWN[model], "lost", "failed", "CPU"]
-    units = {**UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
+    units = {**METRIC_UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
     heads = [f"{name} {units[name]}".strip() for name in columns]
     lines = [
         "| sequence | method | " + " | ".join(heads) + " |",

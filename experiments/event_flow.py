@@ -44,9 +44,9 @@ from jaxevent.egomotion.baselines.planes import normal_flow
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.flow import RigidFlow
 from jaxevent.egomotion.patches import (
-    DURATIONS_S,
-    MAX_DISPLACEMENT_PX,
-    MIN_SHARPNESS,
+    MAX_GRID_DISPLACEMENT_PX,
+    MIN_RELATIVE_SHARPNESS,
+    WINDOW_DURATIONS_S,
     measure_sharpness,
 )
 from jaxevent.recording import Recording
@@ -70,8 +70,10 @@ class Contrast:
 
     def _one(self, t: int) -> NDArray[np.float64]:
         best: dict[tuple[float, ...], tuple[float, NDArray]] = {}
-        for length in DURATIONS_S[DURATIONS_S <= LONGEST]:
-            seen = measure_sharpness(self.recording, t, float(length), MAX_DISPLACEMENT_PX, self.xi)
+        for length in WINDOW_DURATIONS_S[WINDOW_DURATIONS_S <= LONGEST]:
+            seen = measure_sharpness(
+                self.recording, t, float(length), MAX_GRID_DISPLACEMENT_PX, self.xi
+            )
             if seen is None:
                 continue
             energy = seen.energy.mean(0).reshape(len(seen.xi), -1)
@@ -79,8 +81,8 @@ class Contrast:
             way = np.stack([seen.displacements[at % n], seen.displacements[at // n]], -1)
             sharp = energy.max(1) / np.maximum(np.median(energy, 1), 1e-9)
             for k, place in enumerate(map(tuple, seen.xi.tolist())):
-                inside = np.abs(way[k]).max() < MAX_DISPLACEMENT_PX - 0.5
-                if inside and sharp[k] > best.get(place, (MIN_SHARPNESS, way[k]))[0]:
+                inside = np.abs(way[k]).max() < MAX_GRID_DISPLACEMENT_PX - 0.5
+                if inside and sharp[k] > best.get(place, (MIN_RELATIVE_SHARPNESS, way[k]))[0]:
                     best[place] = float(sharp[k]), way[k] / float(length)
         if not best:
             return np.zeros_like(self.xi)
