@@ -509,8 +509,8 @@ class WindowSequence:
         Each grid of motions has a window so short that they differ by `FINEST_GRID_SPACING_PX`
         at the end. The widest grid, of all motions, has the shortest window. Each further grid is
         `GRID_RANGE_RATIO` narrower, and its window as much longer, up to the whole one. The best of
-        each grid, and of the windows before, are refined in the next window. So a motion is found at any
-        speed, and where several explain a short window a longer one separates them.
+        each grid, and of the windows before, are refined in the next window. So a motion is found
+        at any speed, and where several explain a short window a longer one separates them.
 
         Args:
             part: The range of events.
