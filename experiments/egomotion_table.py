@@ -34,7 +34,7 @@ import jaxevent
 from jaxevent.egomotion import batch, contrast, find_model, frames, planes, voting
 from jaxevent.egomotion.estimator import MotionEstimator
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.egomotion.scores import UNITS, score_motion
+from jaxevent.egomotion.scores import METRIC_UNITS, score_motion
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
@@ -185,7 +185,7 @@ def format_value(value: float) -> str:
 
 def markdown(model: str, rows: list[dict[str, Any]]) -> str:
     columns = [*SHOWN[model], "lost", "failed", "CPU"]
-    units = {**UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
+    units = {**METRIC_UNITS, "lost": "%", "failed": "", "CPU": "s/s"}
     heads = [f"{name} {units[name]}".strip() for name in columns]
     lines = []
     rows = [row for row in rows if row["model"] == model]

@@ -26,9 +26,13 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import MAX_CHUNK_US
 
 DISPLAY_PERIOD_US = 25_000  # between displayed images
-MAX_VARIANCE = 3.0  # px^2; the radius follows the size where the position's variances are below
-BLOCK_EVENTS = 8  # pending events that are applied together
-MAX_PENDING = 8 * BLOCK_EVENTS  # pending events of a target; further ones are left out
+MAX_ADAPTING_VARIANCE_PX2 = (
+    3.0  # px^2; the radius follows the size where the position's variances are below
+)
+EVENTS_PER_REAPPLIED_BLOCK = 8  # pending events that are applied together
+MAX_PENDING_EVENTS = (
+    8 * EVENTS_PER_REAPPLIED_BLOCK
+)  # pending events of a target; further ones are left out
 
 
 class ReferenceState(eqx.Module):
@@ -44,7 +48,7 @@ class ReferenceState(eqx.Module):
     @classmethod
     def init(cls, time: Int[Array, " targets"], dtype: Any) -> "ReferenceState":
         """Initialise targets that begin at some times."""
-        pending = jnp.zeros((*time.shape, MAX_PENDING, 2), dtype)
+        pending = jnp.zeros((*time.shape, MAX_PENDING_EVENTS, 2), dtype)
         zero = jnp.zeros_like(time)
         return cls(time - 1, time, time + DISPLAY_PERIOD_US, zero > 0, pending, zero)
 
@@ -109,10 +113,10 @@ def reference_step(
         return lax.cond(reference.n_pending > 0, of_queue, apply_event, state)
 
     state = lax.cond(updated, apply, lambda s: s, state)
-    index = jnp.where(waits, reference.n_pending, MAX_PENDING)  # beyond the queue: dropped
+    index = jnp.where(waits, reference.n_pending, MAX_PENDING_EVENTS)  # beyond the queue: dropped
     pending = reference.pending.at[index].set(batch.xi[0], mode="drop")
     n_pending = jnp.where(updated, 0, reference.n_pending + waits)
-    n_pending = jnp.minimum(n_pending, MAX_PENDING).astype(jnp.int32)
+    n_pending = jnp.minimum(n_pending, MAX_PENDING_EVENTS).astype(jnp.int32)
     reference = ReferenceState(
         reference.last_event, time, reference.next_display, reference.is_adapting, pending,
         n_pending,
@@ -147,8 +151,8 @@ def reapply_pending(
         return lax.cond(some, lambda s: lax.scan(one, s, part)[0], lambda s: s, state), None
 
     blocks = (
-        reference.pending.reshape(-1, BLOCK_EVENTS, 2),
-        jnp.arange(MAX_PENDING).reshape(-1, BLOCK_EVENTS),
+        reference.pending.reshape(-1, EVENTS_PER_REAPPLIED_BLOCK, 2),
+        jnp.arange(MAX_PENDING_EVENTS).reshape(-1, EVENTS_PER_REAPPLIED_BLOCK),
     )
     return lax.scan(block, state, blocks)[0]
 
@@ -164,7 +168,9 @@ def update_reference(
     predicted = filter.predicted_measurement(params, state)
     variances = jnp.diagonal(lax.stop_gradient(predicted).P_p)
     due = time >= reference.next_display
-    is_adapting = jnp.where(due, (variances < MAX_VARIANCE).all(), reference.is_adapting)
+    is_adapting = jnp.where(
+        due, (variances < MAX_ADAPTING_VARIANCE_PX2).all(), reference.is_adapting
+    )
     next_display = reference.next_display + DISPLAY_PERIOD_US * due.astype(jnp.int32)
     return ReferenceState(
         time, reference.last_nearest, next_display, is_adapting, reference.pending,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.search import TargetSearchResult
-from jaxevent.blob.search.paths import NO_OWNER, owner_candidates, tabulate_paths
+from jaxevent.blob.search.paths import NO_OWNER_INDEX, owner_candidates, tabulate_paths
 from jaxevent.blob.seeds import read_seeds, tracking_span
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
@@ -27,10 +27,12 @@ from jaxevent.estimator import ShortRepr
 from jaxevent.events.filters import supported
 from jaxevent.recording import Recording, Times, check_times
 
-STEPS_PER_CHUNK = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
+STEPS_PER_CHUNK_CHOICES = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
 STEPS_PER_SEGMENT = 8192
-ROWS_PER_READ = 65536  # events read from a file at a time
-MAX_TIES = 16  # more events of one time are in the order of a readout, and not of the scene
+EVENTS_PER_READ = 65536  # events read from a file at a time
+MAX_SIMULTANEOUS_EVENTS = (
+    16  # more events of one time are in the order of a readout, and not of the scene
+)
 CANDIDATE_SIGMAS = 3.5  # distance from a found path within which an event may be the target's
 MAX_CHUNK_US = 2**29  # between boundaries; two of them fit into int32
 NEVER_US = np.iinfo(np.int64).max
@@ -171,7 +173,7 @@ class ChunkPacker:
             events = (self.rows[1] - self.rows[0]) * self.period / max(end - begin, 1)
             # Steps between boundaries, and some.
             mean = (events + events**0.5) / self.events_per_step
-            steps = min(STEPS_PER_CHUNK, key=lambda s: max(1, np.ceil(mean / s)) * (s + 4))
+            steps = min(STEPS_PER_CHUNK_CHOICES, key=lambda s: max(1, np.ceil(mean / s)) * (s + 4))
         if chunks is None:
             events = max(events_per_segment, STEPS_PER_SEGMENT * self.events_per_step)
             chunks = max(1, events // (steps * self.events_per_step))
@@ -199,14 +201,16 @@ class ChunkPacker:
             np.zeros(self.chunks, np.int32),
             np.zeros(self.chunks, bool),
             np.full(len(self.seeds.t), -1, np.int32),
-            np.full((*(shape if self.joined is not None else (0, 0, 0)), 2), NO_OWNER, np.int32),
+            np.full(
+                (*(shape if self.joined is not None else (0, 0, 0)), 2), NO_OWNER_INDEX, np.int32
+            ),
         )
         stop = NEVER_US if more else self.stop
         limits = _ChunkLimits(self.start, stop, self.period, self.seeds.t)
         state = _PackingState(0, 0, 0, cursor.row, cursor.previous, cursor.start, 0, cursor.seed)
         row, done = cursor.row, False
         while not done and not (more and row == self.rows[1]):
-            end = min(row + ROWS_PER_READ, self.rows[1])
+            end = min(row + EVENTS_PER_READ, self.rows[1])
             rows = self._read(row, end)
             final = end == self.rows[1] and not more
             done, used, state = _pack(rows, row, final, limits, state, out)
@@ -240,9 +244,9 @@ class ChunkPacker:
         accepted, owner = self._prefilter(part, first), np.empty((0, 2), np.int32)
         if self.joined is not None:
             owner = owner_candidates(part, self.joined, CANDIDATE_SIGMAS)
-            accepted &= owner[:, 0] != NO_OWNER
+            accepted &= owner[:, 0] != NO_OWNER_INDEX
         order = np.arange(len(part))
-        _spread_ties(part.t, len(part) if self._as_stored else MAX_TIES, order)
+        _spread_ties(part.t, len(part) if self._as_stored else MAX_SIMULTANEOUS_EVENTS, order)
         order = order[begin - first : end - first]
         return _EventRows(part.t, part.x, part.y, part.p, accepted, owner, order, first)
 

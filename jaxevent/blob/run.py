@@ -39,7 +39,7 @@ from jaxevent.blob.smoother import (
 )
 from jaxevent.blob.track import TrackBuffer, positions, readout, run_steps
 
-TIMES_PER_CALL = 64  # times read out by one compiled call
+READOUT_TIMES_PER_CALL = 64  # times read out by one compiled call
 
 
 class EventAssociation(eqx.Module):
@@ -267,9 +267,9 @@ class XlaRunner:
             entry = np.argmax(id[chunk] == serial[some][:, None], axis=1)
             entry = np.pad(entry, (0, -len(entry) % 8))
             read = self._chunk_reader(features, starts, following, int(chunk))
-            for first in range(0, len(rows), TIMES_PER_CALL):
-                part = rows[first : first + TIMES_PER_CALL]
-                fill = (0, TIMES_PER_CALL - len(part))
+            for first in range(0, len(rows), READOUT_TIMES_PER_CALL):
+                part = rows[first : first + READOUT_TIMES_PER_CALL]
+                fill = (0, READOUT_TIMES_PER_CALL - len(part))
                 states = read(np.pad(steps[part], fill), np.pad(since[part], fill), entry)
                 at = np.ix_(part, some)
                 for one, value in zip(out, states, strict=True):

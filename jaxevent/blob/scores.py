@@ -14,8 +14,10 @@ from scipy.optimize import linear_sum_assignment
 
 from jaxevent.errors import InputError
 
-ALPHAS = np.arange(1, 20) / 20  # least similarities of a pair, over which HOTA is a mean
-MIN_TIME_SHARE = 0.5  # of its time that a found target has a track, or a true track a target
+HOTA_THRESHOLDS = np.arange(1, 20) / 20  # least similarities of a pair, over which HOTA is a mean
+MIN_MATCHED_TIME_SHARE = (
+    0.5  # of its time that a found target has a track, or a true track a target
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +106,7 @@ def score_tracks(
     i, j = linear_sum_assignment(shared, maximize=True)
     total = number + int(alive.sum())
     most = shared.max(1, initial=0)
-    found = int((most[real] >= MIN_TIME_SHARE * there.sum(0)[real]).sum())
+    found = int((most[real] >= MIN_MATCHED_TIME_SHARE * there.sum(0)[real]).sum())
     lives = np.isfinite(tracks).all(2).sum(0)
     follows = (pairs.any(1) | waits).sum(0)
     deta, assa, hota = _hota(np.where(there[..., None], distance, np.inf), reach, there, alive)
@@ -114,7 +116,7 @@ def score_tracks(
         tracks=int(tracked.sum()),
         found=found,
         missed=int(real.sum()) - found,
-        false=int((tracked & (follows < MIN_TIME_SHARE * lives)).sum()),
+        false=int((tracked & (follows < MIN_MATCHED_TIME_SHARE * lives)).sum()),
         switches=switches,
         covered=float(matched.sum() / max(number, 1)),
         rms=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
@@ -161,7 +163,7 @@ def _hota(
     there: NDArray[np.bool_],
     alive: NDArray[np.bool_],
 ) -> tuple[float, float, float]:
-    """Compute detection, association and HOTA, means over `ALPHAS`."""
+    """Compute detection, association and HOTA, means over `HOTA_THRESHOLDS`."""
     similar = np.maximum(1 - np.where(alive[:, None], distance, np.inf) / (2 * reach), 0)
     if not there.any() and not alive.any():
         return 1.0, 1.0, 1.0
@@ -169,10 +171,10 @@ def _hota(
     possible = (similar / np.maximum(all_pairs, 1e-12)).sum(0)
     n_true, n_tracked = there.sum(0)[:, None], alive.sum(0)
     alignment = possible / np.maximum(n_true + n_tracked - possible, 1e-12)
-    count = np.zeros((len(ALPHAS), *possible.shape))
+    count = np.zeros((len(HOTA_THRESHOLDS), *possible.shape))
     for now in similar:
         i, j = linear_sum_assignment(alignment * now, maximize=True)
-        count[:, i, j] += now[i, j] >= ALPHAS[:, None] - 1e-12
+        count[:, i, j] += now[i, j] >= HOTA_THRESHOLDS[:, None] - 1e-12
     true = count.sum((1, 2))
     deta = true / (there.sum() + alive.sum() - true)
     assa = (count**2 / np.maximum(n_true + n_tracked - count, 1)).sum((1, 2)) / np.maximum(true, 1)

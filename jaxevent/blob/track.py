@@ -30,7 +30,7 @@ from jaxevent.estimator import Estimate
 
 P = TypeVar("P", bound=TrackerParams)
 
-THETA_RATIO = 1.15  # lambda1 / lambda2 from which theta is defined well enough
+MIN_THETA_AXIS_RATIO = 1.15  # lambda1 / lambda2 from which theta is defined well enough
 
 
 class TrackBuffer(eqx.Module):
@@ -110,7 +110,7 @@ class TrackStates(Estimate):
     @property
     def theta_valid(self) -> Any:
         """Validity of theta and q, (times, tracks): lambda1 > 1.15 lambda2."""
-        return self.valid & (self.mean[..., 4] > THETA_RATIO * self.mean[..., 5])
+        return self.valid & (self.mean[..., 4] > MIN_THETA_AXIS_RATIO * self.mean[..., 5])
 
 
 def to_seconds(us: Any, like: Array) -> Array:

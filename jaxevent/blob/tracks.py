@@ -26,18 +26,18 @@ if TYPE_CHECKING:
     import pandas
 
 MAX_CHECKPOINTS = 32  # states from which tracking can be taken up again
-STATES_PER_READOUT = 2**12  # states that are read out at once
-MAX_KEPT_NUMBERS = 2**24  # numbers of the backward pass that are kept between readings
+MAX_STATES_PER_READOUT = 2**12  # states that are read out at once
+MAX_CACHED_VALUES = 2**24  # numbers of the backward pass that are kept between readings
 
-COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
-UNITS = ("px", "px", "px/s", "px/s", "px", "px", "rad", "rad/s")
+STATE_COLUMNS = ("x", "y", "vx", "vy", "lambda1", "lambda2", "theta", "q")
+STATE_UNITS = ("px", "px", "px/s", "px/s", "px", "px", "rad", "rad/s")
 TABLE_UNITS = {
     "t": "s",
     "id": "1",
-    **dict(zip(COLUMNS, UNITS, strict=True)),
-    **{f"sigma_{name}": unit for name, unit in zip(COLUMNS, UNITS, strict=True)},
+    **dict(zip(STATE_COLUMNS, STATE_UNITS, strict=True)),
+    **{f"sigma_{name}": unit for name, unit in zip(STATE_COLUMNS, STATE_UNITS, strict=True)},
 }
-TABLE_RATE = 1000.0  # times per second of a table
+TABLE_RATE_HZ = 1000.0  # times per second of a table
 
 
 def table_columns(
@@ -51,7 +51,7 @@ def table_columns(
     Args:
         t: Times (rows,), us.
         id: Numbers of the tracks (rows,).
-        mean: States (rows, 8), in `UNITS`.
+        mean: States (rows, 8), in `STATE_UNITS`.
         covariance: Their covariances (rows, 8, 8).
 
     Returns:
@@ -143,7 +143,7 @@ class Tracks(HtmlRepr):
         self._runner, self._packer, self._progress = runner, packer, progress
         self._turns = TurnLock(f"tracks of {packer.recording.name}")
         self._checkpoints: list[tuple[PackingCursor, int, Any]] = []
-        # The result of the backward pass in the last segments, up to `MAX_KEPT_NUMBERS`.
+        # The result of the backward pass in the last segments, up to `MAX_CACHED_VALUES`.
         self._kept_infos: dict[PackingCursor, Any] = {}
         self._assign_ids(self._run_all())
 
@@ -226,7 +226,7 @@ class Tracks(HtmlRepr):
 
         for piece in self._read_by_segment(times, ids, extrapolate):
             held.append(piece)
-            if sum(states.valid.size for _, states in held) >= STATES_PER_READOUT:
+            if sum(states.valid.size for _, states in held) >= MAX_STATES_PER_READOUT:
                 yield join_held()
                 held.clear()
         if held:
@@ -254,7 +254,7 @@ class Tracks(HtmlRepr):
         import pandas
 
         if times is None:
-            times = evenly_spaced_times(self.start, self.stop, TABLE_RATE)
+            times = evenly_spaced_times(self.start, self.stop, TABLE_RATE_HZ)
         times = np.sort(np.atleast_1d(microseconds(times)))
         nothing = self._invalid_states(np.zeros(0, np.int64), self._indices_of(ids))
         parts: list[list[NDArray]] = []
@@ -283,7 +283,7 @@ class Tracks(HtmlRepr):
         if not len(self) and end > first:
             yield times[first:end], self._invalid_states(times[first:end], chosen)
             first = end
-        at_once = max(STATES_PER_READOUT // max(len(chosen), 1), 1)
+        at_once = max(MAX_STATES_PER_READOUT // max(len(chosen), 1), 1)
         for segment, record, infos in self._replay(times[first:end]):
             upto = end
             if segment.next is not None:
@@ -439,7 +439,7 @@ class Tracks(HtmlRepr):
     def _segment_infos(self) -> dict[PackingCursor, Any]:
         """Backward information at the starts of all segments, from the last one on."""
         found: dict[PackingCursor, Any] = {}
-        left = MAX_KEPT_NUMBERS
+        left = MAX_CACHED_VALUES
         with self._bar("smooth") as progress:
             for cursor, state, packed in self._segments_backwards():
                 segment = self._packer.pack(cursor) if packed is None else packed

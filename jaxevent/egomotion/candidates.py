@@ -24,8 +24,8 @@ from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Recording
 
-READ_EVENTS = 65536  # events read from a file at a time
-NEVER = np.iinfo(np.int64).min // 2  # us, before all events
+EVENTS_PER_READ = 65536  # events read from a file at a time
+NEVER_US = np.iinfo(np.int64).min // 2  # us, before all events
 
 Numeric = Array | np.ndarray
 Ages = float | int | NDArray[np.floating]
@@ -138,7 +138,7 @@ class CandidateSampler:
         self.xi, self.f = pixel_coordinates(recording.width, recording.height, camera)
         self._recent = RecentEvents(
             self.xi,
-            np.full((2, *shape, per_pixel), NEVER),
+            np.full((2, *shape, per_pixel), NEVER_US),
             np.zeros((2, *shape), np.int16),
             np.zeros((3, (2 * radius + 1) ** 2 * per_pixel)),
         )
@@ -190,21 +190,21 @@ class CandidateSampler:
         # Single precision may fall short of a whole number of microseconds.
         young, old = 1e6 * (1 - 1e-6) * young, 1e6 * (1 + 1e-6) * old
         limits = np.stack([np.maximum(1, np.ceil(young)), np.floor(old)])
-        limits = np.minimum(limits, -NEVER / 2).astype(np.int64)
+        limits = np.minimum(limits, -NEVER_US / 2).astype(np.int64)
         if expected is None:
             gate, margin = np.array([0, 0, np.inf])[:, None, None], 0.0
         else:
             gate = np.concatenate([expected.U, expected.slack[None]]).astype(np.float64)
             margin = expected.margin
-        span = -NEVER if span == np.inf else round(1e6 * span)
+        span = -NEVER_US if span == np.inf else round(1e6 * span)
         rules = BatchRules(
             limits, gate, margin, self.every, self.longest, span, self.radius, self.silence
         )
         # Batch, events in it, time of its first, and after which no event is used.
-        cursor = np.array([0, 0, 0, -NEVER])
+        cursor = np.array([0, 0, 0, -NEVER_US])
         full = False
         while not full and not self.is_exhausted:
-            events = self.recording.events[self._row : self._row + READ_EVENTS]
+            events = self.recording.events[self._row : self._row + EVENTS_PER_READ]
             stream = EventStream(events.t, events.x, events.y, events.p, self._row)
             used, full = _fill_batches(stream, rules, self._recent, out, cursor, self._clock)
             self._row += used

@@ -26,7 +26,7 @@ P = TypeVar("P", bound=Parameters)
 
 COMMON_OPTIONS = frozenset({"model", "camera", "seed"})  # of every method
 SCORE_RATE_HZ = 200.0  # of the times at which estimates are compared with known motion
-TRUTH_POINTS = 256  # of the known motion of a training segment
+N_TRUTH_SAMPLES = 256  # of the known motion of a training segment
 
 
 def score_times(start: int, stop: int) -> NDArray[np.int64]:
@@ -60,7 +60,7 @@ class TrainingSegment(NamedTuple):
             Times (T,) in s, times of the truth (G,) in s, the truth (G, d), 1 or 0 for each of the
             times (T,), and their sum, above 0.
         """
-        grid = np.linspace(self.start, self.stop, TRUTH_POINTS)
+        grid = np.linspace(self.start, self.stop, N_TRUTH_SAMPLES)
         inside = np.clip(grid, self.known.t[0], self.known.t[-1])
         truth = self.known(np.rint(inside).astype(np.int64))
         time = (times - self.start) * 1e-6

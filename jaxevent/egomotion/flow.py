@@ -38,14 +38,14 @@ from jaxevent.parameters import Count, Number, Parameters, Positive
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, microseconds
 
-BATCH_EVENTS = 256
-CHUNK_BATCHES = 32  # batches per call of the compiled function
-REFINEMENTS = 2
+EVENTS_PER_BATCH = 256
+BATCHES_PER_CHUNK = 32  # batches per call of the compiled function
+N_DEPTH_REFINEMENTS = 2
 DEPTH_WINDOW_US = 30_000  # on either side of a time, whose events determine depths
 CANDIDATE_WINDOW_US = 100_000  # before that, whose events are candidates
 DEPTH_SIGMAS_PX = (1.5, 3.0, 6.0, 15.0, 50.0)  # of Gaussians; the narrowest with events counts
-MIN_DENSITY = 0.3  # events per pixel at which a Gaussian counts in full
-DEPTH_SPREAD = 0.3  # relative deviation of the inverse depths of one position
+FULL_WEIGHT_EVENT_DENSITY = 0.3  # events per pixel at which a Gaussian counts in full
+RELATIVE_DEPTH_SPREAD = 0.3  # relative deviation of the inverse depths of one position
 
 
 class Params(Parameters):
@@ -153,7 +153,7 @@ def iterate_flow(
         per_pixel=params.per_pixel,
         most=params.candidates,
         every=1,
-        batch=BATCH_EVENTS,
+        batch=EVENTS_PER_BATCH,
         longest=1e6,
         silence=float(params.tau_max),
     )
@@ -163,7 +163,7 @@ def iterate_flow(
     total = len(recording.events)
     with bar(total=total, unit="event", unit_scale=True, desc="flow", progress=progress) as shown:
         while not sampler.is_exhausted:
-            batches = sampler.sample(CHUNK_BATCHES, *ages)
+            batches = sampler.sample(BATCHES_PER_CHUNK, *ages)
             used = batches.row >= 0
             rows = batches.row[used]
             if not len(rows):
@@ -281,7 +281,7 @@ def _vote_speed(params: Params, grid: Array, found: _Displacements) -> Float[Arr
     S = lax.scan(add, jnp.zeros_like(speed), (found.age, found.along, weight))[0]
     # A fast flow has younger, fewer candidates.
     rho = grid[(S * speed**params.gain).argmax(1)]
-    for _ in range(REFINEMENTS):
+    for _ in range(N_DEPTH_REFINEMENTS):
         votes = weight * jnp.exp((found.along - rho * found.age) ** 2 * exponent)
         U = found.base + rho[:, None] * found.a
         votes = jnp.where(found.in_baseline(params, length(U)), votes, 0)
@@ -369,13 +369,13 @@ class RigidFlow:
         smooth = np.full(size.shape, np.median(rho))
         for sigma in reversed(DEPTH_SIGMAS_PX):
             # Events of a wrong speed deviate from the wider surroundings.
-            off = (rho - smooth[y, x]) / np.maximum(DEPTH_SPREAD * smooth[y, x], 1e-9)
+            off = (rho - smooth[y, x]) / np.maximum(RELATIVE_DEPTH_SPREAD * smooth[y, x], 1e-9)
             weight = size[y, x] / (1 + off**2)
             total, mass, count = (
                 gaussian_filter(_sum_by_pixel(size.shape, y, x, values), sigma)
                 for values in (weight * rho, weight, np.ones(len(x)))
             )
-            trust = np.clip(count / MIN_DENSITY, 0, 1)
+            trust = np.clip(count / FULL_WEIGHT_EVENT_DENSITY, 0, 1)
             smooth = smooth + trust * (total / np.maximum(mass, 1e-12) - smooth)
         return (smooth * size)[..., None] * a
 

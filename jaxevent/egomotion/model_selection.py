@@ -25,7 +25,7 @@ from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import rotation_basis
 from jaxevent.egomotion.models import MODELS, General, Model, Planar, Rotation
 from jaxevent.egomotion.patches import (
-    WINDOW_DISPLACEMENT_PX,
+    FIT_WINDOW_DISPLACEMENT_PX,
     describe_windows,
     fit_general,
     fit_planar,
@@ -39,13 +39,13 @@ from jaxevent.egomotion.patches import (
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 
-MIN_Z = 3.0  # from which one model explains more than another
+MIN_SELECTION_Z = 3.0  # from which one model explains more than another
 # Half-lines fit an edge's ambiguity too, on both halves: simulated rotation and planar motion reach
 # 3.8, simulated depth 3.5 and more.
-MIN_Z_DEPTH = 4.0
+MIN_DEPTH_SELECTION_Z = 4.0
 # Of longer windows, from which general motion is not excluded. Rotations have -6 to 2.5, as the
 # parameters that general motion adds fit noise too, and general motion 2.8 and more.
-MAX_Z_EXCLUDED = 0.0
+MAX_EXCLUSION_Z = 0.0
 N_LONG_WINDOWS = 2  # in which a translation is tested
 
 
@@ -109,7 +109,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
         duration = window.duration
         guesses.append(
             MotionGuess(
-                window.middle, WINDOW_DISPLACEMENT_PX / duration, turn / duration, six[:3],
+                window.middle, FIT_WINDOW_DISPLACEMENT_PX / duration, turn / duration, six[:3],
                 six[3:] / duration,
             )
         )  # fmt: skip
@@ -137,21 +137,23 @@ def select_by_z(
         The selection.
     """
     lines = [
-        _comparison_line(one, other, value, MIN_Z_DEPTH if one == General.name else MIN_Z)
+        _comparison_line(
+            one, other, value, MIN_DEPTH_SELECTION_Z if one == General.name else MIN_SELECTION_Z
+        )
         for (one, other), value in z.items()
     ]
     # Where these two do equally well, a camera that turns is more probable than a scene with one
     # wall.
-    simple = Rotation if z["rotation", "planar"] > -MIN_Z else Planar
-    chosen, sure = General if z["general", simple.name] > MIN_Z_DEPTH else simple, True
+    simple = Rotation if z["rotation", "planar"] > -MIN_SELECTION_Z else Planar
+    chosen, sure = General if z["general", simple.name] > MIN_DEPTH_SELECTION_Z else simple, True
     if chosen is Rotation:
         value = test_long_windows()
         if value is not None:
             z = z | {("general", "rotation"): value}
-            line = _comparison_line("general", "rotation", value, MIN_Z)
+            line = _comparison_line("general", "rotation", value, MIN_SELECTION_Z)
             lines.append(f"in longer windows {line}")
-        chosen = General if value is not None and value > MIN_Z else Rotation
-        sure = chosen is General or (value is not None and value < MAX_Z_EXCLUDED)
+        chosen = General if value is not None and value > MIN_SELECTION_Z else Rotation
+        sure = chosen is General or (value is not None and value < MAX_EXCLUSION_Z)
     lines.append(f"chosen: {chosen.title}")
     if not sure:
         lines.append(

@@ -46,7 +46,9 @@ if TYPE_CHECKING:
 
 Numeric = Array | np.ndarray
 Params = Any  # of the method that calls
-MIN_SEARCH_SPEED = 0.3  # baselines per tau_max: the slowest of the first planar hypotheses
+MIN_SEARCH_BASELINES_PER_TAU = (
+    0.3  # baselines per tau_max: the slowest of the first planar hypotheses
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -434,7 +436,7 @@ class Planar(Model):
     def initial_particle(self, params, uniform):
         # Uniform in direction and in the logarithm of speed: a search has to end within a fraction.
         fastest = lax.stop_gradient(self.search_bound(params))
-        slowest = lax.stop_gradient(MIN_SEARCH_SPEED * params.baseline / params.tau_max)
+        slowest = lax.stop_gradient(MIN_SEARCH_BASELINES_PER_TAU * params.baseline / params.tau_max)
         speed = fastest * (slowest / fastest) ** ((1 + uniform[0]) / 2)
         azimuth = jnp.pi * uniform[1]
         return speed * jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth)])

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 # Standard deviation across the velocity, as a fraction of that along it, where parts of the image
 # move at several speeds.
-TANGENTIAL_FRACTION = 0.1
+TANGENTIAL_SIGMA_RATIO = 0.1
 # Relative error of a motion that a calibrated lens leaves: of a rotation, if f is off by 0.5 %, the
 # centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_model_selection.py).
-LENS_ERROR = 0.01
-MAX_DIRECTION_SIGMA = 1.0  # rad, standard deviation of a direction that the data determine
+RELATIVE_LENS_ERROR = 0.01
+MAX_DIRECTION_SIGMA_RAD = 1.0  # rad, standard deviation of a direction that the data determine
 
 
 def is_observable(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -42,13 +42,13 @@ def is_observable(model: str | type[Model], covariance: NDArray[np.floating]) ->
     for part in find_model(model).parts:
         if part.direction:
             variance = np.trace(covariance[:, part.rows, part.rows], axis1=1, axis2=2)
-            observable[:, part.rows] = ~(variance > MAX_DIRECTION_SIGMA**2)[:, None]
+            observable[:, part.rows] = ~(variance > MAX_DIRECTION_SIGMA_RAD**2)[:, None]
     return observable
 
 
 def lens_error(camera: PinholeCamera | None) -> float:
     """Return the relative error of a motion that the calibration of a camera's lens leaves."""
-    return LENS_ERROR if camera is not None and camera.is_distorted else 0.0
+    return RELATIVE_LENS_ERROR if camera is not None and camera.is_distorted else 0.0
 
 
 def table_columns(
@@ -260,7 +260,7 @@ class MotionEstimate(HtmlRepr):
         size2 = (mean**2).sum(1)[:, None, None]
         spread = found.spread if self.model.uniform else 1.0
         along = spread**2 * mean[:, :, None] * mean[:, None, :]
-        across = (spread * TANGENTIAL_FRACTION) ** 2 * size2 * np.eye(mean.shape[1])
+        across = (spread * TANGENTIAL_SIGMA_RATIO) ** 2 * size2 * np.eye(mean.shape[1])
         expected = "as one" if self.model.uniform else "as a rotation makes it"
         cause, other = "at several depths", "general"
         if self.model.uniform and found.both_directions:
@@ -279,7 +279,7 @@ class MotionEstimate(HtmlRepr):
         for part in self.model.parts:
             m = mean[:, part.rows]
             own = m[:, :, None] * m[:, None, :]
-            across = TANGENTIAL_FRACTION**2 * (m**2).sum(1)
+            across = TANGENTIAL_SIGMA_RATIO**2 * (m**2).sum(1)
             own = own + across[:, None, None] * np.eye(m.shape[1])
             covariance[:, part.rows, part.rows] += np.eye(3) if part.direction else own
         return dataclasses.replace(self, covariance=covariance)

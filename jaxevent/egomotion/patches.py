@@ -39,30 +39,34 @@ from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Recording
 
 PATCH_PX = 24
-MAX_DISPLACEMENT_PX = 7  # of the grid, in x and y
-DURATIONS_S = 0.0015625 * 2.0 ** np.arange(11)  # of the windows
-N_TIMES = 6  # at which windows, or frames, are evaluated
+MAX_GRID_DISPLACEMENT_PX = 7  # of the grid, in x and y
+WINDOW_DURATIONS_S = 0.0015625 * 2.0 ** np.arange(11)  # of the windows
+N_EVALUATED_TIMES = 6  # at which windows, or frames, are evaluated
 MAX_WINDOW_EVENTS = 12_000  # of whole patches
 MIN_PATCH_EVENTS = 40
-MIN_DISPLACEMENT_PX = 2.5  # shorter ones cannot be distinguished from 0
-MIN_SHARPNESS = 1.15  # of a patch's sharpest image, relative to the median of all displacements
-MIN_AGREEMENT = 0.2  # fraction of patches whose halves agree; of noise it is 0.1
-MIN_PATCHES = 6  # with a speed
-MARGIN_PX = 6  # of a patch's image around the patch
+MIN_MEASURED_DISPLACEMENT_PX = 2.5  # shorter ones cannot be distinguished from 0
+MIN_RELATIVE_SHARPNESS = (
+    1.15  # of a patch's sharpest image, relative to the median of all displacements
+)
+MIN_AGREEING_FRACTION = 0.2  # fraction of patches whose halves agree; of noise it is 0.1
+MIN_MEASURED_PATCHES = 6  # with a speed
+PATCH_MARGIN_PX = 6  # of a patch's image around the patch
 IMAGE_PIXEL_PX = 2
-FRAME_DISPLACEMENT_PX = 5.0  # of the image around a frame whose edges are counted
-EDGE_FRACTION = 0.1  # of the pixels, those of the steepest log intensity
-DARK_LEVEL = 0.05  # of full scale, added before the logarithm: darker greys are noise
-MAX_STATIC_EDGES = 0.3  # fraction of edges with events, below which the camera is static
+FRAME_WINDOW_DISPLACEMENT_PX = 5.0  # of the image around a frame whose edges are counted
+EDGE_PIXEL_FRACTION = 0.1  # of the pixels, those of the steepest log intensity
+DARK_GREY_OFFSET = 0.05  # of full scale, added before the logarithm: darker greys are noise
+MAX_STATIC_EDGE_FRACTION = 0.3  # fraction of edges with events, below which the camera is static
 
-FIT_TIMES = 4  # at which patches are evaluated for fits
-FIT_DISPLACEMENT_PX = 10  # of their grid, in x and y
-WINDOW_DISPLACEMENT_PX = 5.0  # median displacement of the image in a window of a fit
-HALF_LINE_PX = np.linspace(0, 1.4 * FIT_DISPLACEMENT_PX, 29)  # positions along a half-line
-N_HEADINGS = 6  # from which a general motion is refined
-MIN_Z = 3.0  # from which parts of the image move apart
+N_FIT_TIMES = 4  # at which patches are evaluated for fits
+MAX_FIT_DISPLACEMENT_PX = 10  # of their grid, in x and y
+FIT_WINDOW_DISPLACEMENT_PX = 5.0  # median displacement of the image in a window of a fit
+HALF_LINE_POSITIONS_PX = np.linspace(
+    0, 1.4 * MAX_FIT_DISPLACEMENT_PX, 29
+)  # positions along a half-line
+N_REFINED_HEADINGS = 6  # from which a general motion is refined
+MIN_INCONSISTENCY_Z = 3.0  # from which parts of the image move apart
 # Of the model's displacement; a roll moves half of the patches backwards.
-SPEED_FACTORS = np.concatenate([-np.geomspace(3.0, 0.3, 25), np.geomspace(0.3, 3.0, 25)])
+TRIED_SPEED_RATIOS = np.concatenate([-np.geomspace(3.0, 0.3, 25), np.geomspace(0.3, 3.0, 25)])
 
 # Of `measure_image_speed`: the latest events, sensor and camera, and result.
 _latest: tuple[Any, Any, "ImageSpeed | None"] = (lambda: None, None, None)
@@ -147,7 +151,7 @@ def describe_windows(recording: Recording) -> str:
     """Describe the durations of the windows that are evaluated, those that fit, in words."""
     if len(recording.events) < MIN_PATCH_EVENTS:
         return "in so few events"
-    fitting = [float(duration) for duration in DURATIONS_S if _fits(recording, duration)]
+    fitting = [float(duration) for duration in WINDOW_DURATIONS_S if _fits(recording, duration)]
     if not fitting:
         return "in so short a recording"
     ends = sorted({fitting[0], fitting[-1]})
@@ -165,25 +169,29 @@ def _measure_speed(recording: Recording, camera: PinholeCamera | None) -> ImageS
         return None
     xi, _ = pixel_coordinates(recording.width, recording.height, camera)
     speeds, by_time, n_patches = [], [], 0
-    for middle in spread_times(recording, N_TIMES):
+    for middle in spread_times(recording, N_EVALUATED_TIMES):
         best: dict[tuple[float, ...], tuple[float, float]] = {}  # sharpness and speed by position
-        for duration in DURATIONS_S:
-            window = measure_sharpness(recording, middle, float(duration), MAX_DISPLACEMENT_PX, xi)
+        for duration in WINDOW_DURATIONS_S:
+            window = measure_sharpness(
+                recording, middle, float(duration), MAX_GRID_DISPLACEMENT_PX, xi
+            )
             if window is None:
                 continue
             sharpness, size, agree = _best_displacements(window)
             for k, position in enumerate(map(tuple, window.xi.tolist())):
                 # At the border of the grid the displacement may be longer still.
-                inside = size[k] < MAX_DISPLACEMENT_PX - 0.5
-                if inside and sharpness[k] > best.get(position, (MIN_SHARPNESS, 0.0))[0]:
-                    known = agree[k] and size[k] >= MIN_DISPLACEMENT_PX
+                inside = size[k] < MAX_GRID_DISPLACEMENT_PX - 0.5
+                if inside and sharpness[k] > best.get(position, (MIN_RELATIVE_SHARPNESS, 0.0))[0]:
+                    known = agree[k] and size[k] >= MIN_MEASURED_DISPLACEMENT_PX
                     best[position] = sharpness[k], size[k] / float(duration) if known else 0.0
         here = np.array([speed for _, speed in best.values() if speed > 0])
         n_patches += len(best)
         speeds.append(here)
-        by_time.append((middle, float(np.median(here)) if len(here) >= MIN_PATCHES else np.nan))
+        by_time.append(
+            (middle, float(np.median(here)) if len(here) >= MIN_MEASURED_PATCHES else np.nan)
+        )
     speed = np.concatenate(speeds)
-    if len(speed) < max(MIN_PATCHES, MIN_AGREEMENT * n_patches):
+    if len(speed) < max(MIN_MEASURED_PATCHES, MIN_AGREEING_FRACTION * n_patches):
         return None
     slow, median, fast = np.percentile(speed, [25, 50, 75])
     return ImageSpeed(float(median), float(slow), float(fast), tuple(by_time))
@@ -254,7 +262,7 @@ def measure_sharpness(
     )
     displacements = np.arange(-max_displacement, max_displacement + 1.0)
     energy = np.zeros((2, len(used), len(displacements), len(displacements)))
-    side = (PATCH_PX + 2 * MARGIN_PX) // IMAGE_PIXEL_PX
+    side = (PATCH_PX + 2 * PATCH_MARGIN_PX) // IMAGE_PIXEL_PX
     _accumulate_energy(of_patches, displacements, np.empty((2, len(used), side, side)), energy)
     for k in range(2):
         events_of_half = np.bincount(which[halves == k], minlength=len(used))
@@ -282,8 +290,8 @@ def _accumulate_energy(events, displacements, scratch, energy):
         for column in range(len(displacements)):
             scratch[:] = 0
             for e in range(len(at)):
-                x = (at[e, 0] - displacements[column] * since[e] + MARGIN_PX) / IMAGE_PIXEL_PX
-                y = (at[e, 1] - displacements[row] * since[e] + MARGIN_PX) / IMAGE_PIXEL_PX
+                x = (at[e, 0] - displacements[column] * since[e] + PATCH_MARGIN_PX) / IMAGE_PIXEL_PX
+                y = (at[e, 1] - displacements[row] * since[e] + PATCH_MARGIN_PX) / IMAGE_PIXEL_PX
                 i, j = int(np.floor(x)), int(np.floor(y))
                 if i < 0 or j < 0 or i >= side - 1 or j >= side - 1:
                     continue
@@ -313,7 +321,7 @@ def is_camera_static(recording: Recording, speed: ImageSpeed | None) -> bool:
         A boolean; false without frames or a speed.
     """
     fraction = None if speed is None else edge_event_fraction(recording, speed)
-    return fraction is not None and fraction < MAX_STATIC_EDGES
+    return fraction is not None and fraction < MAX_STATIC_EDGE_FRACTION
 
 
 def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -> float | None:
@@ -325,19 +333,21 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
 
     Returns:
         The median over some frames, or None. It is None where nothing is seen to move, and where no
-        frame has events before and after it while the image moves by `FRAME_DISPLACEMENT_PX`.
+        frame has events before and after it while it moves by `FRAME_WINDOW_DISPLACEMENT_PX`.
     """
     frames, events, n = recording.frames, recording.events, len(recording.events)
     if frames and speed is None:
         speed = measure_image_speed(recording)
     if frames is None or speed is None:
         return None
-    half = round(5e5 * FRAME_DISPLACEMENT_PX / speed.median)
+    half = round(5e5 * FRAME_WINDOW_DISPLACEMENT_PX / speed.median)
     first, last = int(events[:1].t[0]), int(events[n - 1 :].t[0])
     rows = np.flatnonzero((frames.t - half >= first) & (frames.t + half <= last))
     if not len(rows):
         return None
-    rows = np.unique(rows[((np.arange(N_TIMES) + 0.5) * len(rows) / N_TIMES).astype(int)])
+    rows = np.unique(
+        rows[((np.arange(N_EVALUATED_TIMES) + 0.5) * len(rows) / N_EVALUATED_TIMES).astype(int)]
+    )
     fractions = []
     for at, image in zip(frames.t[rows].tolist(), frames[rows].intensity, strict=True):
         edges = _find_edges(image)
@@ -350,9 +360,9 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
 
 def _find_edges(image: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Find the pixels of a frame (intensity) where log intensity is steepest."""
-    smooth = gaussian_filter(np.log(image + DARK_LEVEL), 1.0)
+    smooth = gaussian_filter(np.log(image + DARK_GREY_OFFSET), 1.0)
     slope = np.hypot(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
-    return slope >= np.quantile(slope, 1 - EDGE_FRACTION)
+    return slope >= np.quantile(slope, 1 - EDGE_PIXEL_FRACTION)
 
 
 @renamed_fields(both="both_directions")
@@ -378,7 +388,7 @@ class FlowConsistency:
     @property
     def is_inconsistent(self) -> bool:
         """Return whether the image does not move as one."""
-        return self.z > MIN_Z
+        return self.z > MIN_INCONSISTENCY_Z
 
 
 def flow_consistency(
@@ -407,7 +417,7 @@ def flow_consistency(
     if speed is None:
         return None
     _, f = pixel_coordinates(recording.width, recording.height, camera)
-    factors = np.append(SPEED_FACTORS, 1.0)
+    factors = np.append(TRIED_SPEED_RATIOS, 1.0)
     differences, best_factors, speeds = [], [], []
     for window in measure_windows(recording, speed, camera):
         d = fit_planar(window)
@@ -454,11 +464,13 @@ def measure_windows(
     """
     windows = []
     xi, _ = pixel_coordinates(recording.width, recording.height, camera or recording.camera)
-    for middle in spread_times(recording, FIT_TIMES):
+    for middle in spread_times(recording, N_FIT_TIMES):
         near = [(abs(t - middle), v) for t, v in speed.by_time if np.isfinite(v)]
         here = min(near)[1] if near else speed.median
-        duration = DURATIONS_S[np.abs(np.log(DURATIONS_S * here / WINDOW_DISPLACEMENT_PX)).argmin()]
-        window = measure_sharpness(recording, middle, float(duration), FIT_DISPLACEMENT_PX, xi)
+        duration = WINDOW_DURATIONS_S[
+            np.abs(np.log(WINDOW_DURATIONS_S * here / FIT_WINDOW_DISPLACEMENT_PX)).argmin()
+        ]
+        window = measure_sharpness(recording, middle, float(duration), MAX_FIT_DISPLACEMENT_PX, xi)
         if window is not None:
             windows.append(window)
     return windows
@@ -477,7 +489,7 @@ def log_sharpness(
     Returns:
         (..., patches) values.
     """
-    at = np.clip(displacements + FIT_DISPLACEMENT_PX, 0, 2 * FIT_DISPLACEMENT_PX)
+    at = np.clip(displacements + MAX_FIT_DISPLACEMENT_PX, 0, 2 * MAX_FIT_DISPLACEMENT_PX)
     patch = np.broadcast_to(np.arange(len(window.xi)), at.shape[:-1])
     values = np.log(np.maximum(window.energy[half], 1e-6))
     return map_coordinates(values, [patch, at[..., 1], at[..., 0]], order=1, mode="nearest")
@@ -552,7 +564,7 @@ def half_line_displacements(
     base = np.asarray(rotation_basis(window.xi, f)) @ turn
     line = np.einsum("pij,j->pi", _translation_basis(window.xi, f), T)
     line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
-    return base + HALF_LINE_PX[:, None, None] * line
+    return base + HALF_LINE_POSITIONS_PX[:, None, None] * line
 
 
 def _translation_basis(xi: NDArray[np.float64], f: float) -> NDArray[np.float64]:
@@ -577,7 +589,7 @@ def fit_general(window: PatchSharpness, f: float, turn: NDArray[np.float64]) -> 
     def displacements(v: NDArray) -> NDArray:
         line = columns @ v[:3]
         line = line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
-        return basis @ (v[3:] / f) + HALF_LINE_PX[:, None, None] * line
+        return basis @ (v[3:] / f) + HALF_LINE_POSITIONS_PX[:, None, None] * line
 
     def loss(v: NDArray) -> float:
         size = float(np.linalg.norm(v[:3]))
@@ -588,7 +600,7 @@ def fit_general(window: PatchSharpness, f: float, turn: NDArray[np.float64]) -> 
     headings /= np.linalg.norm(headings, axis=1, keepdims=True)
     headings = np.concatenate([headings, np.eye(3), -np.eye(3)])
     starts = [np.append(T, factor * f * turn) for T in headings for factor in (0.0, 0.5, 1.0)]
-    starts = sorted(starts, key=loss)[:N_HEADINGS]
+    starts = sorted(starts, key=loss)[:N_REFINED_HEADINGS]
     found = _minimise(loss, starts, 0.3)
     return np.append(found[:3] / np.linalg.norm(found[:3]), found[3:] / f)
 

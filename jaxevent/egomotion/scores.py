@@ -18,8 +18,10 @@ from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.metrics import MEASURE_MEANINGS
 
-OUTLIER_ERROR = 0.05  # relative magnitude error from which a vector is an outlier in the thesis
-UNITS = {  # of `motion_errors`
+OUTLIER_RELATIVE_ERROR = (
+    0.05  # relative magnitude error from which a vector is an outlier in the thesis
+)
+METRIC_UNITS = {  # of `motion_errors`
     "AEE": "px/s", "AEE_rel": "%", "AAE_U": "deg", "AAE_T": "deg", "AAE_Omega": "deg",
     "AME": "deg/s", "AME_rel": "%", "AME_N": "%", "vector_error": "%", "outliers": "%",
 }  # fmt: skip
@@ -116,7 +118,7 @@ def normalised_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray
 
 
 def outlier_percentage(
-    estimate: ArrayLike, truth: ArrayLike, limit: float | int = OUTLIER_ERROR
+    estimate: ArrayLike, truth: ArrayLike, limit: float | int = OUTLIER_RELATIVE_ERROR
 ) -> float:
     """Return the percentage of outliers (thesis 6.5.3).
 
@@ -199,7 +201,7 @@ class MotionScores:
 
     def rows(self) -> list[tuple[str, float, str]]:
         """Return the name, value and unit of each error."""
-        rows = [(name, value, UNITS[name]) for name, value in self.figures.items()]
+        rows = [(name, value, METRIC_UNITS[name]) for name, value in self.figures.items()]
         return [*rows, ("lost", 100 * self.lost, "%"), ("startup", self.startup, "s")]
 
     def table(self) -> list[str]:

@@ -24,13 +24,13 @@ from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses, Recording, Times, microseconds
 
 # Rotations from the axes of an IMU to the camera's, x to the right, y down, z forward, by name.
-AXES = {
+IMU_AXES = {
     "camera": np.eye(3),
     "y-up": np.diag([1.0, -1.0, -1.0]),  # x right, y up, z backward, as jAER has them
     "x-left": np.diag([-1.0, 1.0, -1.0]),  # x left, y down, z backward
     "turned": np.diag([-1.0, -1.0, 1.0]),  # x left, y up, z forward
 }
-MAX_GYRO_BIAS = 0.2  # rad/s
+MAX_GYRO_BIAS_RAD_S = 0.2  # rad/s
 
 
 def _check_known(us: NDArray[np.int64], start: int | np.integer, stop: int | np.integer) -> None:
@@ -194,19 +194,19 @@ def imu_rotation(text: str) -> NDArray[np.float64]:
     """Parse the rotation (3, 3) from the axes of an IMU to the camera's.
 
     Args:
-        text: A name of `AXES`, or nine numbers with commas between, row by row.
+        text: A name of `IMU_AXES`, or nine numbers with commas between, row by row.
 
     Raises:
         InputError: The text is neither.
     """
-    if text in AXES:
-        return AXES[text]
+    if text in IMU_AXES:
+        return IMU_AXES[text]
     try:
         R = np.array([float(part) for part in text.split(",")]).reshape(3, 3)
     except ValueError:
         raise InputError(
-            f"--imu-rotation {text!r} is not known; give {', '.join(AXES)}, or the nine numbers of "
-            "a rotation matrix, row by row"
+            f"--imu-rotation {text!r} is not known; give {', '.join(IMU_AXES)}, or the "
+            "nine numbers of a rotation matrix, row by row"
         ) from None
     if not _is_rotation(R):
         raise InputError(f"--imu-rotation {text} is no rotation; give an orthogonal matrix")
@@ -223,17 +223,17 @@ def fit_gyro_bias(
         measured: (n, 3) measured angular velocity, rad/s.
 
     Returns:
-        (3,) bias, clipped to +- `MAX_GYRO_BIAS`, rad/s.
+        (3,) bias, clipped to +- `MAX_GYRO_BIAS_RAD_S`, rad/s.
     """
     middle = np.median(measured - estimate, 0)
-    return np.clip(middle, -MAX_GYRO_BIAS, MAX_GYRO_BIAS)
+    return np.clip(middle, -MAX_GYRO_BIAS_RAD_S, MAX_GYRO_BIAS_RAD_S)
 
 
 def find_imu_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]) -> str | None:
     """Find the axes of a gyro in which its rates agree with an estimate.
 
     All 24 ways in which axes can lie along the camera's are compared, each with its best bias. One
-    of `AXES` is preferred: others have to fit twice as well.
+    of `IMU_AXES` is preferred: others have to fit twice as well.
 
     Args:
         estimate: (n, 3) estimated angular velocity in the camera's axes, rad/s.
@@ -249,7 +249,7 @@ def find_imu_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]
         # The rates themselves distinguish axes that their changes do not, as of a roll.
         return float(np.sqrt((residual**2).mean() + ((rotated - estimate) ** 2).mean() / 10))
 
-    named = {name: misalignment(R) for name, R in AXES.items()}
+    named = {name: misalignment(R) for name, R in IMU_AXES.items()}
     best = min(named, key=lambda name: named[name])
     found, least = best, named[best]
     for R in np.rint(Rotation.create_group("O").as_matrix()):

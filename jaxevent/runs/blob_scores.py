@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from jaxevent.blob import Tracker, TrackerParams, find
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.blob.scores import score_tracks
-from jaxevent.blob.track import THETA_RATIO
+from jaxevent.blob.track import MIN_THETA_AXIS_RATIO
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
@@ -258,7 +258,7 @@ def _errors(
         if "theta" in more:
             swapped = np.where(sizes[..., 1] > sizes[..., 0], np.pi / 2, 0)
             turn = np.mod(mean[..., 6] - more["theta"] - swapped + np.pi / 2, np.pi) - np.pi / 2
-            long = sizes.max(-1) > THETA_RATIO * sizes.min(-1)
+            long = sizes.max(-1) > MIN_THETA_AXIS_RATIO * sizes.min(-1)
             out["theta"] = _rms(np.degrees(np.where(long, turn, np.nan)))
     if "range" in more and "extent" in options:
         factor = options.get("size_factor", SIZE_FACTORS["ring"])

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.blob.tracks import COLUMNS, TABLE_UNITS, UNITS, table_columns
+from jaxevent.blob.tracks import STATE_COLUMNS, STATE_UNITS, TABLE_UNITS, table_columns
 from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.parameters import Parameters
@@ -107,7 +107,7 @@ def _hdf5_writer(
         for name, unit in (("t", CLOCK_UNIT), ("id", "1")):
             file[name].attrs["unit"] = unit
         for name, unit in (("mean", "units"), ("covariance", "units[i] units[j]")):
-            file[name].attrs["columns"], file[name].attrs["units"] = COLUMNS, UNITS
+            file[name].attrs["columns"], file[name].attrs["units"] = STATE_COLUMNS, STATE_UNITS
             file[name].attrs["unit"] = unit
 
 
@@ -162,7 +162,7 @@ def write_states(path: str | Path, times: Times, states: ArrayLike, valid: Array
     t, ids, states, _, valid = check_tracks(path, t, ids, states, None, valid)
     row, column = np.nonzero(valid)
     columns = {"t": t[row] / 1e6, "id": ids[column]}
-    columns |= {name: states[row, column, i] for i, name in enumerate(COLUMNS)}
+    columns |= {name: states[row, column, i] for i, name in enumerate(STATE_COLUMNS)}
     pd.DataFrame(columns).to_csv(path, index=False)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
 from jaxevent.blob.track import TrackStates
-from jaxevent.blob.tracks import TABLE_RATE, Tracks, evenly_spaced_times
+from jaxevent.blob.tracks import TABLE_RATE_HZ, Tracks, evenly_spaced_times
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.io.output import check_writable, complete
 from jaxevent.progress import bar
@@ -62,7 +62,7 @@ class Output:
     """
 
     path: Path
-    rate: float | int | None = TABLE_RATE
+    rate: float | int | None = TABLE_RATE_HZ
     background: str = "events"
     pairs: Sequence[tuple[int, int]] = ()
     extent: float | int | None = None
@@ -162,7 +162,7 @@ class Output:
     ) -> "WrittenTracks":
         """Write files by kind; states are read once for all of them."""
         duration = (tracks.stop - tracks.start) * 1e-6
-        rate = TABLE_RATE if self.rate is None else float(self.rate)
+        rate = TABLE_RATE_HZ if self.rate is None else float(self.rate)
         coarse = evenly_spaced_times(tracks.start, tracks.stop, min(rate, _MAX_TIMES / duration))
         often = min(max(_MAX_FPS, _MIN_PICTURES / duration), max(rate, _MAX_FPS))
         pictures = (

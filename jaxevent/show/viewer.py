@@ -17,7 +17,7 @@ from jaxevent.io.images import is_series, read_series
 from jaxevent.io.output import complete
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, microseconds
-from jaxevent.show.track_tables import COLUMNS
+from jaxevent.show.track_tables import STATE_COLUMNS
 
 ON_COLOUR, OFF_COLOUR = (200, 64, 30), (58, 120, 181)
 BLOCK_EVENTS = 1 << 20  # events sent at a time
@@ -218,7 +218,7 @@ def _layer_of_table(path: Path) -> _Layer:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: is no table ({error}); write it again") from error
-    if {"t", "id", *COLUMNS[:2], *COLUMNS[4:7]} <= set(table.columns):
+    if {"t", "id", *STATE_COLUMNS[:2], *STATE_COLUMNS[4:7]} <= set(table.columns):
         return path.stem, lambda send, _: send.tracks(table)
     if "t" in table.columns and len(table.columns) > 1 and "id" not in table.columns:
         return path.stem, lambda send, _: send.curves(table)
@@ -246,7 +246,7 @@ def _table_of_tracks(tracks: Tracks) -> pd.DataFrame:
     row, column = np.nonzero(states.valid)
     mean = np.asarray(states.mean)[row, column]
     known = {"t": times[row] / 1e6, "id": tracks.id[column]}
-    return pd.DataFrame(known | dict(zip(COLUMNS, mean.T, strict=True)))
+    return pd.DataFrame(known | dict(zip(STATE_COLUMNS, mean.T, strict=True)))
 
 
 def _table_of_motion(motion: MotionEstimate) -> pd.DataFrame:

@@ -14,7 +14,7 @@ import pytest
 
 import jaxevent
 from jaxevent.blob import chi2, negative_log_likelihood
-from jaxevent.blob.authors import MAX_PENDING
+from jaxevent.blob.authors import MAX_PENDING_EVENTS
 from jaxevent.cli import main
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -97,10 +97,10 @@ def stream(t, xi, p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("waiting", [20, MAX_PENDING + 5])
+@pytest.mark.parametrize("waiting", [20, MAX_PENDING_EVENTS + 5])
 def test_events_of_one_time_are_replayed(waiting):
     """They act as if they had come one after the other until the next event, in its place."""
-    rng, most = np.random.default_rng(waiting), min(waiting, MAX_PENDING)
+    rng, most = np.random.default_rng(waiting), min(waiting, MAX_PENDING_EVENTS)
     few = rng.integers(20, 28, (5, 2))
     tied, n = rng.integers(20, 28, (waiting, 2)), len(few)
     t, gap = 100 + 50 * np.arange(n), 3 * most  # us

@@ -14,7 +14,7 @@ from jaxevent.errors import InputError
 from jaxevent.show import track_figures as pictures
 from jaxevent.show.images import video_writer
 from jaxevent.show.track_figures import write_track_plot
-from jaxevent.show.track_tables import COLUMNS, track_writer
+from jaxevent.show.track_tables import STATE_COLUMNS, track_writer
 from jaxevent.simulate.blobs import CARS, blob_scene
 
 RNG = np.random.default_rng
@@ -349,7 +349,7 @@ def test_csv_holds_every_living_row(tmp_path, flat):
     assert len(table) == 12 + 8
     np.testing.assert_allclose(table["t"], times[row], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(table["id"], ids[column])
-    np.testing.assert_allclose(table[list(COLUMNS)], mean[row, column], rtol=4e-16, atol=0)
+    np.testing.assert_allclose(table[list(STATE_COLUMNS)], mean[row, column], rtol=4e-16, atol=0)
     deviation = np.sqrt(np.diagonal(P[row, column], axis1=1, axis2=2))
     np.testing.assert_array_equal(table.iloc[:, 10:], deviation)
 
@@ -364,7 +364,7 @@ def test_hdf5_holds_means_and_covariances(tmp_path):
         np.testing.assert_array_equal(file["id"], ids[column])
         np.testing.assert_array_equal(file["mean"], mean[row, column])
         np.testing.assert_array_equal(file["covariance"], P[row, column])
-        assert tuple(file["mean"].attrs["columns"]) == COLUMNS
+        assert tuple(file["mean"].attrs["columns"]) == STATE_COLUMNS
         assert file["t"].attrs["unit"].startswith("us")
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxevent.blob.scores import ALPHAS, score_tracks
+from jaxevent.blob.scores import HOTA_THRESHOLDS, score_tracks
 from jaxevent.errors import InputError
 
 T = 10
@@ -60,7 +60,7 @@ def test_distance():
     """2 px off at a reach of 4 px: a similarity of 3/4, which 15 of 19 thresholds allow."""
     result = scored([path(0)], [path(2)])
     assert result.rms == 2 and result.mota == result.idf1 == 1
-    share = (ALPHAS <= 0.75).mean()
+    share = (HOTA_THRESHOLDS <= 0.75).mean()
     assert share == 15 / 19
     assert result.deta == result.assa == result.hota == pytest.approx(share)
     assert scored([path(0)], [path(4.1)]).covered == 0

@@ -20,8 +20,8 @@ from jaxevent.blob.search.background import (
 )
 from jaxevent.blob.search.merge import merge_parts, stitch_paths
 from jaxevent.blob.search.paths import (
-    NO_OWNER,
-    NOISE_GRID,
+    NO_OWNER_INDEX,
+    TRIED_VELOCITY_NOISES,
     TargetPath,
     _log_likelihood,
     fit_velocity_noise,
@@ -465,7 +465,7 @@ def test_candidates_are_those_of_a_slow_loop():
     for i in range(1000):
         far = np.array([distance(path, i) for path in paths])
         mine = np.argsort(far)[: min(np.isfinite(far).sum(), 2)]
-        assert told[i].tolist() == [*mine, NO_OWNER, NO_OWNER][:2]
+        assert told[i].tolist() == [*mine, NO_OWNER_INDEX, NO_OWNER_INDEX][:2]
         several += np.isfinite(far).sum() > 2
     assert several > 5
 
@@ -474,7 +474,7 @@ def test_candidates_are_those_of_a_slow_loop():
 def test_events_near_two_paths_are_taken_by_no_third_target():
     params, filter = blob.moment.Params(), blob.moment.filter
     xi = jnp.array([[20.0, 20], [20, 21], [21, 20], [90, 90], [90, 90]])
-    owner = jnp.array([[0, 1], [1, 2], [2, NO_OWNER], [0, NO_OWNER], [0, 1]])
+    owner = jnp.array([[0, 1], [1, 2], [2, NO_OWNER_INDEX], [0, NO_OWNER_INDEX], [0, 1]])
     batch = EventBatch(xi, jnp.zeros(5), jnp.ones(5))
     state = filter.init(params, jnp.array([20.0, 20]), jnp.array(5.0))
     zero = jnp.zeros((), jnp.int32)
@@ -500,7 +500,7 @@ def test_agility_is_the_most_likely():
         m.append(state[:, 0] + rng.normal(0, np.sqrt(R), 2))
     m, t = np.array(m), dt * np.arange(400)
     found = fit_velocity_noise(t, m, np.full(400, R), 1e6)
-    assert q / 2.5 < found < 2.5 * q and np.isclose(NOISE_GRID * 1e6, found).any()
+    assert q / 2.5 < found < 2.5 * q and np.isclose(TRIED_VELOCITY_NOISES * 1e6, found).any()
 
     # The density of 12 means, given the first two, written out.
     n = 12

@@ -10,7 +10,7 @@ from jaxevent.blob.search import stream as stream_module
 from jaxevent.blob.search.background import (
     CELL_PX,
     FINE_CELL_PX,
-    SLICES,
+    N_TIME_SLICES,
     Background,
     clutter_evidence,
     measure_dispersions,
@@ -63,9 +63,9 @@ def background():
     rng = np.random.default_rng(6)
     return Background(
         rng.uniform(0.2, 0.6, (HEIGHT // FINE_CELL_PX, WIDTH // FINE_CELL_PX)),
-        rng.random((SLICES, *CELLS)) < 0.8,
+        rng.random((N_TIME_SLICES, *CELLS)) < 0.8,
         rng.random(CELLS) < 0.5,
-        rng.uniform(1, 1.3, SLICES),
+        rng.uniform(1, 1.3, N_TIME_SLICES),
         DURATION,
     )
 
@@ -256,7 +256,7 @@ def test_windows_before_the_start_hold_nothing(stream):
 
 def test_streams_tell_the_same_read_piece_by_piece(stream, background, monkeypatch):
     monkeypatch.setattr(stream_module, "MAX_HELD_EVENTS", 0)
-    monkeypatch.setattr(stream_module, "BATCH_EVENTS", 64)
+    monkeypatch.setattr(stream_module, "EVENTS_PER_READ", 64)
     pieces = Stream(stream.recording, stream.start, stream.stop)
     pieces.hot = stream.hot
     (_, path), number = lagging(tail=8.0), len(stream.window(0, 1))

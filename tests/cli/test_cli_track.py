@@ -23,12 +23,12 @@ from jaxevent.errors import InputError, install_command
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import tracks as written
 from jaxevent.show.track_figures import track_colour
-from jaxevent.show.track_tables import COLUMNS
+from jaxevent.show.track_tables import STATE_COLUMNS
 from jaxevent.simulate import Line, Target, simulate_blobs
 
 WIDTH, HEIGHT = 120, 80
 SEEDS = [(30.0, 30.0, 6.0), (80.0, 50.0, 6.0)]
-HEADER = ["t", "id", *COLUMNS]
+HEADER = ["t", "id", *STATE_COLUMNS]
 # A filter that compiles fast.
 METHOD = ["--method", "constant_velocity"]
 SETTINGS = "events_per_step = 8\nQ_v = 1e4\nP0_v = 1e4\n"
@@ -109,7 +109,7 @@ def test_a_folder_of_everything(folder, capsys):
     states = tracks(times)
     assert states.valid.all()
     header, table = read_table(out / "tracks.csv")
-    assert header == [*HEADER, *(f"sigma_{name}" for name in COLUMNS)]
+    assert header == [*HEADER, *(f"sigma_{name}" for name in STATE_COLUMNS)]
     assert np.array_equal(table[:, 0], np.repeat(times, 2) / 1e6)
     assert np.array_equal(table[:, 1], np.tile([0, 1], 25))
     np.testing.assert_allclose(table[:, 2:10], states.mean.reshape(-1, 8), rtol=1e-12)
@@ -119,7 +119,7 @@ def test_a_folder_of_everything(folder, capsys):
         assert np.array_equal(file["t"], np.repeat(times, 2))
         assert np.array_equal(file["mean"], states.mean.reshape(-1, 8))
         assert np.array_equal(file["covariance"], states.covariance.reshape(-1, 8, 8))
-        assert list(file["mean"].attrs["columns"]) == list(COLUMNS)
+        assert list(file["mean"].attrs["columns"]) == list(STATE_COLUMNS)
 
     scale = 6  # 80 rows become 480
     images, about = decoded(out / "tracks.mp4", scale * HEIGHT, scale * WIDTH, "rgb24")

@@ -18,7 +18,7 @@ from jaxevent.egomotion.bundle.hypotheses import Stage, WindowFit, WindowFitter
 from jaxevent.egomotion.bundle.photometric_ba import FitReport, compute_covariance, search_depths
 from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, project_events, residuals
 from jaxevent.egomotion.bundle.warp import (
-    N_ROWS,
+    N_COEFFICIENT_ROWS,
     Path,
     Points,
     Prior,
@@ -26,7 +26,12 @@ from jaxevent.egomotion.bundle.warp import (
     predict_path,
     warp,
 )
-from jaxevent.egomotion.bundle.windows import DARK, Params, read_frame_pixels, stamp_offset
+from jaxevent.egomotion.bundle.windows import (
+    DARK_GREY_OFFSET,
+    Params,
+    read_frame_pixels,
+    stamp_offset,
+)
 from jaxevent.egomotion.truth import Twists
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
@@ -106,7 +111,7 @@ def test_warp_of_a_rigid_scene():
     rng = np.random.default_rng(1)
     O = rng.normal(size=(3, 3)) * [[1.0], [4], [20]]  # noqa: E741
     D = rng.normal(size=(3, 3))
-    more = np.zeros((N_ROWS - 3, 3))
+    more = np.zeros((N_COEFFICIENT_ROWS - 3, 3))
     path = Path(np.append(O, more, 0), np.append(D, more, 0), np.zeros(1))
     C = path.coefficients()[1]
     np.testing.assert_allclose(C[1], D[1] + np.cross(O[0], D[0]))
@@ -187,7 +192,7 @@ def test_the_motion_before_a_wall_is_found():
     exact = np.cross(np.eye(3), OMEGA) + np.outer(T, normal)
     exact -= np.trace(exact) / 3 * np.eye(3)
     M = initialise.homography_flow(
-        few.sample_events(150_000, 0.05, hypotheses.FLOW_EVENTS), few.rotation(150_000)
+        few.sample_events(150_000, 0.05, hypotheses.MAX_FLOW_EVENTS), few.rotation(150_000)
     )
     assert np.linalg.norm(M - exact) < 0.5 * np.linalg.norm(exact)
 
@@ -199,7 +204,7 @@ def test_the_motion_before_a_wall_is_found():
     assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
     assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
     # Depths are the plane's; those smaller than the least were not.
-    x, y = windows.series(150_000, 0.15, hypotheses.HYPOTHESIS_EVENTS).node_positions
+    x, y = windows.series(150_000, 0.15, hypotheses.MAX_HYPOTHESIS_EVENTS).node_positions
     rho = np.exp(found[0][0].path.log_rho)
     rays = np.stack([x / F, y / F, np.ones(len(x))], 1)
     ahead = rays @ normal > 0.3
@@ -279,7 +284,7 @@ def test_gradient_of_contrast():
     """By each generator of a homography flow, against differences."""
     cut = roof().sample_events(150_000, 0.15, 3000)
     basis = np.concatenate([initialise.ROTATION_GENERATORS, initialise.STRAIN_GENERATORS])
-    terms = np.empty((3, initialise.EXPONENTIAL_ORDER + 1, 3))
+    terms = np.empty((3, initialise.MATRIX_EXPONENTIAL_ORDER + 1, 3))
     scratch, slope = ImageScratch.of(cut.shape, cut.x.dtype, terms), np.empty(len(basis))
 
     def contrast(values: np.ndarray) -> float:
@@ -389,7 +394,7 @@ def test_levels_of_frames_are_in_units_of_the_threshold():
     recording = seen(frames=True)
     shown = read_frame_pixels(recording, 0, 300_000)
     assert shown is not None and len(shown.t) == 7 and (shown.precision > 0.5).mean() > 0.9
-    logarithm = np.log(recording.frames.intensity.reshape(7, -1) + DARK)
+    logarithm = np.log(recording.frames.intensity.reshape(7, -1) + DARK_GREY_OFFSET)
     slope = np.polyfit(logarithm.ravel(), shown.level.ravel(), 1)[0]
     assert slope == pytest.approx(1 / 0.25, rel=0.15)
     assert read_frame_pixels(recording, 0, 50_000) is None  # one frame tells no change
@@ -420,7 +425,7 @@ def test_offset_of_stamps():
 )
 def test_an_offset_that_depends_on_the_method_is_none(monkeypatch, told, expected):
     monkeypatch.setattr(
-        data, "_best_offset", lambda *given: told[data.OFFSET_METHODS.index(given[-1])]
+        data, "_best_offset", lambda *given: told[data.STAMP_OFFSET_METHODS.index(given[-1])]
     )
     assert stamp_offset(stamped(0)) == expected
 
@@ -505,9 +510,9 @@ def test_priors_pull():
 
 def test_a_recording_from_end_to_end(monkeypatch):
     """With fewer steps than `fitted`, which are enough to come near."""
-    monkeypatch.setattr(hypotheses, "COARSE_TO_FINE", (Stage(0.3, 4),))
-    monkeypatch.setattr(hypotheses, "FINAL", (Stage(0.1, 3),))
-    monkeypatch.setattr(hypotheses, "PLANAR", ())
+    monkeypatch.setattr(hypotheses, "COARSE_TO_FINE_STAGES", (Stage(0.3, 4),))
+    monkeypatch.setattr(hypotheses, "FINAL_STAGES", (Stage(0.1, 3),))
+    monkeypatch.setattr(hypotheses, "PLANAR_STAGES", ())
     motion = sequence.batch.estimate(seen(), PARAMS)
     mean, covariance, valid = motion(motion.t[len(motion) // 2 :][:1])
     assert valid[0] and covariance.shape == (1, 6, 6)
@@ -556,14 +561,14 @@ def test_the_end_of_a_path_is_less_sure():
     apart = told.covariance[middle, 5, 5] - 1e-4  # of the windows, which a ramp does not join
     lone = sequence._blend(np.zeros(1, int), fits[:1], half, 100_000, (-half, half))
     assert list(lone.t[[0, -1]]) == [-100_000, 100_000]
-    grown = 1e-4 + (sequence.EDGE_UNCERTAINTY * 2.0 * lone.t * 1e-6) ** 2
+    grown = 1e-4 + (sequence.WINDOW_END_SIGMA_PER_CHANGE * 2.0 * lone.t * 1e-6) ** 2
     np.testing.assert_allclose(lone.covariance[:, 5, 5], grown)
     np.testing.assert_allclose(lone.covariance[:, :5, :5], np.tile(np.eye(5) * 1e-4, (11, 1, 1)))
     np.testing.assert_allclose(apart, (2.0 * 0.1) ** 2)
     short = sequence._blend(np.zeros(1, int), fits[:1], half, 100_000, (-4000, 4000))
     assert list(short.t) == [-4000, -2000, 0, 2000, 4000]
     first = told.covariance[told.t == -100_000, 5, 5]
-    assert first > (sequence.EDGE_UNCERTAINTY * 0.2) ** 2
+    assert first > (sequence.WINDOW_END_SIGMA_PER_CHANGE * 0.2) ** 2
     # Where the camera is slower the same errors of its velocity turn the heading farther.
     path.D[1, 2] = -9.9  # 1/s^2, of |T| at the middle
     slower = sequence._blend(np.zeros(1, int), fits[:1], half, 100_000, (-half, half))

@@ -169,9 +169,9 @@ def test_pieces_are_the_whole(monkeypatch):
     motion = true_motion(source)
     whole = flow(recording, motion)
     assert len(whole.valid) == len(recording.events)
-    monkeypatch.setattr(module, "CHUNK_BATCHES", 3)
+    monkeypatch.setattr(module, "BATCHES_PER_CHUNK", 3)
     parts = list(iterate_flow(recording, motion))
-    assert len(parts) == -(-len(recording.events) // (3 * module.BATCH_EVENTS))
+    assert len(parts) == -(-len(recording.events) // (3 * module.EVENTS_PER_BATCH))
     for name in ("flow", "valid", "residual"):
         joined = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_allclose(joined, getattr(whole, name), rtol=1e-5)

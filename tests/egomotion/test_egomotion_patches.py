@@ -13,7 +13,7 @@ from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, B, rotation_basis
 from jaxevent.egomotion.model_selection import select_by_z, select_model
 from jaxevent.egomotion.motion import (
-    LENS_ERROR,
+    RELATIVE_LENS_ERROR,
     CovarianceCalibration,
     MotionEstimate,
     is_observable,
@@ -292,10 +292,10 @@ def test_error_that_a_calibrated_lens_leaves():
         slope, flow = places(lens + off)
         found = np.linalg.lstsq(flow.reshape(-1, 3), (slope @ seen).reshape(-1, 50))[0]
         square += np.square(found - axes).mean()
-    assert LENS_ERROR / 1.3 < np.sqrt(square) < 1.3 * LENS_ERROR
+    assert RELATIVE_LENS_ERROR / 1.3 < np.sqrt(square) < 1.3 * RELATIVE_LENS_ERROR
     ideal = CovarianceCalibration(share=0.02)
     assert ideal.with_lens(None) == ideal.with_lens(CAMERA) == ideal
-    assert ideal.with_lens(camera(lens)).share == pytest.approx(np.hypot(0.02, LENS_ERROR))
+    assert ideal.with_lens(camera(lens)).share == pytest.approx(np.hypot(0.02, RELATIVE_LENS_ERROR))
 
 
 def test_a_gyro_in_other_axes_and_with_a_bias():
@@ -303,7 +303,7 @@ def test_a_gyro_in_other_axes_and_with_a_bias():
     Omega = np.stack([0.3 * np.sin(7 * t), 0.2 * np.cos(5 * t), 0.5 + 0.2 * np.sin(9 * t)], 1)
     bias = np.array([0.05, -0.06, 0.02])
     np.testing.assert_allclose(truth.fit_gyro_bias(Omega, Omega + bias), bias)
-    for name, R in truth.AXES.items():
+    for name, R in truth.IMU_AXES.items():
         assert np.linalg.det(R) == pytest.approx(1)
         measured = (Omega + bias) @ R  # R takes the gyro's axes to the camera's
         found = truth.find_imu_axes(Omega, measured)

@@ -7,7 +7,7 @@ import pytest
 
 from jaxevent.egomotion.bundle import warp
 from jaxevent.egomotion.bundle.photometric_ba import StepControl, update_control
-from jaxevent.egomotion.bundle.warp import N_ROWS, N_SEGMENTS, Path, Prior
+from jaxevent.egomotion.bundle.warp import N_COEFFICIENT_ROWS, N_WINDOW_SEGMENTS, Path, Prior
 
 K = 3
 HALF = 0.15
@@ -59,14 +59,14 @@ def test_jacobian_of_coefficients(k):
     """Against differences of the polynomials, in half windows."""
     path = a_path()
     unit = warp.row_units(path, 80.0, HALF, k)
-    powers = HALF ** np.arange(1, N_ROWS + 1)
+    powers = HALF ** np.arange(1, N_COEFFICIENT_ROWS + 1)
 
     def coefficients(at: Path) -> np.ndarray:
         both = np.stack(at.polynomials()) * powers[:, None]
         return both.transpose(0, 2, 1).ravel()
 
     found, h = warp.coefficient_jacobian(path, unit, HALF, k), 1e-6
-    assert found.shape == (6 * N_ROWS, 6 * k)
+    assert found.shape == (6 * N_COEFFICIENT_ROWS, 6 * k)
     for n, one in enumerate(np.eye(6 * k)):
         step = h * one * unit
         ends = [
@@ -88,14 +88,14 @@ def test_the_size_of_the_translation_is_held():
 def test_cost_of_priors():
     rng = np.random.default_rng(2)
     now, unit = rng.normal(size=6 * K), rng.uniform(0.5, 2, 6 * K)
-    gyro = rng.normal(size=(N_SEGMENTS, 3))
+    gyro = rng.normal(size=(N_WINDOW_SEGMENTS, 3))
     prior = Prior(1.0, 1.0, 0.3, 0.7, gyro, 2.0, 1.0, 1.0, 1.0)
     O = (now * unit)[: 3 * K].reshape(K, 3)  # noqa: E741
-    t = ((np.arange(N_SEGMENTS) + 0.5) / N_SEGMENTS * 2 - 1) * HALF
+    t = ((np.arange(N_WINDOW_SEGMENTS) + 0.5) / N_WINDOW_SEGMENTS * 2 - 1) * HALF
     seen = O[0] + O[1] * t[:, None] + O[2] * t[:, None] ** 2 / 2
     changes = np.concatenate([now[3 : 3 * K], now[3 * K + 3 :]])
     expected = 0.7 * (O[0] ** 2).sum() + 0.3 * (changes**2).sum()
-    expected += 2.0 / N_SEGMENTS * ((seen - gyro) ** 2).sum()
+    expected += 2.0 / N_WINDOW_SEGMENTS * ((seen - gyro) ** 2).sum()
     H, b, constant = warp.row_priors(prior, unit, HALF)
     cost = now @ H @ now / 2 - b @ now + constant
     assert cost == pytest.approx(expected / 2, rel=1e-12)

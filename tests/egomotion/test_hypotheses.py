@@ -84,7 +84,7 @@ def test_rotation_alone_starts_from_the_sharpest_too(monkeypatch, better, least_
         object.__new__(HeldOutTest), path, sharpest, "moving"
     )
     assert refuted == least_z
-    assert steps == (h.N_TEST_STEPS if least_z < h.MIN_TRANSLATION_Z else h.N_MAP_STEPS)
+    assert steps == (h.N_TEST_STEPS if least_z < h.MIN_TRANSLATION_Z else h.N_TEST_MAP_STEPS)
     expected = sharpest if better > 0 else turn
     np.testing.assert_allclose(found.O[0], expected)
     assert not moves and not found.O[1:].any() and np.exp(found.log_rho).max() < 1e-3
@@ -138,7 +138,7 @@ def test_a_hypothesis_that_is_not_refuted_leaves_the_heading_open(monkeypatch, z
     windows.params, windows.sigma_floor = Params(), {}
     _, covariance, *_, ambiguity = inspect.unwrap(WindowFitter.refine_final)(windows, 0, found)
     apart = np.concatenate([turned[0] - [1, 0, 0], turned[1]])
-    more = np.exp(-(z**2) / 2) * np.outer(apart, apart) if cost < h.SIMILAR_COST else 0.0
+    more = np.exp(-(z**2) / 2) * np.outer(apart, apart) if cost < h.MAX_SIMILAR_COST_RATIO else 0.0
     told = h.error_inflation(0.9) * 1e-6 * np.eye(6)
     np.testing.assert_allclose(covariance, told + more, rtol=1e-9)
     assert ambiguity**2 == pytest.approx(np.trace((covariance - told)[:3, :3]))

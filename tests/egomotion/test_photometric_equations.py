@@ -11,7 +11,13 @@ import scipy.ndimage
 from jaxevent.egomotion.bundle import cg
 from jaxevent.egomotion.bundle import normal_equations as fit
 from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, sample_map, subtract_mean
-from jaxevent.egomotion.bundle.warp import N_ROWS, N_SEGMENTS, Path, Prior, replace_rows
+from jaxevent.egomotion.bundle.warp import (
+    N_COEFFICIENT_ROWS,
+    N_WINDOW_SEGMENTS,
+    Path,
+    Prior,
+    replace_rows,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -45,8 +51,11 @@ def some_tracks() -> PixelSeries:
 def some_scene(series: PixelSeries, log_rho: np.ndarray) -> Scene:
     """A motion that changes, before some depths at nodes."""
     rng = np.random.default_rng(1)
-    rows = 0.3 ** np.arange(N_ROWS)[:, None] / HALF ** np.arange(N_ROWS)[:, None]
-    O, D = rng.normal(size=(2, N_ROWS, 3)) * rows * 0.3  # noqa: E741
+    rows = (
+        0.3 ** np.arange(N_COEFFICIENT_ROWS)[:, None]
+        / HALF ** np.arange(N_COEFFICIENT_ROWS)[:, None]
+    )
+    O, D = rng.normal(size=(2, N_COEFFICIENT_ROWS, 3)) * rows * 0.3  # noqa: E741
     D[0] = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
     return Scene(Path(O, D, log_rho), rng.normal(size=SHAPE), 0.05)
 
@@ -73,7 +82,7 @@ def linearised(
     """Before depths that bend, or a plane."""
     series, plane = some_tracks(), normal is not None
     log_rho = np.log(rays_of_nodes(series) @ normal) if plane else smooth(series)
-    gyro = np.full((N_SEGMENTS, 3), 0.2)
+    gyro = np.full((N_WINDOW_SEGMENTS, 3), 0.2)
     prior = Prior(1.0, 1.0, 0.3, 0.7, gyro, 2.0, 0.8, 0.05, 10.0)
     problem = fit.Problem(series, prior, 0.7, plane, 0.5)
     seen = fit.evaluate(problem, some_scene(series, log_rho), np.ones(PIXELS * EACH))
@@ -84,7 +93,7 @@ def linearised(
 def size_of(equations: fit.NormalEquations) -> tuple[int, int, int]:
     """How many numbers of the map, of the path and the like, and depths are unknown."""
     series = equations.problem.series
-    free = fit.N_PATH + len(equations.jacobian.more)
+    free = fit.N_PATH_UNKNOWNS + len(equations.jacobian.more)
     return SHAPE[0] * SHAPE[1], free, series.nodes[0] * series.nodes[1]
 
 
@@ -96,16 +105,16 @@ def joined(parts: fit.Unknowns, n: int) -> np.ndarray:
 def apart(flat: np.ndarray, equations: fit.NormalEquations) -> fit.Unknowns:
     """The same, the other way; those that are not free 0."""
     n, m, _ = size_of(equations)
-    path = np.append(flat[n : n + m], np.zeros(fit.N_PATH + 4 - m))
+    path = np.append(flat[n : n + m], np.zeros(fit.N_PATH_UNKNOWNS + 4 - m))
     return flat[:n].reshape(SHAPE), path, flat[n + m :]
 
 
 def moved(scene: Scene, equations: fit.NormalEquations, v: fit.Unknowns) -> Scene:
     """The scene after a change of the unknowns, the plane's left out."""
     image, t, q = v
-    path = replace_rows(scene.path, (equations.t + t)[: fit.N_PATH] * equations.unit)
+    path = replace_rows(scene.path, (equations.t + t)[: fit.N_PATH_UNKNOWNS] * equations.unit)
     path = Path(path.O, path.D, path.log_rho + q)
-    return Scene(path, scene.map + image, scene.skew + t[fit.N_PATH])
+    return Scene(path, scene.map + image, scene.skew + t[fit.N_PATH_UNKNOWNS])
 
 
 def slopes(function, directions: np.ndarray) -> np.ndarray:
@@ -185,8 +194,8 @@ def test_gradient_of_the_objective():
         depth = new.path.log_rho.reshape(rows, columns)
         bonds = maps = 0.0
         for axis in (0, 1):
-            u = (np.diff(depth, axis=axis) / fit.NODE_EDGE) ** 2
-            bonds += prior.bond * fit.NODE_EDGE**2 * np.log1p(u).sum()
+            u = (np.diff(depth, axis=axis) / fit.NODE_EDGE_LOG_DEPTH) ** 2
+            bonds += prior.bond * fit.NODE_EDGE_LOG_DEPTH**2 * np.log1p(u).sum()
             maps += prior.flat * (np.diff(new.map, axis=axis) ** 2).sum()
         maps += 1e-5 * (new.map**2).sum()
         t = equations.t + parts[1]
@@ -226,7 +235,7 @@ def between_coarse(equations: fit.NormalEquations) -> np.ndarray:
     """The nodes' depths by those of coarse nodes, (nodes, coarse nodes)."""
     rows, columns = equations.problem.series.nodes
     wide = cg.coarse_shape(rows, columns)
-    at = np.indices((rows, columns)).reshape(2, -1) / cg.COARSE_NODES
+    at = np.indices((rows, columns)).reshape(2, -1) / cg.NODES_PER_COARSE_NODE
     each = np.eye(math.prod(wide)).reshape(-1, *wide)
     return np.stack([scipy.ndimage.map_coordinates(one, at, order=1) for one in each], 1)
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from jaxevent.egomotion.scores import UNITS
+from jaxevent.egomotion.scores import METRIC_UNITS
 from jaxevent.errors import InputError, install_command
 from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.show.images import (
@@ -276,7 +276,7 @@ def test_markdown_table():
 
 def test_every_number_that_is_shown_is_explained():
     assert {place for _, place, _, _ in COLUMNS} < MEASURE_MEANINGS.keys()
-    assert {*UNITS, "lost", "startup"} < MEASURE_MEANINGS.keys()
+    assert {*METRIC_UNITS, "lost", "startup"} < MEASURE_MEANINGS.keys()
 
 
 @pytest.mark.parametrize("how", TONES)

@@ -15,7 +15,7 @@ from jaxevent.errors import InputError, MissingExtra
 from jaxevent.io import save
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import view
-from jaxevent.show.track_tables import COLUMNS
+from jaxevent.show.track_tables import STATE_COLUMNS
 
 START = 5_000_000
 
@@ -116,7 +116,9 @@ def test_events_are_shown_in_windows_and_frames_at_their_times(sent):
 def test_a_track_is_an_ellipse_until_it_ends(sent, tmp_path):
     state = {"x": 3.0, "y": 4.0, "vx": 0, "vy": 0, "lambda1": 2.0, "lambda2": 0.5, "theta": 0.3}
     rows = [{"t": 5.0 + 0.01 * k, "id": 7, **state, "q": 0} for k in range(3)]
-    pd.DataFrame(rows, columns=["t", "id", *COLUMNS]).to_csv(tmp_path / "tracks.csv", index=False)
+    pd.DataFrame(rows, columns=["t", "id", *STATE_COLUMNS]).to_csv(
+        tmp_path / "tracks.csv", index=False
+    )
     view(seen(), tmp_path, out=tmp_path / "a.rrd")
     assert (tmp_path / "a.rrd").read_text() == "complete"
     (name, times, outline), (_, end, _), (_, _, path) = [
@@ -178,7 +180,9 @@ def test_the_viewer_itself_reads_it(tmp_path):
     pytest.importorskip("rerun", reason="the extra view is not installed")
     state = {"x": 3.0, "y": 4.0, "vx": 0, "vy": 0, "lambda1": 2.0, "lambda2": 0.5, "theta": 0.3}
     rows = [{"t": 5.0 + 0.01 * k, "id": 7, **state, "q": 0} for k in range(3)]
-    pd.DataFrame(rows, columns=["t", "id", *COLUMNS]).to_csv(tmp_path / "tracks.csv", index=False)
+    pd.DataFrame(rows, columns=["t", "id", *STATE_COLUMNS]).to_csv(
+        tmp_path / "tracks.csv", index=False
+    )
     table = {"t": [5.0, 5.1, 5.2], "vx": [1.0, 2.0, 3.0]}
     pd.DataFrame(table).to_csv(tmp_path / "motion.csv", index=False)
     out = tmp_path / "a.rrd"

@@ -1,7 +1,7 @@
 """Loop over chunks, steps and tracks that the kernels of all filters share, as `run` has it.
 
 The numbers of a track are a row of `reals` and a row of `integers`; the loop's own come first, in
-the order of `REALS` and `INTEGERS`. What differs between filters are the functions of
+the order of `REAL_NAMES` and `INTEGER_NAMES`. What differs between filters are the functions of
 `TrackFunctions`, which `program` writes; so this module is compiled once.
 """
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from jaxevent.blob.prepare import MAX_CHUNK_US
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
-REALS = (
+REAL_NAMES = (
     "track.gate.0", "track.hits.0", "p.0", "p.1", "long.0", "xi.0", "xi.1", "size.0", "frame.0",
     "frame.1",
 )  # fmt: skip
 GATE, HITS, P, _, LONG, XI, _, SIZE, FRAME, _ = range(10)
-INTEGERS = (
+INTEGER_NAMES = (
     "track.last_update.0", "track.last_hit.0", "track.birth.0", "track.last_apart.0", "track.id.0",
     "track.confirmed.0", "limit.0", "events.time.0", "stop.0", "evidence.merging.0",
     "evidence.detected.0", "decision.confirmed.0", "decision.end_reason.0", "decision.death.0",

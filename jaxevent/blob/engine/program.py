@@ -43,23 +43,23 @@ from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
 
 MAX_OPERATIONS = 4000  # of a module; beyond, numba compiles longer than XLA's scan takes
 
-FUNCTION = """@cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **OPTIONS)
+FUNCTION_TEXT = """@cfunc(types.void(CELLS, WHOLE, CELLS, WHOLE, NUMBERS, I, I, I, I), **OPTIONS)
 def {name}(reals, integers, work, owners, numbers, target, row, size, count):
     of_reals, of_integers = target * {n_reals}, target * {n_integers}
 {body}
 
 
 """
-ALONE = """@numba.njit(**LOOP_OPTIONS)
+ALONE_TEXT = """@numba.njit(**LOOP_OPTIONS)
 def alone_0(work, numbers, row, size, count):
     for i in range(count):
 {body}
 
 
 """
-ARGUMENTS = ("work", "owners", "row", "size", "count")
-EVENTS = ElementLoop("i", "count", ARGUMENTS)
-TRACKS_OF_EVENT = ElementLoop("k", "count", ARGUMENTS)
+LOOP_ARGUMENTS = ("work", "owners", "row", "size", "count")
+EVENT_LOOP = ElementLoop("i", "count", LOOP_ARGUMENTS)
+TRACK_LOOP = ElementLoop("k", "count", LOOP_ARGUMENTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Layout:
 
     def function(self, name: str, lines: list[str]) -> str:
         """Return the text of a function with these lines."""
-        return FUNCTION.format(
+        return FUNCTION_TEXT.format(
             name=name,
             body="\n".join(lines),
             n_reals=len(self.reals),
@@ -260,8 +260,8 @@ def trace_track(
 
 def _make_layout(trees: Mapping[str, Any]) -> Layout:
     """Lay out the loop's own numbers first, then all others of one track."""
-    reals = {name: k for k, name in enumerate(loop.REALS)}
-    integers = {name: k for k, name in enumerate(loop.INTEGERS)}
+    reals = {name: k for k, name in enumerate(loop.REAL_NAMES)}
+    integers = {name: k for k, name in enumerate(loop.INTEGER_NAMES)}
     for name, tree in trees.items():
         for leaf_name, leaf in name_leaves(name, tree).items():
             if ELEMENTS in leaf.shape:
@@ -341,11 +341,11 @@ def write_track(program: TrackProgram) -> ModuleText:
             writer.addresses, to = _weight_texts("row", "i")
             lines = writer.lines([*results.values()], 8)
             lines += [f"        {to[k].format(writer.name(n))}" for k, n in results.items()]
-            writer.loops.append(ALONE.format(body="\n".join(lines)))
+            writer.loops.append(ALONE_TEXT.format(body="\n".join(lines)))
             lines = ["    alone_0(work, numbers, row, size, count)"]
         elif name == "weights":
             writer.addresses, to = _weight_texts(f"{TRACKS} + {ROWS_PER_TRACK} * k", "row")
-            lines = writer.body(name, function, to, TRACKS_OF_EVENT)
+            lines = writer.body(name, function, to, TRACK_LOOP)
         elif name == "step" and program.single:
             writer.addresses = places
             lines = _step_lines(writer, program, function, stores)
@@ -356,7 +356,7 @@ def write_track(program: TrackProgram) -> ModuleText:
                 for key, text in stores.items()
                 if key in results and results[key].args != (key,)
             }
-            lines = writer.body(name, function, changed, EVENTS)
+            lines = writer.body(name, function, changed, EVENT_LOOP)
         texts.append(program.layout.function(name, lines))
     return writer.module("Functions of one track (`jaxevent.blob.engine`).", texts, program.layout)
 

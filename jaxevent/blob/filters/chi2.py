@@ -34,7 +34,7 @@ from jaxevent.blob.tracker import Tracker
 from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Count, Positive
 
-P_POSITION_MAX = 1e6  # px^2; in single precision a longer pause would leave nothing of R
+MAX_POSITION_VARIANCE_PX2 = 1e6  # px^2; in single precision a longer pause would leave nothing of R
 
 
 class WindowParams(TrackerParams):
@@ -226,7 +226,7 @@ def _rotate_residuals(
 def _limit_variances(params: WindowParams, state: Chi2State) -> tuple[Array, Array]:
     """Limit variances in P; return too whether the position is certain enough for the shape."""
     P = state.P
-    limits = {0: P_POSITION_MAX, 1: P_POSITION_MAX, 6: params.P_theta_max}
+    limits = {0: MAX_POSITION_VARIANCE_PX2, 1: MAX_POSITION_VARIANCE_PX2, 6: params.P_theta_max}
     if state.logarithmic:
         limits |= {4: 1.0, 5: 1.0}
     keep = [jnp.ones((), P.dtype)] * len(state.x)

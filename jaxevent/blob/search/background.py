@@ -19,11 +19,13 @@ from jaxevent.blob.search.stream import CountedSpans, Stream, cell_at
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.events.filters import busiest_neighbour
 
-SLICES = 64  # equal parts of the recording's time
+N_TIME_SLICES = 64  # equal parts of the recording's time
 CELL_PX, FINE_CELL_PX = 16, 4  # px, sides of cells; fine ones where the background is bright
-GOLDEN = 0.5 * (5**0.5 - 1)
-AT_REST = np.eye(2, 3)  # the map of a scene that does not move
-REFERENCE_PX = np.array([[60.0, 60], [180, 60], [60, 180], [180, 180]])  # points that show motion
+GOLDEN_RATIO_CONJUGATE = 0.5 * (5**0.5 - 1)
+REST_AFFINE_MAP = np.eye(2, 3)  # the map of a scene that does not move
+REFERENCE_POINTS_PX = np.array(
+    [[60.0, 60], [180, 60], [60, 180], [180, 180]]
+)  # points that show motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +43,7 @@ class SceneMotion:
     @property
     def travel(self) -> float:
         """Largest distance (px) of the reference points from their places at the start."""
-        return float(np.hypot(*(self._reference() - REFERENCE_PX[:, None]).T).max())
+        return float(np.hypot(*(self._reference() - REFERENCE_POINTS_PX[:, None]).T).max())
 
     @property
     def speed(self) -> float:
@@ -51,7 +53,7 @@ class SceneMotion:
 
     def _reference(self) -> NDArray[np.float64]:
         """(4, n, 2) px, places of the reference points."""
-        moved = np.einsum("nij,kj->kni", self.maps[:, :, :2], REFERENCE_PX)
+        moved = np.einsum("nij,kj->kni", self.maps[:, :, :2], REFERENCE_POINTS_PX)
         return moved + self.maps[:, :, 2]
 
     def _coefficients(self, t: Any) -> Any:
@@ -116,15 +118,15 @@ class Background:
     duration: float
     scene: SceneMotion | None = None
     corner: tuple[int, int] = (0, 0)
-    level: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.ones(SLICES))
+    level: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.ones(N_TIME_SLICES))
     _means: dict[int, NDArray[np.float64]] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     def slice_at(self, t: NDArray | float | int) -> Any:
         """Return the indices of the slices that hold times (s)."""
-        part = np.asarray(t) / self.duration * SLICES
-        return np.clip(part, 0, SLICES - 1).astype(np.int64)
+        part = np.asarray(t) / self.duration * N_TIME_SLICES
+        return np.clip(part, 0, N_TIME_SLICES - 1).astype(np.int64)
 
     def rate_at(
         self, x: NDArray | float | int, y: NDArray | float | int, t: Any, over: int = FINE_CELL_PX
@@ -142,7 +144,7 @@ class Background:
 
     def rate_field(self, t: float | int, over: int = FINE_CELL_PX) -> CellField:
         """Return `rate_at` of one time (s) as a field."""
-        now = min(max(int(t / self.duration * SLICES), 0), SLICES - 1)
+        now = min(max(int(t / self.duration * N_TIME_SLICES), 0), N_TIME_SLICES - 1)
         factor = float(self.activity[now])
         return CellField(self._mean_rates(over), FINE_CELL_PX, factor, self._map_at(t))
 
@@ -162,7 +164,7 @@ class Background:
 
     def _map_at(self, t: float | int) -> NDArray[np.float64]:
         """Return the map (2, 3) from pixels at a time (s) to px from `corner`."""
-        return AT_REST if self.scene is None else _map_to_scene(self.scene, self.corner, t)
+        return REST_AFFINE_MAP if self.scene is None else _map_to_scene(self.scene, self.corner, t)
 
     @functools.cached_property
     def min_rate(self) -> float:
@@ -208,7 +210,9 @@ def spans_at_rest(
 ) -> CountedSpans:
     """Divide spans (n, 2) s so that the scene is at rest in each part, counted in its span."""
     if scene is None:
-        return CountedSpans(spans, np.tile(AT_REST, (len(spans), 1, 1)), np.arange(len(spans)))
+        return CountedSpans(
+            spans, np.tile(REST_AFFINE_MAP, (len(spans), 1, 1)), np.arange(len(spans))
+        )
     times = [scene.still_times(*span) for span in spans]
     parts = np.concatenate([np.stack([t[:-1], t[1:]], 1) for t in times])
     maps = np.stack([_map_to_scene(scene, corner, t) for t in parts.mean(1)])
@@ -219,8 +223,8 @@ def count_in_slices(
     stream: Stream, shape: tuple[int, int], scene: SceneMotion | None, corner: tuple[int, int]
 ) -> NDArray[np.int32]:
     """Count events in the fine cells (rows, columns) of a scene, in all slices."""
-    cells = np.zeros((SLICES, *shape), np.int32)
-    edges = np.linspace(0, stream.duration, SLICES + 1)
+    cells = np.zeros((N_TIME_SLICES, *shape), np.int32)
+    edges = np.linspace(0, stream.duration, N_TIME_SLICES + 1)
     spans = spans_at_rest(np.stack([edges[:-1], edges[1:]], 1), scene, corner)
     stream.count_in_cells(spans, FINE_CELL_PX, cells)
     return cells
@@ -306,7 +310,7 @@ def _background_of_counts(cells: NDArray[np.int32], duration: float) -> Backgrou
     ratio = N / m
     low = ratio <= np.quantile(ratio, 0.7, axis=(1, 2), keepdims=True)
     counted, expected = (N * low).sum((1, 2)), (m * low).sum((1, 2))
-    activity = np.ones(SLICES)
+    activity = np.ones(N_TIME_SLICES)
     typical = float(np.median(counted / expected))
     if typical > 0 and counted.mean() >= CONFIG.min_calm_events:
         activity = np.maximum(1, counted / expected / typical)
@@ -325,7 +329,7 @@ def _background_of_counts(cells: NDArray[np.int32], duration: float) -> Backgrou
             density = np.where(full, np.maximum(m / cell**2, least), density)
     filled = np.maximum(np.quantile(N, CONFIG.filled_quantile, axis=0), 1)
     level = np.median(N / filled, axis=(1, 2))
-    rate = density / (duration / SLICES)
+    rate = density / (duration / N_TIME_SLICES)
     return Background(rate, calm, bright, activity, duration, level=level)
 
 
@@ -341,7 +345,7 @@ def _calm_mean(N: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
     For small counts the mean follows from the share of zeros.
     """
     quarter, empty = np.quantile(N, 0.25, axis=0), (N == 0).mean(0)
-    few = np.minimum(-np.log(np.clip(empty, 0.5 / SLICES, 1)), 5.0)
+    few = np.minimum(-np.log(np.clip(empty, 0.5 / N_TIME_SLICES, 1)), 5.0)
     return quarter, np.where(quarter >= 3, quarter + 0.674 * np.sqrt(quarter + 0.5), few)
 
 
@@ -366,7 +370,7 @@ def measure_dispersions(
     for w in windows:
         # At no fixed steps, as flicker has a period.
         k = np.arange(int(min(CONFIG.max_dispersion_windows, stream.duration / w)))
-        centres.append((k + k * GOLDEN % 1) / len(k) * stream.duration)
+        centres.append((k + k * GOLDEN_RATIO_CONJUGATE % 1) / len(k) * stream.duration)
     spans = [np.stack([t - w / 2, t + w / 2], 1) for t, w in zip(centres, windows, strict=True)]
     spans = np.concatenate(spans)
     N = np.zeros((len(spans), *background.calm.shape[1:]), np.int32)

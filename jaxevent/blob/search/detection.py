@@ -20,7 +20,7 @@ from jaxevent.blob.search.stream import PixelCounts, WindowEvents
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _cells = ZeroedScratch(np.int32)
-MAX_FEW_EVENTS = 1000  # so many events are compared with the clutter wherever they are
+MAX_EXHAUSTIVE_EVENTS = 1000  # so many events are compared with the clutter wherever they are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,7 +208,7 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
     wide, g, hit = clutter.row_cells, 1 << clutter.cell_bits, scratch.hit
     # Fewer events are no evidence even where the clutter is least.
     few, least = 1, clutter.log_threshold * clutter.min_dispersion
-    while few < MAX_FEW_EVENTS and poisson_nats(few, clutter.min_events) <= least:
+    while few < MAX_EXHAUSTIVE_EVENTS and poisson_nats(few, clutter.min_events) <= least:
         few += 1
     some = count = 0
     for i in range(filled):

@@ -32,8 +32,8 @@ from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
 from jaxevent.blob.search.scene import map_gain, measure_moving_background
 from jaxevent.blob.search.stream import Stream
 
-ANGLES, RING_PX = 256, FINE_CELL_PX  # bins of a turn, and px of a ring
-BLUR_BINS = 1.5
+N_ANGLE_BINS, RING_WIDTH_PX = 256, FINE_CELL_PX  # bins of a turn, and px of a ring
+ANGLE_BLUR_BINS = 1.5
 
 
 def merge_parts(paths: list[TargetPath]) -> list[TargetPath]:
@@ -293,21 +293,23 @@ def _measure_turn(own: Stream, turn: Turn, window: float) -> SceneMotion:
     """
     number = int(own.duration / window)
     polar = _PolarImages(own, turn, window)
-    order = 1j * np.arange(ANGLES // 2 + 1)
+    order = 1j * np.arange(N_ANGLE_BINS // 2 + 1)
     step = turn.rate * window
-    reach = max(2, int(CONFIG.turn_search * abs(step) / (2 * np.pi) * ANGLES))
-    reach = min(reach, ANGLES // 2 - 1)
+    reach = max(2, int(CONFIG.turn_search * abs(step) / (2 * np.pi) * N_ANGLE_BINS))
+    reach = min(reach, N_ANGLE_BINS // 2 - 1)
     near = np.arange(-reach, reach + 1)
     angles, seen = [0.0], polar.spectrum(0)
     for k in range(1, number):
         now = polar.spectrum(k)
         expected = angles[-1] + step
-        correlation = np.fft.irfft((now * seen.conj()).sum(0) * np.exp(order * expected), ANGLES)
+        correlation = np.fft.irfft(
+            (now * seen.conj()).sum(0) * np.exp(order * expected), N_ANGLE_BINS
+        )
         best = int(near[np.argmax(correlation[near])])
-        before, peak, after = (correlation[i % ANGLES] for i in (best - 1, best, best + 1))
+        before, peak, after = (correlation[i % N_ANGLE_BINS] for i in (best - 1, best, best + 1))
         bend = before - 2 * peak + after
         top = best + (0.5 * (before - after) / bend if bend < 0 else 0.0)
-        angles.append(expected + top * 2 * np.pi / ANGLES)
+        angles.append(expected + top * 2 * np.pi / N_ANGLE_BINS)
         gain = max(CONFIG.reference_gain, 1 / (k + 1))
         seen = (1 - gain) * seen + gain * now * np.exp(order * angles[-1])
     c, s = np.cos(angles), np.sin(angles)
@@ -324,7 +326,7 @@ class _PolarImages:
         self.own, self.turn, self.window = own, turn, window
         whole = own.pixel_counts(0, own.duration)
         far = np.sort(np.hypot(whole.x - turn.centre[0], whole.y - turn.centre[1]))
-        self.rings = int(far[int(CONFIG.rim_share * (len(far) - 1))] / RING_PX) + 1
+        self.rings = int(far[int(CONFIG.rim_share * (len(far) - 1))] / RING_WIDTH_PX) + 1
 
     def spectrum(self, k: int) -> NDArray[np.complex128]:
         """Transform window k to (rings, frequencies), its events carried to its middle."""
@@ -332,11 +334,11 @@ class _PolarImages:
         dx, dy = part.x - self.turn.centre[0], part.y - self.turn.centre[1]
         late = part.t - (k + 0.5) * self.window
         angle = (np.arctan2(dy, dx) - self.turn.rate * late) / (2 * np.pi) % 1
-        ring = (np.hypot(dx, dy) / RING_PX).astype(np.int64)
-        place = ring * ANGLES + (angle * ANGLES).astype(np.int64) % ANGLES
-        size = self.rings * ANGLES
-        counts = np.bincount(place[place < size], minlength=size).reshape(-1, ANGLES)
-        image = ndimage.gaussian_filter1d(np.sqrt(counts), BLUR_BINS, axis=1, mode="wrap")
+        ring = (np.hypot(dx, dy) / RING_WIDTH_PX).astype(np.int64)
+        place = ring * N_ANGLE_BINS + (angle * N_ANGLE_BINS).astype(np.int64) % N_ANGLE_BINS
+        size = self.rings * N_ANGLE_BINS
+        counts = np.bincount(place[place < size], minlength=size).reshape(-1, N_ANGLE_BINS)
+        image = ndimage.gaussian_filter1d(np.sqrt(counts), ANGLE_BLUR_BINS, axis=1, mode="wrap")
         return np.fft.rfft(image - image.mean(1, keepdims=True))
 
 

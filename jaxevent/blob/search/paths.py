@@ -12,9 +12,9 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.deprecated import RenamedAttribute
 from jaxevent.recording import Events
 
-NO_OWNER = -1  # index of the path of an event that is near none
+NO_OWNER_INDEX = -1  # index of the path of an event that is near none
 # Velocity noises that are tried, in (larger size)^2 / window^3.
-NOISE_GRID = 10.0 ** np.arange(-7, 2.01, 0.25)
+TRIED_VELOCITY_NOISES = 10.0 ** np.arange(-7, 2.01, 0.25)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,10 +140,10 @@ def owner_candidates(events: Events, table: PathTable, sigmas: float | int) -> N
         sigmas: Radius of the gate, standard deviations.
 
     Returns:
-        (N, 2) indices of the two likeliest paths, the likelier first; `NO_OWNER` for none.
+        (N, 2) indices of the two likeliest paths, the likelier first; `NO_OWNER_INDEX` for none.
     """
     t, single = events.t, len(table.window) == 1
-    owner = np.full((len(events), 2), NO_OWNER, np.int32)
+    owner = np.full((len(events), 2), NO_OWNER_INDEX, np.int32)
     near = _Near(t, events.x, events.y, events.p, owner, np.empty((0 if single else len(t), 2)))
     rows = np.stack([np.searchsorted(t, us) for us in (table.begins, table.ends)])
     _find_owners(near, table, rows, float(sigmas) ** 2)
@@ -215,8 +215,8 @@ def _insert_owner(owner: Any, cost: Any, k: int, new: float) -> None:
 def fit_velocity_noise(t: NDArray, m: NDArray, R: NDArray, unit: float | int) -> float:
     """Fit the velocity noise of a path by maximum likelihood.
 
-    Constant-velocity Kalman filters with the noises of `NOISE_GRID` predict each mean from those
-    before.
+    Constant-velocity Kalman filters with the noises of `TRIED_VELOCITY_NOISES` predict each mean from
+    those before.
 
     Args:
         t: (windows,) s, times.
@@ -230,8 +230,8 @@ def fit_velocity_noise(t: NDArray, m: NDArray, R: NDArray, unit: float | int) ->
     """
     if len(t) < CONFIG.min_noise_windows:
         return 0.01 * unit
-    scores = np.array([_log_likelihood(t, m, R, float(q)) for q in NOISE_GRID * unit])
-    return float(NOISE_GRID[np.argmax(scores)] * unit)
+    scores = np.array([_log_likelihood(t, m, R, float(q)) for q in TRIED_VELOCITY_NOISES * unit])
+    return float(TRIED_VELOCITY_NOISES[np.argmax(scores)] * unit)
 
 
 @njit_noalloc

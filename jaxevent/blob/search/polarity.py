@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.paths import (
-    NO_OWNER,
+    NO_OWNER_INDEX,
     TargetPath,
     fit_velocity_noise,
     tabulate_paths,
@@ -92,7 +92,7 @@ def _mains_coherence(
     gate = CONFIG.gate_sigmas
     for _, part, near in batches_near_paths(recording.events, table, gate, every=every):
         owner = near[:, 0]
-        seen = (owner != NO_OWNER) & ~hot[part.y, part.x]
+        seen = (owner != NO_OWNER_INDEX) & ~hot[part.y, part.x]
         t = part.t[seen] - begin
         place = owner[seen] * pieces + t // piece
         n += np.bincount(place, minlength=n.size).reshape(n.shape)

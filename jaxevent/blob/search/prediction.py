@@ -22,10 +22,13 @@ from jaxevent.blob.search.stream import PixelCounts, Stream
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _bins = ZeroedScratch(np.int32)
-KERNEL_RADII_PX, BINS_PX = (3.0, 8.0, 20.0), (2, 4, 8)  # of the kernels, and of bins of events
-KERNELS = len(KERNEL_RADII_PX)
-EM_STEPS = 15  # expectation and maximisation, for the shares of ellipses and kernels
-STRIP_PX = 16  # px, rows of pixels that are sorted together
+KERNEL_RADII_PX, KERNEL_BINS_PX = (
+    (3.0, 8.0, 20.0),
+    (2, 4, 8),
+)  # of the kernels, and of bins of events
+N_KERNELS = len(KERNEL_RADII_PX)
+N_EM_STEPS = 15  # expectation and maximisation, for the shares of ellipses and kernels
+SORTED_STRIP_PX = 16  # px, rows of pixels that are sorted together
 MAX_SQUARED_SIGMAS = 80.0  # squared standard deviations beyond which a Gaussian is 0
 
 
@@ -42,7 +45,7 @@ def _kernel_weights(r: float, g: int) -> NDArray[np.float64]:
     return 3 / (np.pi * r**2) * np.maximum(1 - squared / r**2, 0) ** 2
 
 
-_TABLES = tuple(_kernel_weights(r, g) for r, g in zip(KERNEL_RADII_PX, BINS_PX, strict=True))
+_TABLES = tuple(_kernel_weights(r, g) for r, g in zip(KERNEL_RADII_PX, KERNEL_BINS_PX, strict=True))
 
 
 class ScoredEvents(NamedTuple):
@@ -93,9 +96,9 @@ class _PredictionScratch(NamedTuple):
         """Allocate scratch memory for so many pixels of windows and of scored events."""
         bins = tuple(
             _bins(*(n // g + table.shape[-1] for n in shape))
-            for table, g in zip(_TABLES, BINS_PX, strict=True)
+            for table, g in zip(_TABLES, KERNEL_BINS_PX, strict=True)
         )
-        strips = shape[0] // STRIP_PX + 2
+        strips = shape[0] // SORTED_STRIP_PX + 2
         return cls(
             DetectionScratch.empty(pixels), Blobs.empty(pixels), Blobs.empty(pixels),
             np.empty((pixels, 2)), np.empty((pixels, 2, 2)), np.empty((2, pixels)),
@@ -134,7 +137,7 @@ def predict(
     out = []
     for clutter in clutters:
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
-        density, sums = np.zeros((number, 1 + KERNELS)), np.zeros(3)
+        density, sums = np.zeros((number, 1 + N_KERNELS)), np.zeros(3)
         _predict(before, scored.pixels, clutter, cells, scratch, (density, sums))
         out.append(ScalePrediction(density, scored, *sums.tolist()))
     return out
@@ -155,7 +158,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
         np.array([getattr(one, name) for one in predictions])
         for name in ("expected", "large", "split")
     )
-    gains, shares = np.zeros(len(predictions)), np.full((2, 1 + KERNELS), 1 / (1 + KERNELS))
+    gains, shares = np.zeros(len(predictions)), np.full((2, 1 + N_KERNELS), 1 / (1 + N_KERNELS))
     _sum_gains(density, b, weight, ends, (np.empty(len(b), np.int64), shares), gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
@@ -169,27 +172,27 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
     near, (share, new), number = scratch[0], scratch[1], 0
     for i in range(len(b)):
         total = 0.0
-        for j in range(1 + KERNELS):
+        for j in range(1 + N_KERNELS):
             total += density[i, j]
         if total > 0:  # a blob may reach the pixel
             near[number] = i
             number += 1
-    for _ in range(EM_STEPS):
-        for j in range(1 + KERNELS):
+    for _ in range(N_EM_STEPS):
+        for j in range(1 + N_KERNELS):
             new[j] = 0.0
         for k in range(number):
             i = near[k]
             total = b[i]
-            for j in range(1 + KERNELS):
+            for j in range(1 + N_KERNELS):
                 total += density[i, j] * share[j]
             part = weight[i] / total
-            for j in range(1 + KERNELS):
+            for j in range(1 + N_KERNELS):
                 new[j] += part * density[i, j]
         total = 0.0
-        for j in range(1 + KERNELS):
+        for j in range(1 + N_KERNELS):
             share[j] = share[j] * new[j] + 1e-12
             total += share[j]
-        for j in range(1 + KERNELS):
+        for j in range(1 + N_KERNELS):
             share[j] /= total
     window = 0
     for k in range(number):
@@ -197,7 +200,7 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
         while i >= ends[window + 1]:
             window += 1
         total = 0.0
-        for j in range(1 + KERNELS):
+        for j in range(1 + N_KERNELS):
             total += density[i, j] * share[j]
         gains[window] += weight[i] * np.log(total / b[i] + 1)
 
@@ -219,11 +222,11 @@ def _predict(before: Any, scored: Any, clutter: Any, cells: Any, scratch: Any, o
     pixels = _move_pixels(second, scratch)
     for j in range(near):
         order[j] = j
-    for k in range(KERNELS - 1, -1, -1):
+    for k in range(N_KERNELS - 1, -1, -1):
         added = density[:, k + 1]
         _add_kernels(added, scored, order[:near], pixels, k, scratch)
         # What the widest one does not reach the others do not.
-        if k == KERNELS - 1:
+        if k == N_KERNELS - 1:
             near = 0
             for j in range(len(scored.x)):
                 if added[j] > 0:
@@ -268,12 +271,12 @@ def _add_ellipses(density: Any, x: Any, y: Any, number: int, scratch: Any) -> No
     for j in range(strips + 1):
         first[j] = 0
     for j in range(len(x)):
-        first[y[j] // STRIP_PX + 1] += 1
+        first[y[j] // SORTED_STRIP_PX + 1] += 1
     for j in range(strips):
         first[j + 1] += first[j]
         following[j] = first[j]
     for j in range(len(x)):
-        strip = y[j] // STRIP_PX
+        strip = y[j] // SORTED_STRIP_PX
         order[following[strip]] = j
         following[strip] += 1
     for k in range(number):
@@ -281,8 +284,8 @@ def _add_ellipses(density: Any, x: Any, y: Any, number: int, scratch: Any) -> No
         determinant = a * c - b * b
         peak = n[k] / (2 * np.pi * np.sqrt(determinant))
         wide, high = np.sqrt(MAX_SQUARED_SIGMAS * a), np.sqrt(MAX_SQUARED_SIGMAS * c)
-        low = min(max(int((p[k, 1] - high) / STRIP_PX), 0), strips - 1)
-        top = min(max(int((p[k, 1] + high) / STRIP_PX), 0), strips - 1)
+        low = min(max(int((p[k, 1] - high) / SORTED_STRIP_PX), 0), strips - 1)
+        top = min(max(int((p[k, 1] + high) / SORTED_STRIP_PX), 0), strips - 1)
         for i in range(first[low], first[top + 1]):
             j = order[i]
             ex, ey = x[j] - p[k, 0], y[j] - p[k, 1]

@@ -27,8 +27,8 @@ from jaxevent.blob.search.detection import (
 from jaxevent.blob.search.prediction import ScalePrediction, predict, sample_scored, score
 from jaxevent.blob.search.stream import PixelCounts, Stream
 
-WINDOWS_US = 500 * 2 ** np.arange(12)
-CELLS_PX = (2, 4, 8, 16)
+TRIED_WINDOWS_US = 500 * 2 ** np.arange(12)
+TRIED_CELLS_PX = (2, 4, 8, 16)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ def select_scale(
         The scale; None if the recording is too short or nothing is gained.
     """
     longest = min(stream.duration / CONFIG.min_windows, background.max_window)
-    windows = np.asarray(WINDOWS_US[WINDOWS_US * 1e-6 <= longest] * 1e-6, np.float64)
+    windows = np.asarray(TRIED_WINDOWS_US[TRIED_WINDOWS_US * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
         return None
     number = CONFIG.scale_trials if min_gain is None else CONFIG.later_scale_trials
@@ -73,7 +73,7 @@ def select_scale(
     good = scores >= best - CONFIG.equal_score_loss * best
     most = raw.max(0)
     sharp = raw >= most - (1 - CONFIG.sharp_score) * abs(most)
-    cells = range(len(CELLS_PX))
+    cells = range(len(TRIED_CELLS_PX))
     longest = [trial.scales[np.flatnonzero(sharp[:, j]).max()][j] for j in cells]
     gaps, some = _GapTest(stream, background), trial.begins[::2]
     for j in cells[::-1]:
@@ -100,12 +100,12 @@ class _ScaleTrial:
         self.begins = np.clip(stream.quantile_times(number)[:, None], 2 * windows, last)
         dispersions = measure_dispersions(stream, background, windows)
         self.scales = [
-            [Scale(float(w), cell, dispersion) for cell in CELLS_PX]
+            [Scale(float(w), cell, dispersion) for cell in TRIED_CELLS_PX]
             for w, dispersion in zip(windows, dispersions, strict=True)
         ]
-        self.tried = np.ones((len(windows), len(CELLS_PX)), bool)
+        self.tried = np.ones((len(windows), len(TRIED_CELLS_PX)), bool)
         self.predictions: list[list[list[ScalePrediction]]] = [
-            [[] for _ in CELLS_PX] for _ in windows
+            [[] for _ in TRIED_CELLS_PX] for _ in windows
         ]
 
     def evaluate(self, trials: NDArray[np.int64]) -> None:
@@ -130,7 +130,7 @@ class _ScaleTrial:
             The most that one of the scales may gain, nats per event.
         """
         most = -np.inf
-        for j in range(len(CELLS_PX)):
+        for j in range(len(TRIED_CELLS_PX)):
             scores = [score(one[j]) for one in self.predictions]
             best = max(scores, key=lambda one: one.raw)
             for i, one in enumerate(scores):

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from jaxevent.blob.search.background import (
-    AT_REST,
     CELL_PX,
     FINE_CELL_PX,
-    SLICES,
+    N_TIME_SLICES,
+    REST_AFFINE_MAP,
     Background,
     SceneMotion,
     count_in_slices,
@@ -29,16 +29,19 @@ from jaxevent.blob.search.background import (
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import clutter_model, detect
 from jaxevent.blob.search.paths import TargetPath
-from jaxevent.blob.search.scale import WINDOWS_US, ScaleSelection
+from jaxevent.blob.search.scale import TRIED_WINDOWS_US, ScaleSelection
 from jaxevent.blob.search.stream import Stream, WindowEvents
 from jaxevent.codegen import njit, njit_inlined
 
-BLURS_BINS = (4, 2, 1)  # standard deviations of blurs, from coarse to fine
-MAX_STEPS, MIN_STEP_BINS = 8, 0.02  # Gauss-Newton steps, and the step at which they end
-TILES = 4  # along each side of the sensor
+BLUR_SIGMAS_BINS = (4, 2, 1)  # standard deviations of blurs, from coarse to fine
+MAX_GAUSS_NEWTON_STEPS, MIN_STEP_BINS = (
+    8,
+    0.02,
+)  # Gauss-Newton steps, and the step at which they end
+N_TILES_PER_SIDE = 4  # along each side of the sensor
 # Windows in those of blobs: of a shaking scene any of them may be suitable.
-WINDOW_RATIOS = (1, 1 / 4, 1 / 16, 4)
-VELOCITY_STEP_S = 0.01  # s before and after, between which the scene's velocity is measured
+TRIED_WINDOW_RATIOS = (1, 1 / 4, 1 / 16, 4)
+VELOCITY_DIFFERENCE_S = 0.01  # s before and after, between which the scene's velocity is measured
 
 
 def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
@@ -53,7 +56,7 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
     steps = int(min(CONFIG.max_scene_steps, stream.duration / window))
     begins = np.linspace(0, stream.duration - window, steps)
     bins = -(-max(stream.width, stream.height) // CONFIG.max_image_bins)
-    maps, motion, reference = [AT_REST], None, None
+    maps, motion, reference = [REST_AFFINE_MAP], None, None
     for number, begin in enumerate(begins):
         image = _event_image(stream.window(begin, begin + window), stream, bins)
         if reference is None:
@@ -95,9 +98,9 @@ def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
 
 def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]:
     """Estimate the motion (3,), see `_normal_equations`, that takes one image to the other."""
-    for blur in BLURS_BINS:
+    for blur in BLUR_SIGMAS_BINS:
         a, b = (ndimage.gaussian_filter(image, blur, mode="constant") for image in (one, other))
-        for _ in range(MAX_STEPS):
+        for _ in range(MAX_GAUSS_NEWTON_STEPS):
             H, gradient = _normal_equations(a, b, motion)
             H += np.eye(3) * (1e-4 * np.trace(H) / 3 + 1e-12)
             step = np.linalg.solve(H, gradient)
@@ -200,7 +203,7 @@ def split_at_pauses(background: Background) -> list[tuple[float, float]]:
     quiet = ndimage.binary_opening(background.level < CONFIG.pause_level * full, long)
     moves = ndimage.binary_opening(~quiet, long)
     first = np.flatnonzero(np.diff(moves)) + 1 if is_dense(background) else []
-    edges = np.array([0, *first, SLICES]) / SLICES * background.duration
+    edges = np.array([0, *first, N_TIME_SLICES]) / N_TIME_SLICES * background.duration
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
@@ -219,9 +222,9 @@ def find_moving_background(
     """
     if _count_filled_tiles(stream, background, selection) < CONFIG.filled_tiles:
         return None
-    for ratio in WINDOW_RATIOS:
+    for ratio in TRIED_WINDOW_RATIOS:
         window = ratio * selection.scale.window
-        if not WINDOWS_US[0] * 1e-6 <= window <= stream.duration / CONFIG.min_windows:
+        if not TRIED_WINDOWS_US[0] * 1e-6 <= window <= stream.duration / CONFIG.min_windows:
             continue
         scene = measure_scene_motion(stream, window)
         moving = measure_moving_background(stream, scene)
@@ -254,7 +257,7 @@ def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
     """Compute the nats per event that a map gains by moving, in most windows of w s."""
     scene = moving.scene
     assert scene is not None
-    rest = dataclasses.replace(scene, maps=np.broadcast_to(AT_REST, scene.maps.shape))
+    rest = dataclasses.replace(scene, maps=np.broadcast_to(REST_AFFINE_MAP, scene.maps.shape))
     still, gains = measure_moving_background(stream, rest), []
     for t in np.maximum(stream.quantile_times(CONFIG.scale_trials), w):
         part = stream.window(t - w, t)
@@ -279,8 +282,8 @@ def _count_filled_tiles(stream: Stream, background: Background, selection: Scale
         clutter = clutter_model(background, selection.scale, stream.shape, t)
         labels, _ = detect(part, clutter, stream.shape)
         y, x = part.y[labels > 0], part.x[labels > 0]
-        place = y * TILES // rows * TILES + x * TILES // columns
-        tiles.append((np.bincount(place, minlength=TILES**2) >= few).sum())
+        place = y * N_TILES_PER_SIDE // rows * N_TILES_PER_SIDE + x * N_TILES_PER_SIDE // columns
+        tiles.append((np.bincount(place, minlength=N_TILES_PER_SIDE**2) >= few).sum())
         strips = [width * v < n for v, n in ((x, columns), (y, rows))]
         strips += [width * (n - 1 - v) < n for v, n in ((x, columns), (y, rows))]
         sides.append(sum(strip.sum() >= few for strip in strips))
@@ -343,7 +346,9 @@ def _scene_flow(
     path: TargetPath, scene: SceneMotion, t: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Compute velocities (rows, 2) px/s of the scene at a path's places."""
-    now = np.clip(t[:, None] + [-VELOCITY_STEP_S, VELOCITY_STEP_S], scene.t[0], scene.t[-1])
+    now = np.clip(
+        t[:, None] + [-VELOCITY_DIFFERENCE_S, VELOCITY_DIFFERENCE_S], scene.t[0], scene.t[-1]
+    )
     x, y = scene.to_scene(path.p[:, 0], path.p[:, 1], t)
     x, y = scene.to_sensor(x[:, None], y[:, None], now)
     flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
@@ -360,7 +365,7 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
         scene: Motion of the scene.
     """
     size = np.array([stream.width, stream.height])
-    middles = (np.arange(SLICES) + 0.5) / SLICES * stream.duration
+    middles = (np.arange(N_TIME_SLICES) + 0.5) / N_TIME_SLICES * stream.duration
     x, y = (np.array([[0, 1, 0, 1], [0, 0, 1, 1]]) * (size[:, None] - 1))[..., None]
     places = np.stack(scene.to_scene(x, y, middles))
     low = np.floor(places.min((1, 2)))
@@ -384,7 +389,7 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
     known = expected > 0
     usual = max(float(rate[known].mean()), 0.02 / CELL_PX**2)
     rate = np.where(known, np.maximum(rate, CONFIG.min_rate_share * usual), usual)
-    rate = rate * SLICES / stream.duration
+    rate = rate * N_TIME_SLICES / stream.duration
     bright = np.ones((rows, columns), bool)
     return Background(rate, calm, bright, activity, stream.duration, scene, corner)
 

@@ -37,9 +37,9 @@ from jaxevent.recording import Recording
 
 # Coefficients of x^3, x^2 and x in 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)), see
 # `max_events_per_step`.
-VARIANCE_GROWTH = (1 / (3 * 2**0.5), 1.0, 2**0.5)
-START_WINDOWS = 4  # windows that give a target's size at its start
-FOREVER_S, ANYWHERE_PX = 1e3, 1e9  # the search decides when targets end
+VARIANCE_GROWTH_COEFFICIENTS = (1 / (3 * 2**0.5), 1.0, 2**0.5)
+N_START_SIZE_WINDOWS = 4  # windows that give a target's size at its start
+UNLIMITED_COAST_S, UNLIMITED_SIGMA_PX = 1e3, 1e9  # the search decides when targets end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +123,7 @@ class TargetSearchResult:
             x, y = path.p[0]
             at = int(np.clip(path.begin, start, stop - 1))
             x, y = np.clip(x, -0.5, width - 0.5), np.clip(y, -0.5, height - 0.5)
-            size = np.median(path.size[:START_WINDOWS].mean(1))
+            size = np.median(path.size[:N_START_SIZE_WINDOWS].mean(1))
             out.append((float(x), float(y), float(size), at))
         return out
 
@@ -155,10 +155,10 @@ class TargetSearchResult:
             "events_per_step": events,
             "lambda_min": min(0.5, smallest / 3),
             "lambda_max": 6 * largest,
-            "t_coast": FOREVER_S,
-            "t_merge": FOREVER_S,
+            "t_coast": UNLIMITED_COAST_S,
+            "t_merge": UNLIMITED_COAST_S,
             "aspect_max": 1e3,
-            "sigma_max": ANYWHERE_PX,
+            "sigma_max": UNLIMITED_SIGMA_PX,
             "cycle": W,
         }
 
@@ -252,7 +252,7 @@ def max_events_per_step(
     Returns:
         (targets,) events per step.
     """
-    roots = np.roots([*VARIANCE_GROWTH, 1 - (1 + accuracy) ** 2])
+    roots = np.roots([*VARIANCE_GROWTH_COEFFICIENTS, 1 - (1 + accuracy) ** 2])
     x = float(roots[abs(roots.imag) < 1e-9].real.max())
     return x * rate * (size**2 / rate / noise) ** 0.25
 

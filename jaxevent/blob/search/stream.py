@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.search.paths import (
-    NO_OWNER,
+    NO_OWNER_INDEX,
     PathTable,
     TargetPath,
     owner_candidates,
@@ -18,9 +18,12 @@ from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events, EventSource, Recording
 
 _counts = ZeroedScratch(np.int32)
-BATCH_EVENTS = 1 << 20  # events read at a time
+EVENTS_PER_READ = 1 << 20  # events read at a time
 MAX_HELD_EVENTS = 1 << 22  # a stream of so many events is held in memory
-ALL, COLD = np.ones(0, bool), np.zeros((0, 0), bool)  # all events are kept, no pixel is hot
+KEEP_ALL_MASK, NO_HOT_PIXELS = (
+    np.ones(0, bool),
+    np.zeros((0, 0), bool),
+)  # all events are kept, no pixel is hot
 
 
 class WindowEvents(NamedTuple):
@@ -59,8 +62,8 @@ class _Rows(NamedTuple):
     t: NDArray[np.int64]  # us
     x: NDArray[np.integer]
     y: NDArray[np.integer]
-    hot: NDArray[np.bool_]  # (rows, columns) pixels that are left out, or `COLD`
-    kept: NDArray[np.bool_]  # events that are kept, or `ALL`
+    hot: NDArray[np.bool_]  # (rows, columns) pixels that are left out, or `NO_HOT_PIXELS`
+    kept: NDArray[np.bool_]  # events that are kept, or `KEEP_ALL_MASK`
 
 
 class Stream:
@@ -122,14 +125,14 @@ class Stream:
         stream, table = copy.copy(self), tabulate_paths(paths)
         if self._held is not None:
             events = self._held if until is None else self._held[: self._index(until)]
-            stream._held = events[owner_candidates(events, table, sigmas)[:, 0] == NO_OWNER]
+            stream._held = events[owner_candidates(events, table, sigmas)[:, 0] == NO_OWNER_INDEX]
             return stream
         kept = np.ones(len(self), bool) if self._kept is None else self._kept.copy()
         rows = self._first, self._last if until is None else self._index(until)
         left, number = [Events.empty()], 0
         for row, part, owner in batches_near_paths(self.recording.events, table, sigmas, rows):
             stays = kept[row - self._first :][: len(part)]
-            stays &= owner[:, 0] == NO_OWNER
+            stays &= owner[:, 0] == NO_OWNER_INDEX
             if number <= MAX_HELD_EVENTS:
                 left.append(part[stays & ~self.hot[part.y, part.x] if self._any_hot else stays])
                 number += len(left[-1])
@@ -188,8 +191,8 @@ class Stream:
             return
         for k, (begin, end) in enumerate(us.tolist()):
             one, last = CountedSpans._make(v[k : k + 1] for v in spans), self._index(end)
-            for row in range(self._index(begin), last, BATCH_EVENTS):
-                rows = self._rows(row, min(row + BATCH_EVENTS, last))
+            for row in range(self._index(begin), last, EVENTS_PER_READ):
+                rows = self._rows(row, min(row + EVENTS_PER_READ, last))
                 _add_to_cells(rows, np.array([[0, len(rows.t)]]), one, cell, counts)
 
     def count_in_spans(
@@ -209,8 +212,8 @@ class Stream:
         edges = np.argsort(us, kind="stable")
         us, done, before = us[edges], 0, np.zeros(counts.shape[1:], np.int32)
         first, last = self._index(int(us[0])), self._index(int(us[-1]))
-        for row in range(first, last, BATCH_EVENTS):
-            end = min(row + BATCH_EVENTS, last)
+        for row in range(first, last, EVENTS_PER_READ):
+            end = min(row + EVENTS_PER_READ, last)
             rows = self._rows(row, end)
             limits = np.searchsorted(rows.t, us[done:])
             some = len(limits) if end == last else int(np.searchsorted(limits, len(rows.t)))
@@ -239,11 +242,14 @@ class Stream:
     def _rows(self, first: int, last: int) -> _Rows:
         """Return rows of the events with the masks of those left out."""
         if self._held is not None:
-            events, hot, kept = self._held[first:last], COLD, ALL
+            events, hot, kept = self._held[first:last], NO_HOT_PIXELS, KEEP_ALL_MASK
         else:
-            events, hot = self.recording.events[first:last], self.hot if self._any_hot else COLD
+            events, hot = (
+                self.recording.events[first:last],
+                self.hot if self._any_hot else NO_HOT_PIXELS,
+            )
             some = slice(first - self._first, last - self._first)
-            kept = ALL if self._kept is None else self._kept[some]
+            kept = KEEP_ALL_MASK if self._kept is None else self._kept[some]
         return _Rows(events.t, events.x, events.y, hot, kept)
 
 
@@ -269,8 +275,8 @@ def batches_near_paths(
     """
     if rows is None:
         rows = events.index(int(table.begins.min())), events.index(int(table.ends.max()))
-    for row in range(*rows, BATCH_EVENTS):
-        part = events[row : min(row + BATCH_EVENTS, rows[1])]
+    for row in range(*rows, EVENTS_PER_READ):
+        part = events[row : min(row + EVENTS_PER_READ, rows[1])]
         part = part if every == 1 else part[::every]
         yield row, part, owner_candidates(part, table, sigmas)
 

@@ -52,19 +52,19 @@ from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterva
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
-COARSE_BLUR = 8  # times [1 2 1] in a search: 2 px
-MIDDLE_BLUR = 2  # times, next
-GRID_SPACING_PX = 2.0  # at the end of a short window, between motions of its grid
-GRID_FACTOR = 4.0  # between the ranges of the grids of a search
-N_CANDIDATES = 4  # motions of a grid that are refined
-CELL_PX = 24  # of the parts of the image whose errors are independent
-PROBE_PX = 0.5  # at the window's end, from the maximum, where the curvature is measured
-MIN_SLOPE = 1e-3  # 1/px, relative to the objective, at which an ascent ends
-WINDOW_DISPLACEMENT_PX = 10.0  # of the image in a window, at best
-DISPLACEMENT_LIMITS_PX = (5.0, 60.0)  # within which the default is kept
-DURATION_LIMITS_S = (0.002, 2.0)
-CALIBRATION = CovarianceCalibration(change=0.09)
-INITIAL_VARIANCE = 2.0  # px^2, inverse curvature relative to the objective, at the start
+N_COARSE_BLURS = 8  # times [1 2 1] in a search: 2 px
+N_MIDDLE_BLURS = 2  # times, next
+FINEST_GRID_SPACING_PX = 2.0  # at the end of a short window, between motions of its grid
+GRID_RANGE_RATIO = 4.0  # between the ranges of the grids of a search
+N_REFINED_MOTIONS = 4  # motions of a grid that are refined
+INDEPENDENT_CELL_PX = 24  # of the parts of the image whose errors are independent
+CURVATURE_PROBE_PX = 0.5  # at the window's end, from the maximum, where the curvature is measured
+MIN_RELATIVE_GRADIENT = 1e-3  # 1/px, relative to the objective, at which an ascent ends
+BEST_WINDOW_DISPLACEMENT_PX = 10.0  # of the image in a window, at best
+WINDOW_DISPLACEMENT_RANGE_PX = (5.0, 60.0)  # within which the default is kept
+WINDOW_DURATION_RANGE_S = (0.002, 2.0)
+COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.09)
+INITIAL_VARIANCE_PX2 = 2.0  # px^2, inverse curvature relative to the objective, at the start
 
 Numeric = Array | np.ndarray
 
@@ -184,7 +184,7 @@ def warped_image(
     def blur_again(J, k):
         return lax.cond(k < times, blur, lambda J: J, J), None
 
-    return lax.scan(blur_again, image, jnp.arange(max(COARSE_BLUR, params.blur)))[0]
+    return lax.scan(blur_again, image, jnp.arange(max(N_COARSE_BLURS, params.blur)))[0]
 
 
 def objective(
@@ -229,9 +229,20 @@ def _cell_gradients(params: Params, window: Window, z: Array) -> Float[Array, "c
 
     def parts(z: Array) -> Array:
         J = warped_image(params, window, z * jnp.asarray(window.scale)) * window.mask
-        height, width = (-(-n // CELL_PX) for n in J.shape)
-        J = jnp.pad(J, [(0, height * CELL_PX - J.shape[0]), (0, width * CELL_PX - J.shape[1])])
-        squares = (J**2).reshape(height, CELL_PX, width, CELL_PX).sum((1, 3)).reshape(-1)
+        height, width = (-(-n // INDEPENDENT_CELL_PX) for n in J.shape)
+        J = jnp.pad(
+            J,
+            [
+                (0, height * INDEPENDENT_CELL_PX - J.shape[0]),
+                (0, width * INDEPENDENT_CELL_PX - J.shape[1]),
+            ],
+        )
+        squares = (
+            (J**2)
+            .reshape(height, INDEPENDENT_CELL_PX, width, INDEPENDENT_CELL_PX)
+            .sum((1, 3))
+            .reshape(-1)
+        )
         return squares / window.total_weight
 
     return jax.jacfwd(parts)(z)
@@ -269,8 +280,8 @@ def ascend(
         value, slope = _evaluate(params, window, z, times)
         return -value / unit, -slope / unit
 
-    initial = INITIAL_VARIANCE * np.eye(len(begin))
-    options = {"gtol": MIN_SLOPE, "maxiter": params.steps, "hess_inv0": initial}
+    initial = INITIAL_VARIANCE_PX2 * np.eye(len(begin))
+    options = {"gtol": MIN_RELATIVE_GRADIENT, "maxiter": params.steps, "hess_inv0": initial}
     found = minimize(loss, begin, jac=True, method="BFGS", options=options)
     return found.x * scale, -float(found.fun) * unit
 
@@ -294,7 +305,7 @@ def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> Wind
     Returns:
         The estimate.
     """
-    for times in (MIDDLE_BLUR, params.blur):
+    for times in (N_MIDDLE_BLURS, params.blur):
         if params.whole:
             window = _mask_visible(window, jnp.asarray(motion, window.xi.dtype))
         motion, value = ascend(params, window, motion, times)
@@ -325,13 +336,13 @@ def covariance(
     """
     scale = np.asarray(window.scale, np.float64)
     z = np.asarray(motion, np.float64) / scale
-    probes = PROBE_PX * np.eye(len(z))
+    probes = CURVATURE_PROBE_PX * np.eye(len(z))
     H = [
         _evaluate(params, window, z + h, params.blur)[1]
         - _evaluate(params, window, z - h, params.blur)[1]
         for h in probes
     ]
-    H = np.array(H) / (2 * PROBE_PX)
+    H = np.array(H) / (2 * CURVATURE_PROBE_PX)
     g = np.asarray(_cell_gradients(params, window, jnp.asarray(z, window.xi.dtype)), np.float64)
     if not (np.isfinite(H).all() and np.isfinite(g).all()):
         return None
@@ -495,11 +506,11 @@ class WindowSequence:
     def search(self, part: EventRange) -> NDArray[np.float64]:
         """Search all motions for that of a window.
 
-        By grids of motions. Each has a window so short that its motions differ by `GRID_SPACING_PX`
+        Each grid of motions has a window so short that they differ by `FINEST_GRID_SPACING_PX`
         at the end. The widest grid, of all motions, has the shortest window. Each further grid is
-        `GRID_FACTOR` narrower, and its window as much longer, up to the whole one. The best of each
-        grid, and of the windows before, are refined in the next window. So a motion is found at any
-        speed, and where several explain a short window a longer one separates them.
+        `GRID_RANGE_RATIO` narrower, and its window as much longer, up to the whole one. The best of
+        each grid, and of the windows before, are refined in the next window. So a motion is found
+        at any speed, and where several explain a short window a longer one separates them.
 
         Args:
             part: The range of events.
@@ -509,10 +520,10 @@ class WindowSequence:
         """
         params, whole = self.params, self.half_length(part)
         # Range of a grid in px, in units of the motion times s.
-        reach = GRID_SPACING_PX * (params.starts - 1) / 2 / self.pixel_scale.max()
+        reach = FINEST_GRID_SPACING_PX * (params.starts - 1) / 2 / self.pixel_scale.max()
         bounds = [self.search_bound]
         while params.starts > 1 and reach / bounds[-1] < whole:
-            bounds.append(bounds[-1] / GRID_FACTOR)
+            bounds.append(bounds[-1] / GRID_RANGE_RATIO)
         found: list[NDArray[np.float64]] = []
         for bound in bounds:
             half = min(max(reach / bound, 1e-6), whole)
@@ -520,10 +531,12 @@ class WindowSequence:
             if np.count_nonzero(window.weight) < params.fewest and bound != bounds[-1]:
                 continue
             starts = [*found, *self._grid_peaks(window, bound)]
-            refined = [ascend(params, window, motion, COARSE_BLUR) for motion in starts]
-            found = _drop_duplicates(refined, np.asarray(window.scale, np.float64))[:N_CANDIDATES]
+            refined = [ascend(params, window, motion, N_COARSE_BLURS) for motion in starts]
+            found = _drop_duplicates(refined, np.asarray(window.scale, np.float64))[
+                :N_REFINED_MOTIONS
+            ]
         window = self.crop(part)
-        refined = [ascend(params, window, motion, COARSE_BLUR) for motion in found]
+        refined = [ascend(params, window, motion, N_COARSE_BLURS) for motion in found]
         return max(refined, key=lambda one: one[1])[0]
 
     def _grid_peaks(self, window: Window, bound: float) -> list[NDArray[np.float64]]:
@@ -532,10 +545,10 @@ class WindowSequence:
         axis = np.linspace(-bound, bound, number) if number > 1 else np.zeros(1)
         motions = np.stack(np.meshgrid(*[axis] * dimension, indexing="ij"), -1)
         steps = motions.reshape(-1, dimension) / np.asarray(window.scale, np.float64)
-        values = np.array([_evaluate(self.params, window, z, COARSE_BLUR)[0] for z in steps])
+        values = np.array([_evaluate(self.params, window, z, N_COARSE_BLURS)[0] for z in steps])
         values = values.reshape(motions.shape[:-1])
         peaks = np.where(values == maximum_filter(values, 3), values, -np.inf).ravel()
-        best = np.argsort(-peaks, kind="stable")[:N_CANDIDATES]
+        best = np.argsort(-peaks, kind="stable")[:N_REFINED_MOTIONS]
         return [motions.reshape(-1, dimension)[row] for row in best if np.isfinite(peaks[row])]
 
 
@@ -545,7 +558,9 @@ def _drop_duplicates(
     """Sort motions by their values, the best first, and keep one of those that are near."""
     kept: list[NDArray[np.float64]] = []
     for motion, _ in sorted(refined, key=lambda one: -one[1]):
-        if all(np.abs((motion - other) / scale).max() > GRID_SPACING_PX / 2 for other in kept):
+        if all(
+            np.abs((motion - other) / scale).max() > FINEST_GRID_SPACING_PX / 2 for other in kept
+        ):
             kept.append(motion)
     return kept
 
@@ -595,7 +610,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         k = int(estimate.valid.argmax())
         change = windows.measure_change(parts[k], estimate.mean[k])
         rate = np.outer(change, change) / max(1e6 * spans[k], 1) ** 2
-    calibration = CALIBRATION.with_lens(inputs.camera)
+    calibration = COVARIANCE_CALIBRATION.with_lens(inputs.camera)
     estimate = estimate.with_calibrated_covariance(calibration, spans, change)
     before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))
     return estimate.extended_to(int(t[0]) - before, int(t[-1]) + after, rate)
@@ -604,11 +619,11 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
 def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """Return a duration in which the image moves by some pixels, if the default is far off."""
     displacement = speed.fast * float(params.duration)
-    low, high = DISPLACEMENT_LIMITS_PX
+    low, high = WINDOW_DISPLACEMENT_RANGE_PX
     if params.window != "duration" or low <= displacement <= high:
         return {}
-    shortest, longest = DURATION_LIMITS_S
-    return {"duration": min(max(WINDOW_DISPLACEMENT_PX / speed.fast, shortest), longest)}
+    shortest, longest = WINDOW_DURATION_RANGE_S
+    return {"duration": min(max(BEST_WINDOW_DISPLACEMENT_PX / speed.fast, shortest), longest)}
 
 
 contrast = HostEstimator(

@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import MotionEstimate
 
-CELL_PX = 16  # size of the cells of the image within which errors are correlated
-HUBER = 1.345  # standard deviations from which a residual counts linearly: 95 % efficient
-MAX_ROUNDS = 20  # of reweighting
-MIN_INFORMATION = 0.02  # of the largest, below which a direction is undetermined: aperture
+CORRELATED_CELL_PX = 16  # size of the cells of the image within which errors are correlated
+HUBER_THRESHOLD_SIGMAS = (
+    1.345  # standard deviations from which a residual counts linearly: 95 % efficient
+)
+MAX_REWEIGHTINGS = 20  # of reweighting
+MIN_RELATIVE_INFORMATION = 0.02  # of the largest, below which a direction is undetermined: aperture
 
 
 class Fit(NamedTuple):
@@ -40,22 +42,24 @@ def robust_fit(
 
     Returns:
         The fit. It is None if a direction is undetermined: its information is less than
-        `MIN_INFORMATION` of the largest.
+        `MIN_RELATIVE_INFORMATION` of the largest.
     """
     dimension = rows.shape[1]
     if len(rows) <= dimension:
         return None
     scaled = rows / size
     weight, m = np.ones(len(rows)), np.zeros(dimension)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(MAX_REWEIGHTINGS):
         H = (scaled * weight[:, None]).T @ scaled
         information = np.linalg.eigvalsh(H)
-        if not information[0] > MIN_INFORMATION * information[-1]:
+        if not information[0] > MIN_RELATIVE_INFORMATION * information[-1]:
             return None
         new = np.linalg.solve(H, (scaled * weight[:, None]).T @ values)
         residual = values - scaled @ new
         scale = 1.4826 * np.median(np.abs(residual)) + 1e-12 * np.abs(values).max()
-        weight = np.minimum(1, HUBER * scale / np.maximum(np.abs(residual), 1e-300))
+        weight = np.minimum(
+            1, HUBER_THRESHOLD_SIGMAS * scale / np.maximum(np.abs(residual), 1e-300)
+        )
         done, m = np.abs(new - m).max() <= 1e-9 * np.abs(new).max(), new
         if done:
             break

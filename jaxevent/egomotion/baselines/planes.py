@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
-from jaxevent.egomotion.baselines.fits import CELL_PX, motion_of_fits, robust_fit
-from jaxevent.egomotion.candidates import NEVER, READ_EVENTS, pixel_coordinates
+from jaxevent.egomotion.baselines.fits import CORRELATED_CELL_PX, motion_of_fits, robust_fit
+from jaxevent.egomotion.candidates import EVENTS_PER_READ, NEVER_US, pixel_coordinates
 from jaxevent.egomotion.estimator import HostEstimator, HostInputs
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.parameters import Choice, Count, Parameters, Positive
@@ -36,7 +36,7 @@ from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
 # Planes of simulated textures give 1 to 3 % too much speed; otherwise they err as cells do.
-CALIBRATION = CovarianceCalibration(share=0.009, speed=0.015, change=0.25)
+COVARIANCE_CALIBRATION = CovarianceCalibration(share=0.009, speed=0.015, change=0.25)
 
 
 class Params(Parameters):
@@ -97,16 +97,16 @@ def normal_flow(
     shape = (2, recording.height, recording.width)
     surface = EventSurface(
         xi,
-        np.full(shape, NEVER),
-        np.full(shape, NEVER),
+        np.full(shape, NEVER_US),
+        np.full(shape, NEVER_US),
         np.zeros((3, (2 * params.radius + 1) ** 2)),
     )
     end, parts, rules = len(recording.events), [], PlaneRules.from_params(params)
     with bar(
         total=end, desc="fit planes", unit="event", unit_scale=True, progress=progress
     ) as shown:
-        for start in range(0, end, READ_EVENTS):
-            events = recording.events[start : start + READ_EVENTS]
+        for start in range(0, end, EVENTS_PER_READ):
+            events = recording.events[start : start + EVENTS_PER_READ]
             row = np.arange(start, start + len(events))
             wanted = row % params.every == 0
             flow, age = np.zeros((len(row), 2)), np.zeros(len(row))
@@ -153,13 +153,16 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         speed = np.linalg.norm(flow, axis=1)
         basis = np.asarray(model.basis(xi[y, x]), np.float64)
         rows = np.einsum("ni,nid->nd", flow / speed[:, None] ** 2, basis)
-        cells = y // CELL_PX * (recording.width // CELL_PX + 1) + x // CELL_PX
+        cells = (
+            y // CORRELATED_CELL_PX * (recording.width // CORRELATED_CELL_PX + 1)
+            + x // CORRELATED_CELL_PX
+        )
         enough = len(valid) >= params.constraints
         fits.append(robust_fit(rows, np.ones(len(valid)), cells, size) if enough else None)
         lags.append(flows.age[valid].mean() if len(valid) else 0.0)
     motion = motion_of_fits(inputs.model, begins + window // 2, fits)
     return dataclasses.replace(motion, lag=np.array(lags)).with_calibrated_covariance(
-        CALIBRATION.with_lens(camera), float(params.window)
+        COVARIANCE_CALIBRATION.with_lens(camera), float(params.window)
     )
 
 

@@ -28,8 +28,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from jaxevent.egomotion.baselines.fits import (
-    CELL_PX,
-    HUBER,
+    CORRELATED_CELL_PX,
+    HUBER_THRESHOLD_SIGMAS,
     Fit,
     motion_of_fits,
     robust_fit,
@@ -45,12 +45,12 @@ from jaxevent.parameters import Count, Parameters, Positive, UnitInterval
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Recording
 
-SPAN_DISPLACEMENT_PX = 20.0  # of the image between two frames that determine a general motion
-SPAN_LIMITS_S = (0.05, 1.0)  # between them
-MIN_POINTS = 8  # of a general motion: 5 of a sample, and others that test it
-INLIER_PX = 1.0  # from the epipolar line
-CONFIDENCE = 0.999  # of having drawn five inliers
-MIN_NOISE_PX = 0.1  # of tracked points
+PAIR_DISPLACEMENT_PX = 20.0  # of the image between two frames that determine a general motion
+PAIR_SPAN_RANGE_S = (0.05, 1.0)  # between them
+MIN_TRACKED_POINTS = 8  # of a general motion: 5 of a sample, and others that test it
+MAX_EPIPOLAR_DISTANCE_PX = 1.0  # from the epipolar line
+RANSAC_CONFIDENCE = 0.999  # of having drawn five inliers
+MIN_POINT_NOISE_PX = 0.1  # of tracked points
 
 
 class Params(Parameters):
@@ -94,8 +94,8 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         before, after = interpolate_positions(begin, xi), interpolate_positions(end, xi)
         dt = float(frames.t[two] - frames.t[one]) * 1e-6
         # Errors of points of a cell are correlated.
-        columns = np.array([1, recording.width // CELL_PX + 1])
-        cells = np.floor(begin / CELL_PX).astype(int) @ columns
+        columns = np.array([1, recording.width // CORRELATED_CELL_PX + 1])
+        cells = np.floor(begin / CORRELATED_CELL_PX).astype(int) @ columns
         if len(begin) < params.fewest:
             fits.append(None)
         elif model.half_line:
@@ -207,12 +207,14 @@ def fit_general(
     Returns:
         The fit, or None if no motion explains the points.
     """
-    if len(begin) < MIN_POINTS:
+    if len(begin) < MIN_TRACKED_POINTS:
         return None
     cv2.setRNGSeed(0)
     K = np.diag([f, f, 1.0])
-    E, inliers = cv2.findEssentialMat(begin, end, K, cv2.RANSAC, CONFIDENCE, INLIER_PX)
-    if E is None or E.shape != (3, 3) or inliers.sum() < MIN_POINTS:
+    E, inliers = cv2.findEssentialMat(
+        begin, end, K, cv2.RANSAC, RANSAC_CONFIDENCE, MAX_EPIPOLAR_DISTANCE_PX
+    )
+    if E is None or E.shape != (3, 3) or inliers.sum() < MIN_TRACKED_POINTS:
         return None
     good = inliers.ravel() > 0
     begin, end, cells = begin[good], end[good], cells[good]
@@ -232,10 +234,12 @@ def fit_general(
         return f * _sampson_distances(motion(z), *rays)
 
     # The scale is that of the inliers; beyond Huber's bound residuals count linearly.
-    scale = max(1.4826 * float(np.median(np.abs(distances(np.zeros(5))))), MIN_NOISE_PX)
-    found = least_squares(distances, np.zeros(5), loss="huber", f_scale=HUBER * scale)
+    scale = max(1.4826 * float(np.median(np.abs(distances(np.zeros(5))))), MIN_POINT_NOISE_PX)
+    found = least_squares(
+        distances, np.zeros(5), loss="huber", f_scale=HUBER_THRESHOLD_SIGMAS * scale
+    )
     residual = distances(found.x)
-    weight = np.minimum(1, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+    weight = np.minimum(1, HUBER_THRESHOLD_SIGMAS * scale / np.maximum(np.abs(residual), 1e-12))
     # least_squares scales its Jacobian by the loss, so here it is computed by differences.
     h = 1e-6
     J = np.stack([(distances(found.x + s) - distances(found.x - s)) / (2 * h)
@@ -287,8 +291,8 @@ def _sampson_distances(
 
 
 def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
-    """Return a span in which the image moves by `SPAN_DISPLACEMENT_PX`."""
-    return {"span": float(np.clip(SPAN_DISPLACEMENT_PX / speed.median, *SPAN_LIMITS_S))}
+    """Return a span in which the image moves by `PAIR_DISPLACEMENT_PX`."""
+    return {"span": float(np.clip(PAIR_DISPLACEMENT_PX / speed.median, *PAIR_SPAN_RANGE_S))}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -20,11 +20,11 @@ from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
 from jaxevent.egomotion.bundle import warp
 from jaxevent.egomotion.bundle.cg import cholesky, cholesky_solve
 
-BORDER_PX = 3  # at the sensor's border, that is not compared
+UNCOMPARED_BORDER_PX = 3  # at the sensor's border, that is not compared
 SCORE_BLOCK_PX = 12  # of the image, whose contrast is scored
-N_ALIGNED_ROWS = 3  # of O and of D that are fitted
-N_ALIGNED = 6 * N_ALIGNED_ROWS  # their numbers
-CELL_EDGE = 0.3  # a larger difference of log depth between cells is an edge
+N_ALIGNED_COEFFICIENT_ROWS = 3  # of O and of D that are fitted
+N_ALIGNED_UNKNOWNS = 6 * N_ALIGNED_COEFFICIENT_ROWS  # their numbers
+CELL_EDGE_LOG_DEPTH = 0.3  # a larger difference of log depth between cells is an edge
 
 
 class WindowEvents(NamedTuple):
@@ -272,7 +272,7 @@ def _measure_displacements(
         blurs: Number of times that images are blurred.
     """
     real, cells = window.x.dtype, shifts.X.shape[1]
-    own = np.zeros((warp.N_SEGMENTS, *window.shape), real)
+    own = np.zeros((warp.N_WINDOW_SEGMENTS, *window.shape), real)
     _accumulate_segments(_warp_by_cells(path, window), own)
     work = np.empty(window.shape, real)
     for image in own:
@@ -280,13 +280,13 @@ def _measure_displacements(
     low, high = (
         np.array([window.box[k], window.box[2 + k]]) - np.array(window.corner) for k in (0, 1)
     )
-    others, share = np.empty_like(own), np.zeros((warp.N_SEGMENTS, cells))
-    both = np.zeros((warp.N_SEGMENTS, cells, 3))
-    region = VisibleRegion(low + BORDER_PX, high - BORDER_PX, *shifts)
+    others, share = np.empty_like(own), np.zeros((warp.N_WINDOW_SEGMENTS, cells))
+    both = np.zeros((warp.N_WINDOW_SEGMENTS, cells, 3))
+    region = VisibleRegion(low + UNCOMPARED_BORDER_PX, high - UNCOMPARED_BORDER_PX, *shifts)
     _compare_segments(own, window.cell, region, others, share, both)
     share /= window.cell**2
     gain = both[..., 0] / np.maximum(both[..., 1], 1e-6)
-    sums = np.zeros((warp.N_SEGMENTS, cells, 6))
+    sums = np.zeros((warp.N_WINDOW_SEGMENTS, cells, 6))
     _accumulate_gradients(own, others, gain, window.cell, sums)
     # Noise (per px) of a cell; blurring correlates it.
     noise = sums[..., 0].sum(0) / np.maximum(share.sum(0), 1) / window.cell**2
@@ -317,39 +317,52 @@ def _take_step(
     """
     f, half, (_, cells), n = window.f, window.half, tracks.x.shape, tracks.x.size
     rho = np.broadcast_to(np.exp(path.log_rho), tracks.x.shape)
-    unit = warp.row_units(path, f, half, N_ALIGNED_ROWS)
+    unit = warp.row_units(path, f, half, N_ALIGNED_COEFFICIENT_ROWS)
     by, r = np.empty((n, 6, 2)), np.empty((n, 2))
     parts = [np.ascontiguousarray(part, np.float64).ravel() for part in (*tracks, rho)]
     warp.point_derivatives(warp.Points(*parts[:3]), parts[3], path.motion(f), by, r)
-    powers = (parts[2] / half)[:, None] ** np.arange(1, warp.N_ROWS + 1)
-    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * warp.N_ROWS, 2)
-    J = J.transpose(0, 2, 1) @ warp.coefficient_jacobian(path, unit, half, N_ALIGNED_ROWS)
-    now = warp.pack_rows(path, N_ALIGNED_ROWS) / unit
+    powers = (parts[2] / half)[:, None] ** np.arange(1, warp.N_COEFFICIENT_ROWS + 1)
+    J = (by[:, :, None] * powers[:, None, :, None]).reshape(n, 6 * warp.N_COEFFICIENT_ROWS, 2)
+    J = J.transpose(0, 2, 1) @ warp.coefficient_jacobian(
+        path, unit, half, N_ALIGNED_COEFFICIENT_ROWS
+    )
+    now = warp.pack_rows(path, N_ALIGNED_COEFFICIENT_ROWS) / unit
     W, v = found
     MJ = W @ J
     # By einsum: larger products wake BLAS's threads, which spin then, beside other starts' steps.
-    upper = np.einsum("ep,eq->pq", J.reshape(-1, N_ALIGNED), MJ.reshape(-1, N_ALIGNED))
-    mixed = np.einsum("ekp,ek->ep", MJ, r).reshape(warp.N_SEGMENTS, cells, N_ALIGNED).sum(0).T
-    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(warp.N_SEGMENTS, cells).sum(0)
+    upper = np.einsum(
+        "ep,eq->pq", J.reshape(-1, N_ALIGNED_UNKNOWNS), MJ.reshape(-1, N_ALIGNED_UNKNOWNS)
+    )
+    mixed = (
+        np.einsum("ekp,ek->ep", MJ, r)
+        .reshape(warp.N_WINDOW_SEGMENTS, cells, N_ALIGNED_UNKNOWNS)
+        .sum(0)
+        .T
+    )
+    lower = np.einsum("ek,ekl,el->e", r, W, r).reshape(warp.N_WINDOW_SEGMENTS, cells).sum(0)
     H = np.block([[upper, mixed], [mixed.T, np.diag(lower)]])
     g = np.concatenate(
-        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(warp.N_SEGMENTS, cells).sum(0)]
+        [np.einsum("ekp,ek->p", J, v), (r * v).sum(1).reshape(warp.N_WINDOW_SEGMENTS, cells).sum(0)]
     )
     depth = path.log_rho.reshape(window.cells)
-    bound = _smoothness_matrix(*warp.smoothness_weights(depth, prior.smooth, CELL_EDGE)[:2])
-    H[N_ALIGNED:, N_ALIGNED:] += bound
-    g[N_ALIGNED:] += np.einsum("ij,j->i", bound, path.log_rho)
-    H[N_ALIGNED:, N_ALIGNED:] += prior.relief * np.eye(cells)
-    g[N_ALIGNED:] += prior.relief * (path.log_rho - path.log_rho.mean())
+    bound = _smoothness_matrix(
+        *warp.smoothness_weights(depth, prior.smooth, CELL_EDGE_LOG_DEPTH)[:2]
+    )
+    H[N_ALIGNED_UNKNOWNS:, N_ALIGNED_UNKNOWNS:] += bound
+    g[N_ALIGNED_UNKNOWNS:] += np.einsum("ij,j->i", bound, path.log_rho)
+    H[N_ALIGNED_UNKNOWNS:, N_ALIGNED_UNKNOWNS:] += prior.relief * np.eye(cells)
+    g[N_ALIGNED_UNKNOWNS:] += prior.relief * (path.log_rho - path.log_rho.mean())
     known, side, _ = warp.row_priors(prior, unit, half)
-    H[:N_ALIGNED, :N_ALIGNED] += known
-    g[:N_ALIGNED] += known @ now - side
+    H[:N_ALIGNED_UNKNOWNS, :N_ALIGNED_UNKNOWNS] += known
+    g[:N_ALIGNED_UNKNOWNS] += known @ now - side
     gauge = warp.gauge_direction(path, unit, len(g))
-    H = H + 100 * np.trace(upper) / N_ALIGNED * gauge[:, None] * gauge
+    H = H + 100 * np.trace(upper) / N_ALIGNED_UNKNOWNS * gauge[:, None] * gauge
     H = H + np.diag(1e-3 * np.diag(H) + 1e-6)
 
     moves = np.ones(len(g), bool)
-    moves[:N_ALIGNED] = np.repeat(np.tile(np.arange(N_ALIGNED_ROWS) <= degree, 2), 3)
+    moves[:N_ALIGNED_UNKNOWNS] = np.repeat(
+        np.tile(np.arange(N_ALIGNED_COEFFICIENT_ROWS) <= degree, 2), 3
+    )
     change = np.zeros(len(g))
     # LAPACK would wake BLAS's threads, which spin then: half of the CPU seconds of all starts.
     free, down = H[np.ix_(moves, moves)], -g[moves]
@@ -358,9 +371,9 @@ def _take_step(
     change[moves] = down
     if not np.isfinite(change).all():
         return path
-    change *= warp.step_fraction(change[:N_ALIGNED])
-    path = warp.replace_rows(path, (now + change[:N_ALIGNED]) * unit)
-    deeper = np.clip(change[N_ALIGNED:], -warp.MAX_DEPTH_STEP, warp.MAX_DEPTH_STEP)
+    change *= warp.step_fraction(change[:N_ALIGNED_UNKNOWNS])
+    path = warp.replace_rows(path, (now + change[:N_ALIGNED_UNKNOWNS]) * unit)
+    deeper = np.clip(change[N_ALIGNED_UNKNOWNS:], -warp.MAX_LOG_DEPTH_STEP, warp.MAX_LOG_DEPTH_STEP)
     return warp.normalise(
         warp.Path(path.O, path.D, path.log_rho + deeper.astype(path.log_rho.dtype))
     )

@@ -20,15 +20,15 @@ from jaxevent.egomotion.bundle.residuals import (
     multiply_transpose,
     subtract_mean,
 )
-from jaxevent.egomotion.bundle.warp import N_ROWS, bilinear_weight
+from jaxevent.egomotion.bundle.warp import N_COEFFICIENT_ROWS, bilinear_weight
 
-COARSE_NODES = 4  # nodes, 16 px, between coarse nodes
-MAX_BLOCK_STEPS = 240
-CHECK_INTERVAL = 10  # block steps, in which the unknowns of the sides converge ...
-MAX_RELATIVE_CHANGE = 0.1  # ... if they grow by less than this
+NODES_PER_COARSE_NODE = 4  # nodes, 16 px, between coarse nodes
+MAX_BLOCK_CG_STEPS = 240
+STEPS_PER_CONVERGENCE_CHECK = 10  # block steps, in which the unknowns of the sides converge ...
+CONVERGED_RELATIVE_CHANGE = 0.1  # ... if they grow by less than this
 MIN_RELATIVE_EIGENVALUE = 1e-11  # by the largest; directions below repeat others
 MIN_EIGENVALUE = 1e-30  # directions below are solved
-CACHED_NUMBERS = 1024  # of all columns that a core's own memory holds together
+N_CACHED_VALUES = 1024  # of all columns that a core's own memory holds together
 
 
 class BlockVector(NamedTuple):
@@ -61,21 +61,24 @@ class System(NamedTuple):
     preconditioner_map: NDArray  # (height, width)
     preconditioner_depth: NDArray  # (rows, columns)
     preconditioner_coarse: NDArray[np.float64]  # (m, m), Cholesky factor of P' H P
-    coefficients: NDArray  # (6, N_ROWS), scratch
-    more: NDArray  # (n - 6 N_ROWS,), scratch
+    coefficients: NDArray  # (6, N_COEFFICIENT_ROWS), scratch
+    more: NDArray  # (n - 6 N_COEFFICIENT_ROWS,), scratch
     side: NDArray[np.float64]  # (m,), scratch
 
 
 def coarse_shape(rows: int, columns: int) -> tuple[int, int]:
     """Return rows and columns of coarse nodes over nodes of depth."""
-    return (rows - 1) // COARSE_NODES + 2, (columns - 1) // COARSE_NODES + 2
+    return (rows - 1) // NODES_PER_COARSE_NODE + 2, (columns - 1) // NODES_PER_COARSE_NODE + 2
 
 
 @njit_fastmath_inlined
 def _coarse_node(j, i, corner, columns):
     """Return the coarse node at one of four corners about a node, and its weight."""
-    row, column = j // COARSE_NODES, i // COARSE_NODES
-    u, v = (i - column * COARSE_NODES) / COARSE_NODES, (j - row * COARSE_NODES) / COARSE_NODES
+    row, column = j // NODES_PER_COARSE_NODE, i // NODES_PER_COARSE_NODE
+    u, v = (
+        (i - column * NODES_PER_COARSE_NODE) / NODES_PER_COARSE_NODE,
+        (j - row * NODES_PER_COARSE_NODE) / NODES_PER_COARSE_NODE,
+    )
     node = (row + corner // 2) * columns + column + corner % 2
     return node, bilinear_weight(u, v, corner)
 
@@ -84,7 +87,7 @@ def _coarse_node(j, i, corner, columns):
 def _add_depth_priors(hold, across, down, begin, out):
     """Add damping and bonds of depths to P' H P, whose row `begin` is the first coarse node's."""
     rows, columns = hold.shape
-    wide = (columns - 1) // COARSE_NODES + 2
+    wide = (columns - 1) // NODES_PER_COARSE_NODE + 2
     for j in range(rows):
         for i in range(columns):
             for p in range(4):
@@ -165,7 +168,7 @@ def coarse_factor(
 def precondition_path_and_depths(system, t, depth, out_t, out_depth):
     """Write the preconditioned unknowns of path (n,) and depths (rows, columns)."""
     side, n, (rows, columns) = system.side, len(t), depth.shape
-    wide = (columns - 1) // COARSE_NODES + 2
+    wide = (columns - 1) // NODES_PER_COARSE_NODE + 2
     for i in range(n):
         side[i] = t[i]
     for i in range(n, len(side)):
@@ -220,13 +223,13 @@ def _add_prior_products(system, vector, out):
 def multiply(system, vector, value, out):
     """Write H times a `BlockVector` to `out`; `value` (E,) is scratch."""
     jacobian, real, t, out_t = system.jacobian, vector.map.dtype.type, vector.t, out.t
-    n, m = len(t), 6 * N_ROWS
+    n, m = len(t), 6 * N_COEFFICIENT_ROWS
     coefficients, more = system.coefficients, system.more
     for k in range(m):
         s = 0.0
         for i in range(m):
             s += system.coefficient_jacobian[k, i] * t[i]
-        coefficients[k // N_ROWS, k % N_ROWS] = s
+        coefficients[k // N_COEFFICIENT_ROWS, k % N_COEFFICIENT_ROWS] = s
     for i in range(m, n):
         more[i - m] = t[i]
     flat, nodes = vector.map.reshape(-1), vector.depth.reshape(-1)
@@ -240,7 +243,10 @@ def multiply(system, vector, value, out):
     for i in range(m):
         out_t[i] = 0.0
         for k in range(m):
-            out_t[i] += system.coefficient_jacobian[k, i] * coefficients[k // N_ROWS, k % N_ROWS]
+            out_t[i] += (
+                system.coefficient_jacobian[k, i]
+                * coefficients[k // N_COEFFICIENT_ROWS, k % N_COEFFICIENT_ROWS]
+            )
     for i in range(m, n):
         out_t[i] = more[i - m]
     for i in range(n):
@@ -343,11 +349,11 @@ class ColumnVectors(NamedTuple):
 @njit_fastmath
 def add_inner_products(a, b, out):
     """Add a b' of rows (S, N), a part at a time: single precision would not hold all."""
-    for begin in range(0, a.shape[1], CACHED_NUMBERS):
+    for begin in range(0, a.shape[1], N_CACHED_VALUES):
         for k in range(len(a)):
-            one = a[k, begin : begin + CACHED_NUMBERS]
+            one = a[k, begin : begin + N_CACHED_VALUES]
             for c in range(len(b)):
-                other, s = b[c, begin : begin + CACHED_NUMBERS], a.dtype.type(0)
+                other, s = b[c, begin : begin + N_CACHED_VALUES], a.dtype.type(0)
                 for i in range(len(one)):
                     s += one[i] * other[i]
                 out[k, c] += s
@@ -356,11 +362,11 @@ def add_inner_products(a, b, out):
 @njit_fastmath
 def _add_combinations(by, a, out):
     """Add by' a, of rows a (S, N) and factors (S, S)."""
-    for begin in range(0, a.shape[1], CACHED_NUMBERS):
+    for begin in range(0, a.shape[1], N_CACHED_VALUES):
         for c in range(len(out)):
-            to = out[c, begin : begin + CACHED_NUMBERS]
+            to = out[c, begin : begin + N_CACHED_VALUES]
             for k in range(len(a)):
-                one, share = a[k, begin : begin + CACHED_NUMBERS], by[k, c]
+                one, share = a[k, begin : begin + N_CACHED_VALUES], by[k, c]
                 for i in range(len(one)):
                     to[i] += share * one[i]
 
@@ -415,7 +421,7 @@ def solve_columns(system: System, sides: NDArray[np.float64]) -> ColumnVectors:
     precondition(left, better)
     direction, known = better.copy(), np.zeros(number)
     before = ColumnVectors(np.full_like(found.t, np.nan), np.full_like(found.rest, np.nan))
-    for step in range(1, MAX_BLOCK_STEPS + 1):
+    for step in range(1, MAX_BLOCK_CG_STEPS + 1):
         for k in range(number):
             multiply(system, vector(direction, k), value, vector(image, k))
         energy = _inner_products(direction, image)
@@ -438,11 +444,11 @@ def solve_columns(system: System, sides: NDArray[np.float64]) -> ColumnVectors:
         scale = 1 / np.maximum(sizes, 1e-30)
         np.multiply(better.t, scale[:, None], out=direction.t)
         np.multiply(better.rest, scale[:, None].astype(real), out=direction.rest)
-        if step % CHECK_INTERVAL == 0:
+        if step % STEPS_PER_CONVERGENCE_CHECK == 0:
             now = (sides * found.t).sum(1)
-            if not (now >= (1 - MAX_RELATIVE_CHANGE) * known).all():
+            if not (now >= (1 - CONVERGED_RELATIVE_CHANGE) * known).all():
                 return before
-            if (np.abs(now - known) <= MAX_RELATIVE_CHANGE * np.abs(now)).all():
+            if (np.abs(now - known) <= CONVERGED_RELATIVE_CHANGE * np.abs(now)).all():
                 break
             known, before = now, found.copy()
     return found

@@ -44,13 +44,13 @@ from jaxevent.egomotion.bundle.warp import Path, Prior
 from jaxevent.egomotion.bundle.windows import Params, Windows
 from jaxevent.recording import Recording
 
-FLOW_EVENTS = 15_000  # of windows for patches' flows
-ALIGNED_EVENTS = 30_000  # of windows for the first alignments
-SCORED_EVENTS = 60_000  # of windows for the last alignment
-HYPOTHESIS_EVENTS = 30_000  # of the bundle adjustment until one hypothesis is left
+MAX_FLOW_EVENTS = 15_000  # of windows for patches' flows
+MAX_ALIGNED_EVENTS = 30_000  # of windows for the first alignments
+MAX_SCORED_EVENTS = 60_000  # of windows for the last alignment
+MAX_HYPOTHESIS_EVENTS = 30_000  # of the bundle adjustment until one hypothesis is left
 MAX_INITIAL_PATHS = 6  # that go on from the first alignment
-MIN_HEADING_COSINE = np.cos(np.radians(6))  # of motions that are taken for one
-MAX_SAME_TURN = 0.1  # rad/s, likewise
+MIN_SAME_HEADING_COSINE = np.cos(np.radians(6))  # of motions that are taken for one
+MAX_SAME_TURN_RAD_S = 0.1  # rad/s, likewise
 
 
 class Stage(NamedTuple):
@@ -67,14 +67,14 @@ class Stage(NamedTuple):
 
 
 # Stages of new hypotheses, each after a search of depths, and of the rest.
-COARSE_TO_FINE = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)
-FINAL = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
+COARSE_TO_FINE_STAGES = Stage(1.0, 6), Stage(0.5, 6), Stage(0.2, 10), Stage(0.1, 10)
+FINAL_STAGES = Stage(0.05, 20, 10), Stage(0.02, 20, 3)
 # Stages in which the map first takes the frames' brightness, some 10 C from 0.
-BRIGHTNESS = Stage(20.0, 1), Stage(5.0, 1)
+FRAME_BRIGHTNESS_STAGES = Stage(20.0, 1), Stage(5.0, 1)
 # Stages of a predicted path: with and without a search of depths, and the last one.
-PREDICTED_COARSE_TO_FINE = Stage(0.5, 6), Stage(0.1, 8)
-PREDICTED = (Stage(0.05, 10, 10),)
-PREDICTED_FINAL = (Stage(0.02, 8, 3),)
+PREDICTED_COARSE_TO_FINE_STAGES = Stage(0.5, 6), Stage(0.1, 8)
+PREDICTED_STAGES = (Stage(0.05, 10, 10),)
+PREDICTED_FINAL_STAGES = (Stage(0.02, 8, 3),)
 # Hypotheses remain whose cost is below so many times the least, plus so much (C^2): a search of
 # depths leaves up to 0.03 C.
 MAX_COST_RATIO, COST_MARGIN = 1.75, 5e-4
@@ -92,40 +92,43 @@ class PlanarStages(NamedTuple):
 # Scenes that are no plane cost 1.8e-2 and more after the first of these, planes 7e-3 and less; in
 # the end 1.5e-3 and more, 2e-4 and less. Without the flatter maps of the third some fits end on the
 # way, 5 to 30 degrees off at 100 times the cost of the truth.
-PLANAR = (
-    PlanarStages(0.5, HYPOTHESIS_EVENTS // 2, (Stage(2.0, 8), Stage(1.0, 8)), 1e-2),
-    PlanarStages(0.5, HYPOTHESIS_EVENTS, (Stage(0.3, 12, 1, 100), Stage(0.1, 6, 1, 100)), 1e-3),
+PLANAR_STAGES = (
+    PlanarStages(0.5, MAX_HYPOTHESIS_EVENTS // 2, (Stage(2.0, 8), Stage(1.0, 8)), 1e-2),
+    PlanarStages(0.5, MAX_HYPOTHESIS_EVENTS, (Stage(0.3, 12, 1, 100), Stage(0.1, 6, 1, 100)), 1e-3),
     PlanarStages(
-        1.0, HYPOTHESIS_EVENTS, tuple(Stage(sigma, 20, 10) for sigma in (1.0, 0.3, 0.1, 0.05)), 1e-3
+        1.0,
+        MAX_HYPOTHESIS_EVENTS,
+        tuple(Stage(sigma, 20, 10) for sigma in (1.0, 0.3, 0.1, 0.05)),
+        1e-3,
     ),
-    PlanarStages(1.0, HYPOTHESIS_EVENTS, (Stage(0.1, 10), Stage(0.05, 20)), 3e-4),
+    PlanarStages(1.0, MAX_HYPOTHESIS_EVENTS, (Stage(0.1, 10), Stage(0.05, 20)), 3e-4),
 )
-ERROR_RATIO, ERROR_GROWTH = 2.5, 5.0  # see `error_inflation`
+MIN_ERROR_INFLATION, ERROR_GROWTH_PER_OUTLIER_SHARE = 2.5, 5.0  # see `error_inflation`
 # If the thresholds themselves are noisy sigma is never less than that noise: else half of the
 # events are fitted exactly, and the others are outliers, for any motion. Simulated without noise
 # the stage of NOISE_STAGE_SIGMA shows 0.07 C, slider_depth 0.07 to 0.1 C, evbench_seq3 0.13 C.
 NOISE_STAGE_SIGMA = 0.5  # C, of the stage that measures the noise
-MIN_NOISE = 0.1  # C, that limits sigma
+MIN_RESIDUAL_NOISE = 0.1  # C, that limits sigma
 MIN_SIGMA_PER_NOISE = 0.4  # of the residuals: events beside edges are outliers
 # The share of inliers below which hypotheses are compared, whatever they cost. Walls seen with
 # uneven thresholds have 0.70, whichever motion; ideal ones 0.97.
-MIN_INLIERS = 0.8
+MIN_INLIER_SHARE = 0.8
 # Hypotheses that cost at most so many times the least in the end are compared on held-out pixels:
 # fitted events distinguish the motion from its mirror image by 3 % of the cost, or the other way.
-SIMILAR_COST = 1.5
-MIN_PARALLAX_PX = 6.0  # in a window, below which rotation alone is a hypothesis too
-UNOBSERVED_LOG_RHO = -3.0  # added to log inverse depths if translation is not observable
+MAX_SIMILAR_COST_RATIO = 1.5
+MIN_WINDOW_PARALLAX_PX = 6.0  # in a window, below which rotation alone is a hypothesis too
+UNOBSERVED_LOG_RHO_SHIFT = -3.0  # added to log inverse depths if translation is not observable
 
 INDEPENDENT_CELL_PX = 48  # within which errors of the held-out test are alike
 INFINITE_LOG_RHO = -9.0  # log inverse depth that makes no parallax
 MIN_TEST_SIGMA = 0.1  # C
-N_MAP_STEPS, N_TEST_STEPS = 4, 16  # of the map alone, and in all
+N_TEST_MAP_STEPS, N_TEST_STEPS = 4, 16  # of the map alone, and in all
 MIN_TRANSLATION_Z = 3.0  # from which there is a translation
 MIN_REFUTING_Z = 2.0  # of another motion, from which one is refuted
 
-TEST_WINDOW_PX = 25.0  # that the image moves in a window of `translation_z`
-MIN_HALF_S, MAX_HALF_S = 0.01, 1.0  # of half such a window
-RELATIVE_PARALLAX = 0.3  # of the image's motion, that a translation makes at first
+TEST_WINDOW_DISPLACEMENT_PX = 25.0  # that the image moves in a window of `translation_z`
+MIN_TEST_HALF_WINDOW_S, MAX_TEST_HALF_WINDOW_S = 0.01, 1.0  # of half such a window
+INITIAL_RELATIVE_PARALLAX = 0.3  # of the image's motion, that a translation makes at first
 
 
 class WindowFit(NamedTuple):
@@ -151,7 +154,9 @@ def error_inflation(inliers: float) -> float:
 
     The model errs if many events are not explained, as before plain shapes that pass each other.
     """
-    return (ERROR_RATIO * np.exp(ERROR_GROWTH * max(0.95 - inliers, 0.0))) ** 2
+    return (
+        MIN_ERROR_INFLATION * np.exp(ERROR_GROWTH_PER_OUTLIER_SHARE * max(0.95 - inliers, 0.0))
+    ) ** 2
 
 
 class WindowFitter(Windows):
@@ -160,7 +165,7 @@ class WindowFitter(Windows):
     def rotation(self, centre: int) -> NDArray[np.float64]:
         """Return the rotation (3,), rad/s, at the middle of a window, by a gyro if there is one."""
         if self.gyro is None:
-            return sharpest_rotation(self.sample_events(centre, self.half / 3, FLOW_EVENTS))
+            return sharpest_rotation(self.sample_events(centre, self.half / 3, MAX_FLOW_EVENTS))
         middle = np.clip(centre, self.gyro.start, self.gyro.stop)
         return self.gyro(np.array([middle], np.int64))[1][0]
 
@@ -173,9 +178,9 @@ class WindowFitter(Windows):
             planes: Motions before planes.
         """
         params, half = self.params, self.half / 3
-        window = self.sample_events(centre, half, ALIGNED_EVENTS)
+        window = self.sample_events(centre, half, MAX_ALIGNED_EVENTS)
         found = [plane.path(window.cell_positions, self.f, self.real) for plane in planes]
-        cuts = [self.sample_events(centre, length, FLOW_EVENTS) for length in (half / 2, half)]
+        cuts = [self.sample_events(centre, length, MAX_FLOW_EVENTS) for length in (half / 2, half)]
         flow_max = float(params.flow_max)
         for flows in map_parallel(lambda cut: measure_patch_flows(cut, Omega, flow_max), cuts):
             if flows is not None:
@@ -186,8 +191,8 @@ class WindowFitter(Windows):
 
     def align(self, centre: int, paths: list[Path]) -> list[Path]:
         """Align paths over longer windows; return the best, some degrees apart."""
-        middle = self.sample_events(centre, 2 * self.half / 3, ALIGNED_EVENTS)
-        last = self.sample_events(centre, self.half, SCORED_EVENTS)
+        middle = self.sample_events(centre, 2 * self.half / 3, MAX_ALIGNED_EVENTS)
+        last = self.sample_events(centre, self.half, MAX_SCORED_EVENTS)
         best = self._align(middle, centre, paths, (1, 2, 8))[: 2 * self.params.rivals]
         steps = self.params.iterations
         return self._align(last, centre, best, (2, 2, steps))[: self.params.rivals]
@@ -232,7 +237,7 @@ class WindowFitter(Windows):
             Hypotheses, the least costly first; none if no plane explains the events.
         """
         paths, found = [], []
-        for row, (share, events, stages, max_cost) in enumerate(PLANAR):
+        for row, (share, events, stages, max_cost) in enumerate(PLANAR_STAGES):
             half = share * self.half
             series, prior = self.series(centre, half, events), self.prior(centre, half)
             if not paths:
@@ -260,17 +265,19 @@ class WindowFitter(Windows):
         paths = [] if warm is None else [warm]
         Omega = self.rotation(centre)
         cuts = [
-            self.sample_events(centre, share * self.half, ALIGNED_EVENTS)
+            self.sample_events(centre, share * self.half, MAX_ALIGNED_EVENTS)
             for share in (1 / 3, 2 / 3)
         ]
         solutions = map_parallel(lambda cut: planar_solutions(homography_flow(cut, Omega)), cuts)
         planes = solutions[0] + solutions[1]
-        found, ratio, margin = self.planar_hypotheses(centre, planes), SIMILAR_COST, 0.0
+        found, ratio, margin = self.planar_hypotheses(centre, planes), MAX_SIMILAR_COST_RATIO, 0.0
         if not found:
-            series = self.series(centre, self.half, HYPOTHESIS_EVENTS)
+            series = self.series(centre, self.half, MAX_HYPOTHESIS_EVENTS)
             aligned = self.align(centre, self.initial_paths(centre, Omega, planes))
             paths += [self.interpolate_to_nodes(path, series) for path in aligned]
-            found = self.rank(self.refine_coarse_to_fine(centre, series, paths, COARSE_TO_FINE))
+            found = self.rank(
+                self.refine_coarse_to_fine(centre, series, paths, COARSE_TO_FINE_STAGES)
+            )
             ratio, margin = MAX_COST_RATIO, COST_MARGIN
         limit = ratio * self.cost(*found[0]) + margin if found else 0.0
         return [one for one in found if self.cost(*one) < limit]
@@ -295,26 +302,31 @@ class WindowFitter(Windows):
             scenes = [scene for scene, _ in found]
             if stage.sigma == NOISE_STAGE_SIGMA and found:
                 noise = min(report.noise for _, report in found)
-                self.sigma_floor[centre] = noise if noise > MIN_NOISE else 0.0
+                self.sigma_floor[centre] = noise if noise > MIN_RESIDUAL_NOISE else 0.0
         return found
 
     def refine_from(self, centre: int, warm: Path) -> Hypothesis:
         """Refine a path with depths at nodes that is about right, but for the last stage."""
-        series = self.series(centre, self.half, HYPOTHESIS_EVENTS)
-        (found,) = self.refine_coarse_to_fine(centre, series, [warm], PREDICTED_COARSE_TO_FINE)
+        series = self.series(centre, self.half, MAX_HYPOTHESIS_EVENTS)
+        (found,) = self.refine_coarse_to_fine(
+            centre, series, [warm], PREDICTED_COARSE_TO_FINE_STAGES
+        )
         prior, floor = self.prior(centre, self.half), self.sigma_floor[centre]
-        return _refine(found, series, prior, PREDICTED, sigma_floor=floor)
+        return _refine(found, series, prior, PREDICTED_STAGES, sigma_floor=floor)
 
     def fit(self, centre: int, warm: Path | None = None) -> WindowFit | None:
         """Fit a window from new starts, and from a path with depths at nodes if one is given."""
-        return self.refine_final(centre, self.hypotheses(centre, warm), FINAL)
+        return self.refine_final(centre, self.hypotheses(centre, warm), FINAL_STAGES)
 
     def refine_final(
-        self, centre: int, hypotheses: list[Hypothesis], stages: tuple[Stage, ...] = PREDICTED_FINAL
+        self,
+        centre: int,
+        hypotheses: list[Hypothesis],
+        stages: tuple[Stage, ...] = PREDICTED_FINAL_STAGES,
     ) -> WindowFit | None:
         """Refine the remaining hypotheses at the final scales and return the best.
 
-        Hypotheses within `SIMILAR_COST` of the least cost are compared on held-out pixels. The
+        Those within `MAX_SIMILAR_COST_RATIO` of the least cost are compared on held-out pixels. The
         result's covariance includes the hypotheses that were not refuted.
 
         Args:
@@ -335,13 +347,15 @@ class WindowFitter(Windows):
         ranked = self.rank(refined)
         first, report = ranked[0]
         parallax = self.parallax(first.path, series)
-        uncertain = floor > 0 or parallax < MIN_PARALLAX_PX or report.inliers < MIN_INLIERS
-        limit = np.inf if uncertain else SIMILAR_COST * self.cost(*ranked[0])
+        uncertain = (
+            floor > 0 or parallax < MIN_WINDOW_PARALLAX_PX or report.inliers < MIN_INLIER_SHARE
+        )
+        limit = np.inf if uncertain else MAX_SIMILAR_COST_RATIO * self.cost(*ranked[0])
         close = [one for one in ranked if self.cost(*one) <= limit]
         test = self.held_out_test(centre) if uncertain or len(close) > 1 else None
         # A single hypothesis has converged: more steps than its map takes hardly change z.
         alone = len(close) == 1
-        steps = N_MAP_STEPS if alone else N_TEST_STEPS
+        steps = N_TEST_MAP_STEPS if alone else N_TEST_STEPS
         fits = map_parallel(lambda one: test.fit(one[0].path, steps=steps), close) if test else []
         chosen = test.best(fits) if test else 0
         scene, report = close[chosen]
@@ -386,10 +400,10 @@ class WindowFitter(Windows):
         """Divide pixels of a window for a comparison of hypotheses."""
         half = self.half
         first, last = self.event_range(centre, half)
-        limit = min(HYPOTHESIS_EVENTS, int(0.6 * (last - first)))
+        limit = min(MAX_HYPOTHESIS_EVENTS, int(0.6 * (last - first)))
         return HeldOutTest(
-            self.series(centre, half, HYPOTHESIS_EVENTS, limit),
-            self.series(centre, half, HYPOTHESIS_EVENTS, HYPOTHESIS_EVENTS, limit),
+            self.series(centre, half, MAX_HYPOTHESIS_EVENTS, limit),
+            self.series(centre, half, MAX_HYPOTHESIS_EVENTS, MAX_HYPOTHESIS_EVENTS, limit),
             self.prior(centre, half),
             max(MIN_TEST_SIGMA, self.sigma_floor.get(centre, 0.0)),
         )
@@ -406,7 +420,7 @@ class WindowFitter(Windows):
 
     def rotation_prior(self, path: Path) -> float:
         """Return the cost of the prior of |Omega|, per event."""
-        return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / SCORED_EVENTS
+        return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / MAX_SCORED_EVENTS
 
 
 def _without_heading(
@@ -421,7 +435,7 @@ def _without_heading(
     found[:3], found[:, :3] = 0, 0
     found[:3, :3] = (np.pi / 2) ** 2 / 2 * (np.eye(3) - np.outer(heading, heading))
     found[3:, 3:] += np.outer(turn, turn)
-    return Path(still.O, path.D, path.log_rho + UNOBSERVED_LOG_RHO), found
+    return Path(still.O, path.D, path.log_rho + UNOBSERVED_LOG_RHO_SHIFT), found
 
 
 def _ambiguity_covariance(
@@ -449,7 +463,7 @@ def _ambiguity_covariance(
 def is_near(path: Path, other: Path) -> bool:
     """Return whether two paths have about the same motion at the window's middle."""
     turn = float(((path.O[0] - other.O[0]) ** 2).sum())
-    return bool(path.D[0] @ other.D[0] > MIN_HEADING_COSINE) and turn < MAX_SAME_TURN**2
+    return bool(path.D[0] @ other.D[0] > MIN_SAME_HEADING_COSINE) and turn < MAX_SAME_TURN_RAD_S**2
 
 
 def _drop_near(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
@@ -481,9 +495,9 @@ def _settle_and_refine(
         return adjust(series, scene, prior, sigma=sigma, map_steps=steps, steps=steps, plane=plane)
 
     if len(series.x) > series.n_events and not scene.map.any():
-        for stage in BRIGHTNESS:
+        for stage in FRAME_BRIGHTNESS_STAGES:
             scene, _ = settle(scene, stage.sigma, stage.steps)
-    settled = settle(scene, COARSE_TO_FINE[0].sigma, 2)
+    settled = settle(scene, COARSE_TO_FINE_STAGES[0].sigma, 2)
     return _refine(settled, series, prior, stages, plane=plane, sigma_floor=sigma_floor)
 
 
@@ -546,7 +560,7 @@ class HeldOutTest:
         scene = blank_scene(self.series, path, prior)
         scene, _ = adjust(self.series, scene, prior, sigma=1.0, map_steps=2, steps=2)
         return adjust(
-            self.series, scene, prior, sigma=self.sigma, map_steps=N_MAP_STEPS, steps=steps
+            self.series, scene, prior, sigma=self.sigma, map_steps=N_TEST_MAP_STEPS, steps=steps
         )[0]
 
     def fit_rotation(
@@ -577,7 +591,7 @@ class HeldOutTest:
         turn = np.zeros_like(path.O)
         turn[0] = sharpest
         paths = first, Path(turn, first.D, first.log_rho)
-        settled = [self.fit(one, moves=False, steps=N_MAP_STEPS) for one in paths]
+        settled = [self.fit(one, moves=False, steps=N_TEST_MAP_STEPS) for one in paths]
         z = self.least_z(settled, moving)
         if z >= MIN_TRANSLATION_Z:
             return self.likelier(*settled), z
@@ -693,14 +707,17 @@ def _test_window(
     recording: Recording, camera: PinholeCamera, guess: MotionGuess
 ) -> WindowTest | None:
     """Test one window; None if it holds too few events."""
-    half = min(max(TEST_WINDOW_PX / 2 / guess.speed, MIN_HALF_S), MAX_HALF_S)
+    half = min(
+        max(TEST_WINDOW_DISPLACEMENT_PX / 2 / guess.speed, MIN_TEST_HALF_WINDOW_S),
+        MAX_TEST_HALF_WINDOW_S,
+    )
     windows = WindowFitter(recording, Params.of({"half_window": half}), camera)
     first, last = windows.event_range(guess.centre, half)
     if last - first < windows.params.fewest:
         return None
     test = windows.held_out_test(guess.centre)
     nodes = np.prod(test.series.nodes)
-    level = np.log(RELATIVE_PARALLAX * guess.speed / windows.f)
+    level = np.log(INITIAL_RELATIVE_PARALLAX * guess.speed / windows.f)
 
     def constant(heading: NDArray, turn: NDArray, log_rho: float) -> Path:
         return Path.constant_twist(heading, turn, np.full(nodes, log_rho, windows.real))

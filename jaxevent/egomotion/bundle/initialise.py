@@ -26,15 +26,15 @@ from jaxevent.egomotion.bundle.alignment import (
     blur,
     splat,
 )
-from jaxevent.egomotion.bundle.warp import MIN_RELATIVE_RHO, Path, cross_matrix, pixel_rays
+from jaxevent.egomotion.bundle.warp import MIN_RELATIVE_PLANE_RHO, Path, cross_matrix, pixel_rays
 from jaxevent.egomotion.geometry import A, B
 
-N_HEADINGS = 600  # of a hemisphere, that are tried
+N_SEARCHED_HEADINGS = 600  # of a hemisphere, that are tried
 PATCH_PX = 24  # of a patch whose flow is measured
 PATCH_STRIDE_PX = 16  # between patches
-EXPONENTIAL_ORDER = 5  # of exp(M tau)
-MAX_HALVINGS = 12  # of a step of `minimise_bfgs`
-MIN_RELATIVE_GAIN = 1e-8  # of a step that is not the last
+MATRIX_EXPONENTIAL_ORDER = 5  # of exp(M tau)
+MAX_BFGS_STEP_HALVINGS = 12  # of a step of `minimise_bfgs`
+MIN_BFGS_RELATIVE_GAIN = 1e-8  # of a step that is not the last
 
 ROTATION_GENERATORS = np.array([cross_matrix(axis) for axis in np.eye(3)])
 STRAIN_GENERATORS = np.array(
@@ -53,7 +53,7 @@ def _warp_point(M, x, y, t, f):
     """Move a point by exp(M t), px."""
     a, b, c = x / f, y / f, 1.0
     X, Y, Z = a, b, c
-    for k in range(1, EXPONENTIAL_ORDER + 1):
+    for k in range(1, MATRIX_EXPONENTIAL_ORDER + 1):
         s = t / k
         a, b, c = (
             s * (M[0, 0] * a + M[0, 1] * b + M[0, 2] * c),
@@ -112,7 +112,7 @@ def contrast_and_gradient(window, M, basis, blurs, scratch, gradient):
         p_k, q_k = terms[0], terms[1]
         p_k[0, 0], p_k[0, 1], p_k[0, 2] = X, Y, Z
         share = 1.0
-        for k in range(1, EXPONENTIAL_ORDER + 1):
+        for k in range(1, MATRIX_EXPONENTIAL_ORDER + 1):
             share /= k
             for m in range(3):
                 p_k[k, m] = t * (
@@ -124,10 +124,10 @@ def contrast_and_gradient(window, M, basis, blurs, scratch, gradient):
         gx, gy = -2 * p[e] * gx / Z, -2 * p[e] * gy / Z
         q_k[0, 0], q_k[0, 1], q_k[0, 2] = f * gx, f * gy, -(gx * px + gy * py)
         before = t
-        for i in range(EXPONENTIAL_ORDER):
+        for i in range(MATRIX_EXPONENTIAL_ORDER):
             share = before / (i + 1)
             a, b, c, before = 0.0, 0.0, 0.0, share
-            for j in range(EXPONENTIAL_ORDER - i):
+            for j in range(MATRIX_EXPONENTIAL_ORDER - i):
                 a, b, c = a + share * p_k[j, 0], b + share * p_k[j, 1], c + share * p_k[j, 2]
                 share /= i + j + 2
             for m in range(3):
@@ -213,7 +213,7 @@ def minimise_bfgs(
     for number in range(steps):
         way = -inverse @ slope
         down, share = float(slope @ way), 1.0
-        for _ in range(MAX_HALVINGS):
+        for _ in range(MAX_BFGS_STEP_HALVINGS):
             new, beyond = function(at + share * way)
             if new <= value + 1e-4 * share * down:
                 break
@@ -223,7 +223,7 @@ def minimise_bfgs(
             break
         s, y, gain = share * way, beyond - slope, value - new
         at, value, slope = at + s, new, beyond
-        if gain < MIN_RELATIVE_GAIN * abs(value):
+        if gain < MIN_BFGS_RELATIVE_GAIN * abs(value):
             break
         if s @ y > 1e-10 * float(np.sqrt((s @ s) * (y @ y))):
             if not number:
@@ -249,7 +249,7 @@ def _maximise_contrast(
         The factors, and minus the contrast.
     """
     per_px, least = 1 / (window.f * window.half), 0.0
-    terms = np.empty((3, EXPONENTIAL_ORDER + 1, 3))
+    terms = np.empty((3, MATRIX_EXPONENTIAL_ORDER + 1, 3))
     scratch = ImageScratch.of(window.shape, window.x.dtype, terms)
 
     def loss(values: NDArray, times: int) -> tuple[float, NDArray]:
@@ -306,7 +306,7 @@ class PlanarMotion(NamedTuple):
             real: Type of the depths.
         """
         rho = pixel_rays(*positions, f) @ self.normal * np.linalg.norm(self.T)
-        log_rho = np.log(np.maximum(rho, MIN_RELATIVE_RHO * np.median(np.abs(rho))))
+        log_rho = np.log(np.maximum(rho, MIN_RELATIVE_PLANE_RHO * np.median(np.abs(rho))))
         heading = self.T / np.linalg.norm(self.T)
         return Path.constant_twist(heading, self.Omega, log_rho.astype(real))
 
@@ -439,8 +439,8 @@ def search_headings(
         number: Most motions.
         omega_weight: Weight of |Omega|^2, 1 / (rad/s)^2.
     """
-    k = np.arange(N_HEADINGS) + 0.5
-    z, azimuth = k / N_HEADINGS, np.pi * (1 + 5**0.5) * k
+    k = np.arange(N_SEARCHED_HEADINGS) + 0.5
+    z, azimuth = k / N_SEARCHED_HEADINGS, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - z * z)
     T = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], 1)
     x, y = flows.xi.T
@@ -451,7 +451,7 @@ def search_headings(
     variance = np.einsum("tki,kij,tkj->tk", across, flows.covariance, across)
     target = np.einsum("tki,ki->tk", across, flows.U)
     basis = np.einsum("tki,kij->tkj", across, turn)
-    more = np.zeros((N_HEADINGS, 3))
+    more = np.zeros((N_SEARCHED_HEADINGS, 3))
     damping = (1e-6 * f * f + omega_weight) * np.eye(3)
     for turn_number in range(10):
         left = target - np.einsum("tkj,tj->tk", basis, more)

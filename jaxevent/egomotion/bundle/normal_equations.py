@@ -29,17 +29,17 @@ from jaxevent.egomotion.bundle.residuals import (
     subtract_mean,
 )
 
-N_PATH = (
-    6 * warp.N_ROWS
+N_PATH_UNKNOWNS = (
+    6 * warp.N_COEFFICIENT_ROWS
 )  # numbers of a path's rows; after them come the skew and the plane's normal
-NODE_EDGE = 0.1  # a larger difference of log depth between nodes is an edge
+NODE_EDGE_LOG_DEPTH = 0.1  # a larger difference of log depth between nodes is an edge
 # Less accurate solutions save a sixth of the time and lose 0.3 degrees of heading on slider_depth.
 MAX_CG_STEPS, CG_TOLERANCE = 40, 0.01
-SINGLE_SIDE_TOLERANCE = 1e-3  # likewise, of a column of H^-1 that is solved by itself
-MAP_RIDGE = 1e-5  # weight of the map's squares
+SINGLE_COLUMN_CG_TOLERANCE = 1e-3  # likewise, of a column of H^-1 that is solved by itself
+MAP_RIDGE_WEIGHT = 1e-5  # weight of the map's squares
 MAX_SKEW_SIGMAS = 2.0  # standard deviations of its prior by which the skew may be off
-VECTOR_WIDTH = 8  # numbers that a core multiplies at once
-BATCH_ROWS = 64  # rows whose squares single precision sums
+N_SIMD_LANES = 8  # numbers that a core multiplies at once
+ROWS_PER_SINGLE_PRECISION_SUM = 64  # rows whose squares single precision sums
 
 Unknowns = tuple[NDArray, NDArray, NDArray]
 
@@ -55,9 +55,12 @@ class BlockScratch(NamedTuple):
     @classmethod
     def of(cls, n: int, real: np.dtype) -> "BlockScratch":
         """Allocate it for n unknowns."""
-        wide = -(-n // VECTOR_WIDTH) * VECTOR_WIDTH
-        rows, part = np.zeros((BATCH_ROWS, wide), real), np.zeros((n, wide), real)
-        return cls(rows, np.zeros(BATCH_ROWS, real), np.zeros(wide, real), part)
+        wide = -(-n // N_SIMD_LANES) * N_SIMD_LANES
+        rows, part = (
+            np.zeros((ROWS_PER_SINGLE_PRECISION_SUM, wide), real),
+            np.zeros((n, wide), real),
+        )
+        return cls(rows, np.zeros(ROWS_PER_SINGLE_PRECISION_SUM, real), np.zeros(wide, real), part)
 
 
 @njit_fastmath_inlined
@@ -66,11 +69,11 @@ def _write_jacobian_row(jacobian, e, row):
     t = jacobian.tau[e]
     for axis in range(6):
         value = jacobian.base[axis, e]
-        for k in range(warp.N_ROWS):
+        for k in range(warp.N_COEFFICIENT_ROWS):
             value *= t
-            row[axis * warp.N_ROWS + k] = value
+            row[axis * warp.N_COEFFICIENT_ROWS + k] = value
     for k in range(len(jacobian.more)):
-        row[6 * warp.N_ROWS + k] = jacobian.more[k, e]
+        row[6 * warp.N_COEFFICIENT_ROWS + k] = jacobian.more[k, e]
 
 
 @njit_fastmath_inlined
@@ -86,7 +89,7 @@ def _add_outer_products(scratch, number, upper):
         for i in range(len(upper)):
             a, b, c, d = f * p[i], g * q[i], h * s[i], o * t[i]
             to = part[i]
-            for k in range(i // VECTOR_WIDTH * VECTOR_WIDTH + VECTOR_WIDTH):
+            for k in range(i // N_SIMD_LANES * N_SIMD_LANES + N_SIMD_LANES):
                 to[k] += a * p[k] + b * q[k] + c * s[k] + d * t[k]
     for i in range(len(upper)):
         for k in range(i + 1):
@@ -99,9 +102,9 @@ def _coarse_corner(jacobian, e):
     columns = jacobian.columns
     row = jacobian.node[e] // columns
     x, y = jacobian.node[e] - row * columns + jacobian.across[e], row + jacobian.down[e]
-    i, j = int(x / cg.COARSE_NODES), int(y / cg.COARSE_NODES)
-    wide = (columns - 1) // cg.COARSE_NODES + 2
-    return j * wide + i, x / cg.COARSE_NODES - i, y / cg.COARSE_NODES - j
+    i, j = int(x / cg.NODES_PER_COARSE_NODE), int(y / cg.NODES_PER_COARSE_NODE)
+    wide = (columns - 1) // cg.NODES_PER_COARSE_NODE + 2
+    return j * wide + i, x / cg.NODES_PER_COARSE_NODE - i, y / cg.NODES_PER_COARSE_NODE - j
 
 
 @njit_fastmath
@@ -116,7 +119,7 @@ def path_blocks(jacobian, weight, begin, scratch, path_block, coupling):
         path_block: (n, n) output, coefficients axis by axis, each with its powers, and `more`.
         coupling: (coarse nodes, n) output.
     """
-    wide = (jacobian.columns - 1) // cg.COARSE_NODES + 2
+    wide = (jacobian.columns - 1) // cg.NODES_PER_COARSE_NODE + 2
     rows, weights, mean, _ = scratch
     n, filled, series = len(path_block), 0, len(begin) - 1
     path_block[:] = 0
@@ -166,7 +169,7 @@ def depth_blocks(jacobian, weight, begin, scratch, coarse_block, lumped):
         lumped: (nodes,) output, without the means of series.
     """
     columns = jacobian.columns
-    wide = (columns - 1) // cg.COARSE_NODES + 2
+    wide = (columns - 1) // cg.NODES_PER_COARSE_NODE + 2
     mean, touched, latest = scratch
     latest[:] = -1
     coarse_block[:] = 0
@@ -230,10 +233,13 @@ class Problem(NamedTuple):
     def path_prior(self, unit: NDArray) -> tuple[NDArray, NDArray, float]:
         """Return K, b and c of the priors on path and skew, t' K t / 2 - b' t + c."""
         K, b, c = warp.row_priors(self.prior, unit, self.series.half)
-        matrix, side = np.zeros((N_PATH + 4, N_PATH + 4)), np.zeros(N_PATH + 4)
-        matrix[:N_PATH, :N_PATH], side[:N_PATH] = K, b
+        matrix, side = (
+            np.zeros((N_PATH_UNKNOWNS + 4, N_PATH_UNKNOWNS + 4)),
+            np.zeros(N_PATH_UNKNOWNS + 4),
+        )
+        matrix[:N_PATH_UNKNOWNS, :N_PATH_UNKNOWNS], side[:N_PATH_UNKNOWNS] = K, b
         weight, skew = float(self.prior.skew_weight), float(self.prior.skew)
-        matrix[N_PATH, N_PATH], side[N_PATH] = weight, weight * skew
+        matrix[N_PATH_UNKNOWNS, N_PATH_UNKNOWNS], side[N_PATH_UNKNOWNS] = weight, weight * skew
         return matrix, side, c + weight * skew**2 / 2
 
 
@@ -290,10 +296,12 @@ def evaluate(
     objective = t @ matrix @ t / 2 - side @ t + constant
     if not plane:
         depth = scene.path.log_rho.reshape(series.nodes)
-        objective += warp.smoothness_weights(depth, float(prior.bond), NODE_EDGE)[2]
+        objective += warp.smoothness_weights(depth, float(prior.bond), NODE_EDGE_LOG_DEPTH)[2]
     image = scene.map
     differences = sum(float(np.vdot(d, d)) for d in (np.diff(image, axis=k) for k in (0, 1)))
-    objective += (float(prior.flat) * differences + MAP_RIDGE * float(np.vdot(image, image))) / 2
+    objective += (
+        float(prior.flat) * differences + MAP_RIDGE_WEIGHT * float(np.vdot(image, image))
+    ) / 2
     objective += 0.5 * problem.information * of_positions
     number = max(float(samples.inside[: series.n_events].sum()), 1.0)
     return Evaluation(scene, samples, residual, weight, float(objective), float(cost) / number)
@@ -323,14 +331,18 @@ class NormalEquations(NamedTuple):
     @property
     def n(self) -> int:
         """Number of the path's unknowns, skew and a plane's normal included."""
-        return N_PATH + len(self.jacobian.more)
+        return N_PATH_UNKNOWNS + len(self.jacobian.more)
 
     def jacobian_product(self, v: Unknowns) -> NDArray:
         """Return the changes of residuals (E,) by unknowns, before means are subtracted."""
         image, t, depth = v
         real, value = image.dtype.type, np.empty_like(self.residual)
-        coefficients = (self.coefficient_jacobian @ t[:N_PATH]).reshape(6, warp.N_ROWS).astype(real)
-        more = t[N_PATH : self.n].astype(real)
+        coefficients = (
+            (self.coefficient_jacobian @ t[:N_PATH_UNKNOWNS])
+            .reshape(6, warp.N_COEFFICIENT_ROWS)
+            .astype(real)
+        )
+        more = t[N_PATH_UNKNOWNS : self.n].astype(real)
         direction = Direction(image.ravel(), coefficients, more, depth.astype(real))
         multiply_jacobian(self.jacobian, direction, value)
         return value
@@ -339,7 +351,7 @@ class NormalEquations(NamedTuple):
         """Return J' z of values z (E,)."""
         real, series, n = z.dtype, self.problem.series, len(self.jacobian.more)
         image, depth = np.empty(series.shape, real), np.empty(math.prod(series.nodes), real)
-        coefficients, more = np.empty((6, warp.N_ROWS), real), np.empty(n, real)
+        coefficients, more = np.empty((6, warp.N_COEFFICIENT_ROWS), real), np.empty(n, real)
         multiply_transpose(
             self.jacobian, z, Direction(image.reshape(-1), coefficients, more, depth)
         )
@@ -363,8 +375,8 @@ def linearise(problem: Problem, evaluation: Evaluation, map_only: bool) -> Norma
     free = None if map_only else FreeUnknowns(plane, moves, median_rho)
     jacobian = residual_jacobian(scene, series, evaluation.samples, free)
     by = warp.coefficient_jacobian(path, unit, series.half)
-    by[:, 3 * warp.N_ROWS :] *= moves
-    n = N_PATH + len(jacobian.more)
+    by[:, 3 * warp.N_COEFFICIENT_ROWS :] *= moves
+    n = N_PATH_UNKNOWNS + len(jacobian.more)
     residual = evaluation.residual.copy()
     subtract_mean(residual, weight, series.begin)
 
@@ -377,17 +389,20 @@ def linearise(problem: Problem, evaluation: Evaluation, map_only: bool) -> Norma
         path_blocks(jacobian, weight, series.begin, BlockScratch.of(n, real), raw, mixed)
         scratch = np.empty(coarse), np.empty(coarse, np.int64), np.empty(coarse, np.int64)
         depth_blocks(jacobian, weight, series.begin, scratch, coarse_block, lumped.reshape(-1))
-    whole = np.zeros((n, N_PATH + 4))
-    whole[:N_PATH, :N_PATH], whole[N_PATH:, N_PATH:n] = by, np.eye(n - N_PATH)
+    whole = np.zeros((n, N_PATH_UNKNOWNS + 4))
+    whole[:N_PATH_UNKNOWNS, :N_PATH_UNKNOWNS], whole[N_PATH_UNKNOWNS:, N_PATH_UNKNOWNS:n] = (
+        by,
+        np.eye(n - N_PATH_UNKNOWNS),
+    )
     information = problem.information
     path_prior, side, _ = problem.path_prior(unit)
     # Changes of the twist and the skew have priors, the rest may be undetermined.
     held = np.append(~warp.is_twist_change(), [False, True, True, True])
-    gauge = warp.gauge_direction(path, unit, N_PATH + 4)
+    gauge = warp.gauge_direction(path, unit, N_PATH_UNKNOWNS + 4)
     held = np.diag(np.where(held, 1e-3, 0)) + 1e4 * gauge[:, None] * gauge
     path_block = information * whole.T @ raw @ whole + path_prior + held
     depth = path.log_rho.reshape(series.nodes)
-    across, down, _ = warp.smoothness_weights(depth, float(prior.bond), NODE_EDGE)
+    across, down, _ = warp.smoothness_weights(depth, float(prior.bond), NODE_EDGE_LOG_DEPTH)
     if plane:
         across, down = np.zeros_like(across), np.zeros_like(down)
     lumped = information * lumped + 1e-2
@@ -397,7 +412,7 @@ def linearise(problem: Problem, evaluation: Evaluation, map_only: bool) -> Norma
     lumped += 2 * stiff
     # By einsum: larger products wake BLAS's threads, which spin then.
     coupling = np.einsum("ki,ij->kj", mixed, information * whole)
-    diagonal = 0.7 * information * diagonal + 4 * float(prior.flat) + MAP_RIDGE
+    diagonal = 0.7 * information * diagonal + 4 * float(prior.flat) + MAP_RIDGE_WEIGHT
     return NormalEquations(
         problem, evaluation, jacobian, by, unit, path_unknowns(scene, unit), residual, diagonal,
         path_prior, side, held, path_block, coupling, information * coarse_block, lumped,
@@ -416,7 +431,7 @@ def gradient(equations: NormalEquations) -> Unknowns:
     for axis, bond in ((1, equations.across), (0, equations.down)):
         pulled = bond * np.diff(depth, axis=axis, prepend=np.take(depth, [0], axis))
         of_bonds += pulled - np.roll(pulled, -1, axis)
-    flat, ridge = real.type(prior.flat), real.type(MAP_RIDGE)
+    flat, ridge = real.type(prior.flat), real.type(MAP_RIDGE_WEIGHT)
     return (
         of_map + flat * laplacian(scene.map) + ridge * scene.map,
         of_path + equations.path_prior @ equations.t - equations.path_prior_side,
@@ -441,9 +456,11 @@ def damped_system(equations: NormalEquations, damping: float) -> cg.System:
     return cg.System(
         equations.jacobian, equations.evaluation.weight, equations.problem.information,
         series.begin, equations.coefficient_jacobian, path_prior,
-        float(equations.problem.prior.flat), MAP_RIDGE, on(damping * equations.diagonal), on(hold),
+        float(equations.problem.prior.flat), MAP_RIDGE_WEIGHT,
+        on(damping * equations.diagonal), on(hold),
         on(bonds[0]), on(bonds[1]), on(1 / diagonal), on(1 / lumped), lower,
-        np.empty((6, warp.N_ROWS), real), np.empty(n - N_PATH, real), np.empty(len(lower)),
+        np.empty((6, warp.N_COEFFICIENT_ROWS), real), np.empty(n - N_PATH_UNKNOWNS, real),
+        np.empty(len(lower)),
     )  # fmt: skip
 
 
@@ -458,11 +475,13 @@ def inverse_columns(equations: NormalEquations, rows: list[int]) -> list[Unknown
     for row in np.flatnonzero(~np.isfinite(found.t).all(1)):
         none, depths = np.zeros(shape, found.rest.dtype), np.zeros_like(system.across)
         side = cg.BlockVector(none, sides[row], depths)
-        one, _ = cg.conjugate_gradients(system, side, cg.MAX_BLOCK_STEPS, SINGLE_SIDE_TOLERANCE)
+        one, _ = cg.conjugate_gradients(
+            system, side, cg.MAX_BLOCK_CG_STEPS, SINGLE_COLUMN_CG_TOLERANCE
+        )
         found.t[row] = one.t
         found.rest[row] = np.concatenate([one.map.ravel(), one.depth.ravel()])
     return [
-        (rest[:size].reshape(shape), np.append(t, np.zeros(N_PATH + 4 - n)), rest[size:])
+        (rest[:size].reshape(shape), np.append(t, np.zeros(N_PATH_UNKNOWNS + 4 - n)), rest[size:])
         for t, rest in zip(*found, strict=True)
     ]
 
@@ -479,4 +498,4 @@ def solve(
     )
     system = damped_system(equations, damping)
     (image, t, depth), _ = cg.conjugate_gradients(system, vector, MAX_CG_STEPS, tolerance)
-    return image, np.append(t, np.zeros(N_PATH + 4 - n)), depth.ravel()
+    return image, np.append(t, np.zeros(N_PATH_UNKNOWNS + 4 - n)), depth.ravel()

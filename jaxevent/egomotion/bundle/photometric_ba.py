@@ -37,7 +37,7 @@ from jaxevent.codegen import njit_fastmath
 from jaxevent.egomotion.bundle import warp
 from jaxevent.egomotion.bundle.alignment import ContrastMaps, ImageScratch, blur, splat
 from jaxevent.egomotion.bundle.normal_equations import (
-    N_PATH,
+    N_PATH_UNKNOWNS,
     Evaluation,
     NormalEquations,
     Problem,
@@ -52,15 +52,15 @@ from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, subtract_mea
 # A step that costs more is taken back and damped, first by FIRST_DAMPING, then by DAMPING_GROWTH
 # times more, until no step helps. One that costs less leaves DAMPING_DECAY of the damping, and is
 # the last if it gains less than MIN_RELATIVE_GAIN of the objective.
-FIRST_DAMPING = 0.1
-DAMPING_GROWTH = 5
+INITIAL_DAMPING = 0.1
+DAMPING_GROWTH_FACTOR = 5
 MAX_DAMPING = 50
-DAMPING_DECAY = 0.5
+DAMPING_DECAY_FACTOR = 0.5
 MIN_RELATIVE_GAIN = 1e-3
-ERROR_CELLS_PX = 24, 48  # within which errors of events are alike
-MAX_DEPTH_SPREAD = 5.0  # of log depth beside the median, that single precision bears
-N_DEPTHS = 40  # log depths that are tried at a node
-SPOT_PX = 12  # of the square about a node whose contrast counts
+CORRELATED_CELL_SIZES_PX = 24, 48  # within which errors of events are alike
+MAX_LOG_DEPTH_SPREAD = 5.0  # of log depth beside the median, that single precision bears
+N_SEARCHED_DEPTHS = 40  # log depths that are tried at a node
+DEPTH_SEARCH_SQUARE_PX = 12  # of the square about a node whose contrast counts
 
 
 class StepControl(NamedTuple):
@@ -93,8 +93,12 @@ def update_control(
         builds_momentum: Whether an accepted step adds momentum.
     """
     damping = control.damping
-    damping = damping * DAMPING_DECAY if accepted else max(damping * DAMPING_GROWTH, FIRST_DAMPING)
-    damping = damping if damping >= FIRST_DAMPING / 4 else 0.0
+    damping = (
+        damping * DAMPING_DECAY_FACTOR
+        if accepted
+        else max(damping * DAMPING_GROWTH_FACTOR, INITIAL_DAMPING)
+    )
+    damping = damping if damping >= INITIAL_DAMPING / 4 else 0.0
     if accepted and gain < MIN_RELATIVE_GAIN * objective:
         damping = MAX_DAMPING
     return StepControl(control.momentum + 1 if accepted and builds_momentum else 0, damping)
@@ -175,7 +179,7 @@ def extrapolate(scene: Scene, last: Scene, factor: float, plane: bool) -> Scene:
     depth = here.log_rho + factor * (here.log_rho - there.log_rho)
     if plane:
         near, nearer = np.exp(there.log_rho), np.exp(here.log_rho)
-        far = warp.MIN_RELATIVE_RHO * np.median(nearer)
+        far = warp.MIN_RELATIVE_PLANE_RHO * np.median(nearer)
         depth = np.log(np.maximum(nearer + factor * (nearer - near), far))
     skew = scene.skew + factor * (scene.skew - last.skew)
     real = scene.map.dtype
@@ -192,15 +196,17 @@ def gauss_newton_step(problem: Problem, kept: Evaluation, damping: float, map_on
         return scene
     if map_only:
         return Scene(scene.path, scene.map + image, scene.skew)
-    fraction = warp.step_fraction(t[:N_PATH])
-    rows = (equations.t + fraction * t)[:N_PATH] * equations.unit
+    fraction = warp.step_fraction(t[:N_PATH_UNKNOWNS])
+    rows = (equations.t + fraction * t)[:N_PATH_UNKNOWNS] * equations.unit
     path = warp.replace_rows(scene.path, rows)
     if problem.plane:
-        depth = update_plane_normal(path, problem.series, fraction * t[N_PATH + 1 :])
+        depth = update_plane_normal(path, problem.series, fraction * t[N_PATH_UNKNOWNS + 1 :])
     else:
-        depth = path.log_rho + np.clip(fraction * q, -warp.MAX_DEPTH_STEP, warp.MAX_DEPTH_STEP)
+        depth = path.log_rho + np.clip(
+            fraction * q, -warp.MAX_LOG_DEPTH_STEP, warp.MAX_LOG_DEPTH_STEP
+        )
     path = warp.normalise(warp.Path(path.O, path.D, depth.astype(scene.map.dtype)))
-    return Scene(path, scene.map + image, scene.skew + fraction * t[N_PATH])
+    return Scene(path, scene.map + image, scene.skew + fraction * t[N_PATH_UNKNOWNS])
 
 
 def update_plane_normal(
@@ -216,11 +222,11 @@ def update_plane_normal(
     level = np.exp(path.log_rho.astype(np.float64))
     median = float(np.median(level))
     rays = warp.pixel_rays(*series.node_positions, series.f)
-    known = np.where(level > 1.5 * warp.MIN_RELATIVE_RHO * median, rays.T, 0)
+    known = np.where(level > 1.5 * warp.MIN_RELATIVE_PLANE_RHO * median, rays.T, 0)
     # By einsum: larger products wake BLAS's threads, which spin then.
     normal = np.linalg.solve(known @ rays + 1e-6 * np.eye(3), np.einsum("in,n->i", known, level))
     level = np.einsum("ni,i->n", rays, normal + median * change)
-    return np.log(np.maximum(level, warp.MIN_RELATIVE_RHO * median))
+    return np.log(np.maximum(level, warp.MIN_RELATIVE_PLANE_RHO * median))
 
 
 def summarise(problem: Problem, kept: Evaluation) -> FitReport:
@@ -241,7 +247,7 @@ def compute_covariance(
     """Return the covariance (6, 6) of heading C1 and Omega O0 of a scene that was adjusted."""
     path = scene.path
     median = np.median(path.log_rho)
-    depth = np.clip(path.log_rho, median - MAX_DEPTH_SPREAD, median + MAX_DEPTH_SPREAD)
+    depth = np.clip(path.log_rho, median - MAX_LOG_DEPTH_SPREAD, median + MAX_LOG_DEPTH_SPREAD)
     scene = scene._replace(path=warp.Path(path.O, path.D, depth))
     problem, evaluation = init_problem(series, scene, prior, float(sigma), plane)
     return sandwich_covariance(linearise(problem, evaluation, map_only=False))
@@ -259,12 +265,14 @@ def sandwich_covariance(equations: NormalEquations) -> NDArray[np.float64]:
     u = (series.precision * left) ** 2 / problem.loss.limit
     curved = float((weight * (1 - 3 * u) / (1 + u)).sum()) / max(float(weight.sum()), 1.0)
     less = 1 / max(curved, 0.1) ** 2
-    small, large = ERROR_CELLS_PX
+    small, large = CORRELATED_CELL_SIZES_PX
     rows, columns = (-(-n // small) for n in series.shape)
     down, across = ((series.y - series.corner[1]), (series.x - series.corner[0]))
     cell = (down // small * columns + across // small).astype(np.int64)
     sums, own = [], []
-    for v in inverse_columns(equations, [*range(3 * warp.N_ROWS, 3 * warp.N_ROWS + 3), *range(3)]):
+    for v in inverse_columns(
+        equations, [*range(3 * warp.N_COEFFICIENT_ROWS, 3 * warp.N_COEFFICIENT_ROWS + 3), *range(3)]
+    ):
         score = problem.information * weight * left * equations.jacobian_product(v)
         sums.append(np.bincount(cell, score, rows * columns))
         own.append(v[1])
@@ -294,7 +302,7 @@ def _contrast_by_depth(rays, p, depths, series, scratch, out):
     images, strips, node = scratch.images, scratch.sums, series.node
     height, width = images.shape[1:]
     rows, columns = out.contrast.shape[1:]
-    before = SPOT_PX // 2
+    before = DEPTH_SEARCH_SQUARE_PX // 2
     for n in range(len(depths)):
         images[:] = 0
         rho = depths[n]
@@ -305,14 +313,19 @@ def _contrast_by_depth(rays, p, depths, series, scratch, out):
         blur(images[0], scratch.work, 1)
         strips[:] = 0
         for j in range(rows):
-            for k in range(max(j * node - before, 0), min(j * node - before + SPOT_PX, height)):
+            for k in range(
+                max(j * node - before, 0), min(j * node - before + DEPTH_SEARCH_SQUARE_PX, height)
+            ):
                 for i in range(width):
                     strips[0, j, i] += images[0, k, i] * images[0, k, i]
                     strips[1, j, i] += images[1, k, i]
         for j in range(rows):
             for i in range(columns):
                 s = t = 0.0
-                for k in range(max(i * node - before, 0), min(i * node - before + SPOT_PX, width)):
+                for k in range(
+                    max(i * node - before, 0),
+                    min(i * node - before + DEPTH_SEARCH_SQUARE_PX, width),
+                ):
                     s += strips[0, j, k]
                     t += strips[1, j, k]
                 out.contrast[n, j, i], out.number[n, j, i] = s, t
@@ -350,15 +363,17 @@ def search_depths(path: warp.Path, series: PixelSeries) -> NDArray:
     low, high = low - np.log(2.5), high + np.log(2.5)
     S, n = (
         scipy.ndimage.gaussian_filter(part, (0, 1.5, 1.5))
-        for part in _contrast_of_depths(path, series, np.exp(np.linspace(low, high, N_DEPTHS)))
+        for part in _contrast_of_depths(
+            path, series, np.exp(np.linspace(low, high, N_SEARCHED_DEPTHS))
+        )
     )
     sharp = S / np.maximum(n, 20)
     best = sharp.argmax(0)
-    inner = np.clip(best, 1, N_DEPTHS - 2)
+    inner = np.clip(best, 1, N_SEARCHED_DEPTHS - 2)
     before, here, after = (np.take_along_axis(sharp, (inner + k)[None], 0)[0] for k in (-1, 0, 1))
     bend = np.minimum(before - 2 * here + after, -1e-9)
     found = inner + np.where(best == inner, np.clip((before - after) / 2 / bend, -0.5, 0.5), 0)
-    found = low + (high - low) / (N_DEPTHS - 1) * found
+    found = low + (high - low) / (N_SEARCHED_DEPTHS - 1) * found
     clarity = n.mean(0) * np.maximum(1 - sharp.mean(0) / np.maximum(here, 1e-9), 0)
     clarity *= np.where(best == inner, 1, 1e-3)
     clarity /= clarity + max(clarity.mean(), 1e-9)

@@ -302,7 +302,7 @@ class MapField(NamedTuple):
 
 
 class Direction(NamedTuple):
-    """A change of the unknowns, or a gradient, flat: map, coefficients (6, N_ROWS), more, depth."""
+    """A change of the unknowns, or a gradient, flat: map, coefficients (6, rows), more, depth."""
 
     map: NDArray
     coefficients: NDArray

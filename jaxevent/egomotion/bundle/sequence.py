@@ -16,14 +16,14 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.progress import bar
 
-WINDOW_PX_RANGE = (
+WINDOW_DISPLACEMENT_RANGE_PX = (
     24.0,
     150.0,
 )  # motion of the image in a window, with which the default length stays
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.02, 2.0
 # Uncertainty of the motion at the end of a window without neighbour, by its difference from that at
 # the middle. Squared errors of Omega 0.1 s from the middle are then 0.1 to 2 times the variance.
-EDGE_UNCERTAINTY = 0.5
+WINDOW_END_SIGMA_PER_CHANGE = 0.5
 MAX_AMBIGUITY_RAD = 1.0  # of a window whose path is followed into the next one
 LOST_COST_RATIO = 4  # times the least cost of the windows before: the path is not followed
 
@@ -165,7 +165,7 @@ def _blend(
     """Blend the motions of overlapping windows.
 
     Of a window the middle two thirds count, those beyond `step` hardly. The covariance contains the
-    window's disagreement with its neighbours; on a side without neighbour, `EDGE_UNCERTAINTY` of
+    window's disagreement with its neighbours; without neighbour, `WINDOW_END_SIGMA_PER_CHANGE` of
     the difference of its motion there from that at its middle. If the camera is slower than at the
     middle, the heading is less certain.
 
@@ -193,7 +193,11 @@ def _blend(
         heading[near] += weight[:, None] * T
         Omega[near] += weight[:, None] * turn
         way = np.concatenate([T, turn], 1) - np.concatenate(fit.path.twist(0.0), 1)
-        way = EDGE_UNCERTAINTY * way * _has_no_neighbour(fits, k, t[near] - centre)[:, None]
+        way = (
+            WINDOW_END_SIGMA_PER_CHANGE
+            * way
+            * _has_no_neighbour(fits, k, t[near] - centre)[:, None]
+        )
         bent = way[:, :, None] * way[:, None, :]
         speed = fit.path.relative_speed((t[near] - centre) * 1e-6)
         scaled = _scale_heading_covariance(fit.covariance, speed)
@@ -254,7 +258,7 @@ def _disagreements(
 def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """Return `half_window` and `step` for windows in which the image moves by some pixels."""
     way = 2 * float(params.half_window) * speed.median
-    low, high = WINDOW_PX_RANGE
+    low, high = WINDOW_DISPLACEMENT_RANGE_PX
     if low <= way <= high:
         return {}
     half = (low if way < low else high) / speed.median / 2

@@ -22,15 +22,17 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
 
-N_ROWS = 5  # of O and of D: T and Omega are polynomials of the fourth degree
-N_SEGMENTS = 8  # of a window, at whose middles a gyro's prior acts
-MIN_RELATIVE_RHO = 0.1  # least inverse depth of a plane, by the median one
+N_COEFFICIENT_ROWS = 5  # of O and of D: T and Omega are polynomials of the fourth degree
+N_WINDOW_SEGMENTS = 8  # of a window, at whose middles a gyro's prior acts
+MIN_RELATIVE_PLANE_RHO = 0.1  # least inverse depth of a plane, by the median one
 MAX_RAY_SAMPLES = 16  # depths that are tried on a ray
 RAY_STEP_PX = 1.0  # between them, unless that takes more of them
-NEWTON_TOLERANCE = 0.01  # log depth; a larger second step of Newton starts a search of the ray
+NEWTON_TOLERANCE_LOG_DEPTH = (
+    0.01  # log depth; a larger second step of Newton starts a search of the ray
+)
 MIN_RAY_DERIVATIVE = 0.3  # of log depth less that of the scene, along an event's ray
-MAX_STEP_PX = 4.0  # at the window's end, that one Gauss-Newton step of a path moves the image
-MAX_DEPTH_STEP = 0.5  # of log depth, in one step
+MAX_PATH_STEP_PX = 4.0  # at the window's end, that one Gauss-Newton step of a path moves the image
+MAX_LOG_DEPTH_STEP = 0.5  # of log depth, in one step
 
 
 class MapGrid(NamedTuple):
@@ -61,7 +63,7 @@ class Positions(NamedTuple):
 
 
 class CameraMotion(NamedTuple):
-    """Polynomials of a path for compiled functions: factors of tau, tau^2, ..., (N_ROWS, 3)."""
+    """Polynomials of a path for compiled functions: factors of tau, tau^2, ..., (rows, 3)."""
 
     phi: NDArray[np.float64]
     C: NDArray[np.float64]
@@ -89,8 +91,8 @@ class DepthField(NamedTuple):
 @njit_fastmath_inlined
 def _polynomial(c, tau, axis):
     """Evaluate sum_k c_k tau^k of one component, k from 1."""
-    s = c[N_ROWS - 1, axis]
-    for k in range(N_ROWS - 2, -1, -1):
+    s = c[N_COEFFICIENT_ROWS - 1, axis]
+    for k in range(N_COEFFICIENT_ROWS - 2, -1, -1):
         s = s * tau + c[k, axis]
     return s * tau
 
@@ -238,7 +240,7 @@ def project(points, motion, field, log_rho, out):
         if here > -np.inf:
             here = _newton_step(field, ray, here)
             new = _newton_step(field, ray, here)
-        if not abs(new - here) < NEWTON_TOLERANCE:
+        if not abs(new - here) < NEWTON_TOLERANCE_LOG_DEPTH:
             k = bilinear_corner(rx, ry, field.grid)[0]
             top, bottom = field.nearest[k] + 0.02, field.farthest[k] - 0.02
             new = _first_intersection(field, ray, top, bottom)
@@ -293,7 +295,7 @@ def point_derivatives(points, rho, motion, by, by_depth):
 class Path:
     """Unknowns of a path: rows O0, O1, ... (rad/s^k), and C1, D2, D3, ... in units of |T|.
 
-    O and D are (N_ROWS, 3). `log_rho` holds log inverse depths of cells or nodes, in units of
+    O and D are (rows, 3). `log_rho` holds log inverse depths of cells or nodes, in units of
     1/|T|.
     """
 
@@ -304,7 +306,7 @@ class Path:
     @classmethod
     def constant_twist(cls, heading: NDArray, Omega: NDArray, log_rho: NDArray) -> "Path":
         """Make the path of a unit heading and a constant Omega (rad/s)."""
-        O, D = np.zeros((N_ROWS, 3)), np.zeros((N_ROWS, 3))  # noqa: E741
+        O, D = np.zeros((N_COEFFICIENT_ROWS, 3)), np.zeros((N_COEFFICIENT_ROWS, 3))  # noqa: E741
         O[0], D[0] = Omega, heading
         return cls(O, D, log_rho)
 
@@ -358,7 +360,7 @@ def _taylor_powers(tau: NDArray, first: int, number: int) -> NDArray[np.float64]
 
 def segment_times(half: float) -> NDArray[np.float64]:
     """Return the middles (N_SEGMENTS,) of a window's segments, s from its middle."""
-    return ((np.arange(N_SEGMENTS) + 0.5) / N_SEGMENTS * 2 - 1) * half
+    return ((np.arange(N_WINDOW_SEGMENTS) + 0.5) / N_WINDOW_SEGMENTS * 2 - 1) * half
 
 
 def warp(
@@ -434,7 +436,7 @@ def predict_path(path: Path, tau: float, half: float) -> Path:
     from scipy.spatial.transform import Rotation
 
     n = len(path.O)
-    t = np.linspace(-half, half, 8 * N_SEGMENTS + 1)
+    t = np.linspace(-half, half, 8 * N_WINDOW_SEGMENTS + 1)
     velocity, Omega = path.velocities(np.clip(t + tau, -half, half))
     powers = _taylor_powers(t, 0, n)
     O = np.linalg.lstsq(powers, Omega, rcond=None)[0]  # noqa: E741
@@ -448,7 +450,7 @@ def predict_path(path: Path, tau: float, half: float) -> Path:
     return normalise(Path(O.astype(np.float64), np.array(D), path.log_rho))
 
 
-def pack_rows(path: Path, k: int = N_ROWS) -> NDArray[np.float64]:
+def pack_rows(path: Path, k: int = N_COEFFICIENT_ROWS) -> NDArray[np.float64]:
     """Return the first k rows of O and of D as one vector (6 k,)."""
     return np.concatenate([path.O[:k], path.D[:k]]).astype(np.float64).ravel()
 
@@ -461,7 +463,9 @@ def replace_rows(path: Path, values: NDArray) -> Path:
     return Path(O, D, path.log_rho)
 
 
-def row_units(path: Path, f: float, half: float, k: int = N_ROWS) -> NDArray[np.float64]:
+def row_units(
+    path: Path, f: float, half: float, k: int = N_COEFFICIENT_ROWS
+) -> NDArray[np.float64]:
     """Return the rows (6 k,) that each move a point of median depth by 1 px at the window's end.
 
     Args:
@@ -475,7 +479,7 @@ def row_units(path: Path, f: float, half: float, k: int = N_ROWS) -> NDArray[np.
     return np.repeat(np.concatenate([powers, powers / median]), 3)
 
 
-def is_twist_change(k: int = N_ROWS) -> NDArray[np.bool_]:
+def is_twist_change(k: int = N_COEFFICIENT_ROWS) -> NDArray[np.bool_]:
     """Return which of the numbers of `pack_rows` describe a change of the twist."""
     return np.repeat(np.tile(np.arange(k) > 0, 2), 3)
 
@@ -499,7 +503,7 @@ def row_priors(
     k = n // 6
     times = segment_times(half)
     powers = np.stack([times**m / math.factorial(m) for m in range(k)], 1)
-    weight, gyro = float(prior.gyro_weight) / N_SEGMENTS, np.asarray(prior.gyro, np.float64)
+    weight, gyro = float(prior.gyro_weight) / N_WINDOW_SEGMENTS, np.asarray(prior.gyro, np.float64)
     of_O = weight * powers.T @ powers
     of_O[0, 0] += float(prior.omega)
     K, b = np.zeros((n, n)), np.zeros(n)
@@ -518,7 +522,7 @@ def gauge_direction(path: Path, unit: NDArray, size: int) -> NDArray[np.float64]
 
 
 def coefficient_jacobian(
-    path: Path, unit: NDArray, half: float, k: int = N_ROWS
+    path: Path, unit: NDArray, half: float, k: int = N_COEFFICIENT_ROWS
 ) -> NDArray[np.float64]:
     """Return the derivatives of the polynomials' coefficients by the path's first k rows.
 
@@ -529,14 +533,14 @@ def coefficient_jacobian(
         k: Number of rows of O and of D.
 
     Returns:
-        (6 * N_ROWS, 6 k): coefficients of phi and C, those of one component one after another.
+        (6 rows, 6 k): coefficients of phi and C, those of one component one after another.
     """
     O, D = path.O, path.D  # noqa: E741
-    by = np.zeros((6, N_ROWS, 2, N_ROWS, 3))
-    constant, derivative = D[0], np.zeros((3, 2, N_ROWS, 3))
+    by = np.zeros((6, N_COEFFICIENT_ROWS, 2, N_COEFFICIENT_ROWS, 3))
+    constant, derivative = D[0], np.zeros((3, 2, N_COEFFICIENT_ROWS, 3))
     derivative[:, 1, 0] = np.eye(3)
     turn = cross_matrix(O[0])
-    for m in range(N_ROWS):
+    for m in range(N_COEFFICIENT_ROWS):
         by[range(3), m, 0, m, range(3)] = 1
         by[3:, m] = derivative
         if m:
@@ -545,14 +549,14 @@ def coefficient_jacobian(
         derivative = np.einsum("ij,jrka->irka", turn, derivative)
         derivative[:, 0, 0] -= cross_matrix(constant)
         constant = turn @ constant
-    powers = np.array([half**m / math.factorial(m) for m in range(1, N_ROWS + 1)])
+    powers = np.array([half**m / math.factorial(m) for m in range(1, N_COEFFICIENT_ROWS + 1)])
     by = by[:, :, :, :k] * powers[:, None, None, None]
-    return by.reshape(6 * N_ROWS, 6 * k) * unit
+    return by.reshape(6 * N_COEFFICIENT_ROWS, 6 * k) * unit
 
 
 def step_fraction(rows: NDArray) -> float:
     """Return the fraction of a step of the path's rows (px at the window's end) to take."""
-    return min(1.0, MAX_STEP_PX / max(float(np.abs(rows).max()), 1e-9))
+    return min(1.0, MAX_PATH_STEP_PX / max(float(np.abs(rows).max()), 1e-9))
 
 
 def smoothness_weights(

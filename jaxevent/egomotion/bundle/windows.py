@@ -24,33 +24,33 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.bundle.alignment import WindowEvents
 from jaxevent.egomotion.bundle.residuals import PixelSeries
-from jaxevent.egomotion.bundle.warp import N_SEGMENTS, Prior, segment_times
+from jaxevent.egomotion.bundle.warp import N_WINDOW_SEGMENTS, Prior, segment_times
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.motion import lens_error
 from jaxevent.egomotion.truth import Twists
 from jaxevent.parameters import Choice, Count, Number, Parameters, Positive
 from jaxevent.recording import Recording
 
-NODE_PX = 4  # between nodes of depth
-MARGIN_PX = 24  # of the reference view around the sensor
+DEPTH_NODE_SPACING_PX = 4  # between nodes of depth
+VIEW_MARGIN_PX = 24  # of the reference view around the sensor
 SKEW_CELL_PX = 24  # within which errors of the skew are alike
 MIN_SKEW_SIGMA = 0.03  # standard deviation of the thresholds' skew by counts, at least
 
-DARK = 0.02  # grey, added before the logarithm
-UNCLIPPED = 0.03, 0.97  # grey, range in which a pixel shows an intensity
+DARK_GREY_OFFSET = 0.02  # grey, added before the logarithm
+UNCLIPPED_GREY_RANGE = 0.03, 0.97  # grey, range in which a pixel shows an intensity
 MIN_NET_EVENTS = 2  # of one polarity, that count for the threshold
-MIN_PIXELS = 200  # with so many events
-MIN_CORRELATION = 0.5  # of changes and events
-STEEP_SHARE = 0.5  # of pixels, those with the steepest surroundings, that are fitted
-QUANTISATION = 1 / 512  # grey, the noise of 8 bits
-EVENT_NOISE = 0.1  # C, of events; noisier pixels count less
+MIN_THRESHOLD_PIXELS = 200  # with so many events
+MIN_EVENT_CORRELATION = 0.5  # of changes and events
+STEEP_PIXEL_SHARE = 0.5  # of pixels, those with the steepest surroundings, that are fitted
+QUANTISATION_NOISE_GREY = 1 / 512  # grey, the noise of 8 bits
+EVENT_NOISE_THRESHOLDS = 0.1  # C, of events; noisier pixels count less
 N_FRAME_PAIRS = 20  # with most events between them, that determine the offset of stamps
-MAX_OFFSET_US = 20_000  # of stamps
+MAX_STAMP_OFFSET_US = 20_000  # of stamps
 # The second difference in x and y of a pixel, 6 times its noise (Immerkaer, 1996).
 NOISE_KERNEL = np.outer([1, -2, 1], [1, -2, 1])
 
 
-class OffsetMethod(NamedTuple):
+class StampOffsetMethod(NamedTuple):
     """Estimate of a pixel's level at a frame, between the events before and after it."""
 
     following_us: int  # within which the next event after a frame is looked for
@@ -60,8 +60,11 @@ class OffsetMethod(NamedTuple):
 
 # Both methods must find the same offset within MAX_OFFSET_DIFFERENCE_US, else it is taken for 0:
 # walls of little contrast do not determine it.
-OFFSET_METHODS = OffsetMethod(50_000, False, 2000), OffsetMethod(100_000, True, 4000)
-MAX_OFFSET_DIFFERENCE_US = 2000
+STAMP_OFFSET_METHODS = (
+    StampOffsetMethod(50_000, False, 2000),
+    StampOffsetMethod(100_000, True, 4000),
+)
+MAX_STAMP_OFFSET_DIFFERENCE_US = 2000
 
 FramePair = tuple[NDArray, NDArray, NDArray]
 
@@ -131,11 +134,16 @@ def read_frame_pixels(
     if threshold is None:
         return None
     rough = np.abs([scipy.ndimage.convolve(image, NOISE_KERNEL) for image in grey])
-    noise = max(1.48 / 6 * float(np.median(rough)), QUANTISATION)
+    noise = max(1.48 / 6 * float(np.median(rough)), QUANTISATION_NOISE_GREY)
     slopes = np.hypot(*np.gradient(level.mean(0)))
     seen = known.all(0)
-    steep = seen & (slopes >= np.quantile(slopes[seen], 1 - STEEP_SHARE)) if seen.any() else seen
-    precision = np.minimum(1, EVENT_NOISE * threshold * (grey + DARK) / noise) * known
+    steep = (
+        seen & (slopes >= np.quantile(slopes[seen], 1 - STEEP_PIXEL_SHARE)) if seen.any() else seen
+    )
+    precision = (
+        np.minimum(1, EVENT_NOISE_THRESHOLDS * threshold * (grey + DARK_GREY_OFFSET) / noise)
+        * known
+    )
     flat = len(t), -1
     return FramePixels(t, level.reshape(flat) / threshold, precision.reshape(flat), steep.ravel())
 
@@ -146,27 +154,27 @@ def stamp_offset(recording: Recording) -> int:
     if frames is None or len(frames.t) < 2:
         return 0
     lasts, begins = np.diff(frames.t), [recording.events.index(int(t)) for t in frames.t]
-    most = min(MAX_OFFSET_US, int(lasts.min()) // 2)
+    most = min(MAX_STAMP_OFFSET_US, int(lasts.min()) // 2)
     pairs: list[FramePair] = []
     for k in np.argsort(-np.diff(begins), kind="stable")[:N_FRAME_PAIRS]:
         level, known = _log_levels(frames[slice(int(k), int(k) + 2)].intensity.astype(np.float64))
         pairs.append((frames.t[k : k + 2], level, np.all(known, axis=0)))
-    found = _best_offset(recording, pairs, most, OFFSET_METHODS[0])
-    other = None if found is None else _best_offset(recording, pairs, most, OFFSET_METHODS[1])
-    if found is None or other is None or abs(found - other) > MAX_OFFSET_DIFFERENCE_US:
+    found = _best_offset(recording, pairs, most, STAMP_OFFSET_METHODS[0])
+    other = None if found is None else _best_offset(recording, pairs, most, STAMP_OFFSET_METHODS[1])
+    if found is None or other is None or abs(found - other) > MAX_STAMP_OFFSET_DIFFERENCE_US:
         return 0
     return found
 
 
 def _best_offset(
-    recording: Recording, pairs: list[FramePair], most: int, method: OffsetMethod
+    recording: Recording, pairs: list[FramePair], most: int, method: StampOffsetMethod
 ) -> int | None:
     """Return the offset, us, up to `most`, of highest correlation; None if that is no maximum."""
     end = most // method.step_us * method.step_us
     tried = np.arange(-end, end + 1, method.step_us)
     correlation = [_change_correlation(recording, pairs, int(us), method) for us in tried]
     best = int(np.argmax(correlation))
-    if not 0 < best < len(tried) - 1 or not correlation[best] > MIN_CORRELATION:
+    if not 0 < best < len(tried) - 1 or not correlation[best] > MIN_EVENT_CORRELATION:
         return None
     before, at, after = correlation[best - 1 : best + 2]
     bend = max(2 * at - before - after, 1e-9)  # of the parabola through the three
@@ -175,11 +183,13 @@ def _best_offset(
 
 def _log_levels(grey: NDArray) -> tuple[NDArray, NDArray]:
     """Return log intensity, and whether it is not clipped."""
-    return np.log(np.maximum(grey, 0) + DARK), (grey > UNCLIPPED[0]) & (grey < UNCLIPPED[1])
+    return np.log(np.maximum(grey, 0) + DARK_GREY_OFFSET), (grey > UNCLIPPED_GREY_RANGE[0]) & (
+        grey < UNCLIPPED_GREY_RANGE[1]
+    )
 
 
 def _level_changes(
-    recording: Recording, pair: FramePair, method: OffsetMethod | None = None
+    recording: Recording, pair: FramePair, method: StampOffsetMethod | None = None
 ) -> tuple[NDArray, NDArray] | None:
     """Return changes of level between two frames, and sums of polarities, by pixel.
 
@@ -216,7 +226,7 @@ def _level_changes(
 
 
 def _change_correlation(
-    recording: Recording, pairs: list[FramePair], offset_us: int, method: OffsetMethod
+    recording: Recording, pairs: list[FramePair], offset_us: int, method: StampOffsetMethod
 ) -> float:
     """Return the correlation of levels' changes and events' sums, for an offset of the stamps."""
     found = [
@@ -243,11 +253,11 @@ def _contrast_threshold(
         if found is not None:
             several = np.abs(found[1]) >= MIN_NET_EVENTS
             parts.append([part[several] for part in found])
-    if sum(len(change) for change, _ in parts) < MIN_PIXELS:
+    if sum(len(change) for change, _ in parts) < MIN_THRESHOLD_PIXELS:
         return None
     y, n = (np.concatenate(part) for part in zip(*parts, strict=True))
     yy, yn, nn = y @ y, y @ n, n @ n
-    if not yn > MIN_CORRELATION * np.sqrt(yy * nn):
+    if not yn > MIN_EVENT_CORRELATION * np.sqrt(yy * nn):
         return None
     return float(np.sqrt(yn / nn * np.sqrt(yy / nn)))
 
@@ -271,7 +281,7 @@ class Windows:
         self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
         self.xi, self.f = pixel_coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)
-        lower, upper = np.floor(flat.min(0)) - MARGIN_PX, np.ceil(flat.max(0)) + MARGIN_PX
+        lower, upper = np.floor(flat.min(0)) - VIEW_MARGIN_PX, np.ceil(flat.max(0)) + VIEW_MARGIN_PX
         cells = np.ceil((upper - lower + 1) / params.cell).astype(int)
         corner = lower - (cells * params.cell - (upper - lower + 1)) // 2
         self.corner = (float(corner[0]), float(corner[1]))
@@ -323,7 +333,7 @@ class Windows:
     def prior(self, centre: int, half: float) -> Prior:
         """Return the priors of a window, by the parameters, the gyro and counts of events."""
         params = self.params
-        gyro, weight = np.zeros((N_SEGMENTS, 3)), 0.0
+        gyro, weight = np.zeros((N_WINDOW_SEGMENTS, 3)), 0.0
         if self.gyro is not None:
             times = centre + segment_times(half) * 1e6
             at = np.clip(np.rint(times), self.gyro.start, self.gyro.stop).astype(np.int64)
@@ -394,7 +404,10 @@ class Windows:
         begin = np.maximum.accumulate(np.where(begins, np.arange(n), 0))
         p = np.where(events.p[keep], 1, -1)
         total = np.cumsum(p)
-        lower, upper = np.array(self.box[::2]) - MARGIN_PX, np.array(self.box[1::2]) + MARGIN_PX
+        lower, upper = (
+            np.array(self.box[::2]) - VIEW_MARGIN_PX,
+            np.array(self.box[1::2]) + VIEW_MARGIN_PX,
+        )
         lower = np.floor(lower)
         across, down = (np.ceil(upper - lower).astype(int) + 1).tolist()
         x, y = self.xi.reshape(-1, 2)[where].T
@@ -404,7 +417,7 @@ class Windows:
         begin, corner = np.append(np.flatnonzero(begins), n), (float(lower[0]), float(lower[1]))
         series = PixelSeries(
             x, y, tau, level, number, p, np.ones_like(x), n, begin, self.f, half, (down, across),
-            corner, NODE_PX,
+            corner, DEPTH_NODE_SPACING_PX,
         )  # fmt: skip
         return series if frames is None else self._with_frames(series, frames, centre, most)
 

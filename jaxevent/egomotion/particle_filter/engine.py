@@ -33,8 +33,8 @@ from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import engine_loop, filtering, likelihood
 from jaxevent.egomotion.particle_filter.engine_loop import (
-    BLOCK,
-    CELLS,
+    CELL_NAMES,
+    MOTIONS_PER_BLOCK,
     BatchArrays,
     InfoArrays,
     Memory,
@@ -51,7 +51,7 @@ from jaxevent.egomotion.particle_filter.filtering import (
 from jaxevent.egomotion.particle_filter.likelihood import Event
 from jaxevent.egomotion.particle_filter.params import Params
 
-FUNCTION = """@cfunc(types.void(CELLS, CELLS, NUMBERS, I), **OPTIONS)
+FUNCTION_TEXT = """@cfunc(types.void(CELLS, CELLS, NUMBERS, I), **OPTIONS)
 def {name}(cells, work, numbers, count):
     zero = 0
 {body}
@@ -60,7 +60,7 @@ def {name}(cells, work, numbers, count):
 """
 # Candidates fill their entries from the first. Groups of `size` blocks of motions have one range of
 # ages.
-EVENT = """@cfunc(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **OPTIONS)
+EVENT_TEXT = """@cfunc(types.void(CELLS, CELLS, NUMBERS, CELLS, CELLS, WHOLE, I, I, I), **OPTIONS)
 def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
     zero, begin, end = 0, 0, count
 {init}
@@ -91,8 +91,12 @@ def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
 
 
 """
-PARTICLES = ElementLoop("i", "count", ("work", "numbers", "count"))
-LANES = ElementLoop("i", f"begin * {BLOCK}, end * {BLOCK}", ("work", "numbers", "begin", "end"))
+PARTICLE_LOOP = ElementLoop("i", "count", ("work", "numbers", "count"))
+LANE_LOOP = ElementLoop(
+    "i",
+    f"begin * {MOTIONS_PER_BLOCK}, end * {MOTIONS_PER_BLOCK}",
+    ("work", "numbers", "begin", "end"),
+)
 MAX_OPERATIONS = 6000  # beyond, numba compiles longer than XLA's scan takes
 
 
@@ -141,7 +145,7 @@ class FunctionTracer:
         self.graph, self.host = Graph(), ParameterProgram()
         for leaf in jax.tree.leaves(params):
             self.host.add_input(np.asarray(leaf))
-        self.cells = {name: at for at, name in enumerate(CELLS)}
+        self.cells = {name: at for at, name in enumerate(CELL_NAMES)}
         self.rows: dict[str, int] = {}
         self.booleans: set[str] = set()
         self.functions: dict[str, TracedFunction] = {}
@@ -263,7 +267,7 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
         {"state": state, "timing": timing, "predicted": cloud, "likelihood": of_batch},
     )
     tracer.add("restart", restart, {"cloud": cloud})
-    row_size = BLOCK * -(-params.particles // BLOCK)
+    row_size = MOTIONS_PER_BLOCK * -(-params.particles // MOTIONS_PER_BLOCK)
     layout = Layout(tracer.cells, tracer.rows, frozenset(tracer.booleans), row_size)
     return TracedProgram(tracer.functions, tracer.host, layout, dtype)
 
@@ -306,7 +310,7 @@ def write(program: TracedProgram) -> ModuleText:
     places, stores = layout.places(), layout.stores()
     writer, out = Writer(program, places), []
 
-    def body(name: str, indent: int = 4, loop: ElementLoop = LANES) -> str:
+    def body(name: str, indent: int = 4, loop: ElementLoop = LANE_LOOP) -> str:
         function = program.functions[name]
         changed = {
             key: stores[key]
@@ -316,14 +320,14 @@ def write(program: TracedProgram) -> ModuleText:
         return "\n".join(writer.body(name, function, changed, loop, indent))
 
     for name in ("predict", "reweight", "restart"):
-        out.append(FUNCTION.format(name=name, body=body(name, loop=PARTICLES)))
+        out.append(FUNCTION_TEXT.format(name=name, body=body(name, loop=PARTICLE_LOOP)))
     at = {key.partition(".")[0]: n for key, n in layout.cells.items()}
     for name in ("track", "search"):
         has_own_ages = any(key.startswith(f"{name}_votes.ages") for key in layout.rows)
         out.append(
-            EVENT.format(
+            EVENT_TEXT.format(
                 name=name,
-                BLOCK=BLOCK,
+                BLOCK=MOTIONS_PER_BLOCK,
                 size="1" if has_own_ages else "count",
                 init=body(f"{name}_init"),
                 span=body(f"{name}_span", 8),
@@ -391,7 +395,7 @@ class CompiledFilter:
     @property
     def n_interpolated(self) -> int:
         """Number of batches whose log-likelihoods have been interpolated."""
-        return int(self._nodes.counters[engine_loop.USED])
+        return int(self._nodes.counters[engine_loop.INTERPOLATED_COUNTER])
 
     def __call__(
         self, candidates: Candidates, noise: RandomNumbers, state: ParticleState, n_cloud: int = 0

@@ -1,7 +1,7 @@
 """Loop of the particle filter over batches and events, for the compiled functions of any model.
 
 The loop does what `filtering.run` does. Single numbers are in `cells`, the loop's own first, in the
-order of `CELLS`. Numbers of all particles are rows of `work`. What differs between models are the
+order of `CELL_NAMES`. Numbers of all particles are rows of `work`. Models differ in the
 functions of `ModelFunctions`, which `engine` writes, so this module is compiled once.
 
 While the motion is tracked, the log-likelihood of a batch is a smooth function of the motion, a sum
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit, njit_fastmath_inlined, njit_inlined
 
-CELLS = (
+CELL_NAMES = (
     "event.xi.0", "event.xi.1", "event.bounds.0", "event.bounds.1", "event.bounds.2",
     "event.bounds.3", "event.valid.0", "event.scale.0", "event.rate.0", "timing.elapsed.0",
     "timing.history.0", "timing.has_events.0", "counts.0", "lag.0", "votes.0", "chance.0",
@@ -31,16 +31,18 @@ CELLS = (
     XI, _, BOUNDS, _, _, _, VALID, SCALE, RATE, ELAPSED, HISTORY, HAS_EVENTS, COUNTS, LAG, VOTES,
     CHANCE, BATCH_VOTES, BATCH_CHANCE, RADIUS, SEARCHING, _, _, _, _, NEXT_SEARCHING, _, _, _, _,
     IS_FINITE, LOST, RESAMPLE, REPORTED_SEARCHING, CONTRAST, EVIDENCE,
-) = range(len(CELLS))  # fmt: skip
-N_STATE = 5  # cells of the state, from SEARCHING and from NEXT_SEARCHING on
+) = range(len(CELL_NAMES))  # fmt: skip
+N_STATE_CELLS = 5  # cells of the state, from SEARCHING and from NEXT_SEARCHING on
 
-BLOCK = 16  # motions that are scored together
-MIN_CHECKS = 4  # particles that are scored beside the nodes
-MIN_NODES, MAX_NODES = 3, 7  # of a component
-MAX_FRACTION = 0.6  # of the particles, number of nodes and checks
-REST_BATCHES = 64  # without nodes, after MAX_NODES were too few
-REDUCE_BELOW = 0.05  # of the bound, error at which there may be fewer nodes
-K, WAIT, BATCH, USED = range(4)  # in `Interpolation.counters`
+MOTIONS_PER_BLOCK = 16  # motions that are scored together
+MIN_CHECKED_PARTICLES = 4  # particles that are scored beside the nodes
+MIN_NODES_PER_COMPONENT, MAX_NODES_PER_COMPONENT = 3, 7  # of a component
+MAX_SCORED_FRACTION = 0.6  # of the particles, number of nodes and checks
+N_BATCHES_WITHOUT_NODES = 64  # without nodes, after MAX_NODES were too few
+REDUCING_ERROR_RATIO = 0.05  # of the bound, error at which there may be fewer nodes
+NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(
+    4
+)  # in `Interpolation.counters`
 
 
 class ModelFunctions(NamedTuple):
@@ -146,9 +148,14 @@ def init_interpolation(
     Returns:
         The state.
     """
-    basis, product = np.zeros((dimension, MAX_NODES, particles), dtype), np.zeros(particles, dtype)
-    checked = np.zeros(BLOCK + MIN_CHECKS, np.int64)
-    return Interpolation(bound, np.array([MIN_NODES, 0, 0, 0]), basis, product, checked)
+    basis, product = (
+        np.zeros((dimension, MAX_NODES_PER_COMPONENT, particles), dtype),
+        np.zeros(particles, dtype),
+    )
+    checked = np.zeros(MOTIONS_PER_BLOCK + MIN_CHECKED_PARTICLES, np.int64)
+    return Interpolation(
+        bound, np.array([MIN_NODES_PER_COMPONENT, 0, 0, 0]), basis, product, checked
+    )
 
 
 @njit
@@ -178,7 +185,7 @@ def run(functions, memory, rows, batches, out, nodes):
             functions.restart(*pointers[:3], count)
         _report(context, b, out)
         _resample(context, batches.uniform[b])
-        for k in range(N_STATE):
+        for k in range(N_STATE_CELLS):
             cells[SEARCHING + k] = cells[NEXT_SEARCHING + k]
 
 
@@ -201,7 +208,7 @@ def _score(context, b, nodes):
     if rows.youngest >= 0 and searching:
         _place_particles(rows, work, order, count)
         cells[VALID] = 0
-        _score_event(context, b, 0, len(order) // BLOCK)
+        _score_event(context, b, 0, len(order) // MOTIONS_PER_BLOCK)
         _sort(order[:count], work[rows.youngest])
     _place_particles(rows, work, order, count)
     lag = _score_events(context, b, len(order))
@@ -246,7 +253,7 @@ def _score_events(context, b, lanes):
             continue
         valid += 1
         cells[VALID] = 1
-        _score_event(context, b, e, lanes // BLOCK)
+        _score_event(context, b, e, lanes // MOTIONS_PER_BLOCK)
         lag += cells[LAG]
         cells[BATCH_VOTES] += cells[VOTES]
         cells[BATCH_CHANCE] += cells[CHANCE]
@@ -339,18 +346,22 @@ def _draw(log_weights, drawn, uniform, count):
 @njit_inlined
 def _count_lanes(nodes, dimension):
     """Return the number of nodes and checks together."""
-    number = nodes.counters[K] ** dimension
-    return (number + MIN_CHECKS + BLOCK - 1) // BLOCK * BLOCK
+    number = nodes.counters[NODES_COUNTER] ** dimension
+    return (
+        (number + MIN_CHECKED_PARTICLES + MOTIONS_PER_BLOCK - 1)
+        // MOTIONS_PER_BLOCK
+        * MOTIONS_PER_BLOCK
+    )
 
 
 @njit_inlined
 def _can_interpolate(nodes, dimension, count):
     """Count a batch; return whether it may have nodes, and these are fewer than particles."""
-    nodes.counters[BATCH] += 1
-    if nodes.counters[WAIT] > 0:
-        nodes.counters[WAIT] -= 1
+    nodes.counters[BATCH_COUNTER] += 1
+    if nodes.counters[WAIT_COUNTER] > 0:
+        nodes.counters[WAIT_COUNTER] -= 1
         return False
-    return nodes.bound > 0 and _count_lanes(nodes, dimension) <= MAX_FRACTION * count
+    return nodes.bound > 0 and _count_lanes(nodes, dimension) <= MAX_SCORED_FRACTION * count
 
 
 @njit_inlined
@@ -360,7 +371,7 @@ def _place_nodes(nodes, work, rows, count):
     The weight of a node is the sum of its polynomial over the weighted particles.
     """
     motions, predicted, weights = rows.motions, rows.predicted, rows.motion_weights
-    real, d, k = work.dtype.type, len(predicted), nodes.counters[K]
+    real, d, k = work.dtype.type, len(predicted), nodes.counters[NODES_COUNTER]
     number, lanes = k**d, _count_lanes(nodes, d)
     for c in range(d):
         row = work[predicted[c]]
@@ -375,7 +386,9 @@ def _place_nodes(nodes, work, rows, count):
         for j in range(k):
             _fill_basis(nodes.basis[c, j], row, middle, half, k, real(_chebyshev(k, j)))
     for i in range(number, lanes):
-        particle = ((i - number) * count // (lanes - number) + nodes.counters[BATCH]) % count
+        particle = (
+            (i - number) * count // (lanes - number) + nodes.counters[BATCH_COUNTER]
+        ) % count
         nodes.checked[i - number] = particle
         for c in range(d):
             work[motions[c], i] = work[predicted[c], particle]
@@ -390,7 +403,7 @@ def _place_nodes(nodes, work, rows, count):
 def _interpolate(nodes, work, rows, lanes, count):
     """Interpolate particles' log-likelihoods; return whether the checks are within the bound."""
     of_particles, of_motions, d = rows.log_likelihood, rows.total, len(rows.motions)
-    number = nodes.counters[K] ** d
+    number = nodes.counters[NODES_COUNTER] ** d
     work[of_particles, :count] = 0
     for j in range(number):
         _fill_product(nodes, j, d)
@@ -406,14 +419,20 @@ def _interpolate(nodes, work, rows, lanes, count):
         error = max(error, off) if off == off else np.inf
     fits = error <= nodes.bound
     if fits:
-        nodes.counters[USED] += 1
-        if error <= REDUCE_BELOW * nodes.bound and nodes.counters[K] > MIN_NODES:
-            nodes.counters[K] -= 1
+        nodes.counters[INTERPOLATED_COUNTER] += 1
+        if (
+            error <= REDUCING_ERROR_RATIO * nodes.bound
+            and nodes.counters[NODES_COUNTER] > MIN_NODES_PER_COMPONENT
+        ):
+            nodes.counters[NODES_COUNTER] -= 1
     else:
-        nodes.counters[K] += 1
-        if nodes.counters[K] > MAX_NODES or _count_lanes(nodes, d) > MAX_FRACTION * count:
-            nodes.counters[K] -= 1
-            nodes.counters[WAIT] = REST_BATCHES
+        nodes.counters[NODES_COUNTER] += 1
+        if (
+            nodes.counters[NODES_COUNTER] > MAX_NODES_PER_COMPONENT
+            or _count_lanes(nodes, d) > MAX_SCORED_FRACTION * count
+        ):
+            nodes.counters[NODES_COUNTER] -= 1
+            nodes.counters[WAIT_COUNTER] = N_BATCHES_WITHOUT_NODES
     return fits
 
 
@@ -441,7 +460,7 @@ def _fill_basis(basis, row, middle, half, k, z):
 @njit_fastmath_inlined
 def _fill_product(nodes, j, d):
     """Multiply the polynomials of the components of node j."""
-    k = nodes.counters[K]
+    k = nodes.counters[NODES_COUNTER]
     product, one = nodes.product, nodes.basis[d - 1, j % k]
     for i in range(len(product)):
         product[i] = one[i]

@@ -37,18 +37,20 @@ from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
-CHUNK_EVENTS = 1024  # scored events after which the range of candidates is updated
-CHUNK_TAUS = 0.1  # tau_max, time after which it is updated at the latest
-SPEED_CHANGE = 1.2  # largest factor by which speeds are expected to change until then
+EVENTS_PER_CHUNK = 1024  # scored events after which the range of candidates is updated
+MAX_CHUNK_TAUS = 0.1  # tau_max, time after which it is updated at the latest
+MAX_SPEED_CHANGE_RATIO = 1.2  # largest factor by which speeds are expected to change until then
 GATE_SIGMAS = 3.5  # sigma_x, margin of candidates around the expected flow
-CELL_PX = 16  # approximate size of the parts of the sensor with a range of candidates each
-AGE_BASELINES = 1.2  # largest age of candidates, in baselines of the fast quarter of the image
-MAX_AGE_S = 1.0
-SEARCH_SPEEDS = 2.5  # median image speeds, least largest speed of a search
-KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
-TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
+CANDIDATE_CELL_PX = (
+    16  # approximate size of the parts of the sensor with a range of candidates each
+)
+MAX_AGE_BASELINES = 1.2  # largest age of candidates, in baselines of the fast quarter of the image
+MAX_CANDIDATE_AGE_S = 1.0
+MIN_SEARCH_SPEED_RATIO = 2.5  # median image speeds, least largest speed of a search
+MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
+RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 PLANAR_CALIBRATION = CovarianceCalibration(change=0.12)
-CALIBRATION = CovarianceCalibration(factor=0.7, change=0.05)  # of other models
+CAMERA_MOTION_CALIBRATION = CovarianceCalibration(factor=0.7, change=0.05)  # of other models
 
 _run = eqx.filter_jit(filtering.run)
 _init = eqx.filter_jit(filtering.init)
@@ -221,11 +223,11 @@ class VotingEstimator(MotionEstimator[Params]):
             start = self.initial_params(found)
             params = self.adapt_params(recording, start, camera=camera).params
         kind, sampler = self.sampler(recording, params, model, camera)
-        batches = -(-CHUNK_EVENTS // params.batch)
+        batches = -(-EVENTS_PER_CHUNK // params.batch)
         events = len(recording.events) // params.every
         run = self._kernel(params, kind, compiler, events) or functools.partial(_run, params, kind)
         key, corners = jax.random.key(seed), _basis_at_corners(kind, sampler)
-        state, parts, number, span = None, [], 0, CHUNK_TAUS * float(params.tau_max)
+        state, parts, number, span = None, [], 0, MAX_CHUNK_TAUS * float(params.tau_max)
         with bar(
             total=len(recording.events), desc="find motion", unit="event", unit_scale=True,
             progress=progress,
@@ -246,7 +248,7 @@ class VotingEstimator(MotionEstimator[Params]):
         motion = _join_reports(kind, parts, cloud > 0).with_recording(recording)
         if not parts:
             return motion
-        calibration = PLANAR_CALIBRATION if kind.uniform else CALIBRATION
+        calibration = PLANAR_CALIBRATION if kind.uniform else CAMERA_MOTION_CALIBRATION
         calibration = calibration.with_lens(camera or recording.camera)
         smoothed = filtering.smooth(motion, params) if smooth else motion
         return smoothed.with_calibrated_covariance(calibration, 2 * motion.lag)
@@ -255,7 +257,7 @@ class VotingEstimator(MotionEstimator[Params]):
         self, params: Params, model: Model, compiler: str | None, events: int
     ) -> CompiledFilter | None:
         """Return the filter as a kernel, or None where XLA compiles it."""
-        is_faster = jnp.result_type(float) == np.float32 and events >= KERNEL_EVENTS
+        is_faster = jnp.result_type(float) == np.float32 and events >= MIN_KERNEL_EVENTS
         return make_kernel(self.name, compiler, is_faster, lambda: CompiledFilter(params, model))
 
     def training_runs(
@@ -348,7 +350,7 @@ class WarmStartedRuns(TrainingRuns):
         particles = []
         for part in self.model.parts:
             middle, normal_part = first[part.rows], normal[:, part.rows]
-            near = middle + TRAINING_SPREAD * jnp.sqrt((middle**2).mean()) * normal_part
+            near = middle + RELATIVE_TRAINING_SPREAD * jnp.sqrt((middle**2).mean()) * normal_part
             if part.direction:
                 near = near / length(near)[:, None]
             particles.append(near)
@@ -404,7 +406,7 @@ def _basis_at_corners(model: Model, sampler: CandidateSampler) -> NDArray[np.flo
     """
     parts = (1, 1)
     if not (model.uniform or model.half_line):
-        parts = tuple(max(1, n // CELL_PX) for n in sampler.xi.shape[:2])
+        parts = tuple(max(1, n // CANDIDATE_CELL_PX) for n in sampler.xi.shape[:2])
     lines, columns = (
         np.rint(np.linspace(0, n - 1, k + 1)).astype(int)
         for n, k in zip(sampler.xi.shape[:2], parts, strict=True)
@@ -428,11 +430,11 @@ def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """
     if params.likelihood == "literal":
         return {}
-    chosen, oldest = {}, AGE_BASELINES * float(params.baseline) / speed.fast
+    chosen, oldest = {}, MAX_AGE_BASELINES * float(params.baseline) / speed.fast
     if oldest > 2 * float(params.tau_max):
-        chosen["tau_max"] = min(oldest, MAX_AGE_S)
-    if SEARCH_SPEEDS * speed.median > float(params.speed_max):
-        chosen["speed_max"] = SEARCH_SPEEDS * speed.median
+        chosen["tau_max"] = min(oldest, MAX_CANDIDATE_AGE_S)
+    if MIN_SEARCH_SPEED_RATIO * speed.median > float(params.speed_max):
+        chosen["speed_max"] = MIN_SEARCH_SPEED_RATIO * speed.median
     return chosen
 
 
@@ -479,11 +481,11 @@ def candidate_range(
     centre = four.mean(0)
     radius = np.sqrt(((four - centre) ** 2).sum(-1)).max(0)
     speed = np.sqrt((centre**2).sum(-1))
-    fastest = SPEED_CHANGE * (speed + radius)
-    slowest = np.maximum(speed - radius, 0) / SPEED_CHANGE
+    fastest = MAX_SPEED_CHANGE_RATIO * (speed + radius)
+    slowest = np.maximum(speed - radius, 0) / MAX_SPEED_CHANGE_RATIO
     young = np.minimum(b / np.maximum(fastest, 1e-9), tau_max)
     old = np.minimum(b / np.maximum(slowest, 1e-9), tau_max)
-    slack = radius + 3 * flow_sigma + (SPEED_CHANGE - 1) * (speed + radius)
+    slack = radius + 3 * flow_sigma + (MAX_SPEED_CHANGE_RATIO - 1) * (speed + radius)
     margin = GATE_SIGMAS * float(params.sigma_x)
     expected = ExpectedFlow(np.moveaxis(centre, -1, 0), slack, margin)
     return CandidateRange(youngest * young, old, expected)

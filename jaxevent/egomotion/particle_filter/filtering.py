@@ -18,10 +18,10 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter.likelihood import score_batch
 from jaxevent.egomotion.particle_filter.params import Params
 
-CONTRAST_MEMORIES = 5.0  # time constant of the mean contrast, in `Params.memory`
-SEARCH_NOISE = 0.1  # noise of a search, per batch, in standard deviations of the particles
+CONTRAST_TIME_CONSTANT_MEMORIES = 5.0  # time constant of the mean contrast, in `Params.memory`
+SEARCH_NOISE_SIGMAS = 0.1  # noise of a search, per batch, in standard deviations of the particles
 MAX_LOG_WEIGHT_STD = 0.5  # of a batch over particles, in a search
-MIN_HISTORY = 0.99  # of the oldest candidates of a search
+MIN_RELATIVE_HISTORY = 0.99  # of the oldest candidates of a search
 
 
 class RandomNumbers(eqx.Module):
@@ -196,14 +196,14 @@ def predict(
     spread = model.standard_deviations(_covariance(far, fixed))
     std = model.diffusion(params, mean) * jnp.sqrt(timing.elapsed)
     enough = _has_history(params, model, timing) & timing.has_events
-    search_std = SEARCH_NOISE * spread * enough * model.relative_size(state.particles, fixed)
+    search_std = SEARCH_NOISE_SIGMAS * spread * enough * model.relative_size(state.particles, fixed)
     noise = jnp.where(state.searching, search_std, std) * normal
     return jax.vmap(model.retract)(state.particles, noise), weights
 
 
 def _has_history(params: Params, model: Model, timing: BatchTiming) -> Bool[Array, ""]:
     """Return whether slow hypotheses have candidates; with less history only fast ones have."""
-    return timing.history >= MIN_HISTORY * lax.stop_gradient(model.max_age(params))
+    return timing.history >= MIN_RELATIVE_HISTORY * lax.stop_gradient(model.max_age(params))
 
 
 def reweight(
@@ -250,7 +250,7 @@ def reweight(
     can_search = params.likelihood != "literal"
     converged = model.is_converged(*lax.stop_gradient((params, mean, covariance)))
     found = searching & has_history & counted & converged
-    forget = (1 - memory) / CONTRAST_MEMORIES
+    forget = (1 - memory) / CONTRAST_TIME_CONSTANT_MEMORIES
     change = jnp.where(counted, forget * (contrast - state.mean_contrast), 0)
     mean_contrast = state.mean_contrast + change
     least = lax.stop_gradient(params.drop * mean_contrast)

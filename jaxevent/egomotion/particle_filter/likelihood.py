@@ -22,8 +22,8 @@ from jaxevent.egomotion.particle_filter.params import Params
 SEARCH_SIGMA_FACTOR = 2.0  # sigma_x of a search, in sigma_x
 MIN_CHANCE_VOTES = 0.2  # per event; a point that moves alone gets about 1.5
 BORDER_SIGMAS = 2.0  # sigma_x, distance from the border of the origin of an event that counts
-AGE_TOLERANCE = 1e-6  # relative
-CANDIDATE_BLOCK = 8  # candidates per event that are scored together
+RELATIVE_AGE_TOLERANCE = 1e-6  # relative
+CANDIDATES_PER_BLOCK = 8  # candidates per event that are scored together
 
 
 class EventScores(NamedTuple):
@@ -124,8 +124,9 @@ def age_range(
     """
     own = params.baseline / speed
     return AgeRange(
-        (1 - AGE_TOLERANCE) * params.youngest * jnp.where(band, own, common.tau),
-        (1 + AGE_TOLERANCE) * jnp.where(band, jnp.minimum(own, params.tau_max), common.tau),
+        (1 - RELATIVE_AGE_TOLERANCE) * params.youngest * jnp.where(band, own, common.tau),
+        (1 + RELATIVE_AGE_TOLERANCE)
+        * jnp.where(band, jnp.minimum(own, params.tau_max), common.tau),
     )
 
 
@@ -381,14 +382,14 @@ def _sum_votes(
     are skipped. The condition is outside of the maps, within which both sides would be computed.
     """
     K, C = batch.age.shape
-    pad = -C % CANDIDATE_BLOCK
-    age = jnp.pad(jnp.asarray(batch.age), [(0, 0), (0, pad)]).T.reshape(-1, CANDIDATE_BLOCK, K)
+    pad = -C % CANDIDATES_PER_BLOCK
+    age = jnp.pad(jnp.asarray(batch.age), [(0, 0), (0, pad)]).T.reshape(-1, CANDIDATES_PER_BLOCK, K)
     d = jnp.pad(jnp.asarray(batch.d), [(0, 0), (0, pad), (0, 0)])
-    d = jnp.swapaxes(d, 0, 1).reshape(-1, CANDIDATE_BLOCK, K, 2)
+    d = jnp.swapaxes(d, 0, 1).reshape(-1, CANDIDATES_PER_BLOCK, K, 2)
     accumulate = jax.vmap(functools.partial(accumulate_votes, params, searching=searching))
 
     def add(S, d, age):
-        for c in range(CANDIDATE_BLOCK):
+        for c in range(CANDIDATES_PER_BLOCK):
             S = accumulate(d[c], age[c], votes, S)
         return S
 
