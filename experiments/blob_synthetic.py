@@ -39,7 +39,7 @@ from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
 from jaxevent.simulate import blob_scene
-from jaxevent.simulate.blobs import CARS, Approach, Truth
+from jaxevent.simulate.blobs import CAR_MOTIONS, Approach, Truth
 
 CIRCLE, ELLIPSE = {"gate_shape": "circle"}, {"gate_shape": "ellipse"}
 CONSTANT = "constant velocity, R = 64 px^2"
@@ -264,7 +264,7 @@ def cars(seeds: Sequence[int]) -> dict[str, Any]:
         window = (1.0, 1.2)
         whose = np.concatenate([one.id for one in tracks.events(*window)])
         t = np.concatenate([one.t for one in tracks.events(*window)])
-        for car, (_, distance, speed, acceleration) in enumerate(CARS):
+        for car, (_, distance, speed, acceleration) in enumerate(CAR_MOTIONS):
             pair = 2 * car, 2 * car + 1
             every = np.unique(t[np.isin(whose, pair)])
             for name, told in (("smoothed", tracks), ("filtered", tracks.filtered)):

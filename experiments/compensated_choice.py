@@ -31,10 +31,19 @@ import jaxevent
 from jaxevent.camera import UnknownResponse
 from jaxevent.metrics import ssim
 from jaxevent.reconstruction.compensated import estimator, fusion
-from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
+from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.recording import Frames
 from jaxevent.runs.protocols import frame_times
-from jaxevent.simulate import FITTING, SENSORS, TESTING, Objects, Pan, Sensor, scene, simulate
+from jaxevent.simulate import (
+    FITTING_SCENES,
+    SENSORS,
+    TESTING_SCENES,
+    Objects,
+    Pan,
+    Sensor,
+    scene,
+    simulate,
+)
 from jaxevent.simulate.scenes import Speed
 
 BLOCK = 8  # px, over which the noise of frames is averaged
@@ -458,7 +467,7 @@ class Fit:
 
     def choice(self, used: Any) -> Any:
         """Fit choice weights (2, features)."""
-        start = jnp.zeros((len(FALLBACKS), len(FEATURES) + 1))
+        start = jnp.zeros((len(FALLBACK_SOURCES), len(FEATURE_NAMES) + 1))
         start = start.at[:, -1].set(jnp.array([-2.0, -3.0]))
         return self._choice(start, used, self.pixels)[0]
 
@@ -471,7 +480,7 @@ class Fit:
 
         Of that the geometric mean over images of a kind is taken, and then over kinds.
         """
-        start = jnp.zeros(len(FEATURES) + 1).at[-1].set(jnp.log(squares.mean()))
+        start = jnp.zeros(len(FEATURE_NAMES) + 1).at[-1].set(jnp.log(squares.mean()))
         w, _ = self._variance(start, used, self.pixels, squares)
         edges, factor = np.cumsum([0, *self.images]), 1.0
         for _ in range(5):
@@ -492,7 +501,7 @@ def eliminate(value: Callable[..., Any], weights: Any, *data: Any) -> list[int]:
     flat = np.asarray(weights, float).ravel()
     hessian = jax.hessian(lambda w: value(w.reshape(weights.shape), *data))
     H = np.asarray(hessian(jnp.asarray(flat, jnp.float32)), float)
-    step, rest = weights.shape[-1], list(range(len(FEATURES)))
+    step, rest = weights.shape[-1], list(range(len(FEATURE_NAMES)))
     kept = np.arange(len(flat))
     order: list[int] = []
     while rest:
@@ -515,19 +524,19 @@ COUNTS = (16, 12, 8, 4, 0)  # of features, whose held-out losses are printed
 def select(fitting: list[dict], testing: list[dict], noises: dict[str, float]) -> None:
     """Print the held-out losses of fewer features, in a table."""
     fit, held_out = Fit(gather(fitting, noises, 61), 300), gather(testing, noises, 61)
-    every = jnp.ones(len(FEATURES) + 1)
+    every = jnp.ones(len(FEATURE_NAMES) + 1)
     W = fit.choice(every)
     squares = fit.squares(W)
     choice_order = eliminate(penalised_image_loss, W, fit.pixels)
     w = fit.variance(every, squares)
     variance_order = eliminate(penalised_variance_loss, w, fit.pixels, squares)
     for name, order in (("choice", choice_order), ("variance", variance_order)):
-        print(name, [FEATURES[k] for k in order], flush=True)
+        print(name, [FEATURE_NAMES[k] for k in order], flush=True)
     held_out_squares = (blend(held_out, plain(W, *fit.scales)) - held_out.level) ** 2
     print("| features | image loss, fitted | held out | variance loss, fitted | held out |")
     print("|---:|---:|---:|---:|---:|")
     for count in COUNTS:
-        gone = len(FEATURES) - count
+        gone = len(FEATURE_NAMES) - count
         used = [every.at[jnp.array(o[:gone], int)].set(0) for o in (choice_order, variance_order)]
         W, w = fit.choice(used[0]), fit.variance(used[1], squares)
         cells = (
@@ -602,7 +611,7 @@ def main() -> None:
         rows = ([row for part in parts for row in part] for parts in (fitting, testing))
         return select(*rows, noises)
     fit = Fit(gather([row for part in fitting for row in part], noises))
-    every = jnp.ones(len(FEATURES) + 1)
+    every = jnp.ones(len(FEATURE_NAMES) + 1)
     W = fit.choice(every)
     w = fit.variance(every, fit.squares(W))
     choice, doubt = (np.asarray(v) for v in (plain(W, *fit.scales), plain(w, *fit.variance_scales)))
@@ -623,23 +632,23 @@ def _two_sided(kept: Callable[..., list[dict]], slider: Path, street: Path) -> t
     fitting = [
         kept("slider", hidden(slider, Params(**SLIDER), GAPS, 0)),
         kept("slider_plain", hidden(slider, Params(), GAPS, 0)),
-        kept("hdr", panned(FITTING, 11, 5)),
+        kept("hdr", panned(FITTING_SCENES, 11, 5)),
         kept("textures", textures(range(1000, 1060))),
         kept("objects", objects(range(1, 4))),
         kept("still_objects", objects(range(1, 4), background=0)),
         kept("still_objects_rare", objects(range(1, 7), RARE, background=0)),
-        kept("blurred", blurred(FITTING, 1)),
+        kept("blurred", blurred(FITTING_SCENES, 1)),
     ]
     testing = [
         kept("slider_test", hidden(slider, Params(**SLIDER), {2: 10, 4: 10, 8: 10, 16: 8}, 1)),
         kept("slider_plain_test", hidden(slider, Params(), {2: 10, 4: 10, 8: 10, 16: 8}, 1)),
         kept("street_test", hidden(street, Params(**STREET), {2: 10, 4: 10, 8: 10}, None)),
         kept("street_plain_test", hidden(street, Params(), {2: 10, 4: 10, 8: 10}, None)),
-        kept("hdr_test", panned(TESTING, 2, 4)),
+        kept("hdr_test", panned(TESTING_SCENES, 2, 4)),
         kept("textures_test", textures(range(2000, 2030))),
         kept("objects_test", objects(range(11, 13))),
         kept("still_objects_test", objects(range(11, 12), background=0)),
-        kept("blurred_test", blurred(TESTING[:1], 2)),
+        kept("blurred_test", blurred(TESTING_SCENES[:1], 2)),
     ]
     return fitting, testing
 
@@ -650,7 +659,7 @@ def _beyond(kept: Callable[..., list[dict]], slider: Path, street: Path) -> tupl
     fitting = [
         kept("slider_cut", cut(hidden(slider, Params(), few, 0))),
         kept("slider_ended", ended(slider, Params())),
-        kept("hdr_cut", cut(panned(FITTING[:1], 11, 3))),
+        kept("hdr_cut", cut(panned(FITTING_SCENES[:1], 11, 3))),
         kept("textures_cut", cut(textures(range(1000, 1012)))),
         kept("still_cut", cut(textures(range(1100, 1106), 0.02))),
         kept("objects_cut", cut(objects(range(1, 2)))),

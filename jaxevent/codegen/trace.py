@@ -5,11 +5,11 @@ Arrays of a few rows and one pixel become their numbers. Arrays that only move t
 one node per element. Conditions on parameters alone choose their way here, so that a kernel holds
 nothing that its parameters switch off.
 
-A function may have one axis of elements, as the events of a step. It is traced with `ELEMENTS` of
-them, whatever their number will be. What is computed element by element becomes the body of a
-loop; sums and greatest values over the axis are reduced in it. What rests on such a sum comes after
-the loop, and its elements are computed in a loop of their own, from the inputs: that costs less
-than keeping them.
+A function may have one axis of elements, as the events of a step. It is traced with
+`ELEMENT_AXIS_LENGTH` of them, whatever their number will be. What is computed element by element
+becomes the body of a loop; sums and greatest values over the axis are reduced in it. What rests on
+such a sum comes after the loop, and its elements are computed in a loop of their own, from the
+inputs: that costs less than keeping them.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen.graph import (
-    ELEMENTWISE,
+    ELEMENTWISE_FUNCTIONS,
     Graph,
     Level,
     Node,
@@ -34,14 +34,14 @@ from jaxevent.codegen.graph import (
     move_elements,
 )
 
-ELEMENTS = 7919  # elements in a trace: a prime that no other axis has
-REDUCTIONS = ("total", "largest", "place")  # operations over the axis
-SHAPE_PARAMETERS = ("shape", "new_sizes", "sizes", "limit_indices", "slice_sizes")
-REDUCE_OPERATIONS = {
+ELEMENT_AXIS_LENGTH = 7919  # elements in a trace: a prime that no other axis has
+ELEMENT_REDUCTIONS = ("total", "largest", "place")  # operations over the axis
+SHAPE_VALUED_PARAMETERS = ("shape", "new_sizes", "sizes", "limit_indices", "slice_sizes")
+OPERATION_BY_REDUCTION = {
     "reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_or": "or",
     "reduce_and": "and",
 }  # fmt: skip
-KINDS = {"f": "f", "i": "i", "u": "i", "b": "b"}
+KIND_BY_DTYPE = {"f": "f", "i": "i", "u": "i", "b": "b"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Translation:
             if number is None or (sparse and array[place] == 0):
                 out[place] = self.graph.constant(array[place])
             else:
-                kind = KINDS[array.dtype.kind]
+                kind = KIND_BY_DTYPE[array.dtype.kind]
                 node = self.graph.node("number", (number, flat), kind, Level.HOST)
                 if isinstance(value, ParameterValue) and value.change:
                     self.changes.add(node)
@@ -165,7 +165,7 @@ class Translation:
 
     def _symbolic(self, eqn: Any, values: list[Value]) -> NDArray:
         name = eqn.primitive.name
-        kind = KINDS.get(eqn.outvars[0].aval.dtype.kind)
+        kind = KIND_BY_DTYPE.get(eqn.outvars[0].aval.dtype.kind)
         if kind is None or len(eqn.outvars) > 1:
             raise TranslationError(f"the operation {name!r}")
         own = self.translate_special(eqn, values)
@@ -178,9 +178,11 @@ class Translation:
         moved = move_elements(eqn, [self.nodes(v) for v in values])
         if moved is not None:
             return moved
-        if name in REDUCE_OPERATIONS:
+        if name in OPERATION_BY_REDUCTION:
             return self.reduce_axes(
-                REDUCE_OPERATIONS[name], self.nodes(values[0]), list(map(int, eqn.params["axes"]))
+                OPERATION_BY_REDUCTION[name],
+                self.nodes(values[0]),
+                list(map(int, eqn.params["axes"])),
             )
         if name == "argmax":
             return self._argmax(self.nodes(values[0]), int(eqn.params["axes"][0]))
@@ -209,7 +211,7 @@ class Translation:
             return self._select(args, kind)
         if name == "div" and kind == "f":
             return apply(name, tuple(args), kind)
-        if name in ELEMENTWISE:
+        if name in ELEMENTWISE_FUNCTIONS:
             return apply(name.removesuffix("_any"), tuple(args), kind)
         raise TranslationError(f"the operation {name!r}")
 
@@ -350,9 +352,9 @@ class ElementTranslation(Translation):
 
     def _equation(self, eqn: Any, values: list[Value]) -> list[Value]:
         name = eqn.primitive.name
-        if any(isinstance(v, Constant) and ELEMENTS in v.value.shape for v in values):
+        if any(isinstance(v, Constant) and ELEMENT_AXIS_LENGTH in v.value.shape for v in values):
             raise TranslationError("a table of elements")
-        marked = [ELEMENTS in np.shape(v.aval) for v in (*eqn.invars, *eqn.outvars)]
+        marked = [ELEMENT_AXIS_LENGTH in np.shape(v.aval) for v in (*eqn.invars, *eqn.outvars)]
         if name in ("split", "unstack") and any(marked):
             raise TranslationError("a split of elements")
         if name == "iota" and any(marked) and not self.single:
@@ -362,10 +364,12 @@ class ElementTranslation(Translation):
     def _element_numbers(self, eqn: Any) -> NDArray:
         """Return the elements' own numbers, from 0 on."""
         shape, along = eqn.params["shape"], eqn.params["dimension"]
-        if shape[along] != ELEMENTS:
+        if shape[along] != ELEMENT_AXIS_LENGTH:
             raise TranslationError("a table of elements")
         number = self.graph.input("element", "i", Level.ELEMENT)
-        return np.full([1 if size == ELEMENTS else size for size in shape], number, object)
+        return np.full(
+            [1 if size == ELEMENT_AXIS_LENGTH else size for size in shape], number, object
+        )
 
     def translate_special(self, eqn: Any, values: list[Value]) -> NDArray | None:
         name = eqn.primitive.name
@@ -374,7 +378,7 @@ class ElementTranslation(Translation):
             return None
         if name == "dot_general":
             return self._reduce_product(eqn, values)
-        if name not in (*REDUCE_OPERATIONS, "argmax"):
+        if name not in (*OPERATION_BY_REDUCTION, "argmax"):
             raise TranslationError(f"the operation {name!r} over elements")
         array = self.nodes(values[0])
         if not self.single:
@@ -386,7 +390,7 @@ class ElementTranslation(Translation):
             array = np.full(array.shape, self.graph.constant(0), object)
         axes = [int(a) for a in eqn.params["axes"] if a not in along]
         if axes:
-            array = self.reduce_axes(REDUCE_OPERATIONS[name], array, axes)
+            array = self.reduce_axes(OPERATION_BY_REDUCTION[name], array, axes)
             along = [a - sum(b < a for b in axes) for a in along]
         return array.squeeze(tuple(along))
 
@@ -449,33 +453,38 @@ class ElementTranslation(Translation):
 
 
 def _with_one_element(eqn: Any) -> Any:
-    """Return an equation with one element for `ELEMENTS`; `along` are the axes that it reduces."""
+    """Return an equation with one element for `ELEMENT_AXIS_LENGTH`.
+
+    `along` are the axes that it reduces.
+    """
     name, p = eqn.primitive.name, dict(eqn.params)
     shapes = [np.shape(v.aval) for v in eqn.invars]
     if name == "slice":
         for axis, size in enumerate(shapes[0]):
             given = p["start_indices"][axis], p["limit_indices"][axis]
-            if size == ELEMENTS and (
-                given != (0, ELEMENTS) or (p["strides"] or [1] * 9)[axis] != 1
+            if size == ELEMENT_AXIS_LENGTH and (
+                given != (0, ELEMENT_AXIS_LENGTH) or (p["strides"] or [1] * 9)[axis] != 1
             ):
                 raise TranslationError("single elements")
-    if name == "concatenate" and any(shape[p["dimension"]] == ELEMENTS for shape in shapes):
+    if name == "concatenate" and any(
+        shape[p["dimension"]] == ELEMENT_AXIS_LENGTH for shape in shapes
+    ):
         raise TranslationError("elements joined to others")
     if name in ("gather", "scatter", "dynamic_slice", "rev", "pad", "sort"):
         table = shapes[0] if name != "gather" else ()
-        if any(ELEMENTS in shape for shape in (table, *shapes[1:])):
+        if any(ELEMENT_AXIS_LENGTH in shape for shape in (table, *shapes[1:])):
             raise TranslationError(f"the operation {name!r} over elements")
-    if name == "dot_general" and np.shape(eqn.outvars[0].aval).count(ELEMENTS) > 1:
+    if name == "dot_general" and np.shape(eqn.outvars[0].aval).count(ELEMENT_AXIS_LENGTH) > 1:
         raise TranslationError("a matrix product of elements with elements")
-    for key in SHAPE_PARAMETERS:
+    for key in SHAPE_VALUED_PARAMETERS:
         if key in p and p[key] is not None:
-            p[key] = tuple(1 if size == ELEMENTS else size for size in p[key])
+            p[key] = tuple(1 if size == ELEMENT_AXIS_LENGTH else size for size in p[key])
     axes = p["dimension_numbers"][0][0] if name == "dot_general" else p.get("axes", ())
-    along = [int(a) for a in axes if shapes and shapes[0][a] == ELEMENTS]
+    along = [int(a) for a in axes if shapes and shapes[0][a] == ELEMENT_AXIS_LENGTH]
     outs = [
         types.SimpleNamespace(
             aval=types.SimpleNamespace(
-                shape=tuple(1 if size == ELEMENTS else size for size in v.aval.shape),
+                shape=tuple(1 if size == ELEMENT_AXIS_LENGTH else size for size in v.aval.shape),
                 dtype=v.aval.dtype,
             )
         )
@@ -497,7 +506,7 @@ class TracedFunction:
         found: dict[Node, int] = {}
         for node in dependencies([*self.results.values()]):
             arguments = [found[a] for a in node.args if isinstance(a, Node)]
-            found[node] = max(arguments, default=0) + (node.op in REDUCTIONS)
+            found[node] = max(arguments, default=0) + (node.op in ELEMENT_REDUCTIONS)
         return found
 
 
@@ -519,7 +528,7 @@ def name_leaves(name: str, tree: Any) -> dict[str, Any]:
 
 def name_numbers(name: str, leaf: Any, elements: bool = True) -> list[str]:
     """Return the names of a leaf's single numbers; an axis of elements counts once."""
-    shape = [1 if size == ELEMENTS and elements else size for size in np.shape(leaf)]
+    shape = [1 if size == ELEMENT_AXIS_LENGTH and elements else size for size in np.shape(leaf)]
     return [f"{name}.{k}" for k in range(int(np.prod(shape)))]
 
 
@@ -581,8 +590,8 @@ def translate_function(
     Args:
         function: A function of pytrees.
         params: Its parameters.
-        given: Trees of shapes, by the names of the other arguments; an axis of `ELEMENTS` has
-            elements.
+        given: Trees of shapes, by the names of the other arguments; an axis of
+            `ELEMENT_AXIS_LENGTH` has elements.
         graph: Graph to which the expressions are added.
         host: Program whose inputs are the leaves of the parameters.
         single: Whether there is one element only.
@@ -599,14 +608,14 @@ def translate_function(
 
 
 def _inputs(graph: Graph, name: str, leaf: Any, single: bool, zeros: Collection[str]) -> Value:
-    shape = tuple(1 if size == ELEMENTS else size for size in leaf.shape)
-    elements = ELEMENTS in leaf.shape and not single
+    shape = tuple(1 if size == ELEMENT_AXIS_LENGTH else size for size in leaf.shape)
+    elements = ELEMENT_AXIS_LENGTH in leaf.shape and not single
     level = Level.ELEMENT if elements else Level.POINT
     out = np.empty(shape, object)
     names = iter(name_numbers(name, leaf))
     for place in np.ndindex(*shape):
         number = next(names)
         none = number in zeros
-        kind = KINDS[leaf.dtype.kind]
+        kind = KIND_BY_DTYPE[leaf.dtype.kind]
         out[place] = graph.constant(0.0) if none else graph.input(number, kind, level)
     return out

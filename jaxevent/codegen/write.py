@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen.graph import Level, Node, TranslationError, dependencies
 from jaxevent.codegen.support import intrinsic, ir, types
-from jaxevent.codegen.trace import REDUCTIONS, TracedFunction
+from jaxevent.codegen.trace import ELEMENT_REDUCTIONS, TracedFunction
 
 # Texts of operations that no block has.
-FORMS = {
+PYTHON_EXPRESSIONS = {
     "pow": "{0} ** {1}",
     "rem": "np.fmod({0}, {1})",
     "sign": "np.sign({0})",
@@ -33,11 +33,11 @@ FORMS = {
     **{name: f"np.{name}({{0}})" for name in ("abs", "expm1", "tanh")},
 }
 # Functions of `functions`.
-FUNCTIONS = ("exp", "log", "log1p", "logistic", "sin", "cos", "erf", "erfc")
+CALLED_FUNCTION_NAMES = ("exp", "log", "log1p", "logistic", "sin", "cos", "erf", "erfc")
 
 Address = tuple[str, str, int]  # pointer, index and offset: pointer[index + offset]
 
-HEAD = '''"""{about}"""
+MODULE_HEAD_TEMPLATE = '''"""{about}"""
 
 import numba
 import numpy as np
@@ -172,14 +172,14 @@ class Writer:
         wanted = {key: node for key, node in function.results.items() if key in store}
         phases = TracedFunction(wanted).phases()
         last = max((phases[n] for n in wanted.values()), default=0)
-        scalars = [n for n in phases if n.level < Level.ELEMENT and n.op not in REDUCTIONS]
+        scalars = [n for n in phases if n.level < Level.ELEMENT and n.op not in ELEMENT_REDUCTIONS]
         out, known = [], set[Node]()
         for phase in range(last + 1):
             now = [n for n in scalars if phases[n] <= phase and n not in known]
             used = {a for n in phases if n not in now for a in n.args if isinstance(a, Node)}
             out += self.assign(now, used | {*wanted.values()}, indent)
             known |= set(now)
-            reduced = [n for n in phases if n.op in REDUCTIONS and phases[n] == phase + 1]
+            reduced = [n for n in phases if n.op in ELEMENT_REDUCTIONS and phases[n] == phase + 1]
             elements = {}
             if phase == last:
                 elements = {store[key]: n for key, n in wanted.items() if n.level == Level.ELEMENT}
@@ -242,9 +242,11 @@ class Writer:
             numbers: Kind of the numbers of parameters.
         """
         dtype = self.program.dtype
-        head = HEAD.format(
+        head = MODULE_HEAD_TEMPLATE.format(
             about=about,
-            functions=", ".join(f"{name}{8 * dtype.itemsize} as {name}" for name in FUNCTIONS),
+            functions=", ".join(
+                f"{name}{8 * dtype.itemsize} as {name}" for name in CALLED_FUNCTION_NAMES
+            ),
             real=dtype.name,
             constants="\n".join([*self._blocks, *self.constants]),
         )
@@ -260,7 +262,7 @@ class Writer:
         if node.op in ("number", "entry") or self._address(node) is not None:
             return True
         operands = [a for a in node.args if isinstance(a, Node)]
-        return bool(operands) and node.op in OPERATIONS[operands[0].kind]
+        return bool(operands) and node.op in BLOCK_OPERATIONS[operands[0].kind]
 
     def _block(self, nodes: list[Node], results: list[Node]) -> str:
         """Define the block of some nodes, and write the line that calls it."""
@@ -303,10 +305,10 @@ class Writer:
         if isinstance(found, str):
             return found
         names = [self.name(a) for a in node.args if isinstance(a, Node)]
-        if node.op in FUNCTIONS:
+        if node.op in CALLED_FUNCTION_NAMES:
             return f"{node.op}({names[0]})"
-        if node.op in FORMS:
-            return FORMS[node.op].format(*names)
+        if node.op in PYTHON_EXPRESSIONS:
+            return PYTHON_EXPRESSIONS[node.op].format(*names)
         about = f"use of {node.args[0]!r}" if node.op == "input" else f"operation {node.op!r}"
         raise TranslationError(f"the {about}")
 
@@ -350,15 +352,26 @@ class Writer:
         return f"{targets + ' = ' if names else ''}{name}({arguments})"
 
 
-ORDERED = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=="}
-CHOICES = {"max": ">", "min": "<"}
-REAL = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "neg": "fneg"}
-WHOLE = ("add", "sub", "mul", "neg")
-LIBRARY = {"abs": "fabs", "sqrt": "sqrt", "floor": "floor", "ceil": "ceil"}  # of LLVM
+COMPARISON_SIGNS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=="}
+EXTREMUM_SIGNS = {"max": ">", "min": "<"}
+REAL_INSTRUCTIONS = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "neg": "fneg"}
+INTEGER_INSTRUCTIONS = ("add", "sub", "mul", "neg")
+LLVM_INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "floor": "floor", "ceil": "ceil"}  # of LLVM
 # Which operations there are, by the kind of what they are applied to.
-OPERATIONS = {
-    "f": {*ORDERED, *CHOICES, *REAL, *LIBRARY, "ne", "rsqrt", "is_finite", "to_f", "to_i", "to_b"},
-    "i": {*ORDERED, *CHOICES, *WHOLE, "ne", "to_f", "to_i", "to_b"},
+BLOCK_OPERATIONS = {
+    "f": {
+        *COMPARISON_SIGNS,
+        *EXTREMUM_SIGNS,
+        *REAL_INSTRUCTIONS,
+        *LLVM_INTRINSICS,
+        "ne",
+        "rsqrt",
+        "is_finite",
+        "to_f",
+        "to_i",
+        "to_b",
+    },
+    "i": {*COMPARISON_SIGNS, *EXTREMUM_SIGNS, *INTEGER_INSTRUCTIONS, "ne", "to_f", "to_i", "to_b"},
     "b": {"and", "or", "not", "eq", "ne", "select_n", "to_f", "to_i", "to_b"},
 }
 
@@ -437,13 +450,17 @@ class _Machine:
             return builder.not_(values[0])
         if op in ("to_f", "to_i", "to_b"):
             return self._cast(op[-1], values[0])
-        if op in ORDERED or op == "ne":
-            return self._compare(ORDERED.get(op, "!="), *values)
-        if op in CHOICES:
-            return builder.select(self._compare(CHOICES[op], *values), *values)
+        if op in COMPARISON_SIGNS or op == "ne":
+            return self._compare(COMPARISON_SIGNS.get(op, "!="), *values)
+        if op in EXTREMUM_SIGNS:
+            return builder.select(self._compare(EXTREMUM_SIGNS[op], *values), *values)
         if values[0].type != self.real:
             return getattr(builder, op)(*values)
-        return getattr(builder, REAL[op])(*values) if op in REAL else self._library(op, *values)
+        return (
+            getattr(builder, REAL_INSTRUCTIONS[op])(*values)
+            if op in REAL_INSTRUCTIONS
+            else self._library(op, *values)
+        )
 
     def _compare(self, how: str, a: Any, b: Any) -> Any:
         if isinstance(a.type, ir.IntType):
@@ -452,7 +469,10 @@ class _Machine:
         return kind(how, a, b)
 
     def _library(self, op: str, value: Any) -> Any:
-        builder, name = self.builder, LIBRARY.get(op, "fabs" if op == "is_finite" else "sqrt")
+        builder, name = (
+            self.builder,
+            LLVM_INTRINSICS.get(op, "fabs" if op == "is_finite" else "sqrt"),
+        )
         function = builder.module.declare_intrinsic(f"llvm.{name}", [self.real])
         found = builder.call(function, [value])
         if op == "rsqrt":

@@ -12,7 +12,7 @@ from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segment
 from jaxevent.reconstruction.stream import EdgeCounts, Stream
 from jaxevent.recording import Recording
 
-MIN_SEGMENTS = 1 << 14  # for which memory is allocated; eightfold until it suffices
+MIN_SEGMENT_CAPACITY = 1 << 14  # for which memory is allocated; eightfold until it suffices
 
 
 class Timing(NamedTuple):
@@ -312,7 +312,7 @@ def make_segments(
             count = np.zeros_like(counts.base.start)
             parts.append(_cut_exposure(part, weight[i:j], middle - i, row, exact[row], count))
     total = sum(len(part[0]) for part in parts)
-    capacity = MIN_SEGMENTS
+    capacity = MIN_SEGMENT_CAPACITY
     while capacity < total:
         capacity *= 8
     fields = []

@@ -21,11 +21,11 @@ from jaxevent.locks import synchronized
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.frames import Clock, FrameImages, Timing
-from jaxevent.reconstruction.video import BATCH, ImageSequence
+from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 
 MIN_SIDE_PX = 12  # pixels that OpenCV's search needs in width or height
-OUTLIER_FRACTION = 1e-3  # of the greys of two frames, at either end, that do not set the range
+GREY_OUTLIER_FRACTION = 1e-3  # of the greys of two frames, at either end, that do not set the range
 
 
 class Params(FrameParams):
@@ -111,7 +111,7 @@ def _levels(
     """
     if gain[0] != gain[1]:
         grey = np.asarray(response.grey(jnp.asarray(intensity * gain.min())))
-    low, high = np.quantile(grey, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION])
+    low, high = np.quantile(grey, [GREY_OUTLIER_FRACTION, 1 - GREY_OUTLIER_FRACTION])
     spread = 255 / (high - low) if high > low else 0.0
     return np.rint(((grey - low) * spread).clip(0, 255)).astype(np.uint8)
 
@@ -153,8 +153,8 @@ class FlowVideo(ImageSequence[Params]):
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         located = _locate(self._clock, times)
-        for first in range(0, len(times), BATCH):
-            batch = slice(first, first + BATCH)
+        for first in range(0, len(times), N_BATCH_IMAGES):
+            batch = slice(first, first + N_BATCH_IMAGES)
             places = zip(located.frame[batch], located.share[batch], strict=True)
             images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)

@@ -26,7 +26,7 @@ from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pix
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import (
-    WINDOW_EVENTS,
+    MAX_WINDOW_EVENTS,
     EventWindow,
     ImageReader,
     WindowedRecording,
@@ -36,9 +36,9 @@ from jaxevent.recording import Recording, Times, microseconds
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
 
-MAX_STARTS = 32  # windows from which filtering can be taken up again
-BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
-DEVICE_BATCH = 32  # on a GPU, where each call costs as much as several images
+MAX_WINDOW_STARTS = 32  # windows from which filtering can be taken up again
+N_BATCH_IMAGES = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
+N_DEVICE_BATCH_IMAGES = 32  # on a GPU, where each call costs as much as several images
 
 
 @runtime_checkable
@@ -361,7 +361,7 @@ class Video(ImageSequence[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         progress: bool | None = None,
         devices: Sequence[Any] = (),
         factors: NDArray[np.floating] | None = None,
@@ -369,7 +369,7 @@ class Video(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
         self._mesh = pixel_mesh(devices)
-        self._batch = DEVICE_BATCH if has_accelerator() else BATCH
+        self._batch = N_DEVICE_BATCH_IMAGES if has_accelerator() else N_BATCH_IMAGES
         self._windows = WindowedRecording(
             recording,
             Timing.of(params),
@@ -512,7 +512,7 @@ class Video(ImageSequence[P]):
         following = WindowStart(window.stop, window.after, end)
         if window.stop is not None and all(b.start != window.stop for b in self._starts):
             self._starts = sorted([*self._starts, following], key=lambda b: b.time)
-            if len(self._starts) > MAX_STARTS:  # first, last, half of the others
+            if len(self._starts) > MAX_WINDOW_STARTS:  # first, last, half of the others
                 self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
         return FilteredWindow(window, window.reader(self._batch), trajectory), following
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.features import (
-    SLOTS,
+    N_TILE_SLOTS,
     DeadTimeDerivative,
     Features,
     ImagePoints,
@@ -49,9 +49,10 @@ from jaxevent.reconstruction.stream import (
 from jaxevent.reconstruction.tiles import Layout, SlotMap, TileMemory, make_tiles
 from jaxevent.recording import Events, Recording, Times, microseconds
 
-WINDOW_EVENTS = 1 << 20
-FRAME_VALUES = 6_000_000  # pixels of all frames of a window: 16 frames of 346x260 take 60 MB
-FRAMES = (6, 16)  # least and greatest number of frames of a window
+MAX_WINDOW_EVENTS = 1 << 20
+# Pixels of all frames of a window: 16 frames of 346x260 take 60 MB.
+MAX_WINDOW_FRAME_PIXELS = 6_000_000
+WINDOW_FRAME_BOUNDS = (6, 16)  # least and greatest number of frames of a window
 
 
 class ReaderInputs(NamedTuple):
@@ -195,7 +196,7 @@ def _read(inputs, row, times, exposure, states, out):
                 ranks, lanes = shapes[k, 0], shapes[k, 1]
                 rank_of[pixel] = rank + 1
                 tile = round_tile[round_first[k] + rank // ranks] + lane // lanes
-                at[pixel] = tile * SLOTS + rank % ranks * lanes + lane % lanes
+                at[pixel] = tile * N_TILE_SLOTS + rank % ranks * lanes + lane % lanes
             row += 1
         base = counts.left[exposure[j]] if exposure[j] >= 0 else counts.start
         for pixel in range(len(last)):
@@ -245,7 +246,7 @@ class WindowedRecording:
         timing: Timing = Timing(),  # noqa: B008
         *,
         filtering: bool = True,
-        events: int = WINDOW_EVENTS,
+        events: int = MAX_WINDOW_EVENTS,
         reuse: bool = False,
         derivative: bool = False,
     ):
@@ -258,7 +259,10 @@ class WindowedRecording:
         self._count_dtype = np.dtype(np.float64 if self.dead.rho or self.reach else np.int32)
         self.pixels = recording.width * recording.height
         # The number of frames depends on the sensor only, to compile once.
-        self.frames = max(FRAMES[0], min(FRAMES[1], FRAME_VALUES // self.pixels))
+        self.frames = max(
+            WINDOW_FRAME_BOUNDS[0],
+            min(WINDOW_FRAME_BOUNDS[1], MAX_WINDOW_FRAME_PIXELS // self.pixels),
+        )
         self.dtype = np.dtype(jnp.result_type(float))
         self._images = FrameImages(recording, self.dtype)
         self._memory = TileMemory(reuse, self.dtype)
@@ -408,7 +412,7 @@ class WindowedRecording:
             last, row = self.initial().last, 0
         last = last.copy()
         while row < context:
-            part = self.recording.events[row : min(row + WINDOW_EVENTS, context)]
+            part = self.recording.events[row : min(row + MAX_WINDOW_EVENTS, context)]
             update_last_times(self._stream(part), last)
             row += len(part)
         return dataclasses.replace(state, context=context, context_last=last)

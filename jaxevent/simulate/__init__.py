@@ -50,16 +50,16 @@ from jaxevent.simulate.motion import (
     simulate_motion,
 )
 from jaxevent.simulate.objects import Objects
-from jaxevent.simulate.scenes import FITTING, SCENES, TESTING, Pan, Source, scene
+from jaxevent.simulate.scenes import FITTING_SCENES, SCENES, TESTING_SCENES, Pan, Source, scene
 from jaxevent.simulate.video import Clip, from_video
 
 __all__ = [
     "BLOB_SCENES",
-    "FITTING",
+    "FITTING_SCENES",
     "MOTION_SCENES",
     "SCENES",
     "SENSORS",
-    "TESTING",
+    "TESTING_SCENES",
     "Approach",
     "CameraMotion",
     "Circle",

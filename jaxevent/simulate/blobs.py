@@ -28,7 +28,7 @@ from jaxevent.simulate.scenes import parse_seconds
 
 Pair = tuple[float | int, float | int]
 Shape = Literal["gaussian", "ring", "uniform", "disc"]
-BACKGROUND = -1  # source of background events
+BACKGROUND_SOURCE = -1  # source of background events
 _DELTA_S = 1e-6  # of the central difference for a heading's rate
 
 
@@ -437,7 +437,7 @@ def simulate_blobs(
     for target, own in zip(targets, seeds[1:], strict=True):
         parts.append(target.events(duration, np.random.default_rng(own)))
     t, xi, on = (np.concatenate(column) for column in zip(*parts, strict=True))
-    source = np.repeat(np.arange(len(parts)) + BACKGROUND, [len(part[0]) for part in parts])
+    source = np.repeat(np.arange(len(parts)) + BACKGROUND_SOURCE, [len(part[0]) for part in parts])
     pixel = np.rint(xi)
     inside = ((pixel >= 0) & (pixel < size)).all(1)
     order = np.flatnonzero(inside)[np.argsort(t[inside], kind="stable")]
@@ -475,7 +475,7 @@ def _ttc(rate: float | int = 5e4, ratio: float | int = 0.1) -> Scene:
 
 def _cars(rate: float | int = 2e4, ratio: float | int = 0.1) -> Scene:
     targets = []
-    for lane, distance, speed, acceleration in CARS:
+    for lane, distance, speed, acceleration in CAR_MOTIONS:
         for x in (lane - 0.7, lane + 0.7):
             light = Approach((x, 0.8), distance, speed, (0.2, 0.15), acceleration=acceleration)
             targets.append(Target(light, rate))
@@ -527,7 +527,7 @@ def _walk(
 
 
 # Of `_cars`, left, in front, right: offset (m), distance (m), speed (m/s), acceleration (m/s^2).
-CARS = ((-3.2, 22.0, 2.0, 2.0), (0.0, 18.0, 0.5, 0.0), (3.0, 14.0, 3.5, 0.0))
+CAR_MOTIONS = ((-3.2, 22.0, 2.0, 2.0), (0.0, 18.0, 0.5, 0.0), (3.0, 14.0, 3.5, 0.0))
 
 _SCENES: dict[str, Callable[..., Scene]] = {
     "lissajous": _lissajous,

@@ -44,7 +44,7 @@ def _cross(x: NDArray, y: NDArray, r: float) -> NDArray:
     return np.minimum(bar, post)
 
 
-SHAPES: tuple[Distance, ...] = (_disc, _box, _triangle, _diamond, _cross)
+OBJECT_SHAPES: tuple[Distance, ...] = (_disc, _box, _triangle, _diamond, _cross)
 
 
 class Surface(NamedTuple):
@@ -203,10 +203,15 @@ class Objects:
         """The background and the objects, from far to near."""
         rng = np.random.default_rng(self.seed)
         size = np.array(self.size, float)
-        shapes: list[Distance | None] = [None, *(SHAPES[k] for k in rng.permutation(len(SHAPES)))]
+        shapes: list[Distance | None] = [
+            None,
+            *(OBJECT_SHAPES[k] for k in rng.permutation(len(OBJECT_SHAPES))),
+        ]
         # Middles about a ring, from where all objects come across one another.
-        angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(len(SHAPES)) / len(SHAPES)
-        lights = rng.permutation(np.linspace(0.3, 0.7, len(SHAPES)))
+        angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(len(OBJECT_SHAPES)) / len(
+            OBJECT_SHAPES
+        )
+        lights = rng.permutation(np.linspace(0.3, 0.7, len(OBJECT_SHAPES)))
         surfaces = []
         for k, shape in enumerate(shapes):
             swing = size * rng.uniform(0.15, 0.25, 2)

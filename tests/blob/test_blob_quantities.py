@@ -15,7 +15,7 @@ from jaxevent.show import track_figures as pictures
 from jaxevent.show.images import video_writer
 from jaxevent.show.track_figures import write_track_plot
 from jaxevent.show.track_tables import COLUMNS, track_writer
-from jaxevent.simulate.blobs import CARS, blob_scene
+from jaxevent.simulate.blobs import CAR_MOTIONS, blob_scene
 
 RNG = np.random.default_rng
 INVERSE_TTC = jax.jit(quantities.inverse_ttc)
@@ -81,7 +81,7 @@ def test_three_cars_tell_their_times_to_contact():
     tracks = blob.constant_velocity.estimate(recording, params, seeds=seeds, progress=False)
     target_of = np.concatenate([one.id for one in tracks.events()])
     t = np.concatenate([one.t for one in tracks.events()])
-    for car, (_, distance, speed, acceleration) in enumerate(CARS):
+    for car, (_, distance, speed, acceleration) in enumerate(CAR_MOTIONS):
         pair = 2 * car, 2 * car + 1
         times = t[np.isin(target_of, pair)]
         assert len(times) > 0.95 * 2 * 2e3 * truth.duration

@@ -30,7 +30,7 @@ from jaxevent.reconstruction.compensated.normal_equations import (
     PackedImages,
     solve,
 )
-from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
+from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.recording import Frames
 from jaxevent.simulate import Sensor, simulate
 
@@ -246,8 +246,8 @@ def only(name, beyond="none"):
     """Return params that choose one candidate; `beyond` where frames are on one side alone."""
     chosen = []
     for one in (name, beyond):
-        rows = np.zeros((len(FALLBACKS), len(FEATURES) + 1))
-        rows[:, -1] = [40.0 if one == other else -40.0 for other in FALLBACKS]
+        rows = np.zeros((len(FALLBACK_SOURCES), len(FEATURE_NAMES) + 1))
+        rows[:, -1] = [40.0 if one == other else -40.0 for other in FALLBACK_SOURCES]
         chosen.append(rows.ravel().tolist())
     return Params(choice=chosen[0], choice_beyond=chosen[1])
 
@@ -268,7 +268,7 @@ def test_what_differs_is_hidden():
     np.testing.assert_allclose(np.asarray(fused.sources).sum(0), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", FALLBACKS)
+@pytest.mark.parametrize("name", FALLBACK_SOURCES)
 def test_other_candidates_can_be_chosen(name):
     L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
     at = make_layout(9, 2, 1, 5)
@@ -287,7 +287,7 @@ def test_other_candidates_can_be_chosen(name):
     mild = Params(choice=(np.array(only(name).choice) / 10).tolist())
     V = np.full_like(L, 0.01)
     V[:, 5, 7] = 9.0
-    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + FALLBACKS.index(name)]
+    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + FALLBACK_SOURCES.index(name)]
     assert share[5, 7] < 0.03 and np.delete(share, 5, 0).min() > 0.97
 
 
@@ -663,7 +663,7 @@ def test_variance_and_flow_are_true():
 def test_sources_are_shares():
     shares = video().sources(np.array([200_000]))
     assert shares["before"].shape == (1, 40, 48)
-    total = sum(shares[name] for name in fusion.SOURCES)
+    total = sum(shares[name] for name in fusion.SOURCE_NAMES)
     np.testing.assert_allclose(total, 1, atol=1e-4)
     assert shares["visible_before"].mean() > 0.5
 
@@ -917,7 +917,7 @@ def test_blurring_is_scipys():
 
 def test_variance_features_of_frames_on_one_side():
     X, known = (
-        np.random.default_rng(3).normal(-4, 1, (len(FEATURES) + 1, 1, 3)),
+        np.random.default_rng(3).normal(-4, 1, (len(FEATURE_NAMES) + 1, 1, 3)),
         np.array([[0, 0.5, 1]]),
     )
     given = jnp.asarray(X), jnp.asarray(known)
@@ -928,11 +928,13 @@ def test_variance_features_of_frames_on_one_side():
         np.asarray(fusion.variance_features(*given, jnp.asarray(True), jnp.asarray(away)))
         for away in (1, 3, 0.5)
     )
-    apart, twice = (FEATURES.index(name) for name in ("from_each_other", "seen_twice"))
-    squares = np.exp(X[apart]) - fusion.MIN_SQUARE
-    np.testing.assert_allclose(np.exp(once[apart]) - fusion.MIN_SQUARE, known * squares, atol=1e-7)
+    apart, twice = (FEATURE_NAMES.index(name) for name in ("from_each_other", "seen_twice"))
+    squares = np.exp(X[apart]) - fusion.MIN_SQUARED_DIFFERENCE
     np.testing.assert_allclose(
-        np.exp(far[apart]) - fusion.MIN_SQUARE, 3 * known * squares, atol=1e-7
+        np.exp(once[apart]) - fusion.MIN_SQUARED_DIFFERENCE, known * squares, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        np.exp(far[apart]) - fusion.MIN_SQUARED_DIFFERENCE, 3 * known * squares, atol=1e-7
     )
     np.testing.assert_array_equal(near, once)
     np.testing.assert_allclose(once[twice], known * X[twice])

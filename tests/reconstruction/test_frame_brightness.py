@@ -110,7 +110,7 @@ def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
 
 def test_smooth_part():
     image = np.random.default_rng(5).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
-    got, reach = images.smooth_part(image), images.SMOOTH_SIGMA_PX
+    got, reach = images.smooth_part(image), images.SMOOTH_PART_SIGMA_PX
     ones = gaussian_filter(np.ones((HEIGHT, WIDTH)), reach, mode="constant", truncate=8)
     for one, part in zip(image, got, strict=True):
         expected = gaussian_filter(one, reach, mode="constant", truncate=8) / ones

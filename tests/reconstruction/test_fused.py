@@ -156,7 +156,7 @@ def test_smoothers_of_one_kernel_equal_the_scan(monkeypatch):
     monkeypatch.setattr(codegen, "N_THREADS", 1)
     np.testing.assert_array_equal(images("numba").mean, mean)
     # Bands of three rows each.
-    monkeypatch.setattr(bands, "STRIDES", (5 * 13,))
+    monkeypatch.setattr(bands, "BAND_STRIDES", (5 * 13,))
     np.testing.assert_allclose(images("numba").mean, mean, rtol=1e-9, atol=1e-9)
 
 
@@ -192,7 +192,7 @@ def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
 
     whole = images()
     # Bands of three rows each: the events of two of them are neighbours of other bands.
-    monkeypatch.setattr(bands, "STRIDES", (5 * 13,))
+    monkeypatch.setattr(bands, "BAND_STRIDES", (5 * 13,))
     layout = bands.BandLayout.of(11, 9)
     assert layout is not None and len(layout.edges) == 4
     np.testing.assert_array_equal(images(), whole)
@@ -225,7 +225,7 @@ def test_stored_events_are_checked_while_they_are_divided(tmp_path):
 
 @pytest.mark.slow
 def test_images_that_are_held_are_not_written_over(monkeypatch):
-    monkeypatch.setattr(bands, "IMAGE_PIXELS", 2 * 11 * 9)  # two images at once
+    monkeypatch.setattr(bands, "MAX_PASS_PIXELS", 2 * 11 * 9)  # two images at once
     recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
     times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
     params = params_of(jaxevent.high_pass, **PARAMS)

@@ -32,7 +32,7 @@ from jaxevent.blob.track import (
 from jaxevent.codegen.graph import Graph, ParameterProgram, TranslationError, constant_value
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
-    ELEMENTS,
+    ELEMENT_AXIS_LENGTH,
     TracedFunction,
     TracedProgram,
     name_leaves,
@@ -227,7 +227,7 @@ def trace_track(
 
     own = {name: shape() for name in overrides}
     track = jax.eval_shape(make_track, params, own, shape(2), shape(), time, flag)
-    M = 1 if single else ELEMENTS
+    M = 1 if single else ELEMENT_AXIS_LENGTH
     batch = jax.eval_shape(EventBatch, shape(M, 2), shape(M), shape(M))
     owner = shape(M, 2, kind=np.int32) if has_owners else None
     events = jax.eval_shape(StepEvents, time, batch, shape(M, kind=bool), owner)
@@ -237,7 +237,10 @@ def trace_track(
     predicted = jax.eval_shape(steps.measurement, params, **at_stop)["evidence.predicted"]
     evidence = jax.eval_shape(TrackEvidence, predicted, flag, flag)
     update = {"track": track, "events": events, "prediction": prediction, "weight": shape(M)}
-    weights = {"inside": shape(ELEMENTS, kind=bool), "log_likelihood": shape(ELEMENTS)}
+    weights = {
+        "inside": shape(ELEMENT_AXIS_LENGTH, kind=bool),
+        "log_likelihood": shape(ELEMENT_AXIS_LENGTH),
+    }
     decide = {**at_stop, "frame": shape(2), "evidence": evidence}
     functions = {
         "init": (steps.init, {"track": track, "xi": shape(2), "size": shape()}, True),
@@ -264,7 +267,7 @@ def _make_layout(trees: Mapping[str, Any]) -> Layout:
     integers = {name: k for k, name in enumerate(loop.INTEGERS)}
     for name, tree in trees.items():
         for leaf_name, leaf in name_leaves(name, tree).items():
-            if ELEMENTS in leaf.shape:
+            if ELEMENT_AXIS_LENGTH in leaf.shape:
                 continue
             columns = reals if leaf.dtype.kind == "f" else integers
             for number in name_numbers(leaf_name, leaf):

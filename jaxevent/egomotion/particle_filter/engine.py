@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
-    ELEMENTS,
+    ELEMENT_AXIS_LENGTH,
     TracedFunction,
     TracedProgram,
     name_leaves,
@@ -187,7 +187,7 @@ class FunctionTracer:
         leaves = []
         for name, leaf in name_leaves(key, tree).items():
             names = name_numbers(name, leaf)
-            of_all = ELEMENTS in leaf.shape
+            of_all = ELEMENT_AXIS_LENGTH in leaf.shape
             if translated is not None and of_all:
                 nodes = [translated.results[number] for number in names]
                 of_all = any(node.level == Level.ELEMENT for node in nodes)
@@ -202,7 +202,7 @@ class FunctionTracer:
                 where.setdefault(number, len(set(where.values())))
                 if leaf.dtype == bool:
                     self.booleans.add(number)
-            leaves.append(leaf if of_all or ELEMENTS not in leaf.shape else self.shape())
+            leaves.append(leaf if of_all or ELEMENT_AXIS_LENGTH not in leaf.shape else self.shape())
         return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def _of_all(self, node: Node) -> Node:
@@ -230,7 +230,7 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
         raise TranslationError('likelihood = "literal"')
     tracer = FunctionTracer(params, model, dtype)
     shape, d = tracer.shape, model.dimension
-    cloud, each, flag = shape(ELEMENTS, d), shape(ELEMENTS), shape(kind=bool)
+    cloud, each, flag = shape(ELEMENT_AXIS_LENGTH, d), shape(ELEMENT_AXIS_LENGTH), shape(kind=bool)
     # Classes that check their fields take shapes in a trace.
     state, timing, event, of_batch = jax.eval_shape(
         lambda cloud, each, flag, one, two, four: (

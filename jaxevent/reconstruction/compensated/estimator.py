@@ -34,7 +34,7 @@ from jaxevent.reconstruction.compensated.exposures import (
     constrain_image_jax,
 )
 from jaxevent.reconstruction.compensated.fusion import (
-    SOURCES,
+    SOURCE_NAMES,
     FusedImage,
     ReferenceImages,
     after_weight,
@@ -101,15 +101,15 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import Clock, FrameImages, Timing, time_span
 from jaxevent.reconstruction.video import ImageSequence
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
+from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
 
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
 N_CACHED_ANCHORS = 2
-TARGET_STEPS = 2  # with which a target's motion is found at half resolution
-MAX_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
+N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
+MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
@@ -339,7 +339,7 @@ class TrajectoryEstimator:
         """Take a few steps at half resolution, on the clock on which images agree better."""
 
         def improved(clock: Instants, p: NDArray[np.float32]) -> NDArray[np.float32]:
-            for _ in range(TARGET_STEPS):
+            for _ in range(N_TARGET_STEPS):
                 p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
             return p
 
@@ -351,7 +351,7 @@ class TrajectoryEstimator:
             return instants, found
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
-        if cost(instants, found) < MAX_COST_RATIO * cost(timed, other):
+        if cost(instants, found) < MAX_CLOCK_COST_RATIO * cost(timed, other):
             return instants, found
         return timed, other
 
@@ -502,7 +502,7 @@ class CompensatedVideo(ImageSequence[Params]):
         recording: Recording,
         params: Params,
         *,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         motion: FlowSource | None = None,
         refine: bool = True,
         progress: bool | None = None,
@@ -632,7 +632,7 @@ class CompensatedVideo(ImageSequence[Params]):
             where the frame next to the target shows the point, 0 where it is hidden.
         """
         found = [fused for _, fused in self._targets(times, extrapolate)]
-        shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCES)}
+        shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCE_NAMES)}
         shares["visible_before"] = [one.visible[0] for one in found]
         shares["visible_after"] = [one.visible[1] for one in found]
         return {name: np.stack(images).astype(np.float32) for name, images in shares.items()}
@@ -683,7 +683,7 @@ class MotionCompensation(ImageEstimator[Params]):
             self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
-        trajectories = make_trajectory_estimator(recording, params, WINDOW_EVENTS)
+        trajectories = make_trajectory_estimator(recording, params, MAX_WINDOW_EVENTS)
         chosen = [trajectories.schedule(t) for t in wanted.tolist()]
         count = padded_count(max(len(one) for one in chosen))
         every = merge_instants(chosen)

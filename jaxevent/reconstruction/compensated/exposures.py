@@ -43,10 +43,10 @@ from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
 from jaxevent.recording import Recording
 
-N_STEPS = 4
-BLURRED_PX = 0.5  # motion within an exposure, below which the frame counts as sharp
-DISAGREEMENT_PX = 0.5  # by which points that met within an exposure may move differently
-MAX_SAMPLE_PX = 2.0  # motion from one sample of an exposure to the next
+N_CONSTRAINT_STEPS = 4
+MIN_BLUR_PX = 0.5  # motion within an exposure, below which the frame counts as sharp
+MAX_DISAGREEMENT_PX = 0.5  # by which points that met within an exposure may move differently
+MAX_SAMPLE_SPACING_PX = 2.0  # motion from one sample of an exposure to the next
 SAMPLE_COUNTS = (3, 7, 15, 31)  # of an exposure; few numbers, so that few programs are compiled
 SPEED_MARGIN = 2.0  # times the measured speed, for which exposures are sampled
 
@@ -87,9 +87,9 @@ class _ClippedSide(NamedTuple):
 
 def choose_samples(moved: float) -> int:
     """Choose the number of samples of an exposure in which points move that far (px)."""
-    if moved < BLURRED_PX:
+    if moved < MIN_BLUR_PX:
         return 1
-    return next((n for n in SAMPLE_COUNTS if n * MAX_SAMPLE_PX >= moved), SAMPLE_COUNTS[-1])
+    return next((n for n in SAMPLE_COUNTS if n * MAX_SAMPLE_SPACING_PX >= moved), SAMPLE_COUNTS[-1])
 
 
 class FrameExposures:
@@ -256,8 +256,8 @@ def _frame_evidence(
     inside = is_inside(Y, X, h, w) * jnp.asarray(exposures.present)[:, None, None]
     inside = inside * jnp.where(at_target, 1, fused.visible)
     moved = jnp.sqrt(((D[:, -1] - D[:, 0]) ** 2).sum(-1) + 1e-12)
-    blurred = jnp.clip((moved - BLURRED_PX) / BLURRED_PX, 0, 1)
-    blurred = blurred / (1 + (_motion_disagreement(D) / DISAGREEMENT_PX) ** 2)
+    blurred = jnp.clip((moved - MIN_BLUR_PX) / MIN_BLUR_PX, 0, 1)
+    blurred = blurred / (1 + (_motion_disagreement(D) / MAX_DISAGREEMENT_PX) ** 2)
 
     def read(values: Array) -> Array:
         return sample(values.reshape(-1, h, w), Y, X)
@@ -319,7 +319,7 @@ def constrain_image_jax(
         pull = (L - image) / P + smear_adjoint_jax(pull, shares, D)
         return image + pull / (1 / P + information), None
 
-    image, _ = jax.lax.scan(step, L, None, length=N_STEPS)
+    image, _ = jax.lax.scan(step, L, None, length=N_CONSTRAINT_STEPS)
     P = P + params.smear * _squared_blur(evidence, image, smear_jax(image, D)[0])
     return dataclasses.replace(fused, L=image, P=P)
 
@@ -341,7 +341,7 @@ def constrain_image(
     D = _single(_compiled_displacements(model.exposures, model.paths, samples))
     B, _ = smear(L, D)
     evidence, image = _compiled_evidence(params, model, D, B, fused), L
-    for _ in range(N_STEPS):
+    for _ in range(N_CONSTRAINT_STEPS):
         B, shares = smear(image, D)
         pull, information = map(_single, _compiled_pull(params, evidence, B))
         back = smear_adjoint(pull, shares, D)

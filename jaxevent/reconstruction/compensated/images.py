@@ -37,15 +37,15 @@ from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smooth
 from jaxevent.recording import Recording
 
 N_CACHED_IMAGES = 96  # of instants, in a video
-SMOOTH_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
-MIN_CHANGE = 0.05  # ln I, between frames that are not steady
-BLOCK_PX = 16  # over which the change of pixels without events is a median
+SMOOTH_PART_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
+MIN_UNSTEADY_CHANGE = 0.05  # ln I, between frames that are not steady
+MEDIAN_BLOCK_PX = 16  # over which the change of pixels without events is a median
 MIN_BLOCK_PIXELS, MIN_BLOCKS = 8, 4  # without events
-MAX_FRAMES = 8  # on either side, from which the variance of brightness is estimated
+MAX_BRIGHTNESS_FRAMES = 8  # on either side, from which the variance of brightness is estimated
 # Of independent brightnesses of variance v two differ by 2 v, squared, and one from the mean of two
 # others by 3 v / 2.
-MIDPOINT_FACTOR = 0.75
-UNCLIPPED_GREY = (0.02, 0.98)  # grey values of pixels that are not clipped
+MIDPOINT_VARIANCE_FACTOR = 0.75
+UNCLIPPED_GREY_RANGE = (0.02, 0.98)  # grey values of pixels that are not clipped
 
 
 class FrameLevels(NamedTuple):
@@ -143,7 +143,7 @@ def _averages(size: int, sigma: float) -> NDArray[np.float32]:
 
 
 @full_precision
-def smooth_part(L: Any, sigma: float = SMOOTH_SIGMA_PX) -> Any:
+def smooth_part(L: Any, sigma: float = SMOOTH_PART_SIGMA_PX) -> Any:
     """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma` px."""
     return _averages(L.shape[-2], sigma) @ L @ _averages(L.shape[-1], sigma).T
 
@@ -199,7 +199,7 @@ class FrameBrightness:
         """Return whether all frames between two times (us), included, are equally bright."""
         low = int(np.searchsorted(self._mid, first, "left"))
         high = int(np.searchsorted(self._mid, last, "right"))
-        return all(abs(self._change(k)) < MIN_CHANGE for k in range(low, high - 1))
+        return all(abs(self._change(k)) < MIN_UNSTEADY_CHANGE for k in range(low, high - 1))
 
     def prior(self, t: int) -> BrightnessPrior:
         """Return the prior of the brightness at a time (us)."""
@@ -216,7 +216,7 @@ class FrameBrightness:
         else:
             change, next_change = -self._change(len(mid) - 2), self._change(len(mid) - 3)
             distance, interval = t - mid[-1], mid[-1] - mid[-2]
-        if abs(change) < MIN_CHANGE or abs(next_change) >= MIN_CHANGE:
+        if abs(change) < MIN_UNSTEADY_CHANGE or abs(next_change) >= MIN_UNSTEADY_CHANGE:
             return 0.0
         return change * min(1.0, float(distance / interval))
 
@@ -227,7 +227,10 @@ class FrameBrightness:
         """
         right = int(np.searchsorted(self._mid, t, "right"))
         left = int(np.searchsorted(self._mid, t, "left"))
-        low, high = max(left - MAX_FRAMES, 0), min(right + MAX_FRAMES, len(self._mid))
+        low, high = (
+            max(left - MAX_BRIGHTNESS_FRAMES, 0),
+            min(right + MAX_BRIGHTNESS_FRAMES, len(self._mid)),
+        )
         if left < right or high - low < 2:
             return 0.0
         mid = (self._mid[low:high] - t) * 1e-6
@@ -237,8 +240,10 @@ class FrameBrightness:
             w = (mid[1:-1] - mid[:-2]) / (mid[2:] - mid[:-2])
             error, factor = level[1:-1] - (1 - w) * level[:-2] - w * level[2:], 1.0
         else:
-            error, factor = level[1:], MIDPOINT_FACTOR if between else 1.0
-        variance = factor * float((np.where(np.abs(error) < MIN_CHANGE, 0, error) ** 2).mean())
+            error, factor = level[1:], MIDPOINT_VARIANCE_FACTOR if between else 1.0
+        variance = factor * float(
+            (np.where(np.abs(error) < MIN_UNSTEADY_CHANGE, 0, error) ** 2).mean()
+        )
         if not between:
             return variance
         w = -mid[left - 1 - low] / (mid[right - low] - mid[left - 1 - low])
@@ -255,18 +260,20 @@ class FrameBrightness:
         source, size = self._recording.events, (self._recording.height, self._recording.width)
         begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
         grey, intensity, _, _ = self._images.read(slice(frame, frame + 2), 2)
-        black, white = UNCLIPPED_GREY
+        black, white = UNCLIPPED_GREY_RANGE
         unclipped = ((grey > black) & (grey < white)).all(0).reshape(size)
         events = source[begin:end]
         counts = np.zeros(size, np.float32)
         np.add.at(counts, (events.y, events.x), 1)
         quiet = unclipped & (uniform_filter(counts, 3) < 1 / 18)
         change = np.diff(np.log(intensity + self._I0), axis=0).reshape(size)
-        h, w = (length // BLOCK_PX for length in size)
+        h, w = (length // MEDIAN_BLOCK_PX for length in size)
 
         def blocks(image: NDArray) -> NDArray:
-            cut = image[: h * BLOCK_PX, : w * BLOCK_PX].reshape(h, BLOCK_PX, w, BLOCK_PX)
-            return cut.swapaxes(1, 2).reshape(h * w, BLOCK_PX**2)
+            cut = image[: h * MEDIAN_BLOCK_PX, : w * MEDIAN_BLOCK_PX].reshape(
+                h, MEDIAN_BLOCK_PX, w, MEDIAN_BLOCK_PX
+            )
+            return cut.swapaxes(1, 2).reshape(h * w, MEDIAN_BLOCK_PX**2)
 
         changes = [
             float(np.median(values[chosen]))

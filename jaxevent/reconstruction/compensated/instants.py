@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from jaxevent.recording import Recording
 
 GRID_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # distances of instants from the target
-STEP_PX = 0.6  # motion within a step of the grid
+GRID_STEP_PX = 0.6  # motion within a step of the grid
 MAX_FRAME_MOTION_PX = 6.0  # between the target and a frame beyond the nearest ones
 MIN_FRAMES, MAX_FRAMES = 2, 8  # on either side of the target
 FIRST_HORIZON_STEPS = 2.2  # the horizon at which motion is first sought
-REST_RATE = 0.1  # of the mean rate of events, below which a scene is at rest
-COUNT_MULTIPLE = 4  # numbers of instants are multiples, to compile few shapes
-MIN_STEP_US = 200
+MAX_REST_RATE = 0.1  # of the mean rate of events, below which a scene is at rest
+INSTANT_COUNT_MULTIPLE = 4  # numbers of instants are multiples, to compile few shapes
+MIN_GRID_STEP_US = 200
 
 MAX_EVENT_SHARE = 0.9  # of the clock: time never stands still
-N_SEGMENTS = 8  # of a recording, in which parts of the image are compared
-SEGMENT_FRAMES = 4  # intervals of frames, the length of a segment
+N_RATE_SEGMENTS = 8  # of a recording, in which parts of the image are compared
+SEGMENT_FRAME_INTERVALS = 4  # intervals of frames, the length of a segment
 N_PARTS, N_BINS = 4, 16  # of the image along each axis, and of a segment
 N_CACHED_TIMES = 4096  # times whose number of earlier events is remembered
 MIN_RATE_DEVIATION = 0.05  # deviations of the rate, as a part of it, that do not matter
@@ -76,8 +76,8 @@ def fit_motion_clock(recording: Recording, span: tuple[int, int], interval: int)
         The clock.
     """
     first, last = span
-    length = min(SEGMENT_FRAMES * interval, last - first)
-    begins = np.linspace(first, last - length, N_SEGMENTS).astype(np.int64)
+    length = min(SEGMENT_FRAME_INTERVALS * interval, last - first)
+    begins = np.linspace(first, last - length, N_RATE_SEGMENTS).astype(np.int64)
     counts = [_count_parts(recording, int(begin), length) for begin in np.unique(begins)]
     event_interval = (recording.stop - recording.start) / max(len(recording.events), 1)
     # Targets share instants, and formats that are decoded are slow to search.
@@ -184,7 +184,7 @@ class Schedule:
         self.frames, self.span, self.clock = frames, span, clock
         gap = float(np.median(np.diff(frames))) if len(frames) > 1 else float(span[1] - span[0])
         self.speed = speed = max(speed, 1e-3)
-        self.step = max(round(min(STEP_PX / speed * 1e6, gap / 2)), MIN_STEP_US)  # us
+        self.step = max(round(min(GRID_STEP_PX / speed * 1e6, gap / 2)), MIN_GRID_STEP_US)  # us
         self.max_distance = MAX_FRAME_MOTION_PX / speed * 1e6  # us, of further frames
 
     def __call__(self, t: int) -> Instants:
@@ -208,7 +208,7 @@ class Schedule:
         rest = 0.0
         if len(nearest) == 1 and left == right:
             rate = self.clock.relative_rate(*sorted((int(times[nearest[0]]), t)))
-            rest = 1 / (1 + (rate / REST_RATE) ** 2)
+            rest = 1 / (1 + (rate / MAX_REST_RATE) ** 2)
         return Instants(times, target, before, after, s, unit, horizon, self.clock, rest)
 
     def _near_frames(self, t: int) -> set[int]:
@@ -277,7 +277,7 @@ def _block_means(images: NDArray) -> NDArray:
 
 def padded_count(count: int) -> int:
     """Return the number to which a target's instants are padded."""
-    return -(-count // COUNT_MULTIPLE) * COUNT_MULTIPLE
+    return -(-count // INSTANT_COUNT_MULTIPLE) * INSTANT_COUNT_MULTIPLE
 
 
 def merge_instants(targets: Sequence[Instants]) -> NDArray[np.int64]:

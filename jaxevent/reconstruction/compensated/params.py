@@ -4,7 +4,7 @@ from jaxevent.parameters import Choice, Number, Positive, UnitInterval
 from jaxevent.reconstruction import smoother
 
 # Features of a pixel that decide between the candidates; `fusion.fusion_features` computes them.
-FEATURES = (
+FEATURE_NAMES = (
     "fused",
     "scatter",
     "smoothed",
@@ -22,11 +22,11 @@ FEATURES = (
     "near_from_blend",
     "activity",
 )
-FALLBACKS = ("smoothed", "blend")  # candidates beside the mean along trajectories
+FALLBACK_SOURCES = ("smoothed", "blend")  # candidates beside the mean along trajectories
 
 # Fitted by experiments/compensated_choice.py: a weight of every feature and a constant, for each of
-# `FALLBACKS`; and the same for the logarithm of the result's variance. Those called beyond, by its
-# --beyond, are of times after the last frame and before the first.
+# `FALLBACK_SOURCES`; and the same for the logarithm of the result's variance. Those called beyond,
+# by its --beyond, are of times after the last frame and before the first.
 # fmt: off
 CHOICE_WEIGHTS = (
     0.796, 0.089, 0.222, 0.939, 0.532, -3.802, -3.169, 0.234, -0.268, -0.368, 0.687, 0.136,

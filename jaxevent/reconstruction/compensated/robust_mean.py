@@ -23,9 +23,10 @@ from jaxevent.reconstruction.features import Numeric
 
 SCATTER_TOLERANCE = 3.0  # squared residual of an instant that scatter hardly counts
 OUTSIDE_VARIANCE = 1e6  # (ln I)^2, beyond the image's border
-EXPECTED_SQUARE = 0.6  # squared difference of an image from the mean, in units of its variance
+# Squared difference of an image from the mean, in units of its variance.
+EXPECTED_SQUARED_RESIDUAL = 0.6
 RESIDUAL_SIGMA_PX, SCATTER_SIGMA_PX = 1.5, 2.0  # of the Gaussians that gather them
-N_NEAR = 5  # instants without frame next to the target
+N_NEAR_INSTANTS = 5  # instants without frame next to the target
 
 
 class InstantLayout(NamedTuple):
@@ -60,7 +61,7 @@ def make_layout(instants: Instants, clear: NDArray, count: int) -> InstantLayout
     target, other = instants.target, instants.after
     order = np.argsort(np.abs(instants.t - instants.t[target]), kind="stable")
     near = np.zeros(len(instants), bool)
-    near[[k for k in order if k == target or not framed[k]][:N_NEAR]] = True
+    near[[k for k in order if k == target or not framed[k]][:N_NEAR_INSTANTS]] = True
     near[target] = True
     if instants.before == other:
         other = next((k for k in order if framed[k] and k not in (target, other)), other)
@@ -179,7 +180,7 @@ def robust_mean_jax(
     M = (R * warped.L).sum(0) / total
     # Of all instants but the plainly hidden ones, whatever the tolerance.
     plain = present / variance / (1 + (residual / SCATTER_TOLERANCE) ** 2)
-    excess = (plain * ((warped.L - M) ** 2 - EXPECTED_SQUARE * variance)).sum(0)
+    excess = (plain * ((warped.L - M) ** 2 - EXPECTED_SQUARED_RESIDUAL * variance)).sum(0)
     weight = blur_jax((plain * eta).sum(0), SCATTER_SIGMA_PX)
     scatter = jnp.maximum(blur_jax(excess, SCATTER_SIGMA_PX) / weight, 0)
     W = W * warped.inside
@@ -420,7 +421,7 @@ def _add_excess(inputs, k, y, residual, variance, sums):
     M, excess, weight = sums
     one, tolerance = np.float32(1), np.float32(SCATTER_TOLERANCE)
     L, clear = inputs.warped.L[k, y], inputs.warped.clear[k, y]
-    expected = np.float32(EXPECTED_SQUARE)
+    expected = np.float32(EXPECTED_SQUARED_RESIDUAL)
     for x in range(len(L)):
         eta = inputs.information + (one - inputs.information) * clear[x]
         ratio = residual[x] / tolerance

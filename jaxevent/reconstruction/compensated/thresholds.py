@@ -22,14 +22,14 @@ from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.stream import DeadTime, Stream, count_before, event_weights
 from jaxevent.recording import Recording
 
-N_CHANGES = 8  # between pairs of images that are evenly spaced over a recording
+N_IMAGE_PAIRS = 8  # between pairs of images that are evenly spaced over a recording
 MAX_FRAME_INTERVALS = 4  # between the images of a pair
-MIN_EVENTS = 40.0  # per pixel in all changes together; with fewer nothing is learned
-EXPECTED_SIGMA = 0.1  # standard deviation of d, before it is known
-MIN_SIGMA = 0.05  # of d; pixels that differ less are averaged by the fusion as well
-AROUND_SIGMA_PX = 4.0  # of the Gaussian over the pixels that one is compared with
+MIN_EVENTS_PER_PIXEL = 40.0  # per pixel in all changes together; with fewer nothing is learned
+EXPECTED_DEVIATION_SIGMA = 0.1  # standard deviation of d, before it is known
+MIN_DEVIATION_SIGMA = 0.05  # of d; pixels that differ less are averaged by the fusion as well
+NEIGHBOURHOOD_SIGMA_PX = 4.0  # of the Gaussian over the pixels that one is compared with
 HUBER_SQUARE = 5.0  # standardised squares beyond which changes count less
-FACTOR_BOUNDS = (0.5, 2.0)  # on the common threshold
+COMMON_FACTOR_BOUNDS = (0.5, 2.0)  # on the common threshold
 
 ImageFunction = Callable[[int], tuple[NDArray, NDArray]]  # log intensity, variance at a time (us)
 
@@ -78,7 +78,7 @@ def regress(changes: LogChanges, mismatch: float) -> ThresholdDeviations:
 def local_deviation(found: ThresholdDeviations, size: tuple[int, int]) -> ThresholdDeviations:
     """Subtract the mean of the pixels around: errors of the scene's motion are common to these."""
     d = found.d.reshape(2, *size)
-    smooth = gaussian_filter(d, (0, AROUND_SIGMA_PX, AROUND_SIGMA_PX))
+    smooth = gaussian_filter(d, (0, NEIGHBOURHOOD_SIGMA_PX, NEIGHBOURHOOD_SIGMA_PX))
     return found._replace(d=(d - smooth).reshape(found.d.shape))
 
 
@@ -95,10 +95,10 @@ def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int
     """Return begins and ends (us) of changes that do not overlap."""
     first, last = span
     assert recording.frames is not None
-    lag = (last - first) // N_CHANGES
+    lag = (last - first) // N_IMAGE_PAIRS
     if len(recording.frames) > 1:
         lag = min(lag, MAX_FRAME_INTERVALS * int(np.median(np.diff(recording.frames.t))))
-    begins = np.linspace(first, last - lag, N_CHANGES).astype(np.int64)
+    begins = np.linspace(first, last - lag, N_IMAGE_PAIRS).astype(np.int64)
     return [(t, t + lag) for t in begins.tolist()]
 
 
@@ -127,15 +127,15 @@ def learn_thresholds(
 
     Returns:
         (2, pixels) factors on the common thresholds. None where events are too few, or where both
-        halves of the changes do not have deviations above `MIN_SIGMA` in common.
+        halves of the changes do not have deviations above `MIN_DEVIATION_SIGMA` in common.
     """
     c_on, c_off = float(params.c_on), float(params.c_off)
-    if not params.learn or span[1] - span[0] < N_CHANGES:
+    if not params.learn or span[1] - span[0] < N_IMAGE_PAIRS:
         return None
     times = _change_times(recording, span)
     rho = 1e6 * float(params.rho_ref)  # us
     counts = np.stack([_count_events(recording, *pair, rho) for pair in times], 1)
-    if counts.sum((0, 1)).mean() < MIN_EVENTS:
+    if counts.sum((0, 1)).mean() < MIN_EVENTS_PER_PIXEL:
         return None
     known = {t: images(t) for t in sorted({t for pair in times for t in pair})}
     rest = np.stack([(known[b][0] - known[a][0]).ravel() for a, b in times])
@@ -145,11 +145,14 @@ def learn_thresholds(
     drift = float(params.sigma_bg) ** 2 * np.array([(b - a) * 1e-6 for a, b in times])[:, None]
     changes = LogChanges(rest - on - off, on, off, P + steps + drift + c_on * c_off / 3)
     size = (recording.height, recording.width)
-    halves = (slice(0, N_CHANGES // 2), slice(N_CHANGES // 2, None))
+    halves = (slice(0, N_IMAGE_PAIRS // 2), slice(N_IMAGE_PAIRS // 2, None))
     found = estimate_sigma(
-        *(local_deviation(regress(changes.select(half), EXPECTED_SIGMA), size) for half in halves)
+        *(
+            local_deviation(regress(changes.select(half), EXPECTED_DEVIATION_SIGMA), size)
+            for half in halves
+        )
     )
-    if not found > MIN_SIGMA:
+    if not found > MIN_DEVIATION_SIGMA:
         return None
     factors = 1 + local_deviation(regress(changes, found), size).d
-    return factors.clip(*FACTOR_BOUNDS).astype(np.float32)
+    return factors.clip(*COMMON_FACTOR_BOUNDS).astype(np.float32)

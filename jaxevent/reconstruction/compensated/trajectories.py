@@ -56,13 +56,13 @@ from jaxevent.reconstruction.compensated.warp import (
 MAX_STEP_PX = np.float32(1.5)  # at the horizon
 HALVING_TAPS = np.array([1, 4, 6, 4, 1], np.float32) / np.float32(16)
 # A pixel's own path, and those around it.
-NEIGHBOURS = np.array(
+NEIGHBOUR_OFFSETS = np.array(
     [(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 )
 # Least gain in cost per instant for which a pixel takes another path. With less, pixels of one
 # surface take what noise prefers. Set on pans of HDR scenes for fitting, on objects of seeds that
 # are not scored, and on the first half of slider_depth.
-MIN_GAIN = np.float32(0.1)
+MIN_COST_GAIN = np.float32(0.1)
 MIN_PATH_DIFFERENCE_PX = np.float32(0.5)  # at the farthest instant, between paths to compare
 
 
@@ -564,13 +564,15 @@ def select_paths(
         (h, w) flat indices of the pixels whose paths are taken, row by row.
     """
     h, w, _ = paths.shape
-    min_gain = np.float32(MIN_GAIN * len(images.s))
+    min_gain = np.float32(MIN_COST_GAIN * len(images.s))
     path_index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     for spacing, distance, sigma in searches:
         some = paths.reshape(-1, 4)[path_index[::spacing, ::spacing]]
         taps, shape = gaussian_taps(sigma), some.shape[:2]
-        inputs = _SearchInputs(images, some, spacing, NEIGHBOURS * distance, cost, taps, min_gain)
-        costs = np.empty((len(NEIGHBOURS), *shape), np.float32)
+        inputs = _SearchInputs(
+            images, some, spacing, NEIGHBOUR_OFFSETS * distance, cost, taps, min_gain
+        )
+        costs = np.empty((len(NEIGHBOUR_OFFSETS), *shape), np.float32)
         scratch = _SearchScratch.allocate(shape, len(images.s), len(taps))
         run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
         out = np.empty_like(path_index)

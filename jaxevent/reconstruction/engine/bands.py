@@ -20,16 +20,16 @@ from jaxevent.reconstruction.stream import Stream, StreamState, event_weights
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
 
-NEVER = 1 << 45  # us, longer than any recording and within an event's bits
+NEVER_US = 1 << 45  # us, longer than any recording and within an event's bits
 # Pixels of a band and its border. A dozen numbers each fill half a megabyte, of a second-level
 # cache of one; each number begins a cache line further than a power of two. Where derivatives lie
 # beside them the smaller bands are a tenth faster.
-STRIDES = (8208, 16400, 32784, 65488)
-STRIDES_WITH_DERIVATIVES = (4112, *STRIDES)
-MIN_ROWS = 6  # the two rows of a border are read for nothing
-WINDOW_FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
-IMAGE_PIXELS = 1 << 22  # made in one pass, 9 bytes each
-N_BUFFERS = 2  # the last images are held while the next ones are made
+BAND_STRIDES = (8208, 16400, 32784, 65488)
+BAND_STRIDES_WITH_DERIVATIVES = (4112, *BAND_STRIDES)
+MIN_BAND_ROWS = 6  # the two rows of a border are read for nothing
+MAX_WINDOW_FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
+MAX_PASS_PIXELS = 1 << 22  # made in one pass, 9 bytes each
+N_IMAGE_BUFFERS = 2  # the last images are held while the next ones are made
 
 
 class Bands(NamedTuple):
@@ -81,7 +81,7 @@ class BufferPool:
     """
 
     def __init__(self, pixels: int, dtype: np.dtype):
-        self.times = max(1, IMAGE_PIXELS // pixels)
+        self.times = max(1, MAX_PASS_PIXELS // pixels)
         self._pixels, self._dtype = pixels, dtype
         self._sets: list[tuple[NDArray, ...]] = []
 
@@ -93,7 +93,7 @@ class BufferPool:
             arrays = free[0]
         else:
             arrays = tuple(ImageBuffers.empty(self.times, self._pixels, self._dtype)[:3])
-            self._sets = [*self._sets, arrays][-N_BUFFERS:]
+            self._sets = [*self._sets, arrays][-N_IMAGE_BUFFERS:]
         mean, variance, valid = (array[:times] for array in arrays)
         return ImageBuffers(
             mean, variance, valid, np.empty((times, self._pixels, 0, 0), self._dtype)
@@ -124,9 +124,9 @@ class BandLayout:
             TranslationError: The sensor is too wide for a band.
         """
         rows, stride = 0, 0
-        for stride in STRIDES_WITH_DERIVATIVES if derivatives else STRIDES:
+        for stride in BAND_STRIDES_WITH_DERIVATIVES if derivatives else BAND_STRIDES:
             rows = stride // (width + 2) - 2
-            if rows >= min(MIN_ROWS, height):
+            if rows >= min(MIN_BAND_ROWS, height):
                 break
         if rows < min(3, height):  # a row borders on one other band at most
             raise TranslationError(f"a sensor {width} pixels wide")
@@ -161,7 +161,7 @@ class BandLayout:
             The bands, or None if the events are not in order or not on the sensor.
         """
         origin, height = origin - stored.offset, int(self.edges[-1])
-        if len(stored.t) and (stored.t[0] < origin - NEVER or stored.t[-1] > origin + NEVER):
+        if len(stored.t) and (stored.t[0] < origin - NEVER_US or stored.t[-1] > origin + NEVER_US):
             return None
         counts = np.zeros(1 << 16, np.int64)
         _count_rows(stored.y, counts)
@@ -262,14 +262,14 @@ class PartitionedRecording:
         factors: NDArray[np.floating] | None = None,
     ):
         self.layout = BandLayout.of(recording.width, recording.height, filtering and events is None)
-        if recording.stop - recording.start >= NEVER:
+        if recording.stop - recording.start >= NEVER_US:
             raise TranslationError("a recording of over a year")
         whole = max(len(recording.events), 1)
         self.recording, self._factors = recording, factors
         self.windows = WindowedRecording(
             recording, timing, filtering=filtering, events=whole if events is None else events
         )
-        self.windows.frames = max(8, WINDOW_FRAME_PIXELS // self.windows.pixels)
+        self.windows.frames = max(8, MAX_WINDOW_FRAME_PIXELS // self.windows.pixels)
         if events is None:
             self.windows.frames = len(self.windows.clock) + 2
         self.images = FrameImages(recording, self.dtype)

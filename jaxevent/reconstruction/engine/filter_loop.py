@@ -16,7 +16,7 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, run_over_rows
 from jaxevent.codegen.derivative import Directions, parse_derivative
 from jaxevent.codegen.module import CompiledProgram
 from jaxevent.reconstruction.engine.bands import (
-    NEVER,
+    NEVER_US,
     Bands,
     ExposureSums,
     FrameRows,
@@ -30,7 +30,7 @@ from jaxevent.reconstruction.engine.bands import (
     sum_exposure_segments,
 )
 from jaxevent.reconstruction.engine.filter_program import (
-    N_ROWS,
+    N_PIECE_FRAMES,
     FieldPlaces,
     FilterFunctions,
     FilterMethod,
@@ -111,8 +111,8 @@ def make_timeline(
         gain: (frames,) gain of each frame.
         dtype: Kind of real numbers.
     """
-    begin = -NEVER if start is None else start - clock.origin
-    end = NEVER if stop is None else stop - clock.origin
+    begin = -NEVER_US if start is None else start - clock.origin
+    end = NEVER_US if stop is None else stop - clock.origin
     bounds = np.unique(np.ceil(np.concatenate([clock.breaks, clock.mid])).astype(np.int64))
     times = np.concatenate([[begin], bounds[(bounds > begin) & (bounds < end)]]).astype(np.int64)
     piece = np.searchsorted(clock.breaks, times, "right")
@@ -154,21 +154,21 @@ def _uniform_inputs(clock: Clock, frame: int, gain: NDArray) -> NDArray:
     breaks = clock.breaks[clock.first_piece(first) :]
     return np.concatenate(
         [
-            padded(gain[used], N_ROWS, 0, 1.0),
+            padded(gain[used], N_PIECE_FRAMES, 0, 1.0),
             padded(1e6 * rates(breaks), n_pieces(clock.exposed), 1, 0.0),
-            padded(1e6 * rates(clock.mid[used]), N_ROWS, 0, 0.0),
+            padded(1e6 * rates(clock.mid[used]), N_PIECE_FRAMES, 0, 0.0),
         ]
     )
 
 
 # Kinds of steps, and their arguments; fields are places in `cells`.
-MOVE = 0  # to a field, from another
-LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
-FILL = 2  # a field, with half of a number
-SUM = 3  # into a column of `WindowInputs.totals`, the segments of a frame's exposure
-COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
+STEP_MOVE = 0  # to a field, from another
+STEP_LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
+STEP_FILL = 2  # a field, with half of a number
+STEP_SUM = 3  # into a column of `WindowInputs.totals`, the segments of a frame's exposure
+STEP_COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
 
-NO_FRAME = -9
+NO_PREVIOUS_FRAME = -9
 
 
 class EntrySteps(NamedTuple):
@@ -194,7 +194,7 @@ def entry_steps(
             the recording's start; the steps of the intervals before are left out.
     """
     first, now = enter
-    ends, before, found = np.zeros(len(line.start) + 1, np.int64), NO_FRAME, list[Any]()
+    ends, before, found = np.zeros(len(line.start) + 1, np.int64), NO_PREVIOUS_FRAME, list[Any]()
     entry = _FrameEntry(places, frames, line.opening)
     for interval in range(first, len(line.start)):
         frame = int(line.frame[interval])
@@ -226,7 +226,7 @@ class _FrameEntry:
         follows = frame == before + 1
         if follows and frame >= 2:
             for to, of in places.shifted.tolist():
-                yield MOVE, to * places.stride, of * places.stride
+                yield STEP_MOVE, to * places.stride, of * places.stride
         fresh = 0 if not follows else 3 if frame == 0 else 2
         for row in range(fresh, 3):
             yield from self._images(base + row - number, row, rows)
@@ -255,21 +255,21 @@ class _FrameEntry:
         for kind in range(3):
             field = int(places.image[kind, row]) * stride
             if field >= 0 and row < rows:
-                yield LOAD, field, kind, k
+                yield STEP_LOAD, field, kind, k
             elif field >= 0 and rows > 0:
-                yield MOVE, field, int(places.image[kind, row - 1]) * stride
+                yield STEP_MOVE, field, int(places.image[kind, row - 1]) * stride
             elif field >= 0:
-                yield FILL, field, int(kind < 2)
+                yield STEP_FILL, field, int(kind < 2)
         for total in places.total[:, row].tolist():
-            yield FILL, total * stride, 0
+            yield STEP_FILL, total * stride, 0
         if len(places.total) and row < rows:
-            yield SUM, row, k
+            yield STEP_SUM, row, k
 
     def _count(self, fields: NDArray[np.int64], left: int, right: int) -> Iterator[tuple[int, ...]]:
         """List the step that counts ON and OFF events with left <= t < right."""
         if fields[0] >= 0:
             on, off = (fields * self.places.stride).tolist()
-            yield COUNT, on, off, left, right
+            yield STEP_COUNT, on, off, left, right
 
 
 class BandMemory(NamedTuple):
@@ -305,13 +305,13 @@ def _take_steps(steps, begin, end, given, band, memory):
         kind, at, of, left, right = (
             steps[i, 0], steps[i, 1], steps[i, 2], steps[i, 3], steps[i, 4]
         )  # fmt: skip
-        if kind == MOVE:
+        if kind == STEP_MOVE:
             copy(cells, at, of, stride)
-        elif kind == LOAD:
+        elif kind == STEP_LOAD:
             load_image(frames, of, left, bands, band, cells[at : at + stride])
-        elif kind == FILL:
+        elif kind == STEP_FILL:
             fill(cells, at, stride, 0.5 * of)
-        elif kind == SUM:
+        elif kind == STEP_SUM:
             sums = ExposureSums(
                 given.functions.excess, given.numbers, given.totals[:, at], memory.counts[band],
                 memory.bound[band],
@@ -489,7 +489,7 @@ class FilterPasses:
         self._memory.last[:] = 0
         line, fields, memory = window.line, self.fields, self._memory
         interval = int(np.searchsorted(line.start, 0, "right")) - 1
-        self.run(window, -NEVER, enter=(interval, 0))
+        self.run(window, -NEVER_US, enter=(interval, 0))
         uniform, addresses = line.uniform[interval], fields.addresses()
         position = {
             "weight.0": -line.begin[interval] * line.rate[interval],
@@ -513,14 +513,14 @@ class FilterPasses:
                 fields.of_bands(name, memory.cells, memory.whole)[:] = values
             elif derivative[0] in fields.states:
                 records[:, :, fields.states[derivative[0]] + derivative[1]] = values
-        self.run(window, -NEVER, enter=(0, -NEVER))
+        self.run(window, -NEVER_US, enter=(0, -NEVER_US))
 
     def resume(self, window: BandedWindow, states: PixelStates, now: int) -> None:
         """Enter a later window at its beginning (us since the recording's start)."""
         memory = self._memory
         memory.cells[:, : states.cells.shape[1]] = states.cells
         memory.whole[:], memory.last[:] = states.whole, states.last
-        self.run(window, -NEVER, enter=(0, now))
+        self.run(window, -NEVER_US, enter=(0, now))
 
     def copy_states(self) -> PixelStates:
         """Copy the state, without derivatives."""

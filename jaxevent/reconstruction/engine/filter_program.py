@@ -36,7 +36,7 @@ from jaxevent.codegen.graph import (
 )
 from jaxevent.codegen.module import CompiledProgram, KernelCache
 from jaxevent.codegen.trace import (
-    KINDS,
+    KIND_BY_DTYPE,
     Constant,
     ParameterValue,
     Trace,
@@ -47,15 +47,15 @@ from jaxevent.codegen.trace import (
 from jaxevent.codegen.write import Address, ModuleText, Writer
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
 
-N_ROWS = 3  # frames that a piece rests on
+N_PIECE_FRAMES = 3  # frames that a piece rests on
 NO_IMAGE_WIDTH = 104_729  # one pixel is no image: a function that makes one of it fails
 # Inputs of the traced functions. Counts are [ON and OFF, rows].
 IMAGE_FIELDS = ("grey", "intensity", "certainty")
 COUNT_FIELDS = ("span", "head", "tail")
-UNIFORM = ("gain", "weight_rate", "blend_rate")  # equal for all pixels
-SEGMENT = ("segment_cell", "share", "edge", "segment_on", "segment_off")
-POINT = ("weight", "blend", "on", "off", "piece", "frame")
-EVENT = ("since", "near", "polarity")
+UNIFORM_INPUTS = ("gain", "weight_rate", "blend_rate")  # equal for all pixels
+SEGMENT_INPUTS = ("segment_cell", "share", "edge", "segment_on", "segment_off")
+POINT_INPUTS = ("weight", "blend", "on", "off", "piece", "frame")
+EVENT_INPUTS = ("since", "near", "polarity")
 
 
 @runtime_checkable
@@ -112,7 +112,7 @@ def variants(exposed: bool) -> list[Variant]:
 
 def n_pieces(exposed: bool) -> int:
     """Return the number of pieces that three frames make."""
-    return 2 * N_ROWS + 1 if exposed else N_ROWS + 1
+    return 2 * N_PIECE_FRAMES + 1 if exposed else N_PIECE_FRAMES + 1
 
 
 def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind) -> Trace:
@@ -136,25 +136,29 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         return jax.ShapeDtypeStruct(shape, kind)
 
     whole = np.dtype(jnp.result_type(int))
-    given: dict[str, Any] = {name: array(N_ROWS, 1) for name in IMAGE_FIELDS}
-    given |= {"gain": array(N_ROWS), "weight_rate": array(n_pieces(exposed))}
-    given |= {"blend_rate": array(N_ROWS), "before": array(2, 1), "rows": array(3, kind=np.int32)}
-    given |= {"span": array(2, N_ROWS, 1)}
+    given: dict[str, Any] = {name: array(N_PIECE_FRAMES, 1) for name in IMAGE_FIELDS}
+    given |= {"gain": array(N_PIECE_FRAMES), "weight_rate": array(n_pieces(exposed))}
+    given |= {
+        "blend_rate": array(N_PIECE_FRAMES),
+        "before": array(2, 1),
+        "rows": array(3, kind=np.int32),
+    }
+    given |= {"span": array(2, N_PIECE_FRAMES, 1)}
     if exposed:
-        given |= {"head": array(2, N_ROWS, 1), "tail": array(2, N_ROWS, 1)}
-        given |= dict.fromkeys(SEGMENT[1:], array(1))
+        given |= {"head": array(2, N_PIECE_FRAMES, 1), "tail": array(2, N_PIECE_FRAMES, 1)}
+        given |= dict.fromkeys(SEGMENT_INPUTS[1:], array(1))
         given["segment_cell"] = array(1, kind=np.int32)
-    given |= dict.fromkeys((*POINT, *EVENT), array())
+    given |= dict.fromkeys((*POINT_INPUTS, *EVENT_INPUTS), array())
     given |= {name: array(kind=whole) for name in ("piece", "frame", "polarity")}
 
     def frame_features(v: dict[str, Any]) -> FrameFeatures:
-        segments = Segments(*(v[name] for name in SEGMENT)) if exposed else None
+        segments = Segments(*(v[name] for name in SEGMENT_INPUTS)) if exposed else None
         made: dict[str, Any] = {f.name: v.get(f.name) for f in dataclasses.fields(FrameFeatures)}
         made |= {"segments": segments, "width": NO_IMAGE_WIDTH}
         return FrameFeatures(**made)
 
     def image_points(v: dict[str, Any], counted: bool) -> ImagePoints:
-        weight, blend, on, off = (v[name][None, None] for name in POINT[:4])
+        weight, blend, on, off = (v[name][None, None] for name in POINT_INPUTS[:4])
         none = jnp.zeros((1, 1), weight.dtype)
         counts = (on, off) if counted else (none, none)
         return ImagePoints(weight, blend, *counts, v["piece"][None], v["frame"][None], none[0])
@@ -175,7 +179,7 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         )
         first = start(params, frame_model, v)
         after, mean, variance = method.step_and_readout(
-            params, frame, state, **{name: v[name] for name in EVENT}
+            params, frame, state, **{name: v[name] for name in EVENT_INPUTS}
         )
         return {"start": first, "state": after, "mean": mean, "variance": variance}
 
@@ -355,13 +359,13 @@ def _input(
     level = Level.POINT
     if name in (*IMAGE_FIELDS, *COUNT_FIELDS, "before"):
         level = Level.TABLE
-    elif name in UNIFORM:
+    elif name in UNIFORM_INPUTS:
         level = Level.PIECE
-    out, kind = np.empty(leaf.shape, object), KINDS[leaf.dtype.kind]
+    out, kind = np.empty(leaf.shape, object), KIND_BY_DTYPE[leaf.dtype.kind]
     # What happens after the last frame is not known.
     counted = last if name == "span" else last + 1
     for number, place in enumerate(np.ndindex(*leaf.shape)):
-        row = number % N_ROWS
+        row = number % N_PIECE_FRAMES
         if name in IMAGE_FIELDS:
             number = min(row, last)
         if name in COUNT_FIELDS and row >= counted:
@@ -480,13 +484,13 @@ class PixelFields:
         used = {n.args[0].partition(".")[0] for n in dependencies(wanted) if n.op == "input"}
         names = ["before.0", "before.1"] if "before" in used else []
         for name in IMAGE_FIELDS:
-            names += [f"{name}.{row}" for row in range(N_ROWS) if name in used]
+            names += [f"{name}.{row}" for row in range(N_PIECE_FRAMES) if name in used]
         for name in COUNT_FIELDS:
-            n_rows = N_ROWS - 1 if name == "span" else N_ROWS
-            rows = [p * N_ROWS + row for p in range(2) for row in range(n_rows)]
+            n_rows = N_PIECE_FRAMES - 1 if name == "span" else N_PIECE_FRAMES
+            rows = [p * N_PIECE_FRAMES + row for p in range(2) for row in range(n_rows)]
             names += [f"{name}.{row}" for row in rows if name in used]
         sums = len(program.excess)
-        names += [f"total.{k}.{row}" for k in range(sums) for row in range(N_ROWS)]
+        names += [f"total.{k}.{row}" for k in range(sums) for row in range(N_PIECE_FRAMES)]
         cells |= {name: len(cells) + k for k, name in enumerate(names)}
         changes = [] if program.derivatives is None else program.derivatives.changes
         lanes = program.directions.lanes
@@ -520,13 +524,15 @@ class PixelFields:
 
     def addresses(self) -> dict[Any, str | Address]:
         """Return the addresses of a pixel's inputs, or texts that read them, by name."""
-        sizes = zip(UNIFORM, (N_ROWS, n_pieces(self.exposed), N_ROWS), strict=True)
+        sizes = zip(
+            UNIFORM_INPUTS, (N_PIECE_FRAMES, n_pieces(self.exposed), N_PIECE_FRAMES), strict=True
+        )
         uniform = [f"{name}.{k}" for name, size in sizes for k in range(size)]
         found: dict[Any, str | Address] = {n: ("uniform", "at", k) for k, n in enumerate(uniform)}
         found |= {name: ("cells", "z", at * self.stride) for name, at in self.cells.items()}
         found |= {name: ("whole", "z", at * self.stride) for name, at in self.whole.items()}
         found |= {slot: found[name] for slot, name in self.slots.items()}
-        for name in (*SEGMENT[1:], *EVENT, "weight", "blend"):
+        for name in (*SEGMENT_INPUTS[1:], *EVENT_INPUTS, "weight", "blend"):
             found[f"{name}.0"] = name.removeprefix("segment_")
         return found
 
@@ -538,11 +544,11 @@ class PixelFields:
             return np.array([self.cells.get(name, -1) for name in names], np.int64)
 
         def rows(name: str, first: int = 0) -> NDArray[np.int64]:
-            return of(*(f"{name}.{first + row}" for row in range(N_ROWS)))
+            return of(*(f"{name}.{first + row}" for row in range(N_PIECE_FRAMES)))
 
         image = np.stack([rows(name) for name in IMAGE_FIELDS])
-        span, head, tail = (np.stack([rows(n), rows(n, N_ROWS)]) for n in COUNT_FIELDS)
-        total = np.full((self.sums, N_ROWS), -1)
+        span, head, tail = (np.stack([rows(n), rows(n, N_PIECE_FRAMES)]) for n in COUNT_FIELDS)
+        total = np.full((self.sums, N_PIECE_FRAMES), -1)
         for k in range(self.sums):
             total[k] = rows(f"total.{k}")
         every = np.concatenate([image, total, span, head, tail])
@@ -554,7 +560,7 @@ class PixelFields:
         )  # fmt: skip
 
 
-EVENTS = """
+EVENTS_TEMPLATE = """
 @cfunc(I(CELLS, WHOLE, NUMBERS, WHOLE, CELLS, I, I, I, I, I, I, I, D, D, D, D, CELLS), **OPTIONS)
 def events(
     cells, whole, last, stream, weights, weighted, i, end, till, first_own, last_own, padded,
@@ -592,7 +598,7 @@ def events(
     return i
 """
 
-IMAGES = """
+IMAGES_TEMPLATE = """
 @cfunc(
     types.void(
         CELLS, WHOLE, NUMBERS, I, I, I, D, D, D, CELLS, CELLS, CELLS, MARKS, CELLS, CELLS, I, I
@@ -620,14 +626,14 @@ def images(
 """
 
 TABLE_PIXELS = 256  # whose derivatives are computed side by side before they go into records
-TABLES = f"""
+TABLES_TEMPLATE = f"""
 @cfunc(types.void(I, CELLS, I, I, CELLS, CELLS, I, CELLS), **OPTIONS)
 def tables(variant, cells, begin, end, numbers, uniform, at, scratch):
     for first in range(begin, end, {TABLE_PIXELS}):
         pixels = min(end - first, {TABLE_PIXELS})
 """
 
-EXCESS = """
+EXCESS_TEMPLATE = """
 @cfunc(types.void(D, D, F, F, CELLS, CELLS), **OPTIONS)
 def excess(share64, edge64, on, off, numbers, out):
     share, edge = REAL(share64), REAL(edge64)
@@ -653,7 +659,7 @@ def write_filter(program: FilterProgram, stride: int) -> ModuleText:
     ]
     lines = writer.lines(program.excess, 4)
     lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(program.excess)]
-    parts.append(EXCESS.format(lines="\n".join(lines)))
+    parts.append(EXCESS_TEMPLATE.format(lines="\n".join(lines)))
     about = "The functions of a filter (`jaxevent.reconstruction.engine`)."
     return writer.module(about, parts, fields, program.dtype)
 
@@ -692,7 +698,9 @@ def _write_events(program: FilterProgram, writer: Writer, fields: PixelFields) -
         given = "".join(f"{writer.name(node)}, " for node in factors)
         out.append("            record = RECORDS + z * RECORD")
         out.append(f"            follow(cells, record, cells, record, numbers, ({given}))")
-    return EVENTS.format(step="\n".join(out), on=fields.cells["on.0"], off=fields.cells["off.0"])
+    return EVENTS_TEMPLATE.format(
+        step="\n".join(out), on=fields.cells["on.0"], off=fields.cells["off.0"]
+    )
 
 
 def _write_images(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
@@ -711,7 +719,7 @@ def _write_images(program: FilterProgram, writer: Writer, fields: PixelFields) -
             "            place = (at + row * width + column) * size",
             f"            show(derivatives, place, cells, record, numbers, ({given}))",
         ]
-    return IMAGES.format(
+    return IMAGES_TEMPLATE.format(
         since=len(factors),
         show="\n".join(lines),
         mean=writer.name(program.mean),
@@ -739,7 +747,7 @@ def _write_tables(program: FilterProgram, writer: Writer, fields: PixelFields) -
     for j, (k, lane, _) in enumerate(changes):
         place = f"record + {fields.vectors[k] + lane}"
         out.append(f"            cells[{place}] = scratch[{j * TABLE_PIXELS} + i]")
-    return TABLES + "\n".join([*out, ""])
+    return TABLES_TEMPLATE + "\n".join([*out, ""])
 
 
 _kernels = KernelCache(FilterFunctions, write_filter)

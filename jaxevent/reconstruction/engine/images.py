@@ -33,7 +33,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.reconstruction.engine.bands import (
-    NEVER,
+    NEVER_US,
     BufferPool,
     ImageBuffers,
     PartitionedRecording,
@@ -54,17 +54,22 @@ from jaxevent.reconstruction.engine.smoother_loop import (
     read_images,
     smooth_frames,
 )
-from jaxevent.reconstruction.engine.smoother_program import LATER, LINK, STATE, SmoothingMethod
+from jaxevent.reconstruction.engine.smoother_program import (
+    LATER_FIELDS,
+    LINK_FIELDS,
+    STATE_FIELDS,
+    SmoothingMethod,
+)
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.frames import Clock, Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.video import MAX_STARTS, ImageSequence, P
+from jaxevent.reconstruction.video import MAX_WINDOW_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 
-WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
-SEGMENT_EVENTS = 1 << 22  # 8 bytes each
-SEGMENT_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
+MAX_WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
+MAX_SEGMENT_EVENTS = 1 << 22  # 8 bytes each
+MAX_SEGMENT_FRAME_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
 IS_SYNCHRONOUS = dispatch.use_synchronous_dispatch()  # so that programs may call kernels
 
 
@@ -101,7 +106,7 @@ class FilterVideo(ImageSequence[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         progress: bool | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
@@ -113,7 +118,7 @@ class FilterVideo(ImageSequence[P]):
         self._buffers = BufferPool(self._partitioned.windows.pixels, self.dtype)
         self._begins = [WindowStart(None, self._partitioned.windows.initial(), None)]
         self._open: BandedWindow | None = None
-        self._done = -NEVER  # the time up to which the open window is passed over
+        self._done = -NEVER_US  # the time up to which the open window is passed over
 
     @property
     def dtype(self) -> np.dtype:
@@ -159,7 +164,7 @@ class FilterVideo(ImageSequence[P]):
         if all(b.start != window.stop for b in self._begins):
             self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
             if (
-                len(self._begins) > MAX_STARTS
+                len(self._begins) > MAX_WINDOW_STARTS
             ):  # the first one, the last one, and half of the others
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
         return begin
@@ -172,13 +177,13 @@ class FilterVideo(ImageSequence[P]):
             self._passes.init(window)
         else:
             self._passes.resume(window, begin.states, begin.start - self._partitioned.origin)
-        self._open, self._done = window, -NEVER
+        self._open, self._done = window, -NEVER_US
         return window
 
 
 def _make_segments(clock: Clock, recording: Recording, events: int) -> list[Segment]:
     """Divide frames into segments of so many events, one frame at least."""
-    most = max(6, SEGMENT_PIXELS // (recording.width * recording.height))
+    most = max(6, MAX_SEGMENT_FRAME_PIXELS // (recording.width * recording.height))
     rows = [recording.events.index(int(np.ceil(t)) + clock.origin) for t in clock.mid]
     rows.append(len(recording.events))
     found, begin = list[Segment](), 0
@@ -194,7 +199,7 @@ class SmootherVideo(ImageSequence[P]):
     """Images of a smoother, made by a kernel; as `Video` in all else.
 
     Of every frame of a segment its message and the state before it are stored, of all other
-    segments only how the message of later frames passes through them (`LINK`).
+    segments only how the message of later frames passes through them (`LINK_FIELDS`).
 
     Args:
         estimator: The smoother.
@@ -214,7 +219,7 @@ class SmootherVideo(ImageSequence[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = SEGMENT_EVENTS,
+        window_events: int = MAX_SEGMENT_EVENTS,
         progress: bool | None = None,
         factors: NDArray[np.floating] | None = None,
     ):
@@ -268,14 +273,14 @@ class SmootherVideo(ImageSequence[P]):
         if self._open is not None and self._open[0] == place:
             return self._open[1]
         self._open = None  # so that two are never held at once
-        for name, values in zip(STATE, self._states[place], strict=True):
+        for name, values in zip(STATE_FIELDS, self._states[place], strict=True):
             self._field(name)[:] = values
         given = self._filter(place, False)
         self._smooth(place, given)
         return given
 
     def _smooth(self, place: int, given: SegmentInputs) -> None:
-        for name, values in zip(LATER, self._later[place], strict=True):
+        for name, values in zip(LATER_FIELDS, self._later[place], strict=True):
             self._field(name)[:] = values
         self._over_bands(smooth_frames, given, self._memory)
         self._open = place, given
@@ -300,11 +305,11 @@ class SmootherVideo(ImageSequence[P]):
             total=last + 1, desc="look ahead", unit="stretch", progress=self.progress
         ) as shown:
             for place in range(last + 1):
-                states.append(fields(STATE))
-                for k, name in enumerate(LINK):
+                states.append(fields(STATE_FIELDS))
+                for k, name in enumerate(LINK_FIELDS):
                     self._field(name)[:] = k == 0
                 given = self._filter(place, last > 0)
-                links.append(fields(LINK))
+                links.append(fields(LINK_FIELDS))
                 shown.update()
         assert given is not None
         later = [np.zeros_like(states[0])]
@@ -525,7 +530,7 @@ def _smooth_bands(
     except queue.Empty:
         memory = passes.memory(1, len(given.line.mid))
     program = passes.kernel.program
-    later = [n for leaf in LATER for n in (f"{leaf}.0", *program.derivatives(f"{leaf}.0"))]
+    later = [n for leaf in LATER_FIELDS for n in (f"{leaf}.0", *program.derivatives(f"{leaf}.0"))]
     for band in range(begin, end):
         passes.field(memory, "given.0")[:] = passes.fractions[band]
         filter_frames(band, band + 1, given, memory, True, False)

@@ -29,10 +29,10 @@ from jaxevent.reconstruction.engine.bands import (
 )
 from jaxevent.reconstruction.engine.filter_program import IMAGE_FIELDS, KernelKind
 from jaxevent.reconstruction.engine.smoother_program import (
-    COUNTS,
-    LATER,
-    STATE,
-    WORK,
+    COUNT_FIELDS,
+    LATER_FIELDS,
+    STATE_FIELDS,
+    WORK_FIELDS,
     SmootherFunctions,
     SmootherProgram,
     SmoothingMethod,
@@ -406,14 +406,14 @@ def _make_timeline(clock: Clock, segment: Segment) -> FrameTimeline:
 
 def _places(program: SmootherProgram, stride: int, exposed: bool) -> SmootherPlaces:
     def of(*names: str) -> NDArray[np.int64]:
-        return np.array([WORK.index(name) for name in names], np.int64)
+        return np.array([WORK_FIELDS.index(name) for name in names], np.int64)
 
     total = [program.work.index(name) for name in ("total.0", *program.derivatives("total.0"))]
-    inside = WORK.index("inside") if program.uses("inside.0") else -1
+    inside = WORK_FIELDS.index("inside") if program.uses("inside.0") else -1
     censored = program.functions["frame"].results != program.functions["clipped"].results
     return SmootherPlaces(
         stride, len(program.work), len(program.row), of(*IMAGE_FIELDS), np.array(total, np.int64),
-        inside, WORK.index("side"), of(*COUNTS[:4]), exposed, censored,
+        inside, WORK_FIELDS.index("side"), of(*COUNT_FIELDS[:4]), exposed, censored,
     )  # fmt: skip
 
 
@@ -476,7 +476,7 @@ class SmootherPasses:
         """Make memory for so many bands and frames of each, [bands, ...]."""
         places = self.places
         memory = np.zeros((bands, (places.work + frames * places.row) * places.stride), self.dtype)
-        for name in (*IMAGE_FIELDS, *STATE, *LATER):
+        for name in (*IMAGE_FIELDS, *STATE_FIELDS, *LATER_FIELDS):
             self.field(memory, f"{name}.0")[:] = 0.5  # where there are no pixels, too
         return memory
 
