@@ -35,7 +35,7 @@ PRESET, BASE = "preset hdr, nothing fitted", "thresholds"
 
 @dataclasses.dataclass(frozen=True)
 class Beside:
-    """Pans of one length and height beside each other: a `Source`."""
+    """Pans of one length and height beside each other: an `IntensitySource`."""
 
     pans: Sequence[Pan]
     size: tuple[int, int]

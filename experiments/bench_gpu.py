@@ -16,7 +16,7 @@ from bench_images import images, losses, stream
 import jaxevent
 from jaxevent.blob import moment
 from jaxevent.egomotion import voting
-from jaxevent.simulate import Line, Target, motion_scene, simulate_blobs
+from jaxevent.simulate import LinearMotion, Target, motion_scene, simulate_blobs
 
 REPEAT = 3  # of which the first compiles
 EVENTS = 5_000_000
@@ -25,7 +25,7 @@ EVENTS = 5_000_000
 def targets() -> tuple[Any, list[tuple[float, float, float]]]:
     """64 blobs that cross an image of 1280x720, and where they begin."""
     places = [(100.0 + 140 * (k % 8), 60.0 + 80 * (k // 8)) for k in range(64)]
-    lines = [Line(at, (60.0, 20.0), size=(6.0, 6.0)) for at in places]
+    lines = [LinearMotion(at, (60.0, 20.0), size=(6.0, 6.0)) for at in places]
     recording, _ = simulate_blobs([Target(line, 1e4) for line in lines], (1280, 720), 1.0, 0.0)
     return recording, [(x, y, 12.0) for x, y in places]
 

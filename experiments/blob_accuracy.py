@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaxevent.blob import TargetSearchResult, moment
 from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
 from jaxevent.recording import Recording
-from jaxevent.simulate.blobs import Circle, Target, simulate_blobs
+from jaxevent.simulate.blobs import CircularMotion, Target, simulate_blobs
 
 WINDOW = 5000  # us
 ACCURACIES = (0.02, 0.1, 0.5)
@@ -56,7 +56,7 @@ def main() -> None:
     print("| seed | accuracy | events per step | sigma / M = 1 | rms / M = 1 |")
     print("|---|" + "---:|" * 4)
     for seed in range(args.seeds):
-        circle = Circle((64, 48), 25, 20.0, 0.3, size=(5.0, 4.0))
+        circle = CircularMotion((64, 48), 25, 20.0, 0.3, size=(5.0, 4.0))
         recording, truth = simulate_blobs([Target(circle, 4e4)], (128, 96), 0.25, 2e3, seed)
         found = known(recording, truth)
         usual = told(found, truth, 1, times)

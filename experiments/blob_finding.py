@@ -40,7 +40,7 @@ from jaxevent.blob.search.detection import clutter_model, detect, measure_blobs
 from jaxevent.blob.search.stream import Stream
 from jaxevent.io import load
 from jaxevent.recording import Recording
-from jaxevent.simulate.blobs import Truth
+from jaxevent.simulate.blobs import BlobTruth
 
 NORFAIR = importlib.util.find_spec("norfair") is not None
 
@@ -163,7 +163,7 @@ def norfair(recording: Recording, found: TargetSearchResult, times: NDArray[np.i
 
 
 def means(
-    recording: Recording, found: TargetSearchResult, truth: Truth, times: NDArray[np.int64]
+    recording: Recording, found: TargetSearchResult, truth: BlobTruth, times: NDArray[np.int64]
 ) -> Answer:
     """A centred mean for each target, from where it is at the first time."""
     states = truth(times)
@@ -183,7 +183,7 @@ def means(
     return _of_lines(lines, times)
 
 
-def by_hand(recording: Recording, truth: Truth, times: NDArray[np.int64]) -> Answer:
+def by_hand(recording: Recording, truth: BlobTruth, times: NDArray[np.int64]) -> Answer:
     """`moment` from seeds with scales of the truth; Q_v is acceleration times speed."""
     states, t = truth(times), times
     seen = truth.visible(times)
@@ -222,7 +222,9 @@ def _of_lines(lines: list[_Line], times: NDArray[np.int64]) -> Answer:
     return Answer(out)
 
 
-def score(answer: Answer, truth: Truth, times: NDArray[np.int64], size: tuple[int, int]) -> dict:
+def score(
+    answer: Answer, truth: BlobTruth, times: NDArray[np.int64], size: tuple[int, int]
+) -> dict:
     """See the module's docstring."""
     states = truth(times)
     states = states[:, (states[..., 4] > 0.5).any(0)]  # the others are hot pixels

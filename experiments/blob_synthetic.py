@@ -39,7 +39,7 @@ from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
 from jaxevent.simulate import blob_scene
-from jaxevent.simulate.blobs import CAR_MOTIONS, Approach, Truth
+from jaxevent.simulate.blobs import CAR_MOTIONS, ApproachMotion, BlobTruth
 
 CIRCLE, ELLIPSE = {"gate_shape": "circle"}, {"gate_shape": "ellipse"}
 CONSTANT = "constant velocity, R = 64 px^2"
@@ -69,7 +69,7 @@ def choose(method: str, **values: Any) -> Chosen:
 
 def followed(
     recording: Recording,
-    truth: Truth,
+    truth: BlobTruth,
     chosen: Chosen,
     size: float,
     seed: int,
@@ -124,7 +124,7 @@ def measured(states: TrackStates, true: np.ndarray, times: np.ndarray) -> dict[s
     }
 
 
-def settled(tracks: Tracks, truth: Truth) -> float:
+def settled(tracks: Tracks, truth: BlobTruth) -> float:
     """ms until both sizes are within 20 % of the truth and stay so for 2 ms."""
     times = np.concatenate([np.arange(0, 6_000, 100), np.arange(6_000, 30_000, 500)])
     true = truth(times)[:, 0, 4:6]
@@ -163,7 +163,7 @@ def averaged(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def over_seeds(
-    scene: Callable[[int], tuple[Recording, Truth]],
+    scene: Callable[[int], tuple[Recording, BlobTruth]],
     methods: Sequence[str],
     seeds: Sequence[int],
     size: float = 20.0,
@@ -211,7 +211,7 @@ def growing(seeds: Sequence[int]) -> dict[str, Any]:
     for seed in seeds:
         recording, truth = blob_scene("growing", seed)
         motion = truth.targets[0].motion
-        assert isinstance(motion, Approach)
+        assert isinstance(motion, ApproachMotion)
         depth = motion.depth(times)
         for method in rows:
             tracks = followed(recording, truth, choose(method), 8.0, seed)
@@ -235,7 +235,7 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
     for seed in seeds[:3]:
         recording, truth = blob_scene("ttc", seed)
         motion = truth.targets[0].motion
-        assert isinstance(motion, Approach)
+        assert isinstance(motion, ApproachMotion)
         true = (motion.speed + motion.acceleration * times) / motion.depth(times)
         for method in rows:
             chosen = choose(method, preset="ttc")
@@ -469,7 +469,7 @@ def picture(path: Path, seed: int, rows: dict[str, Any]) -> None:
     recording, truth = blob_scene("growing", seed)
     times = np.arange(0.02, 1.498, 0.004)
     motion = truth.targets[0].motion
-    assert isinstance(motion, Approach)
+    assert isinstance(motion, ApproachMotion)
     axes[0, 1].plot(times, motion.depth(times), "k", lw=0.8)
     for method in shown[:1] + shown[2:]:
         states = followed(recording, truth, choose(method), 8.0, seed)(times)
@@ -481,7 +481,7 @@ def picture(path: Path, seed: int, rows: dict[str, Any]) -> None:
     recording, truth = blob_scene("ttc", seed)
     times = np.arange(0.02, 3.44, 0.01)
     motion = truth.targets[0].motion
-    assert isinstance(motion, Approach)
+    assert isinstance(motion, ApproachMotion)
     states = followed(recording, truth, choose("moment", preset="ttc"), 10.0, seed)(times)
     value, variance = contact_of(states)
     sigma = np.sqrt(variance)

@@ -38,7 +38,7 @@ from jaxevent.simulate import (
     FITTING_SCENES,
     SENSORS,
     TESTING_SCENES,
-    Objects,
+    MovingObjects,
     Pan,
     Sensor,
     scene,
@@ -216,11 +216,13 @@ def textures(seeds: range, pace: float = 1.0) -> Iterator[tuple]:
 def objects(
     seeds: range, rates: tuple[float, ...] = (25.0, 100.0), **options: Any
 ) -> Iterator[tuple]:
-    """Targets among the true images of objects that move on their own; `options` of `Objects`."""
+    """Targets among the true images of moving objects; `options` of `MovingObjects`."""
     for seed in seeds:
         for rate in rates:
             sensor = dataclasses.replace(SENSORS["davis"], frame_rate=rate, truth_rate=20.0)
-            recording = simulate(Objects(seed=seed, **options), sensor, seed, f"objects {seed}")
+            recording = simulate(
+                MovingObjects(seed=seed, **options), sensor, seed, f"objects {seed}"
+            )
             params = Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
             video = jaxevent.METHODS["mc"].estimate(recording, params, progress=False)
             times, truths = recording.extra["hdr_t"], recording.extra["hdr"]
@@ -245,7 +247,7 @@ def blurred(names: tuple[str, ...], seed: int) -> Iterator[tuple]:
         light = scene(names[int(speed) % len(names)], decades=1.0)
         light = 0.9 * light / np.quantile(light, 0.9999)
         source = (
-            Objects(size, duration, speed, seed=seed)
+            MovingObjects(size, duration, speed, seed=seed)
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )

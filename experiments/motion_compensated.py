@@ -47,7 +47,7 @@ from jaxevent.recording import Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.scores import hidden_scores, moves
-from jaxevent.simulate import SENSORS, Objects, Pan, Source, scene, simulate
+from jaxevent.simulate import SENSORS, IntensitySource, MovingObjects, Pan, scene, simulate
 
 METHODS = ("blend", "flow", "edi", "akf", "aks", "mc")
 LIKELIHOOD = "aks, likelihood"  # the label of the smoother in a fit to slider_depth
@@ -272,7 +272,7 @@ def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:
     )
 
 
-def recorded(file: Path, source: Source, camera: Any, seed: int) -> Recording:
+def recorded(file: Path, source: IntensitySource, camera: Any, seed: int) -> Recording:
     """The recording of a source, kept in a file."""
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -280,8 +280,8 @@ def recorded(file: Path, source: Source, camera: Any, seed: int) -> Recording:
     return jaxevent.load(file)
 
 
-def objects_at(folder: Path, rate: float, seed: int) -> tuple[Objects, Recording]:
-    source = Objects(seed=seed)
+def objects_at(folder: Path, rate: float, seed: int) -> tuple[MovingObjects, Recording]:
+    source = MovingObjects(seed=seed)
     file = folder / "recordings" / f"objects_{rate:g}Hz_{seed}.h5"
     return source, recorded(file, source, sensor(rate), seed)
 
@@ -303,7 +303,7 @@ def fitted_to_objects(folder: Path) -> Path:
     return out
 
 
-def truth_of(source: Source, times: NDArray[np.int64]) -> Frames:
+def truth_of(source: IntensitySource, times: NDArray[np.int64]) -> Frames:
     """The sharp images of a source at times (us)."""
     images = np.stack([source.intensity(float(t) * 1e-6) for t in times])
     return Frames(times, images.clip(0, 1).astype(np.float32), np.zeros_like(times))
@@ -356,7 +356,7 @@ def blurred(
     blurs: tuple[tuple[float, ...], tuple[float, ...]] = BLURS,
     label: str = "",
     **other: Any,
-) -> Iterator[tuple[Row, Source, Recording]]:
+) -> Iterator[tuple[Row, IntensitySource, Recording]]:
     """Recordings of long exposures, with what tells them apart: exposures (s), speeds (px/s).
 
     The label is of the sensor's `other` settings, in the names of files.
@@ -367,8 +367,8 @@ def blurred(
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
         camera = dataclasses.replace(camera, **other)
         size, duration = (160, 120), 7 / rate + exposure
-        source: Source = (
-            Objects(size, duration, speed, seed=seed)
+        source: IntensitySource = (
+            MovingObjects(size, duration, speed, seed=seed)
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )
@@ -406,7 +406,7 @@ def dense_flow(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> No
 
 
 def _flow_scorer(
-    source: Objects, recording: Recording, middles: NDArray[np.int64], step: float
+    source: MovingObjects, recording: Recording, middles: NDArray[np.int64], step: float
 ) -> Callable[..., Row]:
     def score(method: Any, params: Any) -> Row:
         late = round(1e6 * float(params.clock_offset))

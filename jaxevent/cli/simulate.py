@@ -218,7 +218,7 @@ def _simulate_frames(
     with complete(out) as partial:
         if scene is None:
             pace = _pace(speed, "200") or 90.0
-            source = sim.Objects(size or (160, 120), duration or 1.0, pace, seed=seed)
+            source = sim.MovingObjects(size or (160, 120), duration or 1.0, pace, seed=seed)
             name = "objects"
         else:
             way: Any = speed or "slow"

@@ -19,7 +19,7 @@ from jaxevent.codegen import njit_noalloc
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.simulate.scenes import Source
+from jaxevent.simulate.scenes import IntensitySource
 
 _BLOCK_SAMPLES = 32
 _MAX_STEP_S, _MIN_STEP_S = 4e-3, 1e-4  # between samples
@@ -100,7 +100,7 @@ SENSORS = {
 
 
 def simulate(
-    source: Source, sensor: Sensor | None = None, seed: int = 0, name: str = "simulated"
+    source: IntensitySource, sensor: Sensor | None = None, seed: int = 0, name: str = "simulated"
 ) -> Recording:
     """Record a source with a sensor; deterministic in `seed`.
 
@@ -248,7 +248,7 @@ def _truth_times(
 
 
 def _samples(
-    source: Source, sensor: Sensor, name: str
+    source: IntensitySource, sensor: Sensor, name: str
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield blocks of times (us) and ln(I + dark_offset) (samples, pixels); ends are shared.
 
@@ -299,7 +299,7 @@ class _NoiseEvents(NamedTuple):
 
 
 def _simulate_events(
-    source: Source,
+    source: IntensitySource,
     sensor: Sensor,
     thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
     rngs: tuple[np.random.Generator, np.random.Generator],

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from jaxevent.deprecated import warn_renamed
+from jaxevent.deprecated import renamed_names, warn_renamed
 from jaxevent.errors import InputError
 
 # Signed distance (px) of points x, y from a shape's edge, negative inside; distances are of the
@@ -47,7 +47,7 @@ def _cross(x: NDArray, y: NDArray, r: float) -> NDArray:
 OBJECT_SHAPES: tuple[Distance, ...] = (_disc, _box, _triangle, _diamond, _cross)
 
 
-class Surface(NamedTuple):
+class MovingSurface(NamedTuple):
     """The background or an object, with a texture that moves with it."""
 
     distance: Distance | None  # None: everywhere
@@ -66,7 +66,7 @@ class Surface(NamedTuple):
 
     def place(self, t: float | int) -> NDArray[np.floating]:
         """Return `position`; the old name of the method."""
-        warn_renamed("Surface.place", "Surface.position")
+        warn_renamed("MovingSurface.place", "MovingSurface.position")
         return self.position(t)
 
     def velocity(self, t: float | int) -> NDArray[np.floating]:
@@ -105,8 +105,8 @@ class Surface(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Objects:
-    """Five textured objects before a moving background: a `Source` whose optical flow is known.
+class MovingObjects:
+    """Five textured objects before a moving background, an `IntensitySource` with known flow.
 
     A disc, a box, a triangle, a diamond and a cross swing about different points, sideways and up
     and down at different rates, so that they are always accelerated. The speed of each, its root
@@ -199,7 +199,7 @@ class Objects:
         return moves, hidden
 
     @functools.cached_property
-    def surfaces(self) -> tuple[Surface, ...]:
+    def surfaces(self) -> tuple[MovingSurface, ...]:
         """The background and the objects, from far to near."""
         rng = np.random.default_rng(self.seed)
         size = np.array(self.size, float)
@@ -223,7 +223,7 @@ class Objects:
                 turn = np.array([np.cos(angles[k - 1]), np.sin(angles[k - 1])])
                 middle, light, contrast = middle + 0.22 * size * turn, lights[k - 1], 0.2
             surfaces.append(
-                Surface(
+                MovingSurface(
                     shape,
                     float(size.min() * rng.uniform(0.12, 0.2)),
                     middle,
@@ -252,3 +252,6 @@ def _texture(rng: np.random.Generator) -> NDArray[np.floating]:
         grain = gaussian_filter(rng.normal(size=noise.shape), deviation, mode="wrap")
         noise += weight * grain / grain.std()
     return spline_filter(noise / noise.std(), 3, mode="grid-wrap")
+
+
+__getattr__ = renamed_names(__name__)

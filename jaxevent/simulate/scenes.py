@@ -52,7 +52,7 @@ def parse_seconds(times: Times, duration: float | int) -> NDArray[np.float64]:
 
 
 @runtime_checkable
-class Source(Protocol):
+class IntensitySource(Protocol):
     """A scene for the simulated sensor."""
 
     @property
@@ -300,7 +300,7 @@ def scene(
 
 @dataclasses.dataclass(frozen=True)
 class Pan:
-    """A camera that moves over a panorama: a `Source`.
+    """A camera that moves over a panorama: an `IntensitySource`.
 
     The heading swings by 2 rad about left or right within 1.6 s and the speed by a third, 20 to
     40 px/s ("slow") or 200 to 400 px/s ("fast"), or about a number given in px/s; the camera rolls

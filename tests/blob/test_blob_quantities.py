@@ -276,7 +276,9 @@ def test_range_from_size():
 
 @pytest.mark.parametrize("shape", ["ring", "disc", "uniform"])
 def test_size_factors_are_those_of_sampled_events(shape):
-    target = simulate.Target(simulate.Line((100, 100), (50.0, 0.0), size=(7, 7)), 2e5, shape=shape)
+    target = simulate.Target(
+        simulate.LinearMotion((100, 100), (50.0, 0.0), size=(7, 7)), 2e5, shape=shape
+    )
     _, truth = simulate.simulate_blobs([target], (300, 200), 1.0)
     offset = truth.xi - truth(truth.t)[:, 0, :2]
     diameter = 2 * np.hypot(*offset.T).max()
@@ -324,7 +326,7 @@ def tracks(seed=0, T=12, N=2):
 
 
 def still(size=(120, 80)):
-    target = simulate.Target(simulate.Line((40, 30), size=(6, 3), theta=0.5), 2e4)
+    target = simulate.Target(simulate.LinearMotion((40, 30), size=(6, 3), theta=0.5), 2e4)
     return simulate.simulate_blobs([target], size, 1.0, seed=1)[0]
 
 
