@@ -282,11 +282,11 @@ class Features(EventCounts):
 
     def over(self, devices: Sequence[Any]) -> "Features":
         """Put the features on several devices: lanes of tiles and pixels of images are sharded."""
-        mesh = pixel_mesh(devices)
+        mesh = make_pixel_mesh(devices)
         if mesh is None:
             return self
         rest = (self.frames, self.start, self.last)
-        frames, start, last = over_pixels(rest, mesh, self.last.shape[0])
+        frames, start, last = shard_over_pixels(rest, mesh, self.last.shape[0])
         tiles = None if self.tiles is None else self.tiles.over(mesh)
         placed = Features(frames, tiles, start, last)
         if self.derivative is None:
@@ -321,16 +321,16 @@ class ReadOut(EventCounts):
 
     def over(self, devices: Sequence[Any]) -> "ReadOut":
         """Put the read-out on several devices, pixels sharded."""
-        mesh = pixel_mesh(devices)
-        return self if mesh is None else over_pixels(self, mesh, self.slot.shape[1])
+        mesh = make_pixel_mesh(devices)
+        return self if mesh is None else shard_over_pixels(self, mesh, self.slot.shape[1])
 
 
-def pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
+def make_pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
     """Make the mesh over which pixels are sharded, or return None for a single device."""
     return make_mesh(devices, MIN_TILE_LANES)
 
 
-def over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
+def shard_over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
     """Shard arrays [..., n_pixels] along their last axis; put all others whole on every device."""
 
     def put(leaf: Any) -> Any:

@@ -24,7 +24,13 @@ from jaxevent.reconstruction.features import (
     allocate_aligned,
 )
 from jaxevent.reconstruction.frames import FrameTimes
-from jaxevent.reconstruction.stream import BaseCounts, DeadTime, Stream, StreamState, event_weight
+from jaxevent.reconstruction.stream import (
+    BaseCounts,
+    DeadTime,
+    EventStream,
+    StreamState,
+    event_weight,
+)
 
 MIN_KIND_EVENTS = (
     128,
@@ -236,7 +242,7 @@ class LaneStates(NamedTuple):
 
 
 def make_tiles(
-    stream: Stream,
+    stream: EventStream,
     layout: Layout,
     times: FrameTimes,
     counts: BaseCounts,
@@ -278,7 +284,7 @@ def make_tiles(
 
 def _sort_events(
     pool: ThreadPoolExecutor,
-    stream: Stream,
+    stream: EventStream,
     layout: Layout,
     first: NDArray[np.int64],
     latest: NDArray[np.int64],

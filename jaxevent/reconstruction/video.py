@@ -22,7 +22,7 @@ from jaxevent.locks import TurnLock, refuse_to_pickle
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
-from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
+from jaxevent.reconstruction.features import Features, ReadOut, make_pixel_mesh, shard_over_pixels
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import (
@@ -368,7 +368,7 @@ class Video(ImageSequence[P]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
-        self._mesh = pixel_mesh(devices)
+        self._mesh = make_pixel_mesh(devices)
         self._batch = N_DEVICE_BATCH_IMAGES if has_accelerator() else N_BATCH_IMAGES
         self._windows = WindowedRecording(
             recording,
@@ -430,7 +430,11 @@ class Video(ImageSequence[P]):
 
     def _put_state(self, state: Any) -> Any:
         """Put a state or message on the devices; else every change of place is compiled."""
-        return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
+        return (
+            state
+            if self._mesh is None
+            else shard_over_pixels(state, self._mesh, self._windows.pixels)
+        )
 
     def _window_of(self, time: int) -> FilteredWindow:
         """Return the filtered window that contains `time`; those before it are filtered first."""
@@ -466,7 +470,7 @@ class Video(ImageSequence[P]):
         Returns:
             The first row of the events and the first frame that are needed from then on.
         """
-        begin, final = self._starts[0], self._windows.final_time(frames)
+        begin, final = self._starts[0], self._windows.settled_until(frames)
         while True:
             self._current = None
             _, following = self._filter(begin)
@@ -474,7 +478,7 @@ class Video(ImageSequence[P]):
                 break
             begin = following
         self._starts = [begin]
-        return self._windows.first_needed(begin.start, begin.before)
+        return self._windows.first_needed_rows(begin.start, begin.before)
 
     def _run_backward_pass(self) -> None:
         """Pass over all windows once, for the message of later windows at each."""

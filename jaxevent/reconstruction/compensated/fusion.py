@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.estimator import ShortRepr
-from jaxevent.reconstruction.compensated.images import smooth_part
+from jaxevent.reconstruction.compensated.images import gaussian_smooth
 from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.reconstruction.compensated.robust_mean import (
     InstantLayout,
@@ -224,7 +224,7 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     # with those around the target.
     q = _shift_weight(q, given.stationary * given.in_place * quiet, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
-    alone = smooth_part(quiet, NOISE_EVENT_SIGMA_PX)
+    alone = gaussian_smooth(quiet, NOISE_EVENT_SIGMA_PX)
     q = _shift_weight(q, given.rest * jnp.maximum(quiet, alone), 2)
     features = variance_features(X, given.in_place, beyond, given.intervals_away)
     weights = jnp.where(beyond, params.doubt_beyond, params.doubt)

@@ -30,7 +30,7 @@ from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
-from jaxevent.reconstruction.compensated.warp import positions, sample
+from jaxevent.reconstruction.compensated.warp import path_positions, sample_bilinear
 from jaxevent.reconstruction.features import FrameFeatures, Numeric
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
@@ -143,9 +143,9 @@ def _averages(size: int, sigma: float) -> NDArray[np.float32]:
 
 
 @full_precision
-def smooth_part(L: Any, sigma: float = SMOOTH_PART_SIGMA_PX) -> Any:
-    """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma` px."""
-    return _averages(L.shape[-2], sigma) @ L @ _averages(L.shape[-1], sigma).T
+def gaussian_smooth(L: Any, sigma_px: float = SMOOTH_PART_SIGMA_PX) -> Any:
+    """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma_px` px."""
+    return _averages(L.shape[-2], sigma_px) @ L @ _averages(L.shape[-1], sigma_px).T
 
 
 class BrightnessPrior(NamedTuple):
@@ -173,8 +173,8 @@ def smooth_at_target(
         The smooth part (h, w) and its variance (h, w), (ln I)^2.
     """
     nearest = jnp.asarray(smooth)[layout.before][None]
-    Y, X = positions(jnp.asarray(paths), jnp.asarray(layout.s)[layout.before][None])
-    beyond = sample(nearest, Y, X)[0] + prior.offset
+    Y, X = path_positions(jnp.asarray(paths), jnp.asarray(layout.s)[layout.before][None])
+    beyond = sample_bilinear(nearest, Y, X)[0] + prior.offset
     difference = smooth[layout.after] - smooth[layout.before]
     variance = jnp.maximum(weight * (1 - weight) * difference**2, prior.variance)
     one_sided = layout.before == layout.after
@@ -195,15 +195,15 @@ class FrameBrightness:
         self._images = FrameImages(recording, np.dtype(np.float32))
         self._changes: dict[int, float] = {}
 
-    def is_steady(self, first: int, last: int) -> bool:
+    def is_steady(self, first_us: int, last_us: int) -> bool:
         """Return whether all frames between two times (us), included, are equally bright."""
-        low = int(np.searchsorted(self._mid, first, "left"))
-        high = int(np.searchsorted(self._mid, last, "right"))
+        low = int(np.searchsorted(self._mid, first_us, "left"))
+        high = int(np.searchsorted(self._mid, last_us, "right"))
         return all(abs(self._change(k)) < MIN_UNSTEADY_CHANGE for k in range(low, high - 1))
 
-    def prior(self, t: int) -> BrightnessPrior:
+    def prior(self, t_us: int) -> BrightnessPrior:
         """Return the prior of the brightness at a time (us)."""
-        return BrightnessPrior(np.float32(self.variance(t)), np.float32(self._offset(t)))
+        return BrightnessPrior(np.float32(self.variance(t_us)), np.float32(self._offset(t_us)))
 
     def _offset(self, t: int) -> float:
         """Return the brightness (ln I) to add to the nearest frame, beyond the frames; else 0."""
@@ -220,20 +220,20 @@ class FrameBrightness:
             return 0.0
         return change * min(1.0, float(distance / interval))
 
-    def variance(self, t: int) -> float:
+    def variance(self, t_us: int) -> float:
         """Return the variance (ln I)^2 of the brightness at a time (us).
 
         It is 0 at the frames and largest halfway between two, and beyond the last and the first.
         """
-        right = int(np.searchsorted(self._mid, t, "right"))
-        left = int(np.searchsorted(self._mid, t, "left"))
+        right = int(np.searchsorted(self._mid, t_us, "right"))
+        left = int(np.searchsorted(self._mid, t_us, "left"))
         low, high = (
             max(left - MAX_BRIGHTNESS_FRAMES, 0),
             min(right + MAX_BRIGHTNESS_FRAMES, len(self._mid)),
         )
         if left < right or high - low < 2:
             return 0.0
-        mid = (self._mid[low:high] - t) * 1e-6
+        mid = (self._mid[low:high] - t_us) * 1e-6
         level = np.cumsum([0.0, *(self._change(k) for k in range(low, high - 1))])
         between = low < right < high
         if high - low > 2:

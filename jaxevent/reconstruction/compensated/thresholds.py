@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.stream import DeadTime, Stream, count_before, event_weights
+from jaxevent.reconstruction.stream import DeadTime, EventStream, count_before_edges, event_weights
 from jaxevent.recording import Recording
 
 N_IMAGE_PAIRS = 8  # between pairs of images that are evenly spaced over a recording
@@ -54,41 +54,43 @@ class ThresholdDeviations(NamedTuple):
     remaining: NDArray[np.floating]  # part of their prior variance that is left, 0..1
 
 
-def regress(changes: LogChanges, mismatch: float) -> ThresholdDeviations:
+def regress_deviations(changes: LogChanges, prior_sigma: float) -> ThresholdDeviations:
     """Estimate the deviations d by robust ridge regression of every pixel.
 
     Args:
         changes: The changes.
-        mismatch: Prior standard deviation of d.
+        prior_sigma: Prior standard deviation of d.
 
     Returns:
         The deviations.
     """
     rest, on, off, V = changes
     W = 1 / (V + rest**2 / HUBER_SQUARE)
-    A = (W * on * on).sum(0) + mismatch**-2
+    A = (W * on * on).sum(0) + prior_sigma**-2
     B = (W * on * off).sum(0)
-    C = (W * off * off).sum(0) + mismatch**-2
+    C = (W * off * off).sum(0) + prior_sigma**-2
     a, b = (W * on * rest).sum(0), (W * off * rest).sum(0)
     det = A * C - B * B
     d = np.stack([C * a - B * b, A * b - B * a]) / det
-    return ThresholdDeviations(d, np.stack([C, A]) / det / mismatch**2)
+    return ThresholdDeviations(d, np.stack([C, A]) / det / prior_sigma**2)
 
 
-def local_deviation(found: ThresholdDeviations, size: tuple[int, int]) -> ThresholdDeviations:
+def subtract_local_mean(
+    deviations: ThresholdDeviations, image_shape: tuple[int, int]
+) -> ThresholdDeviations:
     """Subtract the mean of the pixels around: errors of the scene's motion are common to these."""
-    d = found.d.reshape(2, *size)
+    d = deviations.d.reshape(2, *image_shape)
     smooth = gaussian_filter(d, (0, NEIGHBOURHOOD_SIGMA_PX, NEIGHBOURHOOD_SIGMA_PX))
-    return found._replace(d=(d - smooth).reshape(found.d.shape))
+    return deviations._replace(d=(d - smooth).reshape(deviations.d.shape))
 
 
-def estimate_sigma(one: ThresholdDeviations, other: ThresholdDeviations) -> float:
+def estimate_deviation_sigma(first: ThresholdDeviations, second: ThresholdDeviations) -> float:
     """Estimate the standard deviation of d from two regressions on different changes.
 
     Each finds the part 1 - `remaining` of d, with independent errors.
     """
-    found = ((1 - one.remaining) * (1 - other.remaining)).sum().clip(1e-12)
-    return float(np.sqrt(max((one.d * other.d).sum() / found, 0.0)))
+    found = ((1 - first.remaining) * (1 - second.remaining)).sum().clip(1e-12)
+    return float(np.sqrt(max((first.d * second.d).sum() / found, 0.0)))
 
 
 def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int, int]]:
@@ -107,22 +109,24 @@ def _count_events(recording: Recording, begin: int, end: int, rho: float) -> NDA
     source = recording.events
     # With enough events before the begin to know the gaps of nearly all pixels.
     rows = slice(source.index(2 * begin - end), source.index(end))
-    stream = Stream.of(source[rows], recording.width)
+    stream = EventStream.of(source[rows], recording.width)
     pixels = recording.width * recording.height
     weight = event_weights(stream, np.full(pixels, recording.start), DeadTime(rho, False))
-    before, after = count_before(stream, weight, np.array([begin, end]), np.zeros((2, pixels)))
+    before, after = count_before_edges(
+        stream, weight, np.array([begin, end]), np.zeros((2, pixels))
+    )
     return after - before
 
 
 def learn_thresholds(
-    recording: Recording, params: Params, span: tuple[int, int], images: ImageFunction
+    recording: Recording, params: Params, span_us: tuple[int, int], images: ImageFunction
 ) -> NDArray[np.float32] | None:
     """Learn the ON and OFF thresholds of every pixel.
 
     Args:
         recording: The recording.
         params: Parameters of `mc`.
-        span: First and last time with data, us.
+        span_us: First and last time with data, us.
         images: A function from a time (us) to log intensity and its variance, of any shape.
 
     Returns:
@@ -130,9 +134,9 @@ def learn_thresholds(
         halves of the changes do not have deviations above `MIN_DEVIATION_SIGMA` in common.
     """
     c_on, c_off = float(params.c_on), float(params.c_off)
-    if not params.learn or span[1] - span[0] < N_IMAGE_PAIRS:
+    if not params.learn or span_us[1] - span_us[0] < N_IMAGE_PAIRS:
         return None
-    times = _change_times(recording, span)
+    times = _change_times(recording, span_us)
     rho = 1e6 * float(params.rho_ref)  # us
     counts = np.stack([_count_events(recording, *pair, rho) for pair in times], 1)
     if counts.sum((0, 1)).mean() < MIN_EVENTS_PER_PIXEL:
@@ -146,13 +150,15 @@ def learn_thresholds(
     changes = LogChanges(rest - on - off, on, off, P + steps + drift + c_on * c_off / 3)
     size = (recording.height, recording.width)
     halves = (slice(0, N_IMAGE_PAIRS // 2), slice(N_IMAGE_PAIRS // 2, None))
-    found = estimate_sigma(
+    found = estimate_deviation_sigma(
         *(
-            local_deviation(regress(changes.select(half), EXPECTED_DEVIATION_SIGMA), size)
+            subtract_local_mean(
+                regress_deviations(changes.select(half), EXPECTED_DEVIATION_SIGMA), size
+            )
             for half in halves
         )
     )
     if not found > MIN_DEVIATION_SIGMA:
         return None
-    factors = 1 + local_deviation(regress(changes, found), size).d
+    factors = 1 + subtract_local_mean(regress_deviations(changes, found), size).d
     return factors.clip(*COMMON_FACTOR_BOUNDS).astype(np.float32)

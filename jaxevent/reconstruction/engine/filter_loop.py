@@ -22,11 +22,11 @@ from jaxevent.reconstruction.engine.bands import (
     FrameRows,
     ImageBuffers,
     PartitionedRecording,
-    copy,
-    count_events,
-    fill,
-    find,
-    load_image,
+    copy_field,
+    count_band_events,
+    fill_field,
+    find_first_event,
+    load_frame_image,
     sum_exposure_segments,
 )
 from jaxevent.reconstruction.engine.filter_program import (
@@ -41,7 +41,7 @@ from jaxevent.reconstruction.engine.filter_program import (
     variants,
 )
 from jaxevent.reconstruction.features import allocate_aligned
-from jaxevent.reconstruction.frames import Clock, rates
+from jaxevent.reconstruction.frames import FrameClock, interval_rates
 from jaxevent.reconstruction.stream import StreamState
 
 
@@ -74,50 +74,50 @@ class BandedWindow(NamedTuple):
         """Start of the window, us."""
         return -math.inf if self.start is None else float(self.start)
 
-    def contains(self, time: int) -> bool:
+    def contains(self, time_us: int) -> bool:
         """Return whether a time (us) is in the window."""
-        return self.begins <= time and (self.stop is None or time < self.stop)
+        return self.begins <= time_us and (self.stop is None or time_us < self.stop)
 
 
 def cut_window(
-    recording: PartitionedRecording, start: int | None, state: StreamState
+    recording: PartitionedRecording, start_us: int | None, state: StreamState
 ) -> BandedWindow:
     """Cut the window that begins at a time, and divide its events among the bands.
 
     Args:
         recording: The recording.
-        start: Start of the window, us; None: the recording's.
+        start_us: Start of the window, us; None: the recording's.
         state: State of the stream at the end of the window before.
     """
     windows, source = recording.windows, recording.recording.events
-    stop = windows.stop_after(start)
-    rows = [0 if start is None else source.index(start)]
+    stop = windows.choose_stop(start_us)
+    rows = [0 if start_us is None else source.index(start_us)]
     rows.append(len(source) if stop is None else source.index(stop))
-    used = windows.clock.used(start, stop)
-    bands, state = recording.partition(state, *windows.context_of(used, *rows))
-    line = make_timeline(windows.clock, start, stop, recording.recording.gain, recording.dtype)
-    return BandedWindow(start, stop, bands, line, recording.frames(used), state)
+    used = windows.clock.frames_within(start_us, stop)
+    bands, state = recording.partition(state, *windows.extend_to_exposures(used, *rows))
+    line = make_timeline(windows.clock, start_us, stop, recording.recording.gain, recording.dtype)
+    return BandedWindow(start_us, stop, bands, line, recording.frames(used), state)
 
 
 def make_timeline(
-    clock: Clock, start: int | None, stop: int | None, gain: NDArray, dtype: np.dtype
+    clock: FrameClock, start_us: int | None, stop_us: int | None, gain: NDArray, dtype: np.dtype
 ) -> Timeline:
     """Make the timeline of a window.
 
     Args:
         clock: Times of the frames.
-        start: Start of the window, us; None: without bound.
-        stop: End of the window.
+        start_us: Start of the window, us; None: without bound.
+        stop_us: End of the window.
         gain: (frames,) gain of each frame.
         dtype: Kind of real numbers.
     """
-    begin = -NEVER_US if start is None else start - clock.origin
-    end = NEVER_US if stop is None else stop - clock.origin
+    begin = -NEVER_US if start_us is None else start_us - clock.origin
+    end = NEVER_US if stop_us is None else stop_us - clock.origin
     bounds = np.unique(np.ceil(np.concatenate([clock.breaks, clock.mid])).astype(np.int64))
     times = np.concatenate([[begin], bounds[(bounds > begin) & (bounds < end)]]).astype(np.int64)
     piece = np.searchsorted(clock.breaks, times, "right")
     before = np.searchsorted(clock.mid, times, "right") - 1
-    frame = np.asarray(clock.frame(piece))
+    frame = np.asarray(clock.frame_of_piece(piece))
     # Positions of a piece, and of the frame before its points, among the frames that it rests on.
     first = np.maximum(frame - 1, 0)
     at = np.stack([piece - clock.first_piece(1) * first, np.maximum(before, 0) - first], 1)
@@ -137,10 +137,10 @@ def _intervals(breaks: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
         return np.zeros(len(at)), np.zeros(len(at))
     inside = (at >= 0) & (at < len(breaks) - 1)
     k = np.where(inside, at, 0)
-    return np.where(inside, breaks[k], 0.0), np.where(inside, rates(breaks)[k], 0.0)
+    return np.where(inside, breaks[k], 0.0), np.where(inside, interval_rates(breaks)[k], 0.0)
 
 
-def _uniform_inputs(clock: Clock, frame: int, gain: NDArray) -> NDArray:
+def _uniform_inputs(clock: FrameClock, frame: int, gain: NDArray) -> NDArray:
     """Return gains and rates of a piece of `frame`: fields of `FrameFeatures` of three frames."""
     first = max(frame - 1, 0)
     used = slice(first, min(len(clock), max(frame, 0) + 2))
@@ -155,8 +155,8 @@ def _uniform_inputs(clock: Clock, frame: int, gain: NDArray) -> NDArray:
     return np.concatenate(
         [
             padded(gain[used], N_PIECE_FRAMES, 0, 1.0),
-            padded(1e6 * rates(breaks), n_pieces(clock.exposed), 1, 0.0),
-            padded(1e6 * rates(clock.mid[used]), N_PIECE_FRAMES, 0, 0.0),
+            padded(1e6 * interval_rates(breaks), n_pieces(clock.exposed), 1, 0.0),
+            padded(1e6 * interval_rates(clock.mid[used]), N_PIECE_FRAMES, 0, 0.0),
         ]
     )
 
@@ -179,7 +179,7 @@ class EntrySteps(NamedTuple):
 
 
 def entry_steps(
-    places: FieldPlaces, line: Timeline, frames: FrameRows, enter: tuple[int, int]
+    places: FieldPlaces, timeline: Timeline, frames: FrameRows, entry_point: tuple[int, int]
 ) -> EntrySteps:
     """List the steps at the beginning of each interval of a window.
 
@@ -188,18 +188,22 @@ def entry_steps(
 
     Args:
         places: Places of the fields.
-        line: Timeline of the window.
+        timeline: Timeline of the window.
         frames: Frames of the window.
-        enter: Interval in which the window is entered, with no frame known, and the time, us since
-            the recording's start; the steps of the intervals before are left out.
+        entry_point: Interval in which the window is entered, with no frame known, and the time, us
+            since the recording's start; the steps of the intervals before are left out.
     """
-    first, now = enter
-    ends, before, found = np.zeros(len(line.start) + 1, np.int64), NO_PREVIOUS_FRAME, list[Any]()
-    entry = _FrameEntry(places, frames, line.opening)
-    for interval in range(first, len(line.start)):
-        frame = int(line.frame[interval])
+    first, now = entry_point
+    ends, before, found = (
+        np.zeros(len(timeline.start) + 1, np.int64),
+        NO_PREVIOUS_FRAME,
+        list[Any](),
+    )
+    entry = _FrameEntry(places, frames, timeline.opening)
+    for interval in range(first, len(timeline.start)):
+        frame = int(timeline.frame[interval])
         if frame != before:
-            time = now if interval == first else int(line.start[interval])
+            time = now if interval == first else int(timeline.start[interval])
             found += entry.steps(frame, before, time)
         before, ends[interval + 1] = frame, len(found)
     steps = np.zeros((len(found), 5), np.int64)
@@ -306,11 +310,11 @@ def _take_steps(steps, begin, end, given, band, memory):
             steps[i, 0], steps[i, 1], steps[i, 2], steps[i, 3], steps[i, 4]
         )  # fmt: skip
         if kind == STEP_MOVE:
-            copy(cells, at, of, stride)
+            copy_field(cells, at, of, stride)
         elif kind == STEP_LOAD:
-            load_image(frames, of, left, bands, band, cells[at : at + stride])
+            load_frame_image(frames, of, left, bands, band, cells[at : at + stride])
         elif kind == STEP_FILL:
-            fill(cells, at, stride, 0.5 * of)
+            fill_field(cells, at, stride, 0.5 * of)
         elif kind == STEP_SUM:
             sums = ExposureSums(
                 given.functions.excess, given.numbers, given.totals[:, at], memory.counts[band],
@@ -318,7 +322,7 @@ def _take_steps(steps, begin, end, given, band, memory):
             )  # fmt: skip
             sum_exposure_segments(bands, band, frames, of, cells, sums)
         else:
-            count_events(bands, band, (left, right), cells, at, of)
+            count_band_events(bands, band, (left, right), cells, at, of)
 
 
 class PassRequest(NamedTuple):
@@ -350,7 +354,10 @@ def filter_events(begin, end, given, memory, request):
         last, scratch = memory.last[band].ctypes, memory.scratch[band].ctypes
         i, s, entering = place[0], place[1], enter[0] >= 0
         if entering:
-            i, s = find(bands.events, first[band], finish, np.int64(enter[1])), np.int64(enter[0])
+            i, s = (
+                find_first_event(bands.events, first[band], finish, np.int64(enter[1])),
+                np.int64(enter[0]),
+            )
         while True:
             if entering:
                 _take_steps(steps, ends[s], ends[s + 1], given, band, memory)

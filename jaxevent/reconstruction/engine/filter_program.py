@@ -1,9 +1,10 @@
 """Kernels of filters: functions of one pixel, traced, translated and written as a module.
 
 What a method says within a piece rests on three frames: the one whose left edge the piece counts
-events from, the one before and the one after (`Clock.used`; windows rely on it too). So a piece is
-a window of its own with three rows of tables, and where a point lies in it is known when the
-program is written: one `Variant` for the beginning, and for every piece and frame after it.
+events from, the one before and the one after (`FrameClock.frames_within`; windows rely on it too).
+So a piece is a window of its own with three rows of tables, and where a point lies in it is known
+when the program is written: one `Variant` for the beginning, and for every piece and frame after
+it.
 """
 
 import dataclasses

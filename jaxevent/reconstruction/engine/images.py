@@ -61,7 +61,7 @@ from jaxevent.reconstruction.engine.smoother_program import (
     SmoothingMethod,
 )
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import Clock, Timing
+from jaxevent.reconstruction.frames import FrameClock, Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.video import MAX_WINDOW_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
@@ -181,7 +181,7 @@ class FilterVideo(ImageSequence[P]):
         return window
 
 
-def _make_segments(clock: Clock, recording: Recording, events: int) -> list[Segment]:
+def _make_segments(clock: FrameClock, recording: Recording, events: int) -> list[Segment]:
     """Divide frames into segments of so many events, one frame at least."""
     most = max(6, MAX_SEGMENT_FRAME_PIXELS // (recording.width * recording.height))
     rows = [recording.events.index(int(np.ceil(t)) + clock.origin) for t in clock.mid]
@@ -324,7 +324,7 @@ def _serves(devices: Sequence[Any]) -> bool:
     return jnp.result_type(float) == np.float32 and len(devices) < 2
 
 
-def video_from_kernel(
+def make_kernel_video(
     kind: Callable[..., ImageSequence[P]],
     method: Any,
     recording: Recording,
@@ -585,7 +585,7 @@ def _rebuild(kernel: ImageKernel, rows: NDArray) -> KernelImages:
     return KernelImages(np.asarray(kernel.number, np.int32), rows, kernel)
 
 
-def images_from_kernel(
+def make_kernel_images(
     kind: type[ImageKernel],
     method: Any,
     recording: Recording,
