@@ -199,10 +199,10 @@ class Graph:
         """Return the node that makes a number of a truth value, if there is one."""
         return self._known.get(("to_f", "f", truth.level, truth.number))
 
-    def suppose(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
+    def assume_truth(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
         """Return the results where a truth value is known."""
         found = {truth: self.constant(value)}
-        for node in dependencies([*results.values()], {truth}):
+        for node in find_dependencies([*results.values()], {truth}):
             if node not in found:
                 args = tuple(found.get(a, a) if isinstance(a, Node) else a for a in node.args)
                 found[node] = node if args == node.args else self.apply(node.op, args, node.kind)
@@ -218,7 +218,7 @@ def constant_value(node: Any) -> Any:
     return {"True": True, "False": False}[node.args[0]] if node.kind == "b" else int(node.args[0])
 
 
-def dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
+def find_dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
     """Return the nodes that results depend on, in order of creation.
 
     `stop` ones are followed no further.
@@ -247,13 +247,13 @@ ARRAY_FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def evaluate_nodes(
-    nodes: list[Node], known: Callable[[Any], Any], values: list[Any], dtype: np.dtype
+    nodes: list[Node], read_input: Callable[[Any], Any], values: list[Any], dtype: np.dtype
 ) -> list[Any]:
     """Evaluate expressions for arrays in place of numbers.
 
     Args:
         nodes: The expressions.
-        known: Returns the array of an input by its name, or of a slot by its number.
+        read_input: Returns the array of an input by its name, or of a slot by its number.
         values: Values of the `ParameterProgram`.
         dtype: Kind of real numbers.
 
@@ -262,11 +262,11 @@ def evaluate_nodes(
     """
     found: dict[Node, Any] = {}
     with np.errstate(all="ignore"):
-        for node in dependencies(nodes):
+        for node in find_dependencies(nodes):
             if node.op == "constant":
                 value = constant_value(node)
             elif node.op in ("input", "slot"):
-                value = known(node.args[0])
+                value = read_input(node.args[0])
             elif node.op == "number":
                 value = np.ravel(values[node.args[0]])[node.args[1]]
             elif node.op == "entry":
@@ -392,18 +392,20 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
     return [np.asarray(made, eqn.outvars[0].aval.dtype)]
 
 
-def evaluate_jaxpr(closed: Any, values: list[NDArray]) -> list[NDArray]:
+def evaluate_jaxpr(closed_jaxpr: Any, values: list[NDArray]) -> list[NDArray]:
     """Evaluate a closed jaxpr for arrays."""
-    known: dict[Any, NDArray] = dict(zip(closed.jaxpr.invars, values, strict=True))
-    known |= dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+    known: dict[Any, NDArray] = dict(zip(closed_jaxpr.jaxpr.invars, values, strict=True))
+    known |= dict(
+        zip(closed_jaxpr.jaxpr.constvars, map(np.asarray, closed_jaxpr.consts), strict=True)
+    )
 
     def of(atom: Any) -> NDArray:
         return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
 
-    for eqn in closed.jaxpr.eqns:
+    for eqn in closed_jaxpr.jaxpr.eqns:
         made = evaluate_equation(eqn, [of(a) for a in eqn.invars])
         known |= dict(zip(eqn.outvars, made, strict=True))
-    return [of(a) for a in closed.jaxpr.outvars]
+    return [of(a) for a in closed_jaxpr.jaxpr.outvars]
 
 
 def evaluate_function(function: Callable[..., Any], *arrays: NDArray) -> NDArray:

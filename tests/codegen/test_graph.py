@@ -25,7 +25,7 @@ def test_what_is_supposed_is_folded_into_the_results(truth):
     share = graph.apply("select_n", (graph.apply("gt", (number, graph.constant(0.0)), "b"),
         graph.constant(7.0), number), "f")  # fmt: skip
     result = graph.apply("add", (graph.apply("mul", (share, x), "f"), y), "f")
-    made = graph.suppose({"a": result}, hit, truth)["a"]
+    made = graph.assume_truth({"a": result}, hit, truth)["a"]
     given = {"x": 1.5, "y": 2.0 if truth else 1.0}
     assert value(made, given) == value(result, given)
     assert made.op == "add" and (made.args[0] is x) == truth  # the number is a constant

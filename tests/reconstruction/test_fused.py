@@ -30,7 +30,7 @@ from test_reconstruction import (
 import jaxevent
 from jaxevent import codegen
 from jaxevent.codegen import functions
-from jaxevent.codegen.derivative import Directions
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.graph import ParameterProgram, evaluate_jaxpr, evaluate_nodes
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.compensated.images import instant_smoother
@@ -86,7 +86,7 @@ def test_expressions_of_a_filter_are_its_functions(name):
     method, random = jaxevent.METHODS[name], np.random.default_rng(0)
     params = params_of(method, **{"weighting": "linear", **ALL})
     fixed = {"clock_offset": np.asarray(0.0), "present": np.asarray(1.0)}
-    known = Directions().inputs(params, fixed | {"response": np.linspace(0, 1, 256)})
+    known = DerivativeDirections().inputs(params, fixed | {"response": np.linspace(0, 1, 256)})
     kind = filter_program.KernelKind(False, np.dtype(float), 8208)
     trace = filter_program.trace_filter(method, known, kind)
     program = filter_program.translate_filter(trace, known, kind)

@@ -24,11 +24,11 @@ from jaxevent.codegen.trace import (
     ELEMENT_AXIS_LENGTH,
     TracedFunction,
     TracedProgram,
-    name_leaves,
-    name_numbers,
+    named_leaves,
+    number_names,
     translate_function,
 )
-from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, ModuleWriter
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import engine_loop, filtering, likelihood
@@ -185,8 +185,8 @@ class FunctionTracer:
     ) -> Any:
         """Give each number of a tree a cell or a row, and return the tree's shapes."""
         leaves = []
-        for name, leaf in name_leaves(key, tree).items():
-            names = name_numbers(name, leaf)
+        for name, leaf in named_leaves(key, tree).items():
+            names = number_names(name, leaf)
             of_all = ELEMENT_AXIS_LENGTH in leaf.shape
             if translated is not None and of_all:
                 nodes = [translated.results[number] for number in names]
@@ -304,7 +304,7 @@ def write(program: TracedProgram) -> ModuleText:
     """Write the text of a program's module."""
     layout = program.layout
     places, stores = layout.places(), layout.stores()
-    writer, out = Writer(program, places), []
+    writer, out = ModuleWriter(program, places), []
 
     def body(name: str, indent: int = 4, loop: ElementLoop = LANES) -> str:
         function = program.functions[name]
@@ -313,7 +313,7 @@ def write(program: TracedProgram) -> ModuleText:
             for key, node in function.results.items()
             if node.op != "input" or places[node.args[0]] != places[key]
         }
-        return "\n".join(writer.body(name, function, changed, loop, indent))
+        return "\n".join(writer.write_body(name, function, changed, loop, indent))
 
     for name in ("predict", "reweight", "restart"):
         out.append(FUNCTION.format(name=name, body=body(name, loop=PARTICLES)))
@@ -336,7 +336,7 @@ def write(program: TracedProgram) -> ModuleText:
             )
         )
     about = "The functions of voting (`jaxevent.egomotion.particle_filter.engine`)."
-    return writer.module(about, out, layout)
+    return writer.write_module(about, out, layout)
 
 
 _kernels = KernelCache(ModelFunctions, write, max_nodes=MAX_OPERATIONS)

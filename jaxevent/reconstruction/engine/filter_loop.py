@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, run_over_rows
-from jaxevent.codegen.derivative import Directions, parse_derivative
+from jaxevent.codegen.derivative import DerivativeDirections, parse_derivative
 from jaxevent.codegen.module import CompiledProgram
 from jaxevent.reconstruction.engine.bands import (
     NEVER_US,
@@ -422,7 +422,7 @@ class FilterPasses:
         method: FilterMethod,
         params: Any,
         clock_offset: Any,
-        directions: Directions = Directions(),  # noqa: B008
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
         self.recording, self._method = recording, method
         self.kind = KernelKind(

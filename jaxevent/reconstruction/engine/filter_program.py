@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen.derivative import (
+    DerivativeDirections,
     Derivatives,
-    Directions,
     collect_derivatives,
     derivative_name,
     parse_derivative,
@@ -32,20 +32,20 @@ from jaxevent.codegen.graph import (
     ParameterProgram,
     TranslationError,
     constant_value,
-    dependencies,
     evaluate_nodes,
+    find_dependencies,
 )
 from jaxevent.codegen.module import CompiledProgram, KernelCache
 from jaxevent.codegen.trace import (
     KIND_BY_DTYPE,
-    Constant,
-    ParameterValue,
-    Trace,
-    Translation,
+    ConstantArray,
+    JaxprTranslator,
+    ParameterArray,
+    TracedJaxpr,
     Value,
     trace_function,
 )
-from jaxevent.codegen.write import Address, ModuleText, Writer
+from jaxevent.codegen.write import Address, ModuleText, ModuleWriter
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
 
 N_PIECE_FRAMES = 3  # frames that a piece rests on
@@ -90,7 +90,7 @@ class KernelKind(NamedTuple):
     exposed: bool  # whether exposures are known
     dtype: np.dtype  # of real numbers
     stride: int  # pixels of a band, with its border
-    directions: Directions = Directions()
+    directions: DerivativeDirections = DerivativeDirections()
 
 
 class Variant(NamedTuple):
@@ -116,12 +116,12 @@ def n_pieces(exposed: bool) -> int:
     return 2 * N_PIECE_FRAMES + 1 if exposed else N_PIECE_FRAMES + 1
 
 
-def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind) -> Trace:
+def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind) -> TracedJaxpr:
     """Trace a method at one pixel, between three frames.
 
     Args:
         method: The filter.
-        known: See `Directions.inputs`.
+        known: See `DerivativeDirections.inputs`.
         kind: Properties of the recording, and derivatives that are wanted.
 
     Returns:
@@ -202,7 +202,7 @@ class FilterProgram:
     host: ParameterProgram
     dtype: np.dtype
     exposed: bool
-    directions: Directions
+    directions: DerivativeDirections
     tables: list[list[Node]]  # of each variant: what its slots hold
     start: list[dict[str, Node]]  # of each variant: the state at the start, by name
     state: dict[str, Node]  # after an event, by name
@@ -246,7 +246,7 @@ class FilterProgram:
         return dict(zip(start, made, strict=True))
 
 
-class PixelTranslation(Translation):
+class PixelTranslator(JaxprTranslator):
     """Translation of functions of one pixel.
 
     Look-ups of tables at a point become nodes "slot", numbered in order; what they hold is
@@ -279,7 +279,7 @@ class PixelTranslation(Translation):
     def _sum_over_segments(self, values: list[Value]) -> NDArray:
         """Translate sums [..., cells] of updates [..., 1]."""
         start, cells, updates = values
-        if not isinstance(start, Constant) or start.value.any():
+        if not isinstance(start, ConstantArray) or start.value.any():
             raise TranslationError("a sum that begins with numbers")
         index, added = np.ravel(self.nodes(cells)), self.nodes(updates)
         ours = len(index) == 1 and index[0].args == ("segment_cell.0",) and added.shape[-1:] == (1,)
@@ -300,12 +300,12 @@ class PixelTranslation(Translation):
         return self.graph.input(f"total.{self.excess.index(node)}.{row}", "f", Level.TABLE)
 
 
-def translate_filter(trace: Trace, known: tuple[Any, ...], kind: KernelKind) -> FilterProgram:
+def translate_filter(trace: TracedJaxpr, known: tuple[Any, ...], kind: KernelKind) -> FilterProgram:
     """Translate a traced method; see `trace_filter`.
 
     Args:
         trace: The traced method.
-        known: See `Directions.inputs`.
+        known: See `DerivativeDirections.inputs`.
         kind: Properties of the recording, and derivatives that are wanted.
 
     Raises:
@@ -318,10 +318,10 @@ def translate_filter(trace: Trace, known: tuple[Any, ...], kind: KernelKind) -> 
     values: list[Value] = []
     for k, leaf in enumerate(jax.tree.leaves(known)):
         number = host.add_input(np.asarray(leaf))
-        values.append(ParameterValue(number, k not in moving, k >= first_seed))
+        values.append(ParameterArray(number, k not in moving, k >= first_seed))
     tables, starts, outs, excess, changes = [], [], None, [], set[Node]()
     for variant in variants(exposed):
-        translation = PixelTranslation(graph, host)
+        translation = PixelTranslator(graph, host)
         last = 1 if variant.is_first(exposed) else 2  # the row that is a frame and has none after
         inputs = [_input(graph, *item, variant, last) for item in trace.inputs.items()]
         results = trace.translate(translation, [*values, *inputs])
@@ -356,7 +356,7 @@ def _input(
 ) -> Value:
     """Return an input of the traced function, an array of nodes."""
     if name in ("piece", "frame"):
-        return Constant(np.asarray(getattr(variant, name)), at_point=True)
+        return ConstantArray(np.asarray(getattr(variant, name)), at_point=True)
     level = Level.POINT
     if name in (*IMAGE_FIELDS, *COUNT_FIELDS, "before"):
         level = Level.TABLE
@@ -381,7 +381,7 @@ def _input(
 def _substitute(results: dict[str, Node], known: dict[Node, Node], graph: Graph) -> Any:
     """Put other nodes in place of some, and simplify what uses them."""
     new = dict(known)
-    for node in dependencies([*results.values()]):
+    for node in find_dependencies([*results.values()]):
         arguments = [a for a in node.args if isinstance(a, Node)]
         if node not in new and any(new.get(a, a) is not a for a in arguments):
             args = tuple(new.get(a, a) if isinstance(a, Node) else a for a in node.args)
@@ -390,7 +390,7 @@ def _substitute(results: dict[str, Node], known: dict[Node, Node], graph: Graph)
 
 
 def _slots(results: dict[str, Node]) -> list[Node]:
-    return [node for node in dependencies([*results.values()]) if node.op == "slot"]
+    return [node for node in find_dependencies([*results.values()]) if node.op == "slot"]
 
 
 def _fill_slots(results: dict[str, Node], table: list[Node], graph: Graph) -> dict[str, Node]:
@@ -470,7 +470,7 @@ class PixelFields:
             of_kind[name] = len(of_kind)
         cells |= {"on.0": len(cells), "off.0": len(cells) + 1}
         slots, known = {}, dict[Any, str]()
-        for node in dependencies(program.results()):
+        for node in find_dependencies(program.results()):
             if node.op == "slot":
                 if node.kind != "f":
                     raise TranslationError("a table that is not of real numbers")
@@ -482,7 +482,7 @@ class PixelFields:
         for variant, table in enumerate(program.tables):
             wanted += [table[k] for k in slots]
             wanted += [node for *_, node in program.table_derivatives(variant)]
-        used = {n.args[0].partition(".")[0] for n in dependencies(wanted) if n.op == "input"}
+        used = {n.args[0].partition(".")[0] for n in find_dependencies(wanted) if n.op == "input"}
         names = ["before.0", "before.1"] if "before" in used else []
         for name in IMAGE_FIELDS:
             names += [f"{name}.{row}" for row in range(N_PIECE_FRAMES) if name in used]
@@ -648,24 +648,24 @@ def write_filter(program: FilterProgram, stride: int) -> ModuleText:
     Raises:
         TranslationError: A number of the piece is not looked up at a point.
     """
-    if any(n.level == Level.PIECE for n in dependencies(program.results())):
+    if any(n.level == Level.PIECE for n in find_dependencies(program.results())):
         raise TranslationError("a number of the piece that is not looked up at a point")
     fields = PixelFields.of(program, stride)
-    writer = Writer(program, fields.addresses())
+    writer = ModuleWriter(program, fields.addresses())
     size = len(fields.cells) * stride
     writer.constants = [f"STRIDE, RECORDS, RECORD = {stride}, {size}, {fields.record}"]
     _define_sums(program, writer, fields)
     parts = [
         write(program, writer, fields) for write in (_write_events, _write_images, _write_tables)
     ]
-    lines = writer.lines(program.excess, 4)
-    lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(program.excess)]
+    lines = writer.write_lines(program.excess, 4)
+    lines += [f"    out[{k}] = {writer.node_name(node)}" for k, node in enumerate(program.excess)]
     parts.append(EXCESS_TEMPLATE.format(lines="\n".join(lines)))
     about = "The functions of a filter (`jaxevent.reconstruction.engine`)."
-    return writer.module(about, parts, fields, program.dtype)
+    return writer.write_module(about, parts, fields, program.dtype)
 
 
-def _define_sums(program: FilterProgram, writer: Writer, fields: PixelFields) -> None:
+def _define_sums(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> None:
     """Define the sums of vectors by which derivatives follow events and make images."""
     derivatives, lanes = program.derivatives, fields.lanes
     if derivatives is None:
@@ -685,18 +685,18 @@ def _define_sums(program: FilterProgram, writer: Writer, fields: PixelFields) ->
                 for node, k in derivatives.factors[name]
             )
             sums.append((place, terms))
-        writer.constants.append(f"{function} = vector_sums({lanes}, {tuple(sums)})")
+        writer.constants.append(f"{function} = make_vector_sums({lanes}, {tuple(sums)})")
 
 
-def _write_events(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
+def _write_events(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     addresses, factors = fields.addresses(), program.factors(*fields.states)
-    out = writer.lines([*program.state.values(), *factors], 12)
+    out = writer.write_lines([*program.state.values(), *factors], 12)
     for name, node in program.state.items():
         if node.op != "input" or node.args != (name,):
             pointer, _, offset = addresses[name]
-            out.append(f"            {pointer}[{offset} + z] = {writer.name(node)}")
+            out.append(f"            {pointer}[{offset} + z] = {writer.node_name(node)}")
     if fields.states:
-        given = "".join(f"{writer.name(node)}, " for node in factors)
+        given = "".join(f"{writer.node_name(node)}, " for node in factors)
         out.append("            record = RECORDS + z * RECORD")
         out.append(f"            follow(cells, record, cells, record, numbers, ({given}))")
     return EVENTS_TEMPLATE.format(
@@ -704,13 +704,13 @@ def _write_events(program: FilterProgram, writer: Writer, fields: PixelFields) -
     )
 
 
-def _write_images(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
+def _write_images(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     """Write images, and row by row, after the factors of their derivatives, these."""
     factors, derivatives = program.factors(*fields.outputs), []
-    lines = writer.lines([program.mean, program.variance, *factors], 12)
+    lines = writer.write_lines([program.mean, program.variance, *factors], 12)
     if fields.outputs:
         lines += [
-            f"            scratch[{k} * width + column] = {writer.name(node)}"
+            f"            scratch[{k} * width + column] = {writer.node_name(node)}"
             for k, node in enumerate(factors)
         ]
         given = "".join(f"scratch[{k} * width + column], " for k in range(len(factors)))
@@ -723,13 +723,13 @@ def _write_images(program: FilterProgram, writer: Writer, fields: PixelFields) -
     return IMAGES_TEMPLATE.format(
         since=len(factors),
         show="\n".join(lines),
-        mean=writer.name(program.mean),
-        variance=writer.name(program.variance),
+        mean=writer.node_name(program.mean),
+        variance=writer.node_name(program.variance),
         derivatives="\n".join(derivatives),
     )
 
 
-def _write_tables(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
+def _write_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     """Write what a piece says, for the pixels from begin to end."""
     stored = {k: fields.cells[name] for k, name in fields.slots.items() if name == f"slot{k}"}
     out, changes = list[str](), []
@@ -737,11 +737,15 @@ def _write_tables(program: FilterProgram, writer: Writer, fields: PixelFields) -
         changes = program.table_derivatives(variant)
         out.append(f"        if variant == {variant}:")
         out += ["            for i in range(pixels):", "                z = first + i"]
-        out += writer.lines([*(table[k] for k in stored), *(node for *_, node in changes)], 16)
+        out += writer.write_lines(
+            [*(table[k] for k in stored), *(node for *_, node in changes)], 16
+        )
         for k, at in stored.items():
-            out.append(f"                cells[{at} * STRIDE + z] = {writer.name(table[k])}")
+            out.append(f"                cells[{at} * STRIDE + z] = {writer.node_name(table[k])}")
         for j, (*_, node) in enumerate(changes):
-            out.append(f"                scratch[{j * TABLE_PIXELS} + i] = {writer.name(node)}")
+            out.append(
+                f"                scratch[{j * TABLE_PIXELS} + i] = {writer.node_name(node)}"
+            )
     if changes:
         out.append("        for i in range(pixels):")
         out.append("            record = RECORDS + (first + i) * RECORD")

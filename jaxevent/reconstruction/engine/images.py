@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.codegen import run_over_rows
-from jaxevent.codegen.derivative import Directions
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision, has_accelerator
@@ -386,7 +386,7 @@ class ImageKernel(abc.ABC):
         self._times = times - self.recording.origin
         self._arguments = method, recording, times, params
         self._turns = TurnLock(f"images of {recording.name}")
-        self._passes: dict[Directions, Any] = {}
+        self._passes: dict[DerivativeDirections, Any] = {}
         dead = params.without_gradient()
         numbers = [
             (leaf, k)
@@ -394,7 +394,7 @@ class ImageKernel(abc.ABC):
             if getattr(path[-1], "key", "point") not in {"point", *dead}
             for k in range(np.size(value))
         ]
-        self.check(params, Directions(tuple(numbers), ("mean", "variance")))
+        self.check(params, DerivativeDirections(tuple(numbers), ("mean", "variance")))
         self.number = next(_numbers)
         _image_kernels[self.number] = self
 
@@ -410,7 +410,11 @@ class ImageKernel(abc.ABC):
     def _key(self) -> tuple:
         return self.method, self.pixels, self.dtype.name
 
-    def passes_of(self, params: Any, directions: Directions = Directions()) -> Any:  # noqa: B008
+    def passes_of(
+        self,
+        params: Any,
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
+    ) -> Any:
         """Return the passes for some derivatives, which go on with these parameters.
 
         Args:
@@ -428,7 +432,7 @@ class ImageKernel(abc.ABC):
         return self._passes[directions]
 
     @abc.abstractmethod
-    def check(self, params: Any, directions: Directions) -> None:
+    def check(self, params: Any, directions: DerivativeDirections) -> None:
         """Raise `TranslationError` unless there are kernels for images and derivatives.
 
         Args:
@@ -437,7 +441,9 @@ class ImageKernel(abc.ABC):
         """
 
     @abc.abstractmethod
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+    def make(
+        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+    ) -> ImageBuffers:
         """Make images and their derivatives.
 
         Args:
@@ -450,7 +456,7 @@ class ImageKernel(abc.ABC):
         """
 
     def images(
-        self, rows: NDArray, params: Any, directions: Directions
+        self, rows: NDArray, params: Any, directions: DerivativeDirections
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Make images at some of the times.
 
@@ -481,12 +487,14 @@ class FilterImages(ImageKernel):
         super().__init__(method, recording, times, params)
         self._window = cut_window(self.recording, None, self.recording.windows.initial())
 
-    def check(self, params: Any, directions: Directions) -> None:
+    def check(self, params: Any, directions: DerivativeDirections) -> None:
         kind = self.passes_of(params).kind._replace(directions=directions)
         fixed = self.recording.fixed_inputs(self.clock_offset)
         check_filter_kernel(self.method, params, fixed, kind)
 
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+    def make(
+        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+    ) -> ImageBuffers:
         passes = self.passes_of(params, directions)
         passes.init(self._window)
         images = passes.image_buffers(len(times), self.pixels)
@@ -505,10 +513,12 @@ class SmootherImages(ImageKernel):
         self._whole = Segment(0, len(passes.clock))
         self._bands, _ = passes.partition(self._whole, self.recording.windows.initial())
 
-    def check(self, params: Any, directions: Directions) -> None:
+    def check(self, params: Any, directions: DerivativeDirections) -> None:
         SmootherPasses(self.recording, self.method, params, self.clock_offset, directions)
 
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+    def make(
+        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+    ) -> ImageBuffers:
         passes = self.passes_of(params, directions)
         images, image_times = passes.image_buffers(len(times)), passes.image_times(times, 0)
         given = passes.inputs(self._whole, self._bands, np.zeros(passes.layout.bands, np.int64))
@@ -629,7 +639,7 @@ def make_kernel_images(
 
 
 def _evaluate(
-    tree: Any, directions: Directions, number: Any, rows: Any, leaves: list[Any]
+    tree: Any, directions: DerivativeDirections, number: Any, rows: Any, leaves: list[Any]
 ) -> tuple[NDArray, ...]:
     kernel = _image_kernels[int(number)]
     params = jax.tree.unflatten(tree, [np.asarray(leaf) for leaf in leaves])
@@ -642,7 +652,7 @@ def _call_kernel(
 ) -> Any:
     kernel, outputs = about
     leaves, tree = jax.tree.flatten(params)
-    directions = Directions(numbers, outputs if numbers else Directions().of)
+    directions = DerivativeDirections(numbers, outputs if numbers else DerivativeDirections().of)
     shape = len(rows), kernel.pixels
     shapes = [jax.ShapeDtypeStruct(shape, kind) for kind in (kernel.dtype, kernel.dtype, bool)]
     if numbers:

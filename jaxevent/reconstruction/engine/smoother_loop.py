@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
-from jaxevent.codegen.derivative import Directions
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.reconstruction.engine.bands import (
     BandLayout,
     Bands,
@@ -451,7 +451,7 @@ class SmootherPasses:
         method: SmoothingMethod,
         params: Any,
         clock_offset: Any,
-        directions: Directions = Directions(),  # noqa: B008
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
         self.recording, self.dtype, self._method = recording, recording.dtype, method
         self.clock, self.layout = recording.windows.clock, recording.layout

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen.derivative import (
-    Directions,
+    DerivativeDirections,
     derivative_name,
     parse_derivative,
     with_derivatives,
@@ -26,11 +26,11 @@ from jaxevent.codegen.graph import (
     ParameterProgram,
     TranslationError,
     constant_value,
-    dependencies,
+    find_dependencies,
 )
 from jaxevent.codegen.module import CompiledProgram, KernelCache
-from jaxevent.codegen.trace import TracedFunction, name_leaves, translate_function
-from jaxevent.codegen.write import Address, ModuleText, Writer
+from jaxevent.codegen.trace import TracedFunction, named_leaves, translate_function
+from jaxevent.codegen.write import Address, ModuleText, ModuleWriter
 from jaxevent.reconstruction.engine.filter_program import EXCESS_TEMPLATE, IMAGE_FIELDS, KernelKind
 from jaxevent.reconstruction.video import ImageMethod
 
@@ -111,7 +111,7 @@ class SmootherProgram:
     work: tuple[str, ...]  # numbers of the frame that a pass has come to
     row: tuple[str, ...]  # numbers that are stored for every frame
     dtype: np.dtype
-    directions: Directions
+    directions: DerivativeDirections
 
     def derivatives(self, number: str) -> list[str]:
         """Return the names of a number's derivatives."""
@@ -120,7 +120,7 @@ class SmootherProgram:
     def uses(self, number: str) -> bool:
         """Return whether the functions read a number."""
         nodes = [n for f in self.functions.values() for n in f.results.values()]
-        return any(n.op == "input" and n.args == (number,) for n in dependencies(nodes))
+        return any(n.op == "input" and n.args == (number,) for n in find_dependencies(nodes))
 
 
 def _select_moving(made: dict[str, Any]) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def translate_smoother(
 
     Args:
         method: The smoother.
-        known: See `Directions.inputs`.
+        known: See `DerivativeDirections.inputs`.
         kind: Properties of the recording, and derivatives that are wanted.
 
     Raises:
@@ -191,7 +191,7 @@ def translate_smoother(
             zeros = {key for key, node in results if constant_value(node) == 0}
             dead |= {key for key in zeros if key.startswith(NEVER_CARRIED)}
     work = tuple(f"{name}.0" for name in WORK_FIELDS)
-    row = tuple(f"{name}.0" for name in (*ROW_FIELDS, *name_leaves("info", info)))
+    row = tuple(f"{name}.0" for name in (*ROW_FIELDS, *named_leaves("info", info)))
     program = SmootherProgram(made, host, work, row, kind.dtype, directions)
     moving = [n for n in work if n.partition(".")[0] in DIFFERENTIATED_TREES]
     work_derivatives = [s for n in moving for s in program.derivatives(n)]
@@ -238,7 +238,7 @@ def write_smoother(program: SmootherProgram, stride: int) -> ModuleText:
         for index, names in (("z", program.work), ("k", program.row))
         for i, name in enumerate(names)
     }
-    writer, parts = Writer(program, addresses), list[str]()
+    writer, parts = ModuleWriter(program, addresses), list[str]()
     for name, function in program.functions.items():
         uniform = {f"{n}.0": f"u{i}" for i, n in enumerate(UNIFORM_INPUTS.get(name, ()))}
         if "here.0" in uniform:
@@ -250,8 +250,8 @@ def write_smoother(program: SmootherProgram, stride: int) -> ModuleText:
             parts.append(_write_images(name, program, writer))
         elif name == "excess":
             totals = [results[n] for n in ("total.0", *program.derivatives("total.0"))]
-            lines = writer.lines(totals, 4)
-            lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(totals)]
+            lines = writer.write_lines(totals, 4)
+            lines += [f"    out[{k}] = {writer.node_name(node)}" for k, node in enumerate(totals)]
             parts.append(EXCESS_TEMPLATE.format(lines="\n".join(lines)))
         else:
             stored = {n: addresses[n] for n in results if n in addresses}
@@ -259,10 +259,10 @@ def write_smoother(program: SmootherProgram, stride: int) -> ModuleText:
             loops = _write_loops(results, targets, writer, PIXELS_LOOP_TEMPLATE, 8)
             parts.append(PIXELS_TEMPLATE.format(name=name, loops=loops))
     about = "The functions of a smoother (`jaxevent.reconstruction.engine`)."
-    return writer.module(about, parts, None, program.dtype)
+    return writer.write_module(about, parts, None, program.dtype)
 
 
-def _write_images(name: str, program: SmootherProgram, writer: Writer) -> str:
+def _write_images(name: str, program: SmootherProgram, writer: ModuleWriter) -> str:
     """Write a function of images, and of their derivatives."""
     results, directions = program.functions[name].results, program.directions
     arrays = {"mean": "mean", "covariance": "variance", "valid": "valid"}
@@ -277,7 +277,7 @@ def _write_images(name: str, program: SmootherProgram, writer: Writer) -> str:
 
 
 def _write_loops(
-    results: dict[str, Node], targets: dict[str, str], writer: Writer, loop: str, indent: int
+    results: dict[str, Node], targets: dict[str, str], writer: ModuleWriter, loop: str, indent: int
 ) -> str:
     """Write loops over pixels that store results: derivatives, one direction each, then the rest.
 
@@ -290,9 +290,9 @@ def _write_loops(
         groups.setdefault(derivative[1] if derivative else len(targets), []).append(key)
     out = []
     for _, keys in sorted(groups.items()):
-        lines = writer.lines([results[key] for key in keys], indent)
+        lines = writer.write_lines([results[key] for key in keys], indent)
         for key in keys:
-            value = writer.name(results[key])
+            value = writer.node_name(results[key])
             value = f"np.uint8({value})" if results[key].kind == "b" else value
             lines.append(f"{' ' * indent}{targets[key]} = {value}")
         out.append(loop.format(lines="\n".join(lines)))
