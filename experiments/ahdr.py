@@ -29,7 +29,7 @@ from jaxevent.parameters import read_toml
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
 from jaxevent.runs.scores import score
-from jaxevent.simulate import FITTING, SENSORS, TESTING, Pan, scene, simulate
+from jaxevent.simulate import FITTING_SCENES, SENSORS, TESTING_SCENES, Pan, scene, simulate
 from jaxevent.simulate.scenes import Speed
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fit_ahdr.toml"
@@ -167,10 +167,10 @@ def scenes_apart(rows: list[dict]) -> str:
     lines = []
     for label in labels:
         mine = [row for row in rows if row["method"] == label and row.get("z2") is not None]
-        own = {n: [r for r in mine if r["recording"].startswith(f"{n}_")] for n in TESTING}
+        own = {n: [r for r in mine if r["recording"].startswith(f"{n}_")] for n in TESTING_SCENES}
         if mine:
             lines.append([label, *map(calibration, own.values())])
-    return markdown_table(["z2 bright, dark, well", *TESTING], lines) + "\n"
+    return markdown_table(["z2 bright, dark, well", *TESTING_SCENES], lines) + "\n"
 
 
 def main() -> None:
@@ -180,14 +180,14 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=LABELS, default=LABELS, metavar="LABEL")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
-    paths = record(out / "test", TESTING, range(2, 2 + arguments.seeds), arguments.sensor)
+    paths = record(out / "test", TESTING_SCENES, range(2, 2 + arguments.seeds), arguments.sensor)
     fitted = out / "fitted"
     wanted = {*arguments.methods, *({"aks"} if "mc" in arguments.methods else ())}
     plan = read_toml(CONFIG)
     plan["method"] = [m for m in plan["method"] if m.get("label", m["name"]) in wanted]
     if plan["method"] and not (fitted / "params.toml").exists():
-        record(out / "fit", FITTING, range(1), arguments.sensor)
-        record(out / "validation", FITTING, range(1, 2), arguments.sensor)
+        record(out / "fit", FITTING_SCENES, range(1), arguments.sensor)
+        record(out / "validation", FITTING_SCENES, range(1, 2), arguments.sensor)
         os.environ["AHDR"] = str(out)
         config = out / "fit.toml"
         config.write_text(toml.dump(plan))

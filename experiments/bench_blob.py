@@ -16,7 +16,7 @@ from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.filters.motion import gated_moments
 from jaxevent.blob.lifecycle import init_state as begin_state
 from jaxevent.blob.prepare import ChunkPacker
-from jaxevent.simulate import Line, Target, blob_scene, simulate_blobs
+from jaxevent.simulate import LinearMotion, Target, blob_scene, simulate_blobs
 
 
 @numba.njit
@@ -163,7 +163,7 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
             )
             events[name] = len(many.events)
     paths = ((200, 300), (600, 50)), ((900, 400), (-500, 100)), ((600, 150), (0, 300))
-    lines = [Line(at, velocity, size=(8.0, 8.0)) for at, velocity in paths]
+    lines = [LinearMotion(at, velocity, size=(8.0, 8.0)) for at, velocity in paths]
     scene, _ = simulate_blobs([Target(line, 2.5e5) for line in lines], (1280, 720), 0.6, 2.5e5)
     found = "`find` at 1280x720"
     tasks[found] = functools.partial(find, scene, progress=False)

@@ -33,7 +33,7 @@ from jaxevent.io.hdf5_files import search_heaps
 from jaxevent.reconstruction.filtering import FrameModel, Observation, PixelState, Trajectory
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.simulate import Line, Target, motion_scene, simulate_blobs
+from jaxevent.simulate import LinearMotion, Target, motion_scene, simulate_blobs
 
 WIDTH, HEIGHT = 346, 260
 NUMBERS = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)  # of the filter, as the programs take them
@@ -518,7 +518,7 @@ GPU_EVENTS = 5_000_000
 def crossing_blobs() -> tuple[Any, list[tuple[float, float, float]]]:
     """Return 64 blobs that cross an image of 1280x720, and their beginnings."""
     places = [(100.0 + 140 * (k % 8), 60.0 + 80 * (k // 8)) for k in range(64)]
-    lines = [Line(at, (60.0, 20.0), size=(6.0, 6.0)) for at in places]
+    lines = [LinearMotion(at, (60.0, 20.0), size=(6.0, 6.0)) for at in places]
     recording, _ = simulate_blobs([Target(line, 1e4) for line in lines], (1280, 720), 1.0, 0.0)
     return recording, [(x, y, 12.0) for x, y in places]
 

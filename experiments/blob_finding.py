@@ -37,7 +37,7 @@ from jaxevent.blob.search.background import measure_background
 from jaxevent.blob.search.detection import clutter_model, detect, measure_blobs
 from jaxevent.blob.search.stream import Stream
 from jaxevent.recording import Recording
-from jaxevent.simulate.blobs import Truth
+from jaxevent.simulate.blobs import BlobTruth
 
 NORFAIR = importlib.util.find_spec("norfair") is not None
 
@@ -160,7 +160,7 @@ def track_by_norfair(
 
 
 def track_by_means(
-    recording: Recording, found: TargetSearchResult, truth: Truth, times: NDArray[np.int64]
+    recording: Recording, found: TargetSearchResult, truth: BlobTruth, times: NDArray[np.int64]
 ) -> Positions:
     """Follow each target by a centred mean, from its true position at the first time."""
     states = truth(times)
@@ -180,7 +180,7 @@ def track_by_means(
     return _of_lines(lines, times)
 
 
-def track_by_hand(recording: Recording, truth: Truth, times: NDArray[np.int64]) -> Positions:
+def track_by_hand(recording: Recording, truth: BlobTruth, times: NDArray[np.int64]) -> Positions:
     """Track by `moment` from seeds with scales of the truth; Q_v is acceleration times speed."""
     states, t = truth(times), times
     seen = truth.visible(times)
@@ -219,7 +219,9 @@ def _of_lines(lines: list[_Line], times: NDArray[np.int64]) -> Positions:
     return out
 
 
-def score(answer: Positions, truth: Truth, times: NDArray[np.int64], size: tuple[int, int]) -> dict:
+def score(
+    answer: Positions, truth: BlobTruth, times: NDArray[np.int64], size: tuple[int, int]
+) -> dict:
     """Return the scores that the module's docstring describes."""
     states = truth(times)
     states = states[:, (states[..., 4] > 0.5).any(0)]  # the others are hot pixels

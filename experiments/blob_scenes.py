@@ -16,18 +16,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate.blobs import (
-    Approach,
-    Circle,
-    Line,
-    Lissajous,
+    ApproachMotion,
+    BlobTruth,
+    CircularMotion,
+    LinearMotion,
+    LissajousMotion,
     Target,
-    Truth,
     blob_scene,
     simulate_blobs,
 )
 
 VGA, DAVIS, DVS, HD = (640, 480), (346, 260), (128, 128), (1280, 720)
-Scene = Callable[[int], tuple[Recording, Truth]]
+Scene = Callable[[int], tuple[Recording, BlobTruth]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Outline:
     segments are separated by NaN.
     """
 
-    motion: Line | Circle | Lissajous | Approach
+    motion: LinearMotion | CircularMotion | LissajousMotion | ApproachMotion
     rate: float
     corners: NDArray[np.float64]
     share: float = 0.9
@@ -133,7 +133,7 @@ def drifting(
     shape: str = "gaussian",
     frame: tuple[int, int] = VGA,
     **target,
-) -> tuple[Recording, Truth]:
+) -> tuple[Recording, BlobTruth]:
     """Targets that circle with random phases, so that they stay on the sensor."""
     rng = np.random.default_rng([seed, count])
     targets = []
@@ -144,7 +144,7 @@ def drifting(
         centre = (np.array([k % columns, k // columns]) + 0.5) * cell
         radius = float(max(0.35 * cell.min() - size, 2.0))
         turn = speed / radius * rng.choice([-1, 1])
-        motion = Circle(
+        motion = CircularMotion(
             tuple(centre), radius, turn, rng.uniform(0, 2 * np.pi), size=(size, 0.7 * size),
             theta=rng.uniform(0, np.pi),
         )  # fmt: skip
@@ -152,25 +152,29 @@ def drifting(
     return simulate_blobs(targets, frame, duration, noise, seed)
 
 
-def _mixed(seed: int) -> tuple[Recording, Truth]:
+def _mixed(seed: int) -> tuple[Recording, BlobTruth]:
     rng = np.random.default_rng([seed, 77])
     kinds = [(200, 15, 2.0)] * 2 + [(5e3, 250, 6.0)] * 2 + [(1e5, 2500, 14.0)]
     targets = []
     for k, (rate, speed, size) in enumerate(kinds):
         centre = (110 + 105 * k, 120 + 60 * (k % 4))
         radius = 25.0 + 12 * (k % 3) if k < 4 else 90.0
-        motion = Circle(centre, radius, speed / radius, rng.uniform(0, 6), size=(size, 0.7 * size))
+        motion = CircularMotion(
+            centre, radius, speed / radius, rng.uniform(0, 6), size=(size, 0.7 * size)
+        )
         targets.append(Target(motion, rate))
     return simulate_blobs(targets, VGA, 2.0, 5e3, seed)
 
 
-def _passing_discs(seed: int) -> tuple[Recording, Truth]:
+def _passing_discs(seed: int) -> tuple[Recording, BlobTruth]:
     """Two discs that touch for 0.1 s while they pass each other."""
     rng = np.random.default_rng([seed, 5])
     shift = rng.uniform(-20, 20)
     targets = [
         Target(
-            Line((320 - s * 120 + shift, 240 - s * 12.5), (s * 240.0, s * 10.0), size=(9.8, 9.8)),
+            LinearMotion(
+                (320 - s * 120 + shift, 240 - s * 12.5), (s * 240.0, s * 10.0), size=(9.8, 9.8)
+            ),
             3e4,
             "disc",
         )
@@ -201,7 +205,7 @@ class _MeetingMotion:
         return out
 
 
-def _turning_pair(seed: int) -> tuple[Recording, Truth]:
+def _turning_pair(seed: int) -> tuple[Recording, BlobTruth]:
     """Two rings that touch, turn about each other and part."""
     phase = np.random.default_rng([seed, 6]).uniform(0, 6)
     targets = [Target(_MeetingMotion(s, phase), 3e4, "ring") for s in (1, -1)]
@@ -222,7 +226,7 @@ class _StoppingMotion:
         return out
 
 
-def _stop_and_go(seed: int) -> tuple[Recording, Truth]:
+def _stop_and_go(seed: int) -> tuple[Recording, BlobTruth]:
     """One target that stands still, without events, for a second."""
     return simulate_blobs(
         [Target(_StoppingMotion(), 2e4, dropouts=((1.0, 2.0),))], VGA, 3.0, 2e4, seed
@@ -232,16 +236,16 @@ def _stop_and_go(seed: int) -> tuple[Recording, Truth]:
 def _hot(rng: np.random.Generator, number: int, frame: tuple[int, int]) -> list[Target]:
     """Pixels that fire all the time; too small to be scored."""
     return [
-        Target(Line((int(x), int(y)), size=(0.05, 0.05)), float(rng.uniform(100, 2000)))
+        Target(LinearMotion((int(x), int(y)), size=(0.05, 0.05)), float(rng.uniform(100, 2000)))
         for x, y in rng.uniform((0, 0), frame, (number, 2))
     ]
 
 
-def _noise_only(seed: int) -> tuple[Recording, Truth]:
+def _noise_only(seed: int) -> tuple[Recording, BlobTruth]:
     """Background and hot pixels; the one target is gone before the first time scored."""
     rng = np.random.default_rng([seed, 8])
     hot = [
-        Target(Line((int(x), int(y)), size=(0.05, 0.05)), 500.0)
+        Target(LinearMotion((int(x), int(y)), size=(0.05, 0.05)), 500.0)
         for x, y in rng.uniform((0, 0), VGA, (8, 2))
     ]
     return simulate_blobs(hot, VGA, 2.0, 2e4, seed)
@@ -286,7 +290,7 @@ def _polygon(corners: int, radius: float, rng: np.random.Generator) -> NDArray[n
 def _outline(
     half: float, rate: float, speed: float, frame: tuple[int, int], duration: float, kind: str
 ) -> Scene:
-    def scene(seed: int) -> tuple[Recording, Truth]:
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
         rng = np.random.default_rng([seed, 21])
         corners = {
             "square": lambda: _square(half),
@@ -302,7 +306,7 @@ def _outline(
         v = speed * np.array([np.cos(heading), np.sin(heading)])
         middle = np.array(frame) / 2 + rng.uniform(-0.1, 0.1, 2) * frame
         spin = 0.0 if kind == "edges" else rng.uniform(-1, 1) * speed / half
-        line = Line(tuple(middle - v * duration / 2), tuple(v), spin=spin)
+        line = LinearMotion(tuple(middle - v * duration / 2), tuple(v), spin=spin)
         outline: Any = Outline(line, rate, corners)  # what a target does
         return simulate_blobs([outline], frame, duration, 5e3, seed)
 
@@ -312,7 +316,7 @@ def _outline(
 def _one_polarity(on: bool) -> Scene:
     """Three blobs of which only one polarity is seen, one of them slow."""
 
-    def scene(seed: int) -> tuple[Recording, Truth]:
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
         recording, truth = drifting(3, 3e3, 150, 5, 2.0, 3e3, seed, frame=DAVIS)
         keep = (truth.source < 0) | (np.asarray(recording.events[:].p) == on)
         events = recording.events[:]
@@ -324,7 +328,7 @@ def _one_polarity(on: bool) -> Scene:
     return scene
 
 
-def _come_and_go(seed: int) -> tuple[Recording, Truth]:
+def _come_and_go(seed: int) -> tuple[Recording, BlobTruth]:
     """Twelve cross the sensor, one after another, some together."""
     rng = np.random.default_rng([seed, 31])
     targets = []
@@ -335,7 +339,9 @@ def _come_and_go(seed: int) -> tuple[Recording, Truth]:
         through = np.array(VGA) * rng.uniform(0.2, 0.8, 2)
         start = through - v * (begin + 1.0)
         targets.append(
-            Target(Line(tuple(start), tuple(v), size=(size, 0.7 * size)), rng.uniform(2e3, 2e4))
+            Target(
+                LinearMotion(tuple(start), tuple(v), size=(size, 0.7 * size)), rng.uniform(2e3, 2e4)
+            )
         )
     return simulate_blobs(targets, VGA, 4.0, 1e4, seed)
 
@@ -343,14 +349,14 @@ def _come_and_go(seed: int) -> tuple[Recording, Truth]:
 def _flicker(frame: tuple[int, int], size: float, rate: float) -> Scene:
     """Lamps of 100 Hz in the background, and two targets that pass before them."""
 
-    def scene(seed: int) -> tuple[Recording, Truth]:
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
         rng = np.random.default_rng([seed, 41])
         lamps = [
             Lamp(tuple(rng.uniform(0.15, 0.85, 2) * frame), rng.uniform(4, 20), 2e4, 1e-3)
             for _ in range(3)
         ]
         moves = [
-            Circle(tuple(np.array(frame) * (0.3 + 0.4 * k, 0.5)), 0.2 * frame[1], 2.0 + k,
+            CircularMotion(tuple(np.array(frame) * (0.3 + 0.4 * k, 0.5)), 0.2 * frame[1], 2.0 + k,
                 rng.uniform(0, 6), size=(size, 0.7 * size))
             for k in range(2)
         ]  # fmt: skip
@@ -412,7 +418,7 @@ def with_background(
     noise: float,
     seed: int,
     others: Sequence[Lamp | Texture],
-) -> tuple[Recording, Truth]:
+) -> tuple[Recording, BlobTruth]:
     """A scene with events of things that are no targets."""
     recording, truth = simulate_blobs(targets, frame, duration, noise, seed)
     events = recording.events[:]
@@ -443,18 +449,18 @@ def with_background(
 def _camera(speed: float, rate: float, contrast: float) -> Scene:
     """The camera moves, so that the whole scene does, and a target goes another way."""
 
-    def scene(seed: int) -> tuple[Recording, Truth]:
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
         rng = np.random.default_rng([seed, 71])
         heading = rng.uniform(0, 2 * np.pi)
         v = speed * np.array([np.cos(heading), np.sin(heading)])
-        own = Circle((173, 130), 70, 3.0, rng.uniform(0, 6), size=(6.0, 4.5))
+        own = CircularMotion((173, 130), 70, 3.0, rng.uniform(0, 6), size=(6.0, 4.5))
         scene = Texture(tuple(v), DAVIS, rate=rate, seed=seed)
         return with_background([Target(own, contrast)], DAVIS, 2.0, 2e3, seed, [scene])
 
     return scene
 
 
-def _stars(seed: int) -> tuple[Recording, Truth]:
+def _stars(seed: int) -> tuple[Recording, BlobTruth]:
     """43 that drift together, of 15 to 200 events/s each, and hot pixels."""
     rng = np.random.default_rng([seed, 81])
     v = rng.uniform(2, 6) * np.array([1.0, rng.uniform(-0.5, 0.5)])
@@ -464,13 +470,13 @@ def _stars(seed: int) -> tuple[Recording, Truth]:
         if all(np.hypot(*(p - q)) > 9 for q in kept) and len(kept) < 43:
             kept.append(p)
     targets = [
-        Target(Line(tuple(p - 5 * v), tuple(v), size=(1.2, 1.0)), float(rate))
+        Target(LinearMotion(tuple(p - 5 * v), tuple(v), size=(1.2, 1.0)), float(rate))
         for p, rate in zip(kept, np.exp(rng.uniform(np.log(15), np.log(200), 43)), strict=True)
     ]
     return simulate_blobs([*targets, *_hot(rng, 5, (240, 180))], (240, 180), 10.0, 2e3, seed)
 
 
-def _stops_and_turns(seed: int) -> tuple[Recording, Truth]:
+def _stops_and_turns(seed: int) -> tuple[Recording, BlobTruth]:
     """20 s of one large target that goes, stops, turns and goes on; few events while it rests."""
     rng = np.random.default_rng([seed, 91])
     t = np.array([0, 3, 5, 8, 11, 13, 16, 17, 20.0])
@@ -482,7 +488,7 @@ def _stops_and_turns(seed: int) -> tuple[Recording, Truth]:
     return simulate_blobs([moving], DAVIS, 20.0, 3e3, seed)
 
 
-def _thrown(seed: int) -> tuple[Recording, Truth]:
+def _thrown(seed: int) -> tuple[Recording, BlobTruth]:
     """A large target on a parabola, and flicker behind."""
     rng = np.random.default_rng([seed, 101])
     t = np.linspace(0, 1.2, 13)
@@ -492,34 +498,34 @@ def _thrown(seed: int) -> tuple[Recording, Truth]:
     return with_background([ball], VGA, 1.2, 1e4, seed, [lamp])
 
 
-def _approach(seed: int) -> tuple[Recording, Truth]:
+def _approach(seed: int) -> tuple[Recording, BlobTruth]:
     """One that grows from 3 to 20 px while it comes nearer."""
     rng = np.random.default_rng([seed, 111])
-    motion = Approach(
+    motion = ApproachMotion(
         (rng.uniform(-1, 1), rng.uniform(-0.5, 0.5)), 20.0, 5.6, (0.24, 0.2), focal=600,
         centre=(320, 240), size_factor=0.4, theta=0.3,
     )  # fmt: skip
     return simulate_blobs([Target(motion, 2e4)], VGA, 3.0, 1e4, seed)
 
 
-def _unsteady(seed: int) -> tuple[Recording, Truth]:
+def _unsteady(seed: int) -> tuple[Recording, BlobTruth]:
     """Two whose rate changes tenfold, four times a second."""
     gaps = tuple((a, a + 0.11) for a in np.arange(0.1, 3, 0.25))
     parts = []
     for k in range(2):
-        circle = Circle((120 + 110 * k, 130), 45, 2.5 - 4 * k, 0.3 * seed, size=(5.0, 4.0))
+        circle = CircularMotion((120 + 110 * k, 130), 45, 2.5 - 4 * k, 0.3 * seed, size=(5.0, 4.0))
         parts += [Target(circle, 1e3), Target(circle, 9e3, dropouts=gaps)]
     recording, truth = simulate_blobs(parts, DAVIS, 3.0, 3e3, seed)
     return recording, dataclasses.replace(truth, targets=truth.targets[::2])
 
 
-def _faint(seed: int) -> tuple[Recording, Truth]:
+def _faint(seed: int) -> tuple[Recording, BlobTruth]:
     """Three of 10 events/s that go 1 px/s, for 20 s."""
     return drifting(3, 10, 1, 1.5, 20.0, 100, seed, frame=(240, 180))
 
 
 def _noise(rate: float, frame: tuple[int, int], duration: float, hot: int) -> Scene:
-    def scene(seed: int) -> tuple[Recording, Truth]:
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
         rng = np.random.default_rng([seed, 121])
         return simulate_blobs(_hot(rng, hot, frame), frame, duration, rate, seed)
 

@@ -35,7 +35,7 @@ from jaxevent.blob import (
 from jaxevent.blob.quantities import inverse_ttc, size_range
 from jaxevent.recording import Recording
 from jaxevent.simulate import blob_scene
-from jaxevent.simulate.blobs import CARS, Approach, Truth
+from jaxevent.simulate.blobs import CAR_MOTIONS, ApproachMotion, BlobTruth
 
 CIRCLE, ELLIPSE = {"gate_shape": "circle"}, {"gate_shape": "ellipse"}
 CONSTANT = "constant velocity, R = 64 px^2"
@@ -65,7 +65,7 @@ def choose(method: str, **values: Any) -> Chosen:
 
 def track_targets(
     recording: Recording,
-    truth: Truth,
+    truth: BlobTruth,
     chosen: Chosen,
     size: float,
     seed: int,
@@ -115,7 +115,7 @@ def track_errors(states: TrackStates, true: np.ndarray, times: np.ndarray) -> di
     }
 
 
-def settling_time(tracks: Tracks, truth: Truth) -> float:
+def settling_time(tracks: Tracks, truth: BlobTruth) -> float:
     """ms until both sizes are within 20 % of the truth and stay so for 2 ms."""
     times = np.concatenate([np.arange(0, 6_000, 100), np.arange(6_000, 30_000, 500)])
     true = truth(times)[:, 0, 4:6]
@@ -154,7 +154,7 @@ def average_runs(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def score_methods(
-    scene: Callable[[int], tuple[Recording, Truth]],
+    scene: Callable[[int], tuple[Recording, BlobTruth]],
     methods: Sequence[str],
     seeds: Sequence[int],
     size: float = 20.0,
@@ -198,7 +198,7 @@ def growing(seeds: Sequence[int]) -> dict[str, Any]:
     for seed in seeds:
         recording, truth = blob_scene("growing", seed)
         motion = truth.targets[0].motion
-        assert isinstance(motion, Approach)
+        assert isinstance(motion, ApproachMotion)
         depth = motion.depth(times)
         for method in rows:
             tracks = track_targets(recording, truth, choose(method), 8.0, seed)
@@ -222,7 +222,7 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
     for seed in seeds[:3]:
         recording, truth = blob_scene("ttc", seed)
         motion = truth.targets[0].motion
-        assert isinstance(motion, Approach)
+        assert isinstance(motion, ApproachMotion)
         true = (motion.speed + motion.acceleration * times) / motion.depth(times)
         for method in rows:
             chosen = choose(method, preset="ttc")
@@ -251,7 +251,7 @@ def cars(seeds: Sequence[int]) -> dict[str, Any]:
         window = (1.0, 1.2)
         whose = np.concatenate([one.id for one in tracks.events(*window)])
         t = np.concatenate([one.t for one in tracks.events(*window)])
-        for car, (_, distance, speed, acceleration) in enumerate(CARS):
+        for car, (_, distance, speed, acceleration) in enumerate(CAR_MOTIONS):
             pair = 2 * car, 2 * car + 1
             every = np.unique(t[np.isin(whose, pair)])
             for name, told in (("smoothed", tracks), ("filtered", tracks.filtered)):

@@ -28,7 +28,7 @@ from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.scores import axis_error, relative_error, relative_magnitude_error
 from jaxevent.recording import Recording
 from jaxevent.simulate import motion_scene
-from jaxevent.simulate.motion import frame_events
+from jaxevent.simulate.motion import simulate_frame_events
 
 Row = dict[str, Any]
 Table = tuple[str, list[Row]]
@@ -165,7 +165,7 @@ def in_frames(
     """Return errors in the thesis' generator; start-up in frames."""
     params, runs, fill = Params.of(settings), [], []
     for seed in seeds:
-        recording, velocity = frame_events(flow, seed=seed, **made)
+        recording, velocity = simulate_frame_events(flow, seed=seed, **made)
         motion = voting.estimate(recording, params, seed=seed)
         frame = np.arange(SETTLE_FRAMES, len(flow) - 1)
         frame = frame[(frame + 1) * STEP <= motion.t[-1] * 1e-6]

@@ -38,7 +38,7 @@ from jaxevent.recording import Frames, Recording
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import frame_times, held_out
 from jaxevent.runs.scores import hidden_scores, moving_pixels
-from jaxevent.simulate import SENSORS, Objects, Pan, Source, scene, simulate
+from jaxevent.simulate import SENSORS, IntensitySource, MovingObjects, Pan, scene, simulate
 
 METHODS = ("blend", "flow", "edi", "akf", "aks", "mc")
 LIKELIHOOD = "aks, likelihood"  # the label of the smoother in a fit to slider_depth
@@ -256,7 +256,7 @@ def sensor(rate: float, exposure: float = 5e-3, samples: int = 8) -> Any:
     )
 
 
-def load_or_simulate(file: Path, source: Source, camera: Any, seed: int) -> Recording:
+def load_or_simulate(file: Path, source: IntensitySource, camera: Any, seed: int) -> Recording:
     """Return the recording of a source, kept in a file."""
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -264,8 +264,8 @@ def load_or_simulate(file: Path, source: Source, camera: Any, seed: int) -> Reco
     return jaxevent.load(file)
 
 
-def objects_at(folder: Path, rate: float, seed: int) -> tuple[Objects, Recording]:
-    source = Objects(seed=seed)
+def objects_at(folder: Path, rate: float, seed: int) -> tuple[MovingObjects, Recording]:
+    source = MovingObjects(seed=seed)
     file = folder / "recordings" / f"objects_{rate:g}Hz_{seed}.h5"
     return source, load_or_simulate(file, source, sensor(rate), seed)
 
@@ -287,7 +287,7 @@ def fitted_to_objects(folder: Path) -> Path:
     return out
 
 
-def truth_of(source: Source, times: NDArray[np.int64]) -> Frames:
+def truth_of(source: IntensitySource, times: NDArray[np.int64]) -> Frames:
     """Return the sharp images of a source at times (us)."""
     images = np.stack([source.intensity(float(t) * 1e-6) for t in times])
     return Frames(times, images.clip(0, 1).astype(np.float32), np.zeros_like(times))
@@ -327,15 +327,15 @@ def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
         store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
 
 
-def blurred_recordings(folder: Path) -> Iterator[tuple[Row, Source, Recording]]:
+def blurred_recordings(folder: Path) -> Iterator[tuple[Row, IntensitySource, Recording]]:
     """Iterate over recordings of long exposures, with scene, exposure and speed."""
     light, seed = make_panorama(), SCORING[0]
     for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
         size, duration = (160, 120), 7 / rate + exposure
-        source: Source = (
-            Objects(size, duration, speed, seed=seed)
+        source: IntensitySource = (
+            MovingObjects(size, duration, speed, seed=seed)
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )

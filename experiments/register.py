@@ -28,10 +28,10 @@ from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import (
     SENSORS,
+    BoxWorld,
     CameraMotion,
     Pan,
     Sensor,
-    World,
     make_texture,
     planar_motion,
     scene,
@@ -72,7 +72,7 @@ class PanoramaView:
 class CameraView:
     """View of a camera with a distorted lens, at `rotation`, `translation` from a moving one."""
 
-    world: World
+    world: BoxWorld
     motion: CameraMotion
     camera: PinholeCamera
     size: tuple[int, int]
@@ -152,7 +152,7 @@ def near_rig(
     rotation = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
     rig = register.Rig(one, two, rotation, np.array([-0.1, 0.01, 0.0]))
     texture = make_texture("noise", 0.012 * shrink, seed, 2.0)
-    world = World((-4.0, -4.0, -3.0), (4.0, 4.0, 2.0), texture)
+    world = BoxWorld((-4.0, -4.0, -3.0), (4.0, 4.0, 2.0), texture)
     motion = planar_motion(
         (20, -15), 2.0, one.fx, amplitude=(60, 90), frequency=1.3, phase=float(rng.uniform(0, 6))
     )

@@ -213,16 +213,16 @@ def _simulate_frames(
     from jaxevent import simulate as sim
     from jaxevent.io import save
     from jaxevent.io.output import complete
-    from jaxevent.simulate.scenes import SPEEDS
+    from jaxevent.simulate.scenes import PAN_SPEEDS_PX_S
 
     with complete(out) as partial:
         if scene is None:
             pace = _pace(speed, "200") or 90.0
-            source = sim.Objects(size or (160, 120), duration or 1.0, pace, seed=seed)
+            source = sim.MovingObjects(size or (160, 120), duration or 1.0, pace, seed=seed)
             name = "objects"
         else:
             way: Any = speed or "slow"
-            if way not in SPEEDS:
+            if way not in PAN_SPEEDS_PX_S:
                 raise InputError(f"--speed {way} is not possible for a scene; give slow or fast")
             panorama = sim.scene(int(scene) if scene.isdecimal() else scene)
             source = sim.Pan(panorama, size or (128, 96), duration or 1.5, way, seed)

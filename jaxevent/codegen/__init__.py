@@ -110,12 +110,12 @@ N_THREADS = (
 )
 
 
-def row_scratch(rows: int, *shape: int) -> NDArray[np.float32]:
+def row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
     """Return scratch (rows, ...) for kernels of `run_over_rows`: parts use that of their first row.
 
     Memory is taken by what is written alone.
     """
-    return np.empty((rows, *shape), np.float32)
+    return np.empty((n_rows, *shape), np.float32)
 
 
 @functools.cache
@@ -123,20 +123,20 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(N_THREADS)
 
 
-def run_over_rows(kernel: Callable, rows: int, *args: Any) -> None:
+def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
     """Call `kernel(begin, end, *args)` for parts of the rows, each on a thread of its own.
 
     Kernels release the interpreter's lock. What they compute must not depend on the parts.
     """
-    parts = min(N_THREADS, rows)
+    parts = min(N_THREADS, n_rows)
     if parts <= 1:
-        kernel(0, rows, *args)
+        kernel(0, n_rows, *args)
         return
-    edges = [rows * part // parts for part in range(parts + 1)]
+    edges = [n_rows * part // parts for part in range(parts + 1)]
     try:
         jobs = [_workers().submit(kernel, *edges[k : k + 2], *args) for k in range(parts)]
     except RuntimeError:  # the interpreter ends, and JAX waits for what it has begun
-        kernel(0, rows, *args)
+        kernel(0, n_rows, *args)
         return
     try:
         for job in jobs:

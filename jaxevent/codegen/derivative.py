@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxevent.codegen.functions import make_intrinsic
-from jaxevent.codegen.graph import Graph, Node, TranslationError, constant_value, dependencies
+from jaxevent.codegen.graph import Graph, Node, TranslationError, constant_value, find_dependencies
 from jaxevent.codegen.support import ir, types
 
 
-class Directions(NamedTuple):
+class DerivativeDirections(NamedTuple):
     """Numbers of the parameters by which derivatives are taken, and outputs that have them."""
 
     numbers: tuple[tuple[int, int], ...] = ()  # leaf of the parameters, number in it
@@ -59,13 +59,14 @@ def _is_real(leaf: Any) -> bool:
 
 
 def with_derivatives(
-    function: Callable[..., dict[str, Any]], outputs: Callable[[dict[str, Any]], dict[str, Any]]
+    function: Callable[..., dict[str, Any]],
+    select_outputs: Callable[[dict[str, Any]], dict[str, Any]],
 ) -> Callable[..., dict[str, Any]]:
     """Extend a function by the derivatives of its results along directions in the parameters.
 
     Args:
         function: A function of `(params, fixed)` and of named trees.
-        outputs: Selects what has derivatives of the dict that the function returns.
+        select_outputs: Selects what has derivatives of the dict that the function returns.
 
     Returns:
         A function of `(params, fixed, seeds)`, of the named trees, and of `sensitivities`: the
@@ -80,7 +81,7 @@ def with_derivatives(
 
         def compute(params: Any, real: Any) -> tuple[Any, Any]:
             made = function((params, fixed), **{**given, **eqx.combine(real, rest)})
-            return eqx.filter(outputs(made), _is_real), made
+            return eqx.filter(select_outputs(made), _is_real), made
 
         def push(seeds: Any, sensitivities: Any) -> Any:
             return jax.jvp(compute, (params, real), (seeds, sensitivities), has_aux=True)[1:]
@@ -109,7 +110,7 @@ def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node,
     Raises:
         TranslationError: The result is no such sum.
     """
-    nodes = dependencies([result], changes)
+    nodes = find_dependencies([result], changes)
     moving = set(changes)
     for node in nodes:
         if any(a in moving for a in node.args if isinstance(a, Node)):
@@ -160,15 +161,15 @@ Term = tuple[int, bool, int]  # which factor; whether of numbers; where the vect
 Sum = tuple[int, tuple[Term, ...]]  # where it is written to, and what is added up
 
 
-def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
-    """Make a function for kernels: sums of products of numbers and vectors of `lanes` numbers.
+def make_vector_sums(n_lanes: int, sums: tuple[Sum, ...]) -> Any:
+    """Make a function for kernels: sums of products of numbers and vectors of `n_lanes` numbers.
 
     `function(out, to, cells, at, numbers, factors)` writes the sums behind the place `to` of `out`.
     Vectors lie in `cells` behind the place `at`, or in `numbers`. All are read before any is
     written.
 
     Args:
-        lanes: Numbers of a vector.
+        n_lanes: Numbers of a vector.
         sums: For each sum where it goes, and its terms: which factor, whether the vector is of
             `numbers`, and where it begins.
     """
@@ -177,7 +178,7 @@ def vector_sums(lanes: int, sums: tuple[Sum, ...]) -> Any:
     @make_intrinsic
     def function(context: Any, out: Any, to: Any, cells: Any, at: Any, numbers: Any, factors: Any):
         def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            lines = _Vectors(builder, context.get_value_type(signature.args[0].dtype), lanes)
+            lines = _Vectors(builder, context.get_value_type(signature.args[0].dtype), n_lanes)
             out, to, cells, at, numbers, factors = arguments
             totals = []
             for _, terms in sums:
@@ -269,16 +270,18 @@ def collect_derivatives(
     Raises:
         TranslationError: They are no such sums.
     """
-    sums = {f"total.{k}." for k, node in enumerate(excess) if moving & set(dependencies([node]))}
+    sums = {
+        f"total.{k}." for k, node in enumerate(excess) if moving & set(find_dependencies([node]))
+    }
 
     def changes(node: Node) -> bool:
         if node.op == "slot":
-            below = dependencies([table[node.args[0]] for table in tables])
+            below = find_dependencies([table[node.args[0]] for table in tables])
             return any(changes(n) for n in below)
         name = str(node.args[0]) if node.op == "input" else ""
         return name.startswith(("sensitivities[", *sums)) or node in moving
 
-    every = dependencies([node for nodes in outs.values() for node in nodes])
+    every = find_dependencies([node for nodes in outs.values() for node in nodes])
     known = {node for node in every if changes(node)}
     # The factors of a change in all results: what has the same ones is one vector.
     found: dict[tuple[int, Node], dict[str, Node]] = {}

@@ -16,7 +16,7 @@ from jaxevent.codegen.support import intrinsic, ir, types
 
 F = np.float32
 INFINITE, NAN = F(np.inf), F(np.nan)
-ROOT = F(0.5**0.5)  # mantissas are taken between it and its double
+SQRT_HALF = F(0.5**0.5)  # mantissas are taken between it and its double
 
 
 def compile_function(function: Callable) -> Any:
@@ -92,7 +92,7 @@ def exp32(x):
 @compile_function
 def log32(x):
     bits = _as_bits(x)
-    n = (bits - _as_bits(ROOT)) >> np.int32(23)
+    n = (bits - _as_bits(SQRT_HALF)) >> np.int32(23)
     m, e = _as_real(bits - (n << np.int32(23))), F(n)
     y = m - F(1)
     z = y * y

@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr
 from numpy.typing import NDArray
 
 # Primitives that act element by element, by name.
-ELEMENTWISE: dict[str, Callable[..., Any]] = {
+ELEMENTWISE_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "add_any": np.add,
     "sub": np.subtract,
@@ -65,15 +65,15 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "copy_p": lambda x: x,
 }
 # Operations that are folded where all operands are constants.
-FOLDABLE: dict[str, Callable[..., Any]] = {
-    **ELEMENTWISE,
+FOLDABLE_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **ELEMENTWISE_FUNCTIONS,
     "div": lambda a, b: np.float64(a) / b,
     "to_f": float,
     "to_i": int,
     "to_b": bool,
 }
 
-COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
+COMPARISON_NAMES = ("lt", "le", "gt", "ge", "eq", "ne")
 
 
 class TranslationError(Exception):
@@ -142,9 +142,9 @@ class Graph:
         Tables and parameters are taken to be finite.
         """
         value = [constant_value(a) for a in args]
-        if op in FOLDABLE and all(v is not None for v in value):
+        if op in FOLDABLE_FUNCTIONS and all(v is not None for v in value):
             with np.errstate(all="ignore"):
-                return self.constant(FOLDABLE[op](*value))
+                return self.constant(FOLDABLE_FUNCTIONS[op](*value))
         if op == "mul":
             for k in (0, 1):
                 if value[k] == 1:
@@ -170,7 +170,7 @@ class Graph:
             if value[0] is not None:
                 return args[1 + int(value[0])]
             return self._selected(*args)
-        if op in COMPARISONS:
+        if op in COMPARISON_NAMES:
             return self._compared(op, args, value[1])
         return None
 
@@ -190,7 +190,7 @@ class Graph:
         number = args[0]
         if bound is None or number.op != "to_f" or number.args[0].kind != "b":
             return None
-        no, yes = (bool(FOLDABLE[op](float(b), bound)) for b in (False, True))
+        no, yes = (bool(FOLDABLE_FUNCTIONS[op](float(b), bound)) for b in (False, True))
         if no == yes:
             return self.constant(yes)
         return number.args[0] if yes else self.apply("not", (number.args[0],), "b")
@@ -199,10 +199,10 @@ class Graph:
         """Return the node that makes a number of a truth value, if there is one."""
         return self._known.get(("to_f", "f", truth.level, truth.number))
 
-    def suppose(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
+    def assume_truth(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
         """Return the results where a truth value is known."""
         found = {truth: self.constant(value)}
-        for node in dependencies([*results.values()], {truth}):
+        for node in find_dependencies([*results.values()], {truth}):
             if node not in found:
                 args = tuple(found.get(a, a) if isinstance(a, Node) else a for a in node.args)
                 found[node] = node if args == node.args else self.apply(node.op, args, node.kind)
@@ -218,7 +218,7 @@ def constant_value(node: Any) -> Any:
     return {"True": True, "False": False}[node.args[0]] if node.kind == "b" else int(node.args[0])
 
 
-def dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
+def find_dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
     """Return the nodes that results depend on, in order of creation.
 
     `stop` ones are followed no further.
@@ -236,8 +236,8 @@ def dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Nod
 
 
 # Operations on arrays in place of numbers.
-ARRAYS: dict[str, Callable[..., Any]] = {
-    **ELEMENTWISE,
+ARRAY_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **ELEMENTWISE_FUNCTIONS,
     "div": np.divide,
     "select_n": lambda c, a, b: np.where(c, b, a),
     "to_f": lambda x: np.asarray(x, float),
@@ -247,13 +247,13 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 
 
 def evaluate_nodes(
-    nodes: list[Node], known: Callable[[Any], Any], values: list[Any], dtype: np.dtype
+    nodes: list[Node], read_input: Callable[[Any], Any], values: list[Any], dtype: np.dtype
 ) -> list[Any]:
     """Evaluate expressions for arrays in place of numbers.
 
     Args:
         nodes: The expressions.
-        known: Returns the array of an input by its name, or of a slot by its number.
+        read_input: Returns the array of an input by its name, or of a slot by its number.
         values: Values of the `ParameterProgram`.
         dtype: Kind of real numbers.
 
@@ -262,30 +262,30 @@ def evaluate_nodes(
     """
     found: dict[Node, Any] = {}
     with np.errstate(all="ignore"):
-        for node in dependencies(nodes):
+        for node in find_dependencies(nodes):
             if node.op == "constant":
                 value = constant_value(node)
             elif node.op in ("input", "slot"):
-                value = known(node.args[0])
+                value = read_input(node.args[0])
             elif node.op == "number":
                 value = np.ravel(values[node.args[0]])[node.args[1]]
             elif node.op == "entry":
                 array = values[node.args[0]]
                 value = array[np.clip(found[node.args[1]], 0, len(array) - 1)]
             else:
-                value = ARRAYS[node.op](*(found[a] for a in node.args))
+                value = ARRAY_FUNCTIONS[node.op](*(found[a] for a in node.args))
             found[node] = np.asarray(value, dtype) if node.kind == "f" else np.asarray(value)
     return [found[node] for node in nodes]
 
 
-CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+JAXPR_PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
 def called_jaxpr(eqn: Any) -> Any | None:
     """Return the closed jaxpr that an equation only calls; None where it does more."""
     if eqn.primitive.name in ("scan", "while", "cond"):
         return None
-    for name in CALLS:
+    for name in JAXPR_PARAMETERS:
         if name in eqn.params:
             called = eqn.params[name]
             return called if hasattr(called, "consts") else ClosedJaxpr(called, [])
@@ -374,8 +374,8 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
         return _scan(eqn, values)
     with np.errstate(all="ignore"):
         made = move_elements(eqn, values)
-        if made is None and name in ELEMENTWISE:
-            made = ELEMENTWISE[name](*values)
+        if made is None and name in ELEMENTWISE_FUNCTIONS:
+            made = ELEMENTWISE_FUNCTIONS[name](*values)
         elif made is None and name == "div":
             whole = np.asarray(values[0]).dtype.kind in "iu"
             made = values[0] // values[1] if whole else values[0] / values[1]
@@ -392,18 +392,20 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
     return [np.asarray(made, eqn.outvars[0].aval.dtype)]
 
 
-def evaluate_jaxpr(closed: Any, values: list[NDArray]) -> list[NDArray]:
+def evaluate_jaxpr(closed_jaxpr: Any, values: list[NDArray]) -> list[NDArray]:
     """Evaluate a closed jaxpr for arrays."""
-    known: dict[Any, NDArray] = dict(zip(closed.jaxpr.invars, values, strict=True))
-    known |= dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+    known: dict[Any, NDArray] = dict(zip(closed_jaxpr.jaxpr.invars, values, strict=True))
+    known |= dict(
+        zip(closed_jaxpr.jaxpr.constvars, map(np.asarray, closed_jaxpr.consts), strict=True)
+    )
 
     def of(atom: Any) -> NDArray:
         return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
 
-    for eqn in closed.jaxpr.eqns:
+    for eqn in closed_jaxpr.jaxpr.eqns:
         made = evaluate_equation(eqn, [of(a) for a in eqn.invars])
         known |= dict(zip(eqn.outvars, made, strict=True))
-    return [of(a) for a in closed.jaxpr.outvars]
+    return [of(a) for a in closed_jaxpr.jaxpr.outvars]
 
 
 def evaluate_function(function: Callable[..., Any], *arrays: NDArray) -> NDArray:

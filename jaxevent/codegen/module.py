@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import cache
-from jaxevent.codegen.graph import TranslationError, dependencies
+from jaxevent.codegen.graph import TranslationError, find_dependencies
 from jaxevent.codegen.support import compiler_lock, numba
 from jaxevent.codegen.write import ModuleText
 from jaxevent.errors import InputError
@@ -125,14 +125,14 @@ class KernelCache:
         if self.max_nodes is not None and count_nodes(program) > self.max_nodes:
             raise TranslationError(f"more than {self.max_nodes} operations")
         text = self.write(program, *layout)
-        module = make_module(text.text)
+        module = compile_module(text.text)
         return text, self.functions(*(getattr(module, n) for n in self.functions._fields))
 
 
 def count_nodes(program: Any) -> int:
     """Count the operations of a program's functions."""
     results = [n for f in program.functions.values() for n in f.results.values()]
-    return len(dependencies(results))
+    return len(find_dependencies(results))
 
 
 def _match(
@@ -190,7 +190,7 @@ def make_kernel(
         return None
 
 
-def make_module(text: str) -> ModuleType:
+def compile_module(text: str) -> ModuleType:
     """Make a module from its text, in a file with its compiled functions beside it (`cache`).
 
     Raises:

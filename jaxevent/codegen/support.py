@@ -1,10 +1,10 @@
 """The interfaces of numba that this process can use: all that kernels want, public ones, or none.
 
 Kernels are compiled in less time, and kept for later processes, by interfaces that numba may change
-in any release. They are used with the releases of `TESTED` alone. With another release functions
-are compiled by `numba.njit` in every process: later, with equal results. Where numba cannot be
-imported, as beside a NumPy that it does not know, functions run as Python and XLA compiles what a
-kernel would compute.
+in any release. They are used with the releases of `TESTED_NUMBA_RELEASES` alone. With another
+release functions are compiled by `numba.njit` in every process: later, with equal results. Where
+numba cannot be imported, as beside a NumPy that it does not know, functions run as Python and XLA
+compiles what a kernel would compute.
 """
 
 import contextlib
@@ -15,7 +15,10 @@ from typing import Any
 
 __all__ = ["HAS_INTERNALS", "HAS_NUMBA", "compiler_lock", "intrinsic", "ir", "numba", "types"]
 
-TESTED = ((0, 61), (0, 68))  # first and last release of numba whose private interfaces are used
+TESTED_NUMBA_RELEASES = (
+    (0, 61),
+    (0, 68),
+)  # first and last release of numba whose private interfaces are used
 
 numba: Any = None
 types: Any = None  # numba's types
@@ -24,12 +27,16 @@ intrinsic: Any = None  # decorator of an operation of the compiler's own
 compiler_lock: Any = threading.RLock()  # held while numba compiles
 
 
-def is_tested(version: str) -> bool:
+def is_tested_release(version: str) -> bool:
     """Return whether the private interfaces of this version of numba are known."""
     numbers = version.split(".")[:2]
     if not all(number.isdecimal() for number in numbers):
         return False
-    return TESTED[0] <= tuple(int(number) for number in numbers) <= TESTED[1]
+    return (
+        TESTED_NUMBA_RELEASES[0]
+        <= tuple(int(number) for number in numbers)
+        <= TESTED_NUMBA_RELEASES[1]
+    )
 
 
 try:
@@ -53,7 +60,7 @@ if numba is not None:
         compiler_lock = importlib.import_module("numba.core.compiler_lock").global_compiler_lock
 
 HAS_NUMBA = numba is not None
-HAS_INTERNALS = HAS_NUMBA and is_tested(numba.__version__)
+HAS_INTERNALS = HAS_NUMBA and is_tested_release(numba.__version__)
 if HAS_INTERNALS:
     try:
         importlib.import_module("jaxevent.codegen.internals")

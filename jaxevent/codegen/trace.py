@@ -5,11 +5,11 @@ Arrays of a few rows and one pixel become their numbers. Arrays that only move t
 one node per element. Conditions on parameters alone choose their way here, so that a kernel holds
 nothing that its parameters switch off.
 
-A function may have one axis of elements, as the events of a step. It is traced with `ELEMENTS` of
-them, whatever their number will be. What is computed element by element becomes the body of a
-loop; sums and greatest values over the axis are reduced in it. What rests on such a sum comes after
-the loop, and its elements are computed in a loop of their own, from the inputs: that costs less
-than keeping them.
+A function may have one axis of elements, as the events of a step. It is traced with
+`ELEMENT_AXIS_LENGTH` of them, whatever their number will be. What is computed element by element
+becomes the body of a loop; sums and greatest values over the axis are reduced in it. What rests on
+such a sum comes after the loop, and its elements are computed in a loop of their own, from the
+inputs: that costs less than keeping them.
 """
 
 import dataclasses
@@ -22,30 +22,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen.graph import (
-    ELEMENTWISE,
+    ELEMENTWISE_FUNCTIONS,
     Graph,
     Level,
     Node,
     ParameterProgram,
     TranslationError,
     called_jaxpr,
-    dependencies,
     evaluate_equation,
+    find_dependencies,
     move_elements,
 )
 
-ELEMENTS = 7919  # elements in a trace: a prime that no other axis has
-REDUCTIONS = ("total", "largest", "place")  # operations over the axis
-SHAPE_PARAMETERS = ("shape", "new_sizes", "sizes", "limit_indices", "slice_sizes")
-REDUCE_OPERATIONS = {
+ELEMENT_AXIS_LENGTH = 7919  # elements in a trace: a prime that no other axis has
+ELEMENT_REDUCTIONS = ("total", "largest", "place")  # operations over the axis
+SHAPE_VALUED_PARAMETERS = ("shape", "new_sizes", "sizes", "limit_indices", "slice_sizes")
+OPERATION_BY_REDUCTION = {
     "reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_or": "or",
     "reduce_and": "and",
 }  # fmt: skip
-KINDS = {"f": "f", "i": "i", "u": "i", "b": "b"}
+KIND_BY_DTYPE = {"f": "f", "i": "i", "u": "i", "b": "b"}
 
 
 @dataclasses.dataclass(frozen=True)
-class Constant:
+class ConstantArray:
     """Array that is known when the program is written.
 
     `at_point`: it depends on where a point lies, which differs between variants of a program.
@@ -56,7 +56,7 @@ class Constant:
 
 
 @dataclasses.dataclass(frozen=True)
-class ParameterValue:
+class ParameterArray:
     """Array that is known with the parameters: a value of the `ParameterProgram`.
 
     Kernels leave out elements of `sparse` ones that are 0. `change`: it is a derivative.
@@ -67,10 +67,10 @@ class ParameterValue:
     change: bool = False
 
 
-Value = Constant | ParameterValue | NDArray  # an array of nodes
+Value = ConstantArray | ParameterArray | NDArray  # an array of nodes
 
 
-class Translation:
+class JaxprTranslator:
     """Translator of jaxprs into one graph.
 
     Families override `translate_special` and `translate_lookup`.
@@ -85,7 +85,7 @@ class Translation:
         return None
 
     def translate_lookup(self, found: NDArray, kind: str) -> NDArray:
-        """Translate elements that were looked up by a `Constant` at a point."""
+        """Translate elements that were looked up by a `ConstantArray` at a point."""
         raise TranslationError("a look-up at a place")
 
     def run(self, closed: Any, values: list[Value]) -> list[Value]:
@@ -93,10 +93,10 @@ class Translation:
         jaxpr = closed.jaxpr
         known: dict[Any, Value] = dict(zip(jaxpr.invars, values, strict=True))
         for var, const in zip(jaxpr.constvars, closed.consts, strict=True):
-            known[var] = Constant(np.asarray(const))
+            known[var] = ConstantArray(np.asarray(const))
 
         def of(atom: Any) -> Value:
-            return Constant(np.asarray(atom.val)) if hasattr(atom, "val") else known[atom]
+            return ConstantArray(np.asarray(atom.val)) if hasattr(atom, "val") else known[atom]
 
         for eqn in jaxpr.eqns:
             made = self._equation(eqn, [of(a) for a in eqn.invars])
@@ -107,19 +107,19 @@ class Translation:
         """Return a value as an array of nodes."""
         if isinstance(value, np.ndarray):
             return value
-        number = value.number if isinstance(value, ParameterValue) else None
-        array = value.value if isinstance(value, Constant) else self.host.values[value.number]
+        number = value.number if isinstance(value, ParameterArray) else None
+        array = value.value if isinstance(value, ConstantArray) else self.host.values[value.number]
         out = np.empty(array.shape, object)
-        sparse = isinstance(value, ParameterValue) and value.sparse
+        sparse = isinstance(value, ParameterArray) and value.sparse
         if number is not None and sparse:
             self.host.zeros[number] = array == 0
         for flat, place in enumerate(np.ndindex(*array.shape)):
             if number is None or (sparse and array[place] == 0):
                 out[place] = self.graph.constant(array[place])
             else:
-                kind = KINDS[array.dtype.kind]
+                kind = KIND_BY_DTYPE[array.dtype.kind]
                 node = self.graph.node("number", (number, flat), kind, Level.HOST)
-                if isinstance(value, ParameterValue) and value.change:
+                if isinstance(value, ParameterArray) and value.change:
                     self.changes.add(node)
                 out[place] = node
         return out
@@ -127,16 +127,16 @@ class Translation:
     def _equation(self, eqn: Any, values: list[Value]) -> list[Value]:
         called = called_jaxpr(eqn)
         chosen = values[0] if eqn.primitive.name == "cond" else None
-        if isinstance(chosen, Constant):
+        if isinstance(chosen, ConstantArray):
             called, values = eqn.params["branches"][int(chosen.value)], values[1:]
         if called is not None:
             return self.run(called, values)
-        if all(isinstance(v, Constant) for v in values):
-            at_point = any(v.at_point for v in values if isinstance(v, Constant))
-            arrays = [v.value for v in values if isinstance(v, Constant)]
-            return [Constant(made, at_point) for made in evaluate_equation(eqn, arrays)]
-        if all(isinstance(v, Constant | ParameterValue) for v in values):
-            if not any(isinstance(v, Constant) and v.at_point for v in values):
+        if all(isinstance(v, ConstantArray) for v in values):
+            at_point = any(v.at_point for v in values if isinstance(v, ConstantArray))
+            arrays = [v.value for v in values if isinstance(v, ConstantArray)]
+            return [ConstantArray(made, at_point) for made in evaluate_equation(eqn, arrays)]
+        if all(isinstance(v, ConstantArray | ParameterArray) for v in values):
+            if not any(isinstance(v, ConstantArray) and v.at_point for v in values):
                 return self._of_parameters(eqn, values)
         if eqn.primitive.name in ("split", "unstack"):
             return self.split_array(eqn, values[0])
@@ -149,23 +149,23 @@ class Translation:
         return [part.reshape(var.aval.shape) for part, var in zip(parts, eqn.outvars, strict=True)]
 
     def _of_parameters(self, eqn: Any, values: list[Any]) -> list[Value]:
-        arguments = [v.number if isinstance(v, ParameterValue) else v.value for v in values]
+        arguments = [v.number if isinstance(v, ParameterArray) else v.value for v in values]
         numbers = self.host.add(eqn, arguments)
-        known = [v for v in values if isinstance(v, ParameterValue)]
+        known = [v for v in values if isinstance(v, ParameterArray)]
         sparse, change = any(v.sparse for v in known), any(v.change for v in known)
         out: list[Value] = []
         for number in numbers:
             if self.host.values[number].dtype == bool:
                 self.host.conditions.append(number)
-                out.append(Constant(self.host.values[number]))
+                out.append(ConstantArray(self.host.values[number]))
             else:
                 real = self.host.values[number].dtype.kind == "f"  # places have no derivatives
-                out.append(ParameterValue(number, sparse, change and real))
+                out.append(ParameterArray(number, sparse, change and real))
         return out
 
     def _symbolic(self, eqn: Any, values: list[Value]) -> NDArray:
         name = eqn.primitive.name
-        kind = KINDS.get(eqn.outvars[0].aval.dtype.kind)
+        kind = KIND_BY_DTYPE.get(eqn.outvars[0].aval.dtype.kind)
         if kind is None or len(eqn.outvars) > 1:
             raise TranslationError(f"the operation {name!r}")
         own = self.translate_special(eqn, values)
@@ -178,9 +178,11 @@ class Translation:
         moved = move_elements(eqn, [self.nodes(v) for v in values])
         if moved is not None:
             return moved
-        if name in REDUCE_OPERATIONS:
+        if name in OPERATION_BY_REDUCTION:
             return self.reduce_axes(
-                REDUCE_OPERATIONS[name], self.nodes(values[0]), list(map(int, eqn.params["axes"]))
+                OPERATION_BY_REDUCTION[name],
+                self.nodes(values[0]),
+                list(map(int, eqn.params["axes"])),
             )
         if name == "argmax":
             return self._argmax(self.nodes(values[0]), int(eqn.params["axes"][0]))
@@ -209,7 +211,7 @@ class Translation:
             return self._select(args, kind)
         if name == "div" and kind == "f":
             return apply(name, tuple(args), kind)
-        if name in ELEMENTWISE:
+        if name in ELEMENTWISE_FUNCTIONS:
             return apply(name.removesuffix("_any"), tuple(args), kind)
         raise TranslationError(f"the operation {name!r}")
 
@@ -282,7 +284,7 @@ class Translation:
     def _set(self, eqn: Any, values: list[Value]) -> NDArray:
         """Replace single elements of an array, at known places."""
         numbers, places = eqn.params["dimension_numbers"], values[1]
-        if not isinstance(places, Constant) or numbers.update_window_dims or places.at_point:
+        if not isinstance(places, ConstantArray) or numbers.update_window_dims or places.at_point:
             raise TranslationError("elements set at places of data")
         out, new = self.nodes(values[0]).copy(), self.nodes(values[2])
         order = numbers.scatter_dims_to_operand_dims
@@ -294,14 +296,14 @@ class Translation:
 
     def _lookup(self, eqn: Any, values: list[Value], kind: str) -> NDArray:
         table, *places = values
-        if all(isinstance(p, Constant) for p in places):
-            entries = [p.value for p in places if isinstance(p, Constant)]
+        if all(isinstance(p, ConstantArray) for p in places):
+            entries = [p.value for p in places if isinstance(p, ConstantArray)]
             found = move_elements(eqn, [self.nodes(table), *entries])
             assert found is not None
-            if not any(p.at_point for p in places if isinstance(p, Constant)):
+            if not any(p.at_point for p in places if isinstance(p, ConstantArray)):
                 return found
             return self.translate_lookup(found, kind)
-        if eqn.primitive.name == "gather" and isinstance(table, ParameterValue):
+        if eqn.primitive.name == "gather" and isinstance(table, ParameterArray):
             index, sizes = self.nodes(places[0]), eqn.params["slice_sizes"]
             size = self.host.values[table.number].shape[-1]
             if index.shape[-1:] == (1,) and sizes == (1,):
@@ -314,7 +316,7 @@ class Translation:
                 return np.stack(found, numbers.offset_dims[0])
         raise TranslationError("a look-up with an index of data")
 
-    def _table_entries(self, table: ParameterValue, index: NDArray, kind: str) -> NDArray:
+    def _table_entries(self, table: ParameterArray, index: NDArray, kind: str) -> NDArray:
         """Look up entries of a table of one axis by an index of data."""
         out, array = np.empty(index.shape, object), self.host.values[table.number]
         if table.sparse or table.change:
@@ -329,7 +331,7 @@ class Translation:
             out[place] = node
         return out
 
-    def _table_row(self, table: ParameterValue, row: int, size: int) -> ParameterValue:
+    def _table_row(self, table: ParameterArray, row: int, size: int) -> ParameterArray:
         """Return a row of a table."""
         out = [types.SimpleNamespace(aval=self.host.values[table.number])]
         cut = {"start_indices": (row, 0), "limit_indices": (row + 1, size), "strides": None}
@@ -341,7 +343,7 @@ class Translation:
         return dataclasses.replace(table, number=number)
 
 
-class ElementTranslation(Translation):
+class ElementTranslator(JaxprTranslator):
     """Translator of functions with one axis of elements; with `single`, of one element only."""
 
     def __init__(self, graph: Graph, host: ParameterProgram, single: bool):
@@ -350,9 +352,11 @@ class ElementTranslation(Translation):
 
     def _equation(self, eqn: Any, values: list[Value]) -> list[Value]:
         name = eqn.primitive.name
-        if any(isinstance(v, Constant) and ELEMENTS in v.value.shape for v in values):
+        if any(
+            isinstance(v, ConstantArray) and ELEMENT_AXIS_LENGTH in v.value.shape for v in values
+        ):
             raise TranslationError("a table of elements")
-        marked = [ELEMENTS in np.shape(v.aval) for v in (*eqn.invars, *eqn.outvars)]
+        marked = [ELEMENT_AXIS_LENGTH in np.shape(v.aval) for v in (*eqn.invars, *eqn.outvars)]
         if name in ("split", "unstack") and any(marked):
             raise TranslationError("a split of elements")
         if name == "iota" and any(marked) and not self.single:
@@ -362,10 +366,12 @@ class ElementTranslation(Translation):
     def _element_numbers(self, eqn: Any) -> NDArray:
         """Return the elements' own numbers, from 0 on."""
         shape, along = eqn.params["shape"], eqn.params["dimension"]
-        if shape[along] != ELEMENTS:
+        if shape[along] != ELEMENT_AXIS_LENGTH:
             raise TranslationError("a table of elements")
         number = self.graph.input("element", "i", Level.ELEMENT)
-        return np.full([1 if size == ELEMENTS else size for size in shape], number, object)
+        return np.full(
+            [1 if size == ELEMENT_AXIS_LENGTH else size for size in shape], number, object
+        )
 
     def translate_special(self, eqn: Any, values: list[Value]) -> NDArray | None:
         name = eqn.primitive.name
@@ -374,7 +380,7 @@ class ElementTranslation(Translation):
             return None
         if name == "dot_general":
             return self._reduce_product(eqn, values)
-        if name not in (*REDUCE_OPERATIONS, "argmax"):
+        if name not in (*OPERATION_BY_REDUCTION, "argmax"):
             raise TranslationError(f"the operation {name!r} over elements")
         array = self.nodes(values[0])
         if not self.single:
@@ -386,7 +392,7 @@ class ElementTranslation(Translation):
             array = np.full(array.shape, self.graph.constant(0), object)
         axes = [int(a) for a in eqn.params["axes"] if a not in along]
         if axes:
-            array = self.reduce_axes(REDUCE_OPERATIONS[name], array, axes)
+            array = self.reduce_axes(OPERATION_BY_REDUCTION[name], array, axes)
             along = [a - sum(b < a for b in axes) for a in along]
         return array.squeeze(tuple(along))
 
@@ -449,33 +455,38 @@ class ElementTranslation(Translation):
 
 
 def _with_one_element(eqn: Any) -> Any:
-    """Return an equation with one element for `ELEMENTS`; `along` are the axes that it reduces."""
+    """Return an equation with one element for `ELEMENT_AXIS_LENGTH`.
+
+    `along` are the axes that it reduces.
+    """
     name, p = eqn.primitive.name, dict(eqn.params)
     shapes = [np.shape(v.aval) for v in eqn.invars]
     if name == "slice":
         for axis, size in enumerate(shapes[0]):
             given = p["start_indices"][axis], p["limit_indices"][axis]
-            if size == ELEMENTS and (
-                given != (0, ELEMENTS) or (p["strides"] or [1] * 9)[axis] != 1
+            if size == ELEMENT_AXIS_LENGTH and (
+                given != (0, ELEMENT_AXIS_LENGTH) or (p["strides"] or [1] * 9)[axis] != 1
             ):
                 raise TranslationError("single elements")
-    if name == "concatenate" and any(shape[p["dimension"]] == ELEMENTS for shape in shapes):
+    if name == "concatenate" and any(
+        shape[p["dimension"]] == ELEMENT_AXIS_LENGTH for shape in shapes
+    ):
         raise TranslationError("elements joined to others")
     if name in ("gather", "scatter", "dynamic_slice", "rev", "pad", "sort"):
         table = shapes[0] if name != "gather" else ()
-        if any(ELEMENTS in shape for shape in (table, *shapes[1:])):
+        if any(ELEMENT_AXIS_LENGTH in shape for shape in (table, *shapes[1:])):
             raise TranslationError(f"the operation {name!r} over elements")
-    if name == "dot_general" and np.shape(eqn.outvars[0].aval).count(ELEMENTS) > 1:
+    if name == "dot_general" and np.shape(eqn.outvars[0].aval).count(ELEMENT_AXIS_LENGTH) > 1:
         raise TranslationError("a matrix product of elements with elements")
-    for key in SHAPE_PARAMETERS:
+    for key in SHAPE_VALUED_PARAMETERS:
         if key in p and p[key] is not None:
-            p[key] = tuple(1 if size == ELEMENTS else size for size in p[key])
+            p[key] = tuple(1 if size == ELEMENT_AXIS_LENGTH else size for size in p[key])
     axes = p["dimension_numbers"][0][0] if name == "dot_general" else p.get("axes", ())
-    along = [int(a) for a in axes if shapes and shapes[0][a] == ELEMENTS]
+    along = [int(a) for a in axes if shapes and shapes[0][a] == ELEMENT_AXIS_LENGTH]
     outs = [
         types.SimpleNamespace(
             aval=types.SimpleNamespace(
-                shape=tuple(1 if size == ELEMENTS else size for size in v.aval.shape),
+                shape=tuple(1 if size == ELEMENT_AXIS_LENGTH else size for size in v.aval.shape),
                 dtype=v.aval.dtype,
             )
         )
@@ -495,9 +506,9 @@ class TracedFunction:
     def phases(self) -> dict[Node, int]:
         """Return the number of loops after which each node is known."""
         found: dict[Node, int] = {}
-        for node in dependencies([*self.results.values()]):
+        for node in find_dependencies([*self.results.values()]):
             arguments = [found[a] for a in node.args if isinstance(a, Node)]
-            found[node] = max(arguments, default=0) + (node.op in REDUCTIONS)
+            found[node] = max(arguments, default=0) + (node.op in ELEMENT_REDUCTIONS)
         return found
 
 
@@ -511,64 +522,64 @@ class TracedProgram:
     dtype: np.dtype
 
 
-def name_leaves(name: str, tree: Any) -> dict[str, Any]:
+def named_leaves(name: str, tree: Any) -> dict[str, Any]:
     """Return the leaves of a tree of arrays or shapes, by their names in kernels."""
     found = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {name + jax.tree_util.keystr(path): leaf for path, leaf in found}
 
 
-def name_numbers(name: str, leaf: Any, elements: bool = True) -> list[str]:
+def number_names(name: str, leaf: Any, elements: bool = True) -> list[str]:
     """Return the names of a leaf's single numbers; an axis of elements counts once."""
-    shape = [1 if size == ELEMENTS and elements else size for size in np.shape(leaf)]
+    shape = [1 if size == ELEMENT_AXIS_LENGTH and elements else size for size in np.shape(leaf)]
     return [f"{name}.{k}" for k in range(int(np.prod(shape)))]
 
 
 @dataclasses.dataclass(frozen=True)
-class Trace:
+class TracedJaxpr:
     """Jaxpr of a function of parameters and named inputs."""
 
     jaxpr: Any
     inputs: dict[str, jax.ShapeDtypeStruct]  # beside the parameters
     outputs: dict[str, jax.ShapeDtypeStruct]
 
-    def translate(self, translation: Translation, values: list[Value]) -> dict[str, Node]:
+    def translate(self, translation: JaxprTranslator, values: list[Value]) -> dict[str, Node]:
         """Translate the function for values of its parameters and inputs: results by name."""
         made = iter(translation.run(self.jaxpr, values))
         results: dict[str, Node] = {}
         for name, leaf in self.outputs.items():
             nodes = np.ravel(translation.nodes(next(made)))
-            results |= dict(zip(name_numbers(name, leaf), nodes, strict=True))
+            results |= dict(zip(number_names(name, leaf), nodes, strict=True))
         return results
 
 
-def trace_function(function: Callable, params: Any, given: Mapping[str, Any]) -> Trace:
+def trace_function(function: Callable, params: Any, input_trees: Mapping[str, Any]) -> TracedJaxpr:
     """Trace `function(params, **given)`, which returns a dict.
 
     Args:
         function: A function of pytrees.
         params: Its parameters.
-        given: Trees of shapes, by the names of the other arguments.
+        input_trees: Trees of shapes, by the names of the other arguments.
 
     Raises:
         TranslationError: The function fails, whatever it raises.
     """
     try:
         call = lambda p, v: function(p, **v)  # noqa: E731
-        closed, shapes = jax.make_jaxpr(call, return_shape=True)(params, dict(given))
+        closed, shapes = jax.make_jaxpr(call, return_shape=True)(params, dict(input_trees))
     except Exception as error:
         about = f"its functions fail for one pixel or target: {error}"
         raise TranslationError(about.partition("\n")[0]) from error
     inputs, outputs = (
-        {leaf: v for name in sorted(trees) for leaf, v in name_leaves(name, trees[name]).items()}
-        for trees in (given, shapes)
+        {leaf: v for name in sorted(trees) for leaf, v in named_leaves(name, trees[name]).items()}
+        for trees in (input_trees, shapes)
     )
-    return Trace(closed, inputs, outputs)
+    return TracedJaxpr(closed, inputs, outputs)
 
 
 def translate_function(
     function: Callable,
     params: Any,
-    given: Mapping[str, Any],
+    input_trees: Mapping[str, Any],
     graph: Graph,
     host: ParameterProgram,
     *,
@@ -581,8 +592,8 @@ def translate_function(
     Args:
         function: A function of pytrees.
         params: Its parameters.
-        given: Trees of shapes, by the names of the other arguments; an axis of `ELEMENTS` has
-            elements.
+        input_trees: Trees of shapes, by the names of the other arguments; an axis of
+            `ELEMENT_AXIS_LENGTH` has elements.
         graph: Graph to which the expressions are added.
         host: Program whose inputs are the leaves of the parameters.
         single: Whether there is one element only.
@@ -592,21 +603,21 @@ def translate_function(
     Raises:
         TranslationError: There is no translation.
     """
-    trace, known = trace_function(function, params, given), len(jax.tree.leaves(params))
-    values: list[Value] = [ParameterValue(k, k >= known - seeds) for k in range(known)]
+    trace, known = trace_function(function, params, input_trees), len(jax.tree.leaves(params))
+    values: list[Value] = [ParameterArray(k, k >= known - seeds) for k in range(known)]
     values += [_inputs(graph, n, leaf, single, zeros) for n, leaf in trace.inputs.items()]
-    return TracedFunction(trace.translate(ElementTranslation(graph, host, single), values))
+    return TracedFunction(trace.translate(ElementTranslator(graph, host, single), values))
 
 
 def _inputs(graph: Graph, name: str, leaf: Any, single: bool, zeros: Collection[str]) -> Value:
-    shape = tuple(1 if size == ELEMENTS else size for size in leaf.shape)
-    elements = ELEMENTS in leaf.shape and not single
+    shape = tuple(1 if size == ELEMENT_AXIS_LENGTH else size for size in leaf.shape)
+    elements = ELEMENT_AXIS_LENGTH in leaf.shape and not single
     level = Level.ELEMENT if elements else Level.POINT
     out = np.empty(shape, object)
-    names = iter(name_numbers(name, leaf))
+    names = iter(number_names(name, leaf))
     for place in np.ndindex(*shape):
         number = next(names)
         none = number in zeros
-        kind = KINDS[leaf.dtype.kind]
+        kind = KIND_BY_DTYPE[leaf.dtype.kind]
         out[place] = graph.constant(0.0) if none else graph.input(number, kind, level)
     return out

@@ -1,8 +1,8 @@
 """Text of a module of functions, from expressions; numba compiles it.
 
 numba takes milliseconds for every operation of a function, LLVM a tenth of that. So straight lines
-of arithmetic are written as a `block`: one operation for numba, with a tuple of results, which
-gives its lines to LLVM without inference of types. A line of a block is
+of arithmetic are written as an `arithmetic_block`: one operation for numba, with a tuple of
+results, which gives its lines to LLVM without inference of types. A line of a block is
 
     v7:f = mul v1 v2
 
@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.graph import Level, Node, TranslationError, dependencies
+from jaxevent.codegen.graph import Level, Node, TranslationError, find_dependencies
 from jaxevent.codegen.support import intrinsic, ir, types
-from jaxevent.codegen.trace import REDUCTIONS, TracedFunction
+from jaxevent.codegen.trace import ELEMENT_REDUCTIONS, TracedFunction
 
 # Texts of operations that no block has.
-FORMS = {
+PYTHON_EXPRESSIONS = {
     "pow": "{0} ** {1}",
     "rem": "np.fmod({0}, {1})",
     "sign": "np.sign({0})",
@@ -33,20 +33,20 @@ FORMS = {
     **{name: f"np.{name}({{0}})" for name in ("abs", "expm1", "tanh")},
 }
 # Functions of `functions`.
-FUNCTIONS = ("exp", "log", "log1p", "logistic", "sin", "cos", "erf", "erfc")
+CALLED_FUNCTION_NAMES = ("exp", "log", "log1p", "logistic", "sin", "cos", "erf", "erfc")
 
 Address = tuple[str, str, int]  # pointer, index and offset: pointer[index + offset]
 
-HEAD = '''"""{about}"""
+MODULE_HEAD_TEMPLATE = '''"""{about}"""
 
 import numba
 import numpy as np
 from numba import types
 
 from jaxevent.codegen.cache import cfunc
-from jaxevent.codegen.derivative import vector_sums
+from jaxevent.codegen.derivative import make_vector_sums
 from jaxevent.codegen.functions import {functions}
-from jaxevent.codegen.write import block
+from jaxevent.codegen.write import arithmetic_block
 
 REAL = np.{real}
 I, D, F = types.int64, types.float64, types.{real}
@@ -99,7 +99,7 @@ class ElementLoop:
     arguments: tuple[str, ...]  # of the function that holds it
 
 
-class Writer:
+class ModuleWriter:
     """Writer of the functions of one module.
 
     Args:
@@ -117,12 +117,18 @@ class Writer:
         self._vectors: list[tuple[int, int, int]] = []
         self._size = 0
 
-    def lines(self, nodes: list[Node], indent: int, known: set[Node] | None = None) -> list[str]:
+    def write_lines(
+        self, nodes: list[Node], indent: int, known: set[Node] | None = None
+    ) -> list[str]:
         """Write lines after which nodes are known by their names, as `known` ones are before."""
         known = set() if known is None else known
-        return self.assign([n for n in dependencies(nodes, known) if n not in known], nodes, indent)
+        return self.write_assignments(
+            [n for n in find_dependencies(nodes, known) if n not in known], nodes, indent
+        )
 
-    def assign(self, nodes: Iterable[Node], wanted: Iterable[Node], indent: int) -> list[str]:
+    def write_assignments(
+        self, nodes: Iterable[Node], wanted: Iterable[Node], indent: int
+    ) -> list[str]:
         """Write lines that compute the nodes: all that the wanted ones depend on and is not known.
 
         What is no plain arithmetic, such as a logarithm, is a line of its own between two blocks.
@@ -138,13 +144,13 @@ class Writer:
             mine = [n for n in order if turn[n] == now]
             inside = [n for n in mine if self._is_in_block(n)]
             outside = [n for n in mine if not self._is_in_block(n)]
-            out += [f"{self.name(n)} = {self._text(n)}" for n in outside]
+            out += [f"{self.node_name(n)} = {self._text(n)}" for n in outside]
             later = {a for n in order if turn[n] > now for a in n.args if isinstance(a, Node)}
             if inside:
                 out.append(self._block(inside, [n for n in inside if n in later or n in wanted]))
         return [f"{' ' * indent}{line}" for line in out]
 
-    def name(self, node: Node) -> str:
+    def node_name(self, node: Node) -> str:
         """Return the name of a node in the text; of a constant, its value."""
         if node.op != "constant":
             return f"v{node.number}"
@@ -152,7 +158,7 @@ class Writer:
         special = {"inf": "np.inf", "-inf": "-np.inf", "nan": "np.nan"}
         return text if node.kind != "f" else f"REAL({special.get(text, text)})"
 
-    def body(
+    def write_body(
         self,
         name: str,
         function: TracedFunction,
@@ -172,14 +178,14 @@ class Writer:
         wanted = {key: node for key, node in function.results.items() if key in store}
         phases = TracedFunction(wanted).phases()
         last = max((phases[n] for n in wanted.values()), default=0)
-        scalars = [n for n in phases if n.level < Level.ELEMENT and n.op not in REDUCTIONS]
+        scalars = [n for n in phases if n.level < Level.ELEMENT and n.op not in ELEMENT_REDUCTIONS]
         out, known = [], set[Node]()
         for phase in range(last + 1):
             now = [n for n in scalars if phases[n] <= phase and n not in known]
             used = {a for n in phases if n not in now for a in n.args if isinstance(a, Node)}
-            out += self.assign(now, used | {*wanted.values()}, indent)
+            out += self.write_assignments(now, used | {*wanted.values()}, indent)
             known |= set(now)
-            reduced = [n for n in phases if n.op in REDUCTIONS and phases[n] == phase + 1]
+            reduced = [n for n in phases if n.op in ELEMENT_REDUCTIONS and phases[n] == phase + 1]
             elements = {}
             if phase == last:
                 elements = {store[key]: n for key, n in wanted.items() if n.level == Level.ELEMENT}
@@ -190,10 +196,10 @@ class Writer:
                 known |= set(reduced)
         for key, node in wanted.items():
             if node.level < Level.ELEMENT:
-                out.append(f"{' ' * indent}{store[key].format(self.name(node))}")
+                out.append(f"{' ' * indent}{store[key].format(self.node_name(node))}")
         return out
 
-    def branches(
+    def write_branches(
         self,
         first: Node,
         cases: list[tuple[str, dict[str, Node]]],
@@ -208,14 +214,14 @@ class Writer:
             store: Texts "target = {}" by the results' names.
             indent: Spaces before each line.
         """
-        known = set(dependencies([first]))
-        used = {node for _, case in cases for node in dependencies([*case.values()], known)}
-        out, margin = self.assign(known, {first} | (known & used), indent), " " * indent
+        known = set(find_dependencies([first]))
+        used = {node for _, case in cases for node in find_dependencies([*case.values()], known)}
+        out, margin = self.write_assignments(known, {first} | (known & used), indent), " " * indent
         for line, case in cases:
-            out.append(margin + line.format(self.name(first)))
-            out += self.lines([*case.values()], indent + 4, set(known))
+            out.append(margin + line.format(self.node_name(first)))
+            out += self.write_lines([*case.values()], indent + 4, set(known))
             for key, node in case.items():
-                out.append(f"{margin}    {store[key].format(self.name(node))}")
+                out.append(f"{margin}    {store[key].format(self.node_name(node))}")
         return out
 
     def add_vector(self, lanes: int, elements: Mapping[int, list[Node]]) -> int:
@@ -230,7 +236,7 @@ class Writer:
             self._vectors += [(begin + lane, *node.args) for node in nodes]
         return begin
 
-    def module(
+    def write_module(
         self, about: str, functions: list[str], places: Any, numbers: Any = np.float64
     ) -> ModuleText:
         """Write the module of some functions.
@@ -242,9 +248,11 @@ class Writer:
             numbers: Kind of the numbers of parameters.
         """
         dtype = self.program.dtype
-        head = HEAD.format(
+        head = MODULE_HEAD_TEMPLATE.format(
             about=about,
-            functions=", ".join(f"{name}{8 * dtype.itemsize} as {name}" for name in FUNCTIONS),
+            functions=", ".join(
+                f"{name}{8 * dtype.itemsize} as {name}" for name in CALLED_FUNCTION_NAMES
+            ),
             real=dtype.name,
             constants="\n".join([*self._blocks, *self.constants]),
         )
@@ -260,7 +268,7 @@ class Writer:
         if node.op in ("number", "entry") or self._address(node) is not None:
             return True
         operands = [a for a in node.args if isinstance(a, Node)]
-        return bool(operands) and node.op in OPERATIONS[operands[0].kind]
+        return bool(operands) and node.op in BLOCK_OPERATIONS[operands[0].kind]
 
     def _block(self, nodes: list[Node], results: list[Node]) -> str:
         """Define the block of some nodes, and write the line that calls it."""
@@ -275,15 +283,15 @@ class Writer:
                 what += map(str, self._parameter(node))
             for a in (a for a in node.args if isinstance(a, Node)):
                 constant = a.op == "constant"
-                what.append(f"{a.kind}:{a.args[0]}" if constant else self.name(a))
+                what.append(f"{a.kind}:{a.args[0]}" if constant else self.node_name(a))
                 if a not in made and not constant:
-                    given[self.name(a)] = a.kind
-            lines.append(f"{self.name(node)}:{node.kind} = {' '.join(what)}")
-        name, names = f"block{len(self._blocks)}", [self.name(n) for n in results]
+                    given[self.node_name(a)] = a.kind
+            lines.append(f"{self.node_name(node)}:{node.kind} = {' '.join(what)}")
+        name, names = f"block{len(self._blocks)}", [self.node_name(n) for n in results]
         arguments = " ".join(f"{argument}:{kind}" for argument, kind in given.items())
         text = "\n".join(lines)
         self._blocks.append(
-            f'{name} = block(F, "{arguments}", """\n{text}\n""", "{" ".join(names)}")'
+            f'{name} = arithmetic_block(F, "{arguments}", """\n{text}\n""", "{" ".join(names)}")'
         )
         return f"{', '.join(names)} = {name}(({', '.join(given)},))"
 
@@ -302,11 +310,11 @@ class Writer:
         found = self.addresses.get(node.args[0]) if node.op == "input" else None
         if isinstance(found, str):
             return found
-        names = [self.name(a) for a in node.args if isinstance(a, Node)]
-        if node.op in FUNCTIONS:
+        names = [self.node_name(a) for a in node.args if isinstance(a, Node)]
+        if node.op in CALLED_FUNCTION_NAMES:
             return f"{node.op}({names[0]})"
-        if node.op in FORMS:
-            return FORMS[node.op].format(*names)
+        if node.op in PYTHON_EXPRESSIONS:
+            return PYTHON_EXPRESSIONS[node.op].format(*names)
         about = f"use of {node.args[0]!r}" if node.op == "input" else f"operation {node.op!r}"
         raise TranslationError(f"the {about}")
 
@@ -320,9 +328,9 @@ class Writer:
     ) -> str:
         """Define a function of one loop, and write the line that calls it."""
         results = [n.args[0] for n in reduced] + [*elements.values()]
-        rest = dependencies(results, known)
+        rest = find_dependencies(results, known)
         given = [n for n in rest if n in known and n.op != "constant"]
-        arguments = ", ".join([*loop.arguments, *(self.name(n) for n in given)])
+        arguments = ", ".join([*loop.arguments, *(self.node_name(n) for n in given)])
         out = ["@numba.njit(**LOOP_OPTIONS)", f"def {name}({arguments}):"]
         for node in reduced:
             start = {"total": "REAL(0)", "largest": "-REAL(np.inf)", "place": "0"}[node.op]
@@ -330,9 +338,9 @@ class Writer:
             if node.op == "place":
                 out.append(f"    m{node.number} = -REAL(np.inf)")
         out.append(f"    for {loop.index} in range({loop.count}):")
-        out += self.assign([n for n in rest if n not in known], results, 8)
+        out += self.write_assignments([n for n in rest if n not in known], results, 8)
         for node in reduced:
-            value, r = self.name(node.args[0]), f"r{node.number}"
+            value, r = self.node_name(node.args[0]), f"r{node.number}"
             if node.op == "total":
                 out.append(f"        {r} += {value}")
             elif node.op == "largest":
@@ -341,29 +349,40 @@ class Writer:
                 m = f"m{node.number}"
                 out.append(f"        {r} = {loop.index} if {value} > {m} else {r}")
                 out.append(f"        {m} = {value} if {value} > {m} else {m}")
-        out += [f"        {text.format(self.name(node))}" for text, node in elements.items()]
+        out += [f"        {text.format(self.node_name(node))}" for text, node in elements.items()]
         names = ", ".join(f"r{n.number}" for n in reduced)
         if names:
             out.append(f"    return {names}")
         self.loops.append("\n".join([*out, "", ""]) + "\n")
-        targets = ", ".join(self.name(n) for n in reduced)
+        targets = ", ".join(self.node_name(n) for n in reduced)
         return f"{targets + ' = ' if names else ''}{name}({arguments})"
 
 
-ORDERED = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=="}
-CHOICES = {"max": ">", "min": "<"}
-REAL = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "neg": "fneg"}
-WHOLE = ("add", "sub", "mul", "neg")
-LIBRARY = {"abs": "fabs", "sqrt": "sqrt", "floor": "floor", "ceil": "ceil"}  # of LLVM
+COMPARISON_SIGNS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=="}
+EXTREMUM_SIGNS = {"max": ">", "min": "<"}
+REAL_INSTRUCTIONS = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "neg": "fneg"}
+INTEGER_INSTRUCTIONS = ("add", "sub", "mul", "neg")
+LLVM_INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "floor": "floor", "ceil": "ceil"}  # of LLVM
 # Which operations there are, by the kind of what they are applied to.
-OPERATIONS = {
-    "f": {*ORDERED, *CHOICES, *REAL, *LIBRARY, "ne", "rsqrt", "is_finite", "to_f", "to_i", "to_b"},
-    "i": {*ORDERED, *CHOICES, *WHOLE, "ne", "to_f", "to_i", "to_b"},
+BLOCK_OPERATIONS = {
+    "f": {
+        *COMPARISON_SIGNS,
+        *EXTREMUM_SIGNS,
+        *REAL_INSTRUCTIONS,
+        *LLVM_INTRINSICS,
+        "ne",
+        "rsqrt",
+        "is_finite",
+        "to_f",
+        "to_i",
+        "to_b",
+    },
+    "i": {*COMPARISON_SIGNS, *EXTREMUM_SIGNS, *INTEGER_INSTRUCTIONS, "ne", "to_f", "to_i", "to_b"},
     "b": {"and", "or", "not", "eq", "ne", "select_n", "to_f", "to_i", "to_b"},
 }
 
 
-def block(real: Any, given: str, lines: str, results: str) -> Any:
+def arithmetic_block(real: Any, given: str, lines: str, results: str) -> Any:
     """An operation for numba: `v7, v9 = operation((numbers, v1, v2))`; of one result, that alone.
 
     Args:
@@ -437,13 +456,17 @@ class _Machine:
             return builder.not_(values[0])
         if op in ("to_f", "to_i", "to_b"):
             return self._cast(op[-1], values[0])
-        if op in ORDERED or op == "ne":
-            return self._compare(ORDERED.get(op, "!="), *values)
-        if op in CHOICES:
-            return builder.select(self._compare(CHOICES[op], *values), *values)
+        if op in COMPARISON_SIGNS or op == "ne":
+            return self._compare(COMPARISON_SIGNS.get(op, "!="), *values)
+        if op in EXTREMUM_SIGNS:
+            return builder.select(self._compare(EXTREMUM_SIGNS[op], *values), *values)
         if values[0].type != self.real:
             return getattr(builder, op)(*values)
-        return getattr(builder, REAL[op])(*values) if op in REAL else self._library(op, *values)
+        return (
+            getattr(builder, REAL_INSTRUCTIONS[op])(*values)
+            if op in REAL_INSTRUCTIONS
+            else self._library(op, *values)
+        )
 
     def _compare(self, how: str, a: Any, b: Any) -> Any:
         if isinstance(a.type, ir.IntType):
@@ -452,7 +475,10 @@ class _Machine:
         return kind(how, a, b)
 
     def _library(self, op: str, value: Any) -> Any:
-        builder, name = self.builder, LIBRARY.get(op, "fabs" if op == "is_finite" else "sqrt")
+        builder, name = (
+            self.builder,
+            LLVM_INTRINSICS.get(op, "fabs" if op == "is_finite" else "sqrt"),
+        )
         function = builder.module.declare_intrinsic(f"llvm.{name}", [self.real])
         found = builder.call(function, [value])
         if op == "rsqrt":

@@ -160,8 +160,8 @@ def certainty(params: CertaintyParams, frames: FrameFeatures) -> Float[Array, "f
         w = w * knots[0]
     else:
         table = jnp.exp(_spline_matrix(len(knots)) @ jnp.log(knots))
-        place = jnp.asarray(frames.grey) * (SPLINE_POINTS - 1)
-        below = jnp.clip(place.astype(int), 0, SPLINE_POINTS - 2)
+        place = jnp.asarray(frames.grey) * (N_SPLINE_SAMPLES - 1)
+        below = jnp.clip(place.astype(int), 0, N_SPLINE_SAMPLES - 2)
         part = place - below
         w = w * ((1 - part) * table[below] + part * table[below + 1])
     return jnp.maximum(w, params.w_min)
@@ -216,7 +216,7 @@ def clipping_bound(params: CertaintyParams, frames: GreyFrames) -> Float[Array, 
     return jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
 
 
-SPLINE_POINTS = 256
+N_SPLINE_SAMPLES = 256
 
 
 @functools.lru_cache
@@ -225,9 +225,9 @@ def _spline_matrix(knots: int) -> NDArray[np.floating]:
     from scipy.interpolate import CubicSpline
 
     if knots < 3:
-        return np.linspace([1.0, 0.0], [0.0, 1.0], SPLINE_POINTS)
+        return np.linspace([1.0, 0.0], [0.0, 1.0], N_SPLINE_SAMPLES)
     kind = CubicSpline(np.linspace(0, 1, knots), np.eye(knots), bc_type="natural")
-    return kind(np.linspace(0, 1, SPLINE_POINTS))
+    return kind(np.linspace(0, 1, N_SPLINE_SAMPLES))
 
 
 def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.io.images import BAYER_PATTERNS, bayer_sites, demosaic
+from jaxevent.io.images import bayer_sites, demosaic
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
-PATTERNS = BAYER_PATTERNS
-REC709 = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
+REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
 _HIDDEN = 1e-3  # what a frame counts where it does not show a point, so that something does
 _SHOULDER = 0.02  # of white: colours fade to grey over the last 2 % below it
 
@@ -36,7 +36,7 @@ def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
         InputError: Colours are not floats of three channels.
     """
     colours = _check_colours(rgb)
-    return np.asarray(colours @ np.asarray(REC709, colours.dtype))
+    return np.asarray(colours @ np.asarray(REC709_LUMINANCE, colours.dtype))
 
 
 def chrominance(
@@ -271,3 +271,6 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     for name, (row, column) in places.items():
         mosaic[:, row::2, column::2] = channels[name]
     return demosaic(mosaic, pattern)
+
+
+__getattr__ = renamed_names(__name__)

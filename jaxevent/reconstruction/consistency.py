@@ -7,14 +7,14 @@ import numpy as np
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.recording import Recording
 
-N_COMPARED_INTERVALS = (
-    4  # between frames, evenly spread over the recording, in which both are compared
-)
-NET_EVENTS = 2  # least size of ON minus OFF events of a pixel that is compared
-GREY_MARGIN = 0.02  # of the range at either end, within which a frame may be clipped
-MIN_PIXELS = 100  # fewer do not determine the ratio
-MIN_AGREEMENT = 0.8  # of signs; below, events and frames differ by more than a scale
-MAX_FACTOR = 2.0  # the ratio may be off by; real recordings at the defaults are within 0.6 to 0.8
+# Intervals between frames, evenly spread over the recording, in which both are compared.
+N_COMPARED_INTERVALS = 4
+MIN_NET_EVENTS = 2  # least size of ON minus OFF events of a pixel that is compared
+CLIPPING_MARGIN = 0.02  # of the range at either end, within which a frame may be clipped
+MIN_COMPARED_PIXELS = 100  # fewer do not determine the ratio
+MIN_SIGN_AGREEMENT = 0.8  # of signs; below, events and frames differ by more than a scale
+# Factor by which the ratio may be off; real recordings at the defaults are within 0.6 to 0.8.
+MAX_RATIO_FACTOR = 2.0
 CONTRADICTION_SIGMAS = 6.0  # of independent pixels; about 3 where neighbours err alike
 
 
@@ -66,9 +66,9 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
         place = events.y.astype(np.int64) * recording.width + events.x
         both = np.bincount(place, minlength=recording.width * recording.height)
         on = np.bincount(place[events.p], minlength=len(both))
-        used = np.flatnonzero(np.abs(2 * on - both) >= NET_EVENTS)
+        used = np.flatnonzero(np.abs(2 * on - both) >= MIN_NET_EVENTS)
         grey = frames[first : first + 2].intensity.reshape(2, -1)[:, used]
-        clear = ((grey > GREY_MARGIN) & (grey < 1 - GREY_MARGIN)).all(0)
+        clear = ((grey > CLIPPING_MARGIN) & (grey < 1 - CLIPPING_MARGIN)).all(0)
         grey, used = grey[:, clear], used[clear]
         intensity = np.interp(grey, np.linspace(0, 1, 256), response)
         level = np.log(intensity / gain[first : first + 2, None] + I0)
@@ -76,7 +76,7 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
     S, dL = (np.concatenate(part) for part in zip(*parts, strict=True))
     known = S != 0
     size, along = np.abs(S[known]), (np.sign(S) * dL)[known]
-    if len(size) < MIN_PIXELS:
+    if len(size) < MIN_COMPARED_PIXELS:
         return None
     ratio = along.sum() / size.sum()
     sigma = np.sqrt(((along - ratio * size) ** 2).sum()) / size.sum()
@@ -87,7 +87,8 @@ def events_contradict_frames(recording: Recording, params: Any) -> str | None:
     """Say that events contradict frames, at thresholds and `I0`, or return None.
 
     They do where both change in the same direction, and the sizes of their changes differ by more
-    than `MAX_FACTOR`, beyond what chance explains. Then thresholds or `I0` are not the sensor's.
+    than `MAX_RATIO_FACTOR`, beyond what chance explains. Then thresholds or `I0` are not the
+    sensor's.
 
     Args:
         recording: Events and frames.
@@ -97,10 +98,10 @@ def events_contradict_frames(recording: Recording, params: Any) -> str | None:
         A sentence that names the parameters, without a full stop.
     """
     found = change_ratio(recording, params)
-    if found is None or found.agreement < MIN_AGREEMENT:
+    if found is None or found.agreement < MIN_SIGN_AGREEMENT:
         return None
-    less = found.ratio + CONTRADICTION_SIGMAS * found.sigma < 1 / MAX_FACTOR
-    more = found.ratio - CONTRADICTION_SIGMAS * found.sigma > MAX_FACTOR
+    less = found.ratio + CONTRADICTION_SIGMAS * found.sigma < 1 / MAX_RATIO_FACTOR
+    more = found.ratio - CONTRADICTION_SIGMAS * found.sigma > MAX_RATIO_FACTOR
     if not (less or more):
         return None
     c_on, c_off, I0 = (f"{float(v):.3g}" for v in (params.c_on, params.c_off, params.I0))

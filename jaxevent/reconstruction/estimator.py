@@ -12,7 +12,7 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
-from jaxevent.reconstruction.engine.images import images_from_kernel, video_from_kernel
+from jaxevent.reconstruction.engine.images import make_kernel_images, make_kernel_video
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.frames import Timing, time_span
 from jaxevent.reconstruction.live import LiveVideo
@@ -341,7 +341,7 @@ class KernelEstimator(PixelEstimator[P]):
         """
         self.check_options(**options)
         params = self.Params() if params is None else params
-        fused = video_from_kernel(self.kernel_video, self, recording, params, compiler, options)
+        fused = make_kernel_video(self.kernel_video, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused
 
     def prepare_images(
@@ -374,7 +374,7 @@ class KernelEstimator(PixelEstimator[P]):
             InputError: As `estimate`, and for times that are not sorted or outside the recording.
         """
         params = self.Params() if params is None else params
-        fused = images_from_kernel(
+        fused = make_kernel_images(
             self.kernel_images,
             self,
             recording,

@@ -9,7 +9,7 @@ it. In each piece the augmented frame is a blend of two integrals of events (`au
 counts of a piece start at the left edge of its exposure.
 
 On several devices (`Features.over`) each device has an equal part of the lanes of every block of
-`LANES`. All kinds of tile consist of such blocks, so no device waits for another.
+`MIN_TILE_LANES`. All kinds of tile consist of such blocks, so no device waits for another.
 """
 
 import abc
@@ -30,9 +30,9 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import DEVICE_AXIS, make_mesh, shard
 from jaxevent.estimator import ShortRepr
 
-SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks and lanes of the three kinds of tile
-SLOTS = 8 * 4096  # of every tile
-LANES = 64  # of the narrowest tile
+TILE_SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks and lanes of the three kinds of tile
+N_TILE_SLOTS = 8 * 4096  # of every tile
+MIN_TILE_LANES = 64  # of the narrowest tile
 
 # Prepared on the host, where they stay until a jitted function takes them.
 if TYPE_CHECKING:
@@ -107,12 +107,12 @@ class ImagePoints(Points):
 class Tiles(ShortRepr):
     """Events of a window; slots without an event have polarity 0 and change nothing.
 
-    On several devices the last axis of the arrays is cut into blocks of `LANES`. The positions in a
-    block become the last axis, which is sharded.
+    On several devices the last axis of the arrays is cut into blocks of `MIN_TILE_LANES`. The
+    positions in a block become the last axis, which is sharded.
     """
 
     pixel: Int[Numeric, "*lanes"]  # the pixel of each lane
-    kind: Int[Numeric, " tiles"]  # index in `SHAPES`; len(SHAPES): the tile is not used
+    kind: Int[Numeric, " tiles"]  # index in `TILE_SHAPES`; len(SHAPES): the tile is not used
     lane: Int[Numeric, " tiles"]  # the tile's first lane
     points: EventPoints
     since: Float[Numeric, "tiles *slots"]  # s since the pixel's previous event
@@ -121,11 +121,11 @@ class Tiles(ShortRepr):
     mesh: Mesh | None = eqx.field(static=True, default=None)
 
     def over(self, mesh: Mesh) -> "Tiles":
-        """Shard the lanes over a mesh whose size divides `LANES`."""
+        """Shard the lanes over a mesh whose size divides `MIN_TILE_LANES`."""
 
         def put(leaf: Any, spec: PartitionSpec) -> Any:
             if len(spec):
-                leaf = leaf.reshape(*leaf.shape[:-1], -1, LANES)
+                leaf = leaf.reshape(*leaf.shape[:-1], -1, MIN_TILE_LANES)
             return jax.device_put(leaf, NamedSharding(mesh, spec))
 
         placed = jax.tree.map(put, self, self._specs())
@@ -166,7 +166,7 @@ class Tiles(ShortRepr):
             out = function(dataclasses.replace(flat, mesh=None), *replicated)
             return jax.tree.map(lambda v: v.reshape(*v.shape[:-1], -1, lanes), out)
 
-        lanes = LANES // self.mesh.size
+        lanes = MIN_TILE_LANES // self.mesh.size
         return jax.shard_map(
             run_shard,
             mesh=self.mesh,
@@ -282,11 +282,11 @@ class Features(EventCounts):
 
     def over(self, devices: Sequence[Any]) -> "Features":
         """Put the features on several devices: lanes of tiles and pixels of images are sharded."""
-        mesh = pixel_mesh(devices)
+        mesh = make_pixel_mesh(devices)
         if mesh is None:
             return self
         rest = (self.frames, self.start, self.last)
-        frames, start, last = over_pixels(rest, mesh, self.last.shape[0])
+        frames, start, last = shard_over_pixels(rest, mesh, self.last.shape[0])
         tiles = None if self.tiles is None else self.tiles.over(mesh)
         placed = Features(frames, tiles, start, last)
         if self.derivative is None:
@@ -321,16 +321,16 @@ class ReadOut(EventCounts):
 
     def over(self, devices: Sequence[Any]) -> "ReadOut":
         """Put the read-out on several devices, pixels sharded."""
-        mesh = pixel_mesh(devices)
-        return self if mesh is None else over_pixels(self, mesh, self.slot.shape[1])
+        mesh = make_pixel_mesh(devices)
+        return self if mesh is None else shard_over_pixels(self, mesh, self.slot.shape[1])
 
 
-def pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
+def make_pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
     """Make the mesh over which pixels are sharded, or return None for a single device."""
-    return make_mesh(devices, LANES)
+    return make_mesh(devices, MIN_TILE_LANES)
 
 
-def over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
+def shard_over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
     """Shard arrays [..., n_pixels] along their last axis; put all others whole on every device."""
 
     def put(leaf: Any) -> Any:

@@ -25,8 +25,8 @@ from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.engine.images import FilterImages, FilterVideo
 from jaxevent.reconstruction.estimator import KernelEstimator, P
 from jaxevent.reconstruction.features import (
-    SHAPES,
-    SLOTS,
+    N_TILE_SLOTS,
+    TILE_SHAPES,
     Features,
     FrameFeatures,
     Numeric,
@@ -307,10 +307,10 @@ def _scan_tiles(step: Callable, lanes: Any, block: LaneBlock, slots: Any) -> Any
     """Scan the tiles in order, and in each its ranks: `step(lanes, slots) -> lanes, output`.
 
     `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots). On
-    several devices each has an equal part of the lanes of every block of `LANES`.
+    several devices each has an equal part of the lanes of every block of `MIN_TILE_LANES`.
     """
-    share = SLOTS // jax.tree.leaves(slots)[0].shape[1]
-    shapes = [(ranks, width // share) for ranks, width in SHAPES]
+    share = N_TILE_SLOTS // jax.tree.leaves(slots)[0].shape[1]
+    shapes = [(ranks, width // share) for ranks, width in TILE_SHAPES]
     widest = max(width for _, width in shapes)
 
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:

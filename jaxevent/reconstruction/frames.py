@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit
 from jaxevent.codegen.graph import evaluate_function
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments, allocate_aligned
-from jaxevent.reconstruction.stream import EdgeCounts, Stream
+from jaxevent.reconstruction.stream import EdgeCounts, EventStream
 from jaxevent.recording import Recording
 
-MIN_SEGMENTS = 1 << 14  # for which memory is allocated; eightfold until it suffices
+MIN_SEGMENT_CAPACITY = 1 << 14  # for which memory is allocated; eightfold until it suffices
 
 
 class Timing(NamedTuple):
@@ -65,7 +65,7 @@ class FrameTimes(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Clock:
+class FrameClock:
     """Times of the frames, float64 microseconds from the recording's start, offset applied.
 
     `breaks` are the times at which pieces end. Exposures that overlap (a jittering stamp) share the
@@ -82,7 +82,7 @@ class Clock:
     origin: int  # us, the recording's start
 
     @classmethod
-    def of(cls, recording: Recording, timing: Timing) -> "Clock":
+    def of(cls, recording: Recording, timing: Timing) -> "FrameClock":
         """Read the times of a recording's frames."""
         offset = round(timing.clock_offset * 1e8) / 100
         frames, origin = recording.frames, recording.start
@@ -103,7 +103,7 @@ class Clock:
     def __len__(self) -> int:
         return len(self.mid)
 
-    def frame(self, piece: Any) -> Any:
+    def frame_of_piece(self, piece: Any) -> Any:
         """Return the frame from whose left edge pieces count events; -1: before any exposure."""
         return (piece - 1) // 2 if self.exposed else piece - 1
 
@@ -111,54 +111,63 @@ class Clock:
         """Return the piece that is 0 in a window, which stands for all before `first_frame`."""
         return (2 if self.exposed else 1) * first_frame
 
-    def locate(self, time: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def locate(self, elapsed_us: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Find times (us from the recording's start) among the frames.
 
         Returns:
             For each time the piece, the frame before (0 if none is), the position in the piece and
             the position between the mid-exposures of two frames, both 0 to 1.
         """
-        piece = np.searchsorted(self.breaks, time, "right")
-        frame = np.searchsorted(self.mid, time, "right") - 1
-        weight, blend = _position(self.breaks, piece - 1, time), _position(self.mid, frame, time)
+        piece = np.searchsorted(self.breaks, elapsed_us, "right")
+        frame = np.searchsorted(self.mid, elapsed_us, "right") - 1
+        weight, blend = (
+            _position(self.breaks, piece - 1, elapsed_us),
+            _position(self.mid, frame, elapsed_us),
+        )
         return piece, np.maximum(frame, 0), weight, blend
 
-    def elapsed(self, time: NDArray, frame: NDArray) -> NDArray:
+    def seconds_since_frame(self, elapsed_us: NDArray, frame: NDArray) -> NDArray:
         """Return the seconds from the middle of frames to times in us; 0 without frames."""
-        return (time - self.mid[frame]) * 1e-6 if len(self) else np.zeros(len(time))
+        return (elapsed_us - self.mid[frame]) * 1e-6 if len(self) else np.zeros(len(elapsed_us))
 
-    def used(self, start: int | None, stop: int | None) -> slice:
-        """Return the frames around the time from `start` to `stop` (us), one more on each side."""
+    def frames_within(self, start_us: int | None, stop_us: int | None) -> slice:
+        """Return the frames from `start_us` to `stop_us`, and one more on each side."""
         span = np.array(
             [
-                -np.inf if start is None else start - self.origin,
-                np.inf if stop is None else stop - self.origin,
+                -np.inf if start_us is None else start_us - self.origin,
+                np.inf if stop_us is None else stop_us - self.origin,
             ]
         )
-        first, last = self.frame(np.searchsorted(self.breaks, span, "right"))
+        first, last = self.frame_of_piece(np.searchsorted(self.breaks, span, "right"))
         return slice(max(int(first) - 1, 0), min(max(int(last), 0) + 2, len(self)))
 
-    def edges(self, used: slice) -> list[NDArray[np.int64]]:
+    def exposure_edges(self, frame_range: slice) -> list[NDArray[np.int64]]:
         """Return left edge, middle and right edge of exposures, us on the recording's clock.
 
         An event with t < edge is before the edge. Half microseconds are rounded up, which orders
         whole ones alike.
         """
         edges = (self.left, self.mid, self.right)
-        return [np.ceil(edge[used]).astype(np.int64) + self.origin for edge in edges]
+        return [np.ceil(edge[frame_range]).astype(np.int64) + self.origin for edge in edges]
 
     def times_from(self, first_frame: int) -> FrameTimes:
         """Return the times of the frames from `first_frame` on."""
         breaks, mids = self.breaks[self.first_piece(first_frame) :], self.mid[first_frame:]
         begins_piece = self.left[first_frame:] == (breaks[::2] if self.exposed else breaks)
         return FrameTimes(
-            self.origin, breaks, rates(breaks), mids, rates(mids), begins_piece, self.exposed
+            self.origin,
+            breaks,
+            interval_rates(breaks),
+            mids,
+            interval_rates(mids),
+            begins_piece,
+            self.exposed,
         )
 
 
-def rates(breaks: NDArray) -> NDArray:
+def interval_rates(breaks_us: NDArray) -> NDArray:
     """Return 1 / length (1/us) of the intervals between breaks, 0 for empty ones."""
-    length = np.diff(breaks)
+    length = np.diff(breaks_us)
     return np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
 
 
@@ -168,7 +177,7 @@ def _position(breaks: NDArray, i: NDArray, time: NDArray) -> NDArray:
     if not inside.any():
         return np.zeros(len(time))
     j = np.where(inside, i, 0)
-    return np.where(inside, (time - breaks[j]) * rates(breaks)[j], 0)
+    return np.where(inside, (time - breaks[j]) * interval_rates(breaks)[j], 0)
 
 
 class FrameImages:
@@ -195,18 +204,21 @@ class FrameImages:
         made = [evaluate_function(table, images).astype(self.dtype) for table in self._tables]
         return np.stack(made)
 
-    def read(self, used: slice, capacity: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def read(self, frame_range: slice, capacity: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Read a range of frames.
 
         Args:
-            used: Range of the recording's frames.
+            frame_range: Range of the recording's frames.
             capacity: Rows of the results. Spare rows repeat the last frame.
 
         Returns:
             Grey values, intensities and certainties, each [capacity, pixels], and gains
             [capacity]. Without frames grey values and intensities are 0.5, certainties 0.
         """
-        pixels, n = self.recording.width * self.recording.height, used.stop - used.start
+        pixels, n = (
+            self.recording.width * self.recording.height,
+            frame_range.stop - frame_range.start,
+        )
         grey, intensity, certainty = (
             allocate_aligned((capacity, pixels), self.dtype) for _ in range(3)
         )
@@ -214,7 +226,7 @@ class FrameImages:
         gain = np.ones(capacity, self.dtype)
         if n:
             assert self.recording.frames is not None
-            images = np.asarray(self.recording.frames[used].images).reshape(n, pixels)
+            images = np.asarray(self.recording.frames[frame_range].images).reshape(n, pixels)
             outs = (grey, intensity, certainty)
             if images.dtype.kind == "f":
                 for values, out in zip(self.values(images), outs, strict=True):
@@ -224,7 +236,7 @@ class FrameImages:
                     np.take(table, images, out=out[:n])
             for out in outs:
                 out[n:] = out[n - 1]
-            gain[:n] = self._gain[used]
+            gain[:n] = self._gain[frame_range]
             intensity[:n] /= gain[:n, None]
             intensity[n:] = intensity[n - 1]
         return grey, intensity, certainty, gain
@@ -232,8 +244,8 @@ class FrameImages:
 
 def make_frame_features(
     images: FrameImages,
-    clock: Clock,
-    used: slice,
+    clock: FrameClock,
+    frame_range: slice,
     rows: NDArray[np.int32],
     counts: EdgeCounts,
     *,
@@ -245,7 +257,7 @@ def make_frame_features(
     Args:
         images: Frames of the recording.
         clock: Times of all its frames.
-        used: Range of frames.
+        frame_range: Range of frames.
         rows: The numbers `FrameFeatures.rows`.
         counts: Events before the edges of the exposures.
         segments: Segments within the exposures, where these are known.
@@ -255,12 +267,12 @@ def make_frame_features(
         The features.
     """
     dtype, n, pixels = images.dtype, len(counts.mid), counts.base.start.shape[1]
-    grey, intensity, certainty, gain = images.read(used, capacity)
+    grey, intensity, certainty, gain = images.read(frame_range, capacity)
     shape = (2, capacity, pixels)
     span, before = allocate_aligned(shape, dtype), np.zeros((2, pixels), dtype)
     if n:
         span[:, : n - 1] = (counts.right[1:] - counts.base.left[:-1]).swapaxes(0, 1)
-        before[:] = counts.right[0] - (counts.base.start if used.start == 0 else 0)
+        before[:] = counts.right[0] - (counts.base.start if frame_range.start == 0 else 0)
     head = tail = None
     if clock.exposed:
         head, tail = allocate_aligned(shape, dtype), allocate_aligned(shape, dtype)
@@ -268,13 +280,13 @@ def make_frame_features(
         tail[:, :n] = (counts.right - counts.mid).swapaxes(0, 1)
 
     pieces = (2 if clock.exposed else 1) * capacity + 1
-    breaks = clock.breaks[clock.first_piece(used.start) :]
+    breaks = clock.breaks[clock.first_piece(frame_range.start) :]
     weight_rate, blend_rate = np.zeros(pieces, dtype), np.zeros(capacity, dtype)
-    for out, times in ((weight_rate[1:], breaks), (blend_rate, clock.mid[used])):
-        rate = 1e6 * rates(times)[: len(out)]
+    for out, times in ((weight_rate[1:], breaks), (blend_rate, clock.mid[frame_range])):
+        rate = 1e6 * interval_rates(times)[: len(out)]
         out[: len(rate)] = rate
 
-    present = np.asarray(float(used.stop > used.start), dtype)
+    present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
         grey, intensity, certainty, images.response(), gain, span, before, head, tail, segments,
         weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
@@ -283,9 +295,9 @@ def make_frame_features(
 
 
 def make_segments(
-    clock: Clock,
-    used: slice,
-    stream: Stream,
+    clock: FrameClock,
+    frame_range: slice,
+    stream: EventStream,
     weight: NDArray,
     counts: EdgeCounts,
     dtype: np.dtype,
@@ -294,7 +306,7 @@ def make_segments(
 
     Args:
         clock: Times of the frames.
-        used: Range of frames.
+        frame_range: Range of frames.
         stream: Events of all their exposures.
         weight: (events,) number of events that each event stands for.
         counts: Events before the edges of the exposures; here only their shape and type.
@@ -303,16 +315,18 @@ def make_segments(
     Returns:
         The segments, with memory for more.
     """
-    exact = np.stack([clock.left[used], clock.mid[used], clock.right[used]], axis=1)
+    exact = np.stack(
+        [clock.left[frame_range], clock.mid[frame_range], clock.right[frame_range]], axis=1
+    )
     parts = []
-    for row, edges in enumerate(np.stack(clock.edges(used), axis=1)):
+    for row, edges in enumerate(np.stack(clock.exposure_edges(frame_range), axis=1)):
         i, middle, j = (int(np.searchsorted(stream.t, edge)) for edge in edges)
         if i < j:
-            part = stream.section(i, j)._replace(t=stream.t[i:j] - clock.origin)
+            part = stream.slice_rows(i, j)._replace(t=stream.t[i:j] - clock.origin)
             count = np.zeros_like(counts.base.start)
             parts.append(_cut_exposure(part, weight[i:j], middle - i, row, exact[row], count))
     total = sum(len(part[0]) for part in parts)
-    capacity = MIN_SEGMENTS
+    capacity = MIN_SEGMENT_CAPACITY
     while capacity < total:
         capacity *= 8
     fields = []
@@ -324,10 +338,10 @@ def make_segments(
     return Segments(*fields)
 
 
-def make_start(clock: Clock, pixels: int, dtype: np.dtype) -> ImagePoints:
+def make_start_points(clock: FrameClock, n_pixels: int, dtype: np.dtype) -> ImagePoints:
     """Prepare the recording's start, before any event; the first window alone uses it."""
     piece, frame, weight, blend = clock.locate(np.zeros(1))
-    counts = np.zeros((1, pixels), dtype)
+    counts = np.zeros((1, n_pixels), dtype)
     return ImagePoints(
         weight[:, None].astype(dtype),
         blend[:, None].astype(dtype),
@@ -335,7 +349,7 @@ def make_start(clock: Clock, pixels: int, dtype: np.dtype) -> ImagePoints:
         counts,
         piece.astype(np.int32),
         frame.astype(np.int32),
-        clock.elapsed(np.zeros(1), frame).astype(dtype),
+        clock.seconds_since_frame(np.zeros(1), frame).astype(dtype),
     )
 
 

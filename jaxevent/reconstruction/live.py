@@ -23,7 +23,7 @@ from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
 from jaxevent.reconstruction.video import PixelMethod, Video
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 
-WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
+MAX_WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
 MAX_HELD_FRAMES = 32  # before what is settled is dropped
 
 
@@ -77,7 +77,7 @@ class LiveVideo:
         params: Any,
         *,
         frames: bool,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         extra: dict[str, NDArray] | None = None,
     ):
         self.estimator, self.params, self.window_events = estimator, params, window_events

@@ -20,12 +20,12 @@ from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
-from jaxevent.reconstruction.frames import Clock, FrameImages, Timing
-from jaxevent.reconstruction.video import BATCH, ImageSequence
+from jaxevent.reconstruction.frames import FrameClock, FrameImages, Timing
+from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 
 MIN_SIDE_PX = 12  # pixels that OpenCV's search needs in width or height
-OUTLIER_FRACTION = 1e-3  # of the greys of two frames, at either end, that do not set the range
+GREY_OUTLIER_FRACTION = 1e-3  # of the greys of two frames, at either end, that do not set the range
 
 
 class Params(FrameParams):
@@ -79,22 +79,22 @@ def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.
     )
 
 
-def make_pair(frames: FrameSeries, first: int) -> FramePair:
+def make_frame_pair(frames: FrameSeries, first_frame: int) -> FramePair:
     """Find the flows between a frame and the next.
 
     Args:
         frames: Frames in time.
-        first: Index of the first of the two.
+        first_frame: Index of the first of the two.
 
     Returns:
         The two frames with the flows.
     """
     cv2 = require("cv2", "vision")
-    two = slice(first, first + 2)
+    two = slice(first_frame, first_frame + 2)
     one, other = _levels(frames.grey[two], frames.intensity[two], frames.gain[two], frames.response)
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     there, back = search.calc(one, other, None), search.calc(other, one, None)
-    return FramePair(frames.intensity[first], frames.intensity[first + 1], there, back)
+    return FramePair(frames.intensity[first_frame], frames.intensity[first_frame + 1], there, back)
 
 
 def _levels(
@@ -111,12 +111,12 @@ def _levels(
     """
     if gain[0] != gain[1]:
         grey = np.asarray(response.grey(jnp.asarray(intensity * gain.min())))
-    low, high = np.quantile(grey, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION])
+    low, high = np.quantile(grey, [GREY_OUTLIER_FRACTION, 1 - GREY_OUTLIER_FRACTION])
     spread = 255 / (high - low) if high > low else 0.0
     return np.rint(((grey - low) * spread).clip(0, 255)).astype(np.uint8)
 
 
-def _read_frames(images: FrameImages, clock: Clock, used: slice) -> FrameSeries:
+def _read_frames(images: FrameImages, clock: FrameClock, used: slice) -> FrameSeries:
     """Read a range of frames as a series."""
     recording, n = images.recording, used.stop - used.start
     shape = (n, recording.height, recording.width)
@@ -142,7 +142,7 @@ class FlowVideo(ImageSequence[Params]):
         progress: bool | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
-        self._clock = Clock.of(recording, Timing.of(params))
+        self._clock = FrameClock.of(recording, Timing.of(params))
         self._dtype = np.dtype(jnp.result_type(float))
         self._images = FrameImages(recording, self._dtype)
         self._pair: tuple[int, FramePair] | None = None  # with the number of its first frame
@@ -153,8 +153,8 @@ class FlowVideo(ImageSequence[Params]):
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         located = _locate(self._clock, times)
-        for first in range(0, len(times), BATCH):
-            batch = slice(first, first + BATCH)
+        for first in range(0, len(times), N_BATCH_IMAGES):
+            batch = slice(first, first + N_BATCH_IMAGES)
             places = zip(located.frame[batch], located.share[batch], strict=True)
             images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)
@@ -195,11 +195,11 @@ class FlowVideo(ImageSequence[Params]):
     def _between(self, frame: int) -> FramePair:
         if self._pair is None or self._pair[0] != frame:
             two = _read_frames(self._images, self._clock, slice(frame, frame + 2))
-            self._pair = frame, make_pair(two, 0)
+            self._pair = frame, make_frame_pair(two, 0)
         return self._pair[1]
 
 
-def _locate(clock: Clock, times: NDArray[np.int64]) -> ImageTimes:
+def _locate(clock: FrameClock, times: NDArray[np.int64]) -> ImageTimes:
     _, frame, _, share = clock.locate(times - clock.origin)
     return ImageTimes(frame, share)
 
@@ -255,7 +255,7 @@ class Flow(ImageEstimator[Params]):
         params = self.Params() if params is None else params
         if not extrapolate:
             self.check_span(recording, times, params)
-        clock = Clock.of(recording, Timing.of(params))
+        clock = FrameClock.of(recording, Timing.of(params))
         images = FrameImages(recording, np.dtype(jnp.result_type(float)))
         frames = _read_frames(images, clock, slice(0, len(clock)))
         return frames, _locate(clock, np.atleast_1d(microseconds(times)))
@@ -273,7 +273,7 @@ class Flow(ImageEstimator[Params]):
         Returns:
             The trajectory, and None: nothing passes from run to run.
         """
-        pairs = [make_pair(features, first) for first in range(len(features.mid) - 1)]
+        pairs = [make_frame_pair(features, first) for first in range(len(features.mid) - 1)]
         return FlowTrajectory(features, pairs), None
 
     def read(self, params: Params, trajectory: FlowTrajectory, out: ImageTimes) -> Estimate:

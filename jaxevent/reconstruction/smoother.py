@@ -226,7 +226,7 @@ def measure_frames(
     )
 
 
-def change_between(params: Params, on: Array, off: Array, seconds: Array) -> tuple[Array, Array]:
+def predict_change(params: Params, on: Array, off: Array, seconds: Array) -> tuple[Array, Array]:
     """Return the sum of s c over events, and the variance that they and time add.
 
     Args:
@@ -263,14 +263,14 @@ def make_frame_steps(
     follows = (rate > 0)[:, None]  # another frame follows
     exists = jnp.concatenate([jnp.asarray(frames.present)[None], (rate > 0)[:-1]])[:, None]
     counts = jnp.where(follows, counts, 0)
-    moves = redistribute_images(params, frames, counts)
+    moves = redistribute_counts(params, frames, counts)
     gap = jnp.where(follows, 1 / jnp.where(follows, rate[:, None], 1), 0)
-    S, q = change_between(params, moves[0], moves[1], gap)
+    S, q = predict_change(params, moves[0], moves[1], gap)
     measured = measure_frames(params, frames, z, exists)
     return FrameSteps(measured, S, jnp.broadcast_to(q, z.shape)), counts
 
 
-def redistribute_images(params: Params, frames: FrameFeatures, counts: Array) -> Array:
+def redistribute_counts(params: Params, frames: FrameFeatures, counts: Array) -> Array:
     """Give a fraction of every pixel's events to its eight neighbours.
 
     Between two events of a pixel its intensity moves by less than a threshold, unseen; events
@@ -431,7 +431,7 @@ def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> Fr
     )
 
 
-def combine(m: Array, precision: Array, later: Message) -> Gaussian:
+def combine_messages(m: Array, precision: Array, later: Message) -> Gaussian:
     """Combine a Gaussian from the past with the message of later frames.
 
     Args:
@@ -552,8 +552,8 @@ def adjacent_counts(
     gap = jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1), 0)
     seconds = jnp.where(behind, -elapsed, jnp.where(rate > 0, gap - elapsed, 0))
     return (
-        redistribute_images(params, frames, since),
-        redistribute_images(params, frames, until),
+        redistribute_counts(params, frames, since),
+        redistribute_counts(params, frames, until),
         elapsed,
         seconds,
     )
@@ -657,15 +657,15 @@ class Smoother(KernelEstimator[Params]):
 
         later = jax.tree.map(lambda v: v[f], trajectory.future)
         later = jax.tree.map(lambda a, b: jnp.where(behind, a, b), trajectory.first, later)
-        later = later.propagate_back(*change_between(params, until[0], until[1], seconds))
-        S, q = change_between(params, since[0], since[1], elapsed)
+        later = later.propagate_back(*predict_change(params, until[0], until[1], seconds))
+        S, q = predict_change(params, since[0], since[1], elapsed)
         # Before the first frame there is no past: its variance is without bound.
         m = jnp.where(behind, 0, trajectory.past.m[f] + S)
         precision = jnp.where(behind, 0, 1 / jnp.where(behind, 1, trajectory.past.P[f] + q))
         # Times are whole microseconds, the middle of an exposure may lie up to one before.
         here = ~behind & (jnp.asarray(points.elapsed)[:, None] < 1e-6)
         info = jax.tree.map(lambda v: v[f], trajectory.info)
-        return self.readout(params, combine(m, precision, later), info, here)
+        return self.readout(params, combine_messages(m, precision, later), info, here)
 
     def pixel_state_spec(self, number: Array) -> dict[str, Any]:
         """Return the pytrees that `pixel_functions` refer to, every leaf the given number."""
@@ -715,16 +715,16 @@ class Smoother(KernelEstimator[Params]):
 
         def move(known, past, seconds, **counts):
             on, off = counted(known[0], **counts)
-            S, q = change_between(known[0], on, off, seconds)
+            S, q = predict_change(known[0], on, off, seconds)
             return {"moved_on": on, "moved_off": off, "state": Gaussian(past.m + S, past.P + q)}
 
         def link(known, link, message, moved_on, moved_off, seconds):
-            S, q = change_between(known[0], moved_on, moved_off, seconds)
+            S, q = predict_change(known[0], moved_on, moved_off, seconds)
             return {"link": link.compose(MessageMap(jnp.ones_like(S), S, q, message.h, message.J))}
 
         def back(known, later, message, moved_on, moved_off, seconds):
             here = (
-                later.propagate_back(*change_between(known[0], moved_on, moved_off, seconds))
+                later.propagate_back(*predict_change(known[0], moved_on, moved_off, seconds))
                 + message
             )
             return {"message": later, "later": here}
@@ -734,16 +734,16 @@ class Smoother(KernelEstimator[Params]):
         ):
             on, off = counted(known[0], **counts)
             rest = jnp.where(seconds > 0, seconds + lag(known), 0)
-            left = change_between(known[0], moved_on - on, moved_off - off, rest)
-            S, q = change_between(known[0], on, off, elapsed - lag(known))
-            state = combine(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
+            left = predict_change(known[0], moved_on - on, moved_off - off, rest)
+            S, q = predict_change(known[0], on, off, elapsed - lag(known))
+            state = combine_messages(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
             return {"image": self.readout(known[0], state, info, here)}
 
         def before(known, later, info, seconds, **counts):
-            left = change_between(known[0], *counted(known[0], **counts), seconds + lag(known))
+            left = predict_change(known[0], *counted(known[0], **counts), seconds + lag(known))
             first = later + state_to_message(init(known[0]))
             zero = jnp.zeros_like(later.h)
-            state = combine(zero, zero, first.propagate_back(*left))
+            state = combine_messages(zero, zero, first.propagate_back(*left))
             return {"image": self.readout(known[0], state, info, zero > 0)}
 
         def start(known):

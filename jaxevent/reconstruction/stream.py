@@ -14,7 +14,7 @@ from jaxevent.codegen import njit, njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events, Recording
 
 
-class Stream(NamedTuple):
+class EventStream(NamedTuple):
     """Events in order of time, as compiled loops take them, of a sensor `width` pixels wide."""
 
     t: NDArray[np.int64]  # us
@@ -24,13 +24,13 @@ class Stream(NamedTuple):
     width: int
 
     @classmethod
-    def of(cls, events: Events, width: int) -> "Stream":
+    def of(cls, events: Events, width: int) -> "EventStream":
         return cls(events.t, events.x, events.y, events.p, width)
 
-    def section(self, begin: int, end: int) -> "Stream":
+    def slice_rows(self, begin_row: int, end_row: int) -> "EventStream":
         """Return the events of the rows [begin, end)."""
-        rows = slice(begin, end)
-        return Stream(self.t[rows], self.x[rows], self.y[rows], self.p[rows], self.width)
+        rows = slice(begin_row, end_row)
+        return EventStream(self.t[rows], self.x[rows], self.y[rows], self.p[rows], self.width)
 
 
 @dataclasses.dataclass
@@ -82,46 +82,48 @@ class EdgeCounts(NamedTuple):
 
 
 @njit
-def count_events(x, y, width, pixels):
+def count_events_per_pixel(x, y, width, n_pixels):
     """Count the events at each pixel, (pixels,)."""
-    counts = np.zeros(pixels, np.int32)
+    counts = np.zeros(n_pixels, np.int32)
     for i in range(len(x)):
         counts[np.int64(y[i]) * width + x[i]] += 1
     return counts
 
 
 @njit_noalloc_inlined
-def event_weight(gap, dead):
-    """Return the number of events that one event stands for, `gap` us after its pixel's last."""
-    if dead.rho == 0:
+def event_weight(gap_us, dead_time):
+    """Return the number of events that one event stands for, `gap_us` us after its pixel's last."""
+    if dead_time.rho == 0:
         return 1.0
-    if gap <= 1.5 * dead.rho:
-        return 0.0 if dead.derivative else 3.0
-    rest = gap - dead.rho
-    return 1e6 * gap / (rest * rest) if dead.derivative else gap / rest
+    if gap_us <= 1.5 * dead_time.rho:
+        return 0.0 if dead_time.derivative else 3.0
+    rest = gap_us - dead_time.rho
+    return 1e6 * gap_us / (rest * rest) if dead_time.derivative else gap_us / rest
 
 
 @njit_noalloc
-def update_last_times(stream, last):
+def update_last_times(stream, out_last_us):
     """Update the times of each pixel's last event to the stream's end, in place."""
     t, x, y = stream.t, stream.x, stream.y
     for i in range(len(t)):
-        last[np.int64(y[i]) * stream.width + x[i]] = t[i]
+        out_last_us[np.int64(y[i]) * stream.width + x[i]] = t[i]
 
 
-def event_weights(stream: Stream, last: NDArray[np.int64], dead: DeadTime) -> NDArray[np.float64]:
+def event_weights(
+    stream: EventStream, last_us: NDArray[np.int64], dead_time: DeadTime
+) -> NDArray[np.float64]:
     """Return the number of events that each event stands for.
 
     Args:
         stream: Events.
-        last: (pixels,) time of each pixel's last event before the stream, us; updated in place.
-        dead: The dead time.
+        last_us: (pixels,) time of each pixel's last event before the stream, us; updated in place.
+        dead_time: The dead time.
 
     Returns:
         (events,).
     """
     out = np.empty(len(stream.t))
-    _event_weights(stream, last, dead, out)
+    _event_weights(stream, last_us, dead_time, out)
     return out
 
 
@@ -134,20 +136,22 @@ def _event_weights(stream, last, dead, out):
         last[pixel] = t[i]
 
 
-def count_before(stream: Stream, weight: NDArray, edges: NDArray, counts: NDArray) -> NDArray:
+def count_before_edges(
+    stream: EventStream, weight: NDArray, edges_us: NDArray, counts: NDArray
+) -> NDArray:
     """Count the ON and OFF events of each pixel that are earlier than each edge.
 
     Args:
         stream: Events.
         weight: (events,) number of events that each event stands for.
-        edges: Sorted times, us.
+        edges_us: Sorted times, us.
         counts: (2, pixels) counts before the stream; updated in place to the last edge.
 
     Returns:
         (edges, 2, pixels).
     """
-    out = np.empty((len(edges), *counts.shape), counts.dtype)
-    _count_before(stream, weight, edges, counts, out)
+    out = np.empty((len(edges_us), *counts.shape), counts.dtype)
+    _count_before(stream, weight, edges_us, counts, out)
     return out
 
 
@@ -164,20 +168,20 @@ def _count_before(stream, weight, edges, counts, out):
 
 
 @njit
-def add_spread(stream, weight, edges, origin, reach, out):
+def add_spread_events(stream, weight, edges_us, origin_us, reach_us, out_counts):
     """Add to the counts at each edge the fraction of the pixel's next event that has happened.
 
     The change of an event is spread evenly over the time since the pixel's event before, if that is
-    at most `reach` us and not the recording's start, `origin`.
+    at most `reach_us` us and not the recording's start, `origin_us`.
     """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
-    last = np.full(out.shape[2], origin)
+    last = np.full(out_counts.shape[2], origin_us)
     for i in range(len(t)):
         pixel = np.int64(y[i]) * stream.width + x[i]
         before, last[pixel] = last[pixel], t[i]
         gap = t[i] - before
-        if before > origin and 0 < gap <= reach:
-            e = np.searchsorted(edges, before, "right")
-            while e < len(edges) and edges[e] <= t[i]:
-                out[e, 0 if p[i] else 1, pixel] += weight[i] * (edges[e] - before) / gap
+        if before > origin_us and 0 < gap <= reach_us:
+            e = np.searchsorted(edges_us, before, "right")
+            while e < len(edges_us) and edges_us[e] <= t[i]:
+                out_counts[e, 0 if p[i] else 1, pixel] += weight[i] * (edges_us[e] - before) / gap
                 e += 1

@@ -16,19 +16,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit, njit_noalloc, njit_noalloc_inlined
-from jaxevent.reconstruction.features import SHAPES, SLOTS, EventPoints, Tiles, allocate_aligned
+from jaxevent.reconstruction.features import (
+    N_TILE_SLOTS,
+    TILE_SHAPES,
+    EventPoints,
+    Tiles,
+    allocate_aligned,
+)
 from jaxevent.reconstruction.frames import FrameTimes
-from jaxevent.reconstruction.stream import BaseCounts, DeadTime, Stream, StreamState, event_weight
+from jaxevent.reconstruction.stream import (
+    BaseCounts,
+    DeadTime,
+    EventStream,
+    StreamState,
+    event_weight,
+)
 
-KIND_EVENTS = (128, 1024)  # events at a pixel from which the next, narrower kind of tile serves it
-WORKERS = min(4, os.cpu_count() or 1)
+MIN_KIND_EVENTS = (
+    128,
+    1024,
+)  # events at a pixel from which the next, narrower kind of tile serves it
+N_TILE_THREADS = min(4, os.cpu_count() or 1)
 
 
 class SlotMap(NamedTuple):
     """The slot of a pixel's event of any rank, as arrays for compiled loops."""
 
     known: bool  # whether there are tiles
-    kind: NDArray[np.int8]  # per pixel: index in `SHAPES`
+    kind: NDArray[np.int8]  # per pixel: index in `TILE_SHAPES`
     lane: NDArray[np.int32]  # per pixel, within its kind
     round_tile: NDArray[np.int32]  # per kind and round of ranks: the first tile
     round_first: NDArray[np.int64]  # per kind: index of its first round in `round_tile`
@@ -37,9 +52,9 @@ class SlotMap(NamedTuple):
     @classmethod
     def empty(cls, n_pixels: int) -> "SlotMap":
         """Return the map of a window without tiles."""
-        lane, kinds = np.zeros(n_pixels, np.int32), len(SHAPES)
+        lane, kinds = np.zeros(n_pixels, np.int32), len(TILE_SHAPES)
         rounds = np.zeros(kinds, np.int32), np.zeros(kinds, np.int64)
-        return cls(False, lane.astype(np.int8), lane, *rounds, np.array(SHAPES))
+        return cls(False, lane.astype(np.int8), lane, *rounds, np.array(TILE_SHAPES))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,11 +78,11 @@ class Layout:
         """
         pixels = len(counts)
         order = _busiest_first(counts)
-        ends = [int(np.searchsorted(-counts[order], -limit, "right")) for limit in KIND_EVENTS]
+        ends = [int(np.searchsorted(-counts[order], -limit, "right")) for limit in MIN_KIND_EVENTS]
         bounds = [pixels, *ends, 0]  # wide tiles serve the tail of the order, narrow its head
         kind, lane = np.zeros(pixels, np.int8), np.zeros(pixels, np.int32)
         lanes, rounds, tiles = [], [], 0
-        for k, (ranks, width) in enumerate(SHAPES):
+        for k, (ranks, width) in enumerate(TILE_SHAPES):
             own = order[bounds[k + 1] : bounds[k]]
             kind[own] = k
             lane[own] = np.arange(len(own))
@@ -79,26 +94,26 @@ class Layout:
             rounds.append(first[:-1].astype(np.int32))
             tiles = int(first[-1])
         # Full tiles, one partly used block of lanes per round, one partly used rank per block.
-        spare = 32 if n_events > SLOTS else 8
-        capacity = n_events // SLOTS + -(-pixels // SHAPES[0][1]) + spare
+        spare = 32 if n_events > N_TILE_SLOTS else 8
+        capacity = n_events // N_TILE_SLOTS + -(-pixels // TILE_SHAPES[0][1]) + spare
         ordinary = tiles <= capacity
         while capacity < tiles:
             capacity *= 2
         round_first = np.cumsum([0] + [len(r) for r in rounds[:-1]])
         round_tile = np.concatenate([*rounds, np.zeros(1, np.int32)])  # never empty
-        slot_map = SlotMap(True, kind, lane, round_tile, round_first, np.array(SHAPES))
+        slot_map = SlotMap(True, kind, lane, round_tile, round_first, np.array(TILE_SHAPES))
         return cls(slot_map, lanes, counts, capacity, ordinary)
 
     def lane_begins(self) -> list[int]:
         """Return the first lane of each kind among those of all kinds, and the number of lanes."""
-        sizes = [-(-len(self.counts) // width) * width for _, width in SHAPES]
-        return [sum(sizes[:k]) for k in range(len(SHAPES) + 1)]
+        sizes = [-(-len(self.counts) // width) * width for _, width in TILE_SHAPES]
+        return [sum(sizes[:k]) for k in range(len(TILE_SHAPES) + 1)]
 
     def lane_pixels(self) -> NDArray[np.int32]:
         """Return the pixels of the lanes of all kinds."""
         *begins, end = self.lane_begins()
         # Zeros at the end, so that as many lanes as the widest tile has can be cut out anywhere.
-        out = np.zeros(end + SHAPES[0][1], np.int32)
+        out = np.zeros(end + TILE_SHAPES[0][1], np.int32)
         for begin, own in zip(begins, self.lanes, strict=True):
             out[begin : begin + len(own)] = own
         return out
@@ -106,12 +121,12 @@ class Layout:
     def last_slots(self) -> NDArray[np.int32]:
         """Return the slot of each pixel's last event, -1 if it has none."""
         kind, lane = self.slot_map.kind, self.slot_map.lane
-        ranks, width = np.array(SHAPES)[kind].T
+        ranks, width = np.array(TILE_SHAPES)[kind].T
         rank = np.maximum(self.counts - 1, 0)
         busy = self.counts > 0
         rounds = np.where(busy, self.slot_map.round_first[kind] + rank // ranks, 0)
         tile = self.slot_map.round_tile[rounds] + lane // width
-        slot = tile * SLOTS + rank % ranks * width + lane % width
+        slot = tile * N_TILE_SLOTS + rank % ranks * width + lane % width
         return np.where(busy, slot, -1).astype(np.int32)
 
 
@@ -171,7 +186,7 @@ class TileInputs(NamedTuple):
 class TileKind(NamedTuple):
     """Lanes and rounds of the tiles of one kind."""
 
-    index: int  # in `SHAPES`
+    index: int  # in `TILE_SHAPES`
     ranks: int
     width: int  # lanes
     offset: int  # of its lanes among those of all kinds
@@ -205,9 +220,12 @@ class TileArrays(NamedTuple):
         reals = dict.fromkeys(("since", "near", "weight", "blend", "on", "off"), memory.dtype)
         kinds = reals | {"piece_cell": np.int32, "frame_cell": np.int32, "polarity": np.int8}
         return cls(
-            np.full(tiles, len(SHAPES), np.int32),
+            np.full(tiles, len(TILE_SHAPES), np.int32),
             np.zeros(tiles, np.int32),
-            **{name: memory.array(name, (tiles, SLOTS), kind) for name, kind in kinds.items()},
+            **{
+                name: memory.array(name, (tiles, N_TILE_SLOTS), kind)
+                for name, kind in kinds.items()
+            },
         )
 
 
@@ -224,7 +242,7 @@ class LaneStates(NamedTuple):
 
 
 def make_tiles(
-    stream: Stream,
+    stream: EventStream,
     layout: Layout,
     times: FrameTimes,
     counts: BaseCounts,
@@ -255,7 +273,7 @@ def make_tiles(
     key, near = memory.array("key", size, np.int64), memory.array("order", size, memory.dtype)
     inputs = TileInputs(EventOrder(key, near), times, counts, dead)
     out = TileArrays.allocate(layout.capacity, memory)
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(N_TILE_THREADS) as pool:
         _sort_events(pool, stream, layout, first, state.near, inputs)
         _fill_tiles(pool, layout, first, inputs, state.last, out)
     points = EventPoints(out.weight, out.blend, out.on, out.off, out.piece_cell, out.frame_cell)
@@ -266,7 +284,7 @@ def make_tiles(
 
 def _sort_events(
     pool: ThreadPoolExecutor,
-    stream: Stream,
+    stream: EventStream,
     layout: Layout,
     first: NDArray[np.int64],
     latest: NDArray[np.int64],
@@ -276,13 +294,13 @@ def _sort_events(
     pixels = len(layout.counts)
     cursor = np.empty(pixels, np.int64)
     cursor[np.concatenate(layout.lanes)] = first[:-1]
-    bands = np.linspace(0, pixels // stream.width, WORKERS + 1).astype(int)
+    bands = np.linspace(0, pixels // stream.width, N_TILE_THREADS + 1).astype(int)
 
     def sort(worker: int) -> None:
         band = bands[worker], bands[worker + 1]
         _sort(stream, band, inputs.times.origin, cursor, latest, inputs.order)
 
-    list(pool.map(sort, range(WORKERS)))
+    list(pool.map(sort, range(N_TILE_THREADS)))
 
 
 def _fill_tiles(
@@ -295,16 +313,16 @@ def _fill_tiles(
 ) -> None:
     """Write events in the order of lanes to slots, and update the `last` times of pixels."""
     begin, slot_map = 0, layout.slot_map
-    for index, (ranks, width) in enumerate(SHAPES):
+    for index, (ranks, width) in enumerate(TILE_SHAPES):
         own, offset = layout.lanes[index], layout.lane_begins()[index]
         rounds = slot_map.round_tile[slot_map.round_first[index] :]
         lane_first = first[begin : begin + len(own) + 1]
         kind = TileKind(index, ranks, width, offset, own, lane_first, rounds)
 
         def fill(worker: int, kind: TileKind = kind) -> None:
-            _fill(worker, WORKERS, kind, inputs, last, out)
+            _fill(worker, N_TILE_THREADS, kind, inputs, last, out)
 
-        list(pool.map(fill, range(WORKERS)))
+        list(pool.map(fill, range(N_TILE_THREADS)))
         begin += len(own)
 
 

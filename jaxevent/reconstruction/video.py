@@ -22,11 +22,11 @@ from jaxevent.locks import TurnLock, refuse_to_pickle
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
-from jaxevent.reconstruction.features import Features, ReadOut, over_pixels, pixel_mesh
+from jaxevent.reconstruction.features import Features, ReadOut, make_pixel_mesh, shard_over_pixels
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import (
-    WINDOW_EVENTS,
+    MAX_WINDOW_EVENTS,
     EventWindow,
     ImageReader,
     WindowedRecording,
@@ -36,9 +36,9 @@ from jaxevent.recording import Recording, Times, microseconds
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
 
-MAX_STARTS = 32  # windows from which filtering can be taken up again
-BATCH = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
-DEVICE_BATCH = 32  # on a GPU, where each call costs as much as several images
+MAX_WINDOW_STARTS = 32  # windows from which filtering can be taken up again
+N_BATCH_IMAGES = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
+N_DEVICE_BATCH_IMAGES = 32  # on a GPU, where each call costs as much as several images
 
 
 @runtime_checkable
@@ -361,15 +361,15 @@ class Video(ImageSequence[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         progress: bool | None = None,
         devices: Sequence[Any] = (),
         factors: NDArray[np.floating] | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._devices, self._factors = devices, factors
-        self._mesh = pixel_mesh(devices)
-        self._batch = DEVICE_BATCH if has_accelerator() else BATCH
+        self._mesh = make_pixel_mesh(devices)
+        self._batch = N_DEVICE_BATCH_IMAGES if has_accelerator() else N_BATCH_IMAGES
         self._windows = WindowedRecording(
             recording,
             Timing.of(params),
@@ -430,7 +430,11 @@ class Video(ImageSequence[P]):
 
     def _put_state(self, state: Any) -> Any:
         """Put a state or message on the devices; else every change of place is compiled."""
-        return state if self._mesh is None else over_pixels(state, self._mesh, self._windows.pixels)
+        return (
+            state
+            if self._mesh is None
+            else shard_over_pixels(state, self._mesh, self._windows.pixels)
+        )
 
     def _window_of(self, time: int) -> FilteredWindow:
         """Return the filtered window that contains `time`; those before it are filtered first."""
@@ -466,7 +470,7 @@ class Video(ImageSequence[P]):
         Returns:
             The first row of the events and the first frame that are needed from then on.
         """
-        begin, final = self._starts[0], self._windows.final_time(frames)
+        begin, final = self._starts[0], self._windows.settled_until(frames)
         while True:
             self._current = None
             _, following = self._filter(begin)
@@ -474,7 +478,7 @@ class Video(ImageSequence[P]):
                 break
             begin = following
         self._starts = [begin]
-        return self._windows.first_needed(begin.start, begin.before)
+        return self._windows.first_needed_rows(begin.start, begin.before)
 
     def _run_backward_pass(self) -> None:
         """Pass over all windows once, for the message of later windows at each."""
@@ -512,7 +516,7 @@ class Video(ImageSequence[P]):
         following = WindowStart(window.stop, window.after, end)
         if window.stop is not None and all(b.start != window.stop for b in self._starts):
             self._starts = sorted([*self._starts, following], key=lambda b: b.time)
-            if len(self._starts) > MAX_STARTS:  # first, last, half of the others
+            if len(self._starts) > MAX_WINDOW_STARTS:  # first, last, half of the others
                 self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
         return FilteredWindow(window, window.reader(self._batch), trajectory), following
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.features import (
-    SLOTS,
+    N_TILE_SLOTS,
     DeadTimeDerivative,
     Features,
     ImagePoints,
@@ -26,22 +26,22 @@ from jaxevent.reconstruction.features import (
     allocate_aligned,
 )
 from jaxevent.reconstruction.frames import (
-    Clock,
+    FrameClock,
     FrameImages,
     Timing,
     make_frame_features,
     make_segments,
-    make_start,
+    make_start_points,
 )
 from jaxevent.reconstruction.stream import (
     BaseCounts,
     DeadTime,
     EdgeCounts,
-    Stream,
+    EventStream,
     StreamState,
-    add_spread,
-    count_before,
-    count_events,
+    add_spread_events,
+    count_before_edges,
+    count_events_per_pixel,
     event_weight,
     event_weights,
     update_last_times,
@@ -49,15 +49,16 @@ from jaxevent.reconstruction.stream import (
 from jaxevent.reconstruction.tiles import Layout, SlotMap, TileMemory, make_tiles
 from jaxevent.recording import Events, Recording, Times, microseconds
 
-WINDOW_EVENTS = 1 << 20
-FRAME_VALUES = 6_000_000  # pixels of all frames of a window: 16 frames of 346x260 take 60 MB
-FRAMES = (6, 16)  # least and greatest number of frames of a window
+MAX_WINDOW_EVENTS = 1 << 20
+# Pixels of all frames of a window: 16 frames of 346x260 take 60 MB.
+MAX_WINDOW_FRAME_PIXELS = 6_000_000
+WINDOW_FRAME_BOUNDS = (6, 16)  # least and greatest number of frames of a window
 
 
 class ReaderInputs(NamedTuple):
     """Inputs of the loop that finds images among the events of a window."""
 
-    stream: Stream  # events of the window and, where changes are spread, those soon after
+    stream: EventStream  # events of the window and, where changes are spread, those soon after
     n_events: int  # of the window itself
     counts: BaseCounts
     slot_map: SlotMap
@@ -93,7 +94,7 @@ class EventWindow:
     stop: int | None
     after: StreamState  # at the window's end
     inputs: ReaderInputs
-    clock: Clock
+    clock: FrameClock
     first_frame: int  # that the window uses
     last: NDArray[np.int64]  # us, of each pixel's last event before the window
     dtype: np.dtype  # of the results
@@ -148,7 +149,7 @@ class ImageReader:
         out = self._buffers[0]
         piece, frame, weight, blend = clock.locate((times - clock.origin).astype(float))
         # The exposure from whose left edge the piece counts; -1: the window's start.
-        exposure = np.maximum(clock.frame(piece) - window.first_frame, -1)
+        exposure = np.maximum(clock.frame_of_piece(piece) - window.first_frame, -1)
         self._row = _read(window.inputs, self._row, times, exposure, self._states, out)
         self._time = times[-1] if len(times) else self._time
 
@@ -164,7 +165,7 @@ class ImageReader:
             out.off,
             pad(piece - clock.first_piece(window.first_frame), np.int32),
             pad(frame - window.first_frame, np.int32),
-            pad(clock.elapsed(times - clock.origin, frame), window.dtype),
+            pad(clock.seconds_since_frame(times - clock.origin, frame), window.dtype),
         )
         return ReadOut(points, out.slot, out.since)
 
@@ -195,7 +196,7 @@ def _read(inputs, row, times, exposure, states, out):
                 ranks, lanes = shapes[k, 0], shapes[k, 1]
                 rank_of[pixel] = rank + 1
                 tile = round_tile[round_first[k] + rank // ranks] + lane // lanes
-                at[pixel] = tile * SLOTS + rank % ranks * lanes + lane % lanes
+                at[pixel] = tile * N_TILE_SLOTS + rank % ranks * lanes + lane % lanes
             row += 1
         base = counts.left[exposure[j]] if exposure[j] >= 0 else counts.start
         for pixel in range(len(last)):
@@ -245,20 +246,23 @@ class WindowedRecording:
         timing: Timing = Timing(),  # noqa: B008
         *,
         filtering: bool = True,
-        events: int = WINDOW_EVENTS,
+        events: int = MAX_WINDOW_EVENTS,
         reuse: bool = False,
         derivative: bool = False,
     ):
         self.recording, self.filtering, self.events = recording, filtering, events
         self._timing = timing
-        self.clock = Clock.of(recording, timing)
+        self.clock = FrameClock.of(recording, timing)
         self.dead = DeadTime(round(timing.rho_ref * 1e8) / 100, derivative)
         self.reach = 0 if filtering else round(timing.spread * 1e6)
         # Whole events are counted in integers, weighted and spread ones in double precision.
         self._count_dtype = np.dtype(np.float64 if self.dead.rho or self.reach else np.int32)
         self.pixels = recording.width * recording.height
         # The number of frames depends on the sensor only, to compile once.
-        self.frames = max(FRAMES[0], min(FRAMES[1], FRAME_VALUES // self.pixels))
+        self.frames = max(
+            WINDOW_FRAME_BOUNDS[0],
+            min(WINDOW_FRAME_BOUNDS[1], MAX_WINDOW_FRAME_PIXELS // self.pixels),
+        )
         self.dtype = np.dtype(jnp.result_type(float))
         self._images = FrameImages(recording, self.dtype)
         self._memory = TileMemory(reuse, self.dtype)
@@ -276,21 +280,23 @@ class WindowedRecording:
         """Return the state before the first window."""
         return StreamState.initial(self.recording, self.dead.rho > 0)
 
-    def prepare(self, start: int | None, before: StreamState) -> tuple[EventWindow, Features]:
+    def prepare(self, start_us: int | None, before: StreamState) -> tuple[EventWindow, Features]:
         """Prepare the window that begins at a time.
 
         Args:
-            start: Start of the window, us; None: that of the recording.
+            start_us: Start of the window, us; None: that of the recording.
             before: State at its start.
 
         Returns:
             The window, shorter if its events are very unevenly spread, and its features.
         """
-        stop = self.stop_after(start)
+        stop = self.choose_stop(start_us)
         source = self.recording.events
-        begin = self._row_of(start)
+        begin = self._row_of(start_us)
         end = len(source) if stop is None else source.index(stop)
-        context, finish = self.context_of(self.clock.used(start, stop), begin, end)
+        context, finish = self.extend_to_exposures(
+            self.clock.frames_within(start_us, stop), begin, end
+        )
         if self.reach and stop is not None:
             finish = max(finish, source.index(stop + self.reach))
         around = source[context:finish]
@@ -304,47 +310,47 @@ class WindowedRecording:
                 spread = around[begin - context :]
                 spread = spread[: len(spread) if stop is None else spread.index(stop + self.reach)]
                 events = WindowEvents(own, spread, around)
-                return self._window(start, stop, events, layout, before)
+                return self._window(start_us, stop, events, layout, before)
             stop = middle
             own = own[: own.index(stop)]
 
     def extend(self, recording: Recording) -> None:
         """Go on with the same recording after events or frames were added to its end."""
         self.recording = recording
-        self.clock = Clock.of(recording, self._timing)
+        self.clock = FrameClock.of(recording, self._timing)
         self._images = FrameImages(recording, self.dtype)
 
-    def final_time(self, frames: bool) -> float:
+    def settled_until(self, frames_follow: bool) -> float:
         """Return the time up to which windows stay as they are if more is added to the end.
 
         A window that ends in the exposure of frame k uses frame k + 1 and the events of its
         exposure.
 
         Args:
-            frames: Whether more frames will be added, else events alone.
+            frames_follow: Whether more frames will be added, else events alone.
 
         Returns:
             The time, us.
         """
         source = self.recording.events
         last = int(source[len(source) - 1 :].t[0]) - self.reach if len(source) else -np.inf
-        if not frames:
+        if not frames_follow:
             return float(last)
         # Events before `last` are known.
         known = np.maximum.accumulate(self.clock.right) + self.clock.origin <= last
         complete = int(np.argmin(known)) if not known.all() else len(known)
         return float(self.clock.left[complete - 2] + self.clock.origin) if complete > 1 else -np.inf
 
-    def first_needed(self, start: int | None, before: StreamState) -> tuple[int, int]:
+    def first_needed_rows(self, start_us: int | None, before: StreamState) -> tuple[int, int]:
         """Return the first row of the events and the first frame that later windows use.
 
         Args:
-            start: Start of the first of these windows, us.
+            start_us: Start of the first of these windows, us.
             before: State at that time.
         """
-        used = self.clock.used(start, None)
-        begin = self._row_of(start)
-        row, _ = self.context_of(used, begin, begin)
+        used = self.clock.frames_within(start_us, None)
+        begin = self._row_of(start_us)
+        row, _ = self.extend_to_exposures(used, begin, begin)
         if before.context_last is not None:
             row = min(row, before.context)
         return row, used.start
@@ -369,18 +375,18 @@ class WindowedRecording:
         same = WindowEvents(events, events, events)
         return self._window(None, None, same, self._layout(events), self.initial())
 
-    def stop_after(self, start: int | None) -> int | None:
-        """Choose the end of the window that starts at `start` (us); None: the recording's end."""
+    def choose_stop(self, start_us: int | None) -> int | None:
+        """Choose the end of the window that starts at `start_us`; None: the recording's end."""
         stops = []
         clock, source = self.clock, self.recording.events
-        at = -np.inf if start is None else start - clock.origin
+        at = -np.inf if start_us is None else start_us - clock.origin
         piece = int(np.searchsorted(clock.breaks, at, "right"))
         # A window uses the frame before its first piece's and the one after its last piece's.
-        last = max(clock.frame(piece) - 1, 0) + self.frames - 2
+        last = max(clock.frame_of_piece(piece) - 1, 0) + self.frames - 2
         if last < len(clock):
             stop = clock.breaks[2 * last if clock.exposed else last]
             stops.append(clock.origin + int(np.ceil(stop)))
-        first = self._row_of(start)
+        first = self._row_of(start_us)
         if first + self.events < len(source):
             row = first + self.events
             stop = int(source[row : row + 1].t[0])
@@ -390,39 +396,41 @@ class WindowedRecording:
                 stops.append(stop)
         return min(stops, default=None)
 
-    def context_of(self, used: slice, begin: int, end: int) -> tuple[int, int]:
+    def extend_to_exposures(
+        self, frame_range: slice, begin_row: int, end_row: int
+    ) -> tuple[int, int]:
         """Extend the rows [begin, end) of the events to those in the exposures of frames."""
-        if used.start < used.stop:
+        if frame_range.start < frame_range.stop:
             # Of overlapping exposures, a later one may begin or an earlier one end further out.
-            left, _, right = self.clock.edges(used)
+            left, _, right = self.clock.exposure_edges(frame_range)
             source = self.recording.events
-            begin = min(begin, source.index(int(left.min()) - self.reach))
-            end = max(end, source.index(int(right.max()) + self.reach))
-        return begin, end
+            begin_row = min(begin_row, source.index(int(left.min()) - self.reach))
+            end_row = max(end_row, source.index(int(right.max()) + self.reach))
+        return begin_row, end_row
 
-    def move_context(self, state: StreamState, context: int) -> StreamState:
-        """Return the state with each pixel's last event before the row `context`."""
+    def move_context(self, state: StreamState, context_row: int) -> StreamState:
+        """Return the state with each pixel's last event before the row `context_row`."""
         last, row = state.context_last, state.context
         assert last is not None
-        if row > context:
+        if row > context_row:
             last, row = self.initial().last, 0
         last = last.copy()
-        while row < context:
-            part = self.recording.events[row : min(row + WINDOW_EVENTS, context)]
+        while row < context_row:
+            part = self.recording.events[row : min(row + MAX_WINDOW_EVENTS, context_row)]
             update_last_times(self._stream(part), last)
             row += len(part)
-        return dataclasses.replace(state, context=context, context_last=last)
+        return dataclasses.replace(state, context=context_row, context_last=last)
 
     def _row_of(self, start: int | None) -> int:
         return 0 if start is None else self.recording.events.index(start)
 
-    def _stream(self, events: Events) -> Stream:
-        return Stream.of(events, self.recording.width)
+    def _stream(self, events: Events) -> EventStream:
+        return EventStream.of(events, self.recording.width)
 
     def _layout(self, events: Events) -> Layout | None:
         if not self.filtering:
             return None
-        counts = count_events(events.x, events.y, self.recording.width, self.pixels)
+        counts = count_events_per_pixel(events.x, events.y, self.recording.width, self.pixels)
         return Layout.of(counts, self.events)
 
     def _window(
@@ -433,7 +441,7 @@ class WindowedRecording:
         layout: Layout | None,
         before: StreamState,
     ) -> tuple[EventWindow, Features]:
-        clock, used = self.clock, self.clock.used(start, stop)
+        clock, used = self.clock, self.clock.frames_within(start, stop)
         weight, counts = self._count(start, used, events.with_frames, before)
         segments = None
         if clock.exposed:
@@ -465,11 +473,13 @@ class WindowedRecording:
             clock.origin,
         )
         window = EventWindow(start, stop, after, inputs, clock, used.start, before.last, self.dtype)
-        return window, Features(frames, tiles, make_start(clock, self.pixels, self.dtype), slots)
+        return window, Features(
+            frames, tiles, make_start_points(clock, self.pixels, self.dtype), slots
+        )
 
     def _frame_rows(self, stop: int | None, used: slice, before: StreamState) -> NDArray[np.int32]:
         """Return `FrameFeatures.rows` of a window that uses some frames."""
-        onward = used.stop if stop is None else self.clock.used(stop, stop).start
+        onward = used.stop if stop is None else self.clock.frames_within(stop, stop).start
         n = max(used.stop - used.start, 0)
         ends = np.maximum([before.frames - 1 - used.start, onward - used.start], 0)
         return np.array([n, *ends], np.int32)
@@ -487,15 +497,15 @@ class WindowedRecording:
             weight = event_weights(stream, before.context_last.copy(), self.dead)
         opening = np.iinfo(np.int64).min if start is None else start
         edges, index = np.unique(
-            np.concatenate([[opening], *self.clock.edges(used)]).astype(np.int64),
+            np.concatenate([[opening], *self.clock.exposure_edges(used)]).astype(np.int64),
             return_inverse=True,
         )
         none = np.zeros((2, self.pixels), self._count_dtype)
-        counted = count_before(stream, weight, edges, none)
+        counted = count_before_edges(stream, weight, edges, none)
         at_start = counted[index[0]]
         if self.reach:
             at_start = at_start.copy()
-            add_spread(stream, weight, edges, self.clock.origin, self.reach, counted)
+            add_spread_events(stream, weight, edges, self.clock.origin, self.reach, counted)
         left, mid, right = (counted[i] for i in np.split(index[1:], 3))
         return weight, EdgeCounts(BaseCounts(at_start, left), mid, right)
 

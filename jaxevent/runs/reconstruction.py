@@ -24,7 +24,7 @@ from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
-from jaxevent.reconstruction.features import Numeric, over_pixels, pixel_mesh
+from jaxevent.reconstruction.features import Numeric, make_pixel_mesh, shard_over_pixels
 from jaxevent.reconstruction.frames import Timing
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import (
@@ -64,11 +64,11 @@ class ImageBatch(eqx.Module):
 
     def over(self, devices: Sequence[Any]) -> "ImageBatch":
         """Partition the batch over devices along pixels."""
-        mesh = pixel_mesh(devices)
+        mesh = make_pixel_mesh(devices)
         if mesh is None:
             return self
         rest = (self.truth, self.weights, self.white, self.weight)
-        placed = over_pixels(rest, mesh, self.truth.shape[1])
+        placed = shard_over_pixels(rest, mesh, self.truth.shape[1])
         return ImageBatch(self.prepared.over(devices), *placed)
 
 

@@ -14,7 +14,7 @@ from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
-from jaxevent.reconstruction.video import BATCH, ImageSequence
+from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, microseconds
 from jaxevent.show.images import display_limits, tone_map, video_writer, write_png
 
@@ -257,9 +257,9 @@ def _batches(
         for batch, estimate in video.batches(times):
             yield batch, {"image": estimate.mean, "variance": estimate.covariance}
         return
-    rows = range(0, len(times), BATCH)
+    rows = range(0, len(times), N_BATCH_IMAGES)
     for row in bar(rows, desc="images", unit="batch", progress=video.progress):
-        batch = times[row : row + BATCH]
+        batch = times[row : row + N_BATCH_IMAGES]
         with np.errstate(invalid="ignore"):  # infinity times 0
             image = colours(batch)
         yield batch, {"image": image}

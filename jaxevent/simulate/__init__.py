@@ -6,7 +6,7 @@
 
 Objects that move on their own, with the true optical flow of every pixel:
 
-    objects = jaxevent.simulate.Objects(speed=90, seed=1)
+    objects = jaxevent.simulate.MovingObjects(speed=90, seed=1)
     recording = jaxevent.simulate.simulate(objects)
     objects.flow(0.2)  # (height, width, 2), px/s
 
@@ -24,62 +24,69 @@ A camera that moves in a rigid world:
 from jaxevent.deprecated import renamed_names
 from jaxevent.simulate.blobs import (
     BLOB_SCENES,
-    Approach,
-    Circle,
-    Line,
-    Lissajous,
+    ApproachMotion,
+    BlobTruth,
+    CircularMotion,
+    LinearMotion,
+    LissajousMotion,
     RandomWalk,
     Target,
     TargetMotion,
-    Truth,
     blob_scene,
     simulate_blobs,
 )
 from jaxevent.simulate.hybrid import SENSORS, Sensor, simulate
 from jaxevent.simulate.motion import (
     MOTION_SCENES,
+    BoxWorld,
     CameraMotion,
+    FlatPatch,
     MovingCamera,
-    Patch,
     Texture,
-    World,
-    frame_events,
     make_texture,
     motion_scene,
     planar_motion,
+    simulate_frame_events,
     simulate_motion,
 )
-from jaxevent.simulate.objects import Objects
-from jaxevent.simulate.scenes import FITTING, SCENES, TESTING, Pan, Source, scene
-from jaxevent.simulate.video import Clip, from_video
+from jaxevent.simulate.objects import MovingObjects
+from jaxevent.simulate.scenes import (
+    FITTING_SCENES,
+    SCENES,
+    TESTING_SCENES,
+    IntensitySource,
+    Pan,
+    scene,
+)
+from jaxevent.simulate.video import VideoClip, from_video
 
 __all__ = [
     "BLOB_SCENES",
-    "FITTING",
+    "FITTING_SCENES",
     "MOTION_SCENES",
     "SCENES",
     "SENSORS",
-    "TESTING",
-    "Approach",
+    "TESTING_SCENES",
+    "ApproachMotion",
     "CameraMotion",
-    "Circle",
-    "Clip",
-    "Line",
-    "Lissajous",
+    "CircularMotion",
+    "VideoClip",
+    "LinearMotion",
+    "LissajousMotion",
     "MovingCamera",
-    "Objects",
+    "MovingObjects",
     "Pan",
-    "Patch",
+    "FlatPatch",
     "RandomWalk",
     "Sensor",
-    "Source",
+    "IntensitySource",
     "Target",
     "TargetMotion",
     "Texture",
-    "Truth",
-    "World",
+    "BlobTruth",
+    "BoxWorld",
     "blob_scene",
-    "frame_events",
+    "simulate_frame_events",
     "from_video",
     "make_texture",
     "motion_scene",

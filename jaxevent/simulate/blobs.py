@@ -1,6 +1,6 @@
 """Events of moving blobs, discs and lights, with the truth of each target's state at any time.
 
-    target = Target(Lissajous((640, 360), (400, 250), (0.6, 0.8), spin=4.0), rate=1e5)
+    target = Target(LissajousMotion((640, 360), (400, 250), (0.6, 0.8), spin=4.0), rate=1e5)
     recording, truth = simulate_blobs([target], (1280, 720), duration=1.5, noise=1e4, seed=0)
     truth(0.25)    # (1, 1, 8): the state of every target at 0.25 s
     truth.source   # (events,): the target that each event came from, -1 for background
@@ -28,7 +28,7 @@ from jaxevent.simulate.scenes import parse_seconds
 
 Pair = tuple[float | int, float | int]
 Shape = Literal["gaussian", "ring", "uniform", "disc"]
-BACKGROUND = -1  # source of background events
+BACKGROUND_SOURCE = -1  # source of background events
 _DELTA_S = 1e-6  # of the central difference for a heading's rate
 
 
@@ -61,7 +61,7 @@ class _ConstantSize:
 
 
 @dataclasses.dataclass(frozen=True)
-class Lissajous(_ConstantSize):
+class LissajousMotion(_ConstantSize):
     """Motion along a Lissajous curve: p = centre + amplitude sin(2 pi frequency t + phase).
 
     Each is a pair for x and y. Centre and amplitude are in px, frequency in Hz, phase in rad.
@@ -80,7 +80,7 @@ class Lissajous(_ConstantSize):
 
 
 @dataclasses.dataclass(frozen=True)
-class Line(_ConstantSize):
+class LinearMotion(_ConstantSize):
     """Motion at constant velocity: p = start (px) + velocity (px/s) t."""
 
     start: Pair
@@ -92,7 +92,7 @@ class Line(_ConstantSize):
 
 
 @dataclasses.dataclass(frozen=True)
-class Circle(_ConstantSize):
+class CircularMotion(_ConstantSize):
     """Motion along a circle of `radius` (px) at `rate` (rad/s) from the angle `phase`.
 
     As y is downwards, a positive rate is clockwise.
@@ -112,7 +112,7 @@ class Circle(_ConstantSize):
 
 
 @dataclasses.dataclass(frozen=True)
-class Approach:
+class ApproachMotion:
     """A target at (X, Y) = `point` (m), whose depth is distance - speed t - acceleration t^2 / 2.
 
     Its image is at centre + focal point / depth (px). Its lambda_i is size_factor focal extent_i /
@@ -344,7 +344,7 @@ class Target:
 
 
 @dataclasses.dataclass(frozen=True)
-class Truth:
+class BlobTruth:
     """The truth of a simulated recording: `truth(times)` gives the states (times, targets, 8).
 
     Rounding of events to pixels adds 1/12 px^2 to the variances of their positions, which the true
@@ -385,7 +385,7 @@ def simulate_blobs(
     noise: float | int = 0.0,
     seed: int = 0,
     name: str = "blobs",
-) -> tuple[Recording, Truth]:
+) -> tuple[Recording, BlobTruth]:
     """Simulate the events of targets; deterministic in `seed`.
 
     Times are rounded to microseconds, positions to pixels; events outside the sensor are lost. A
@@ -437,18 +437,18 @@ def simulate_blobs(
     for target, own in zip(targets, seeds[1:], strict=True):
         parts.append(target.events(duration, np.random.default_rng(own)))
     t, xi, on = (np.concatenate(column) for column in zip(*parts, strict=True))
-    source = np.repeat(np.arange(len(parts)) + BACKGROUND, [len(part[0]) for part in parts])
+    source = np.repeat(np.arange(len(parts)) + BACKGROUND_SOURCE, [len(part[0]) for part in parts])
     pixel = np.rint(xi)
     inside = ((pixel >= 0) & (pixel < size)).all(1)
     order = np.flatnonzero(inside)[np.argsort(t[inside], kind="stable")]
     t, (x, y) = t[order], pixel[order].astype(np.uint16).T
     events = Events(np.rint(t * 1e6).astype(np.int64), x, y, on[order])
     recording = Recording(name, width, height, events).check()
-    return recording, Truth(targets, duration, source[order], t, xi[order])
+    return recording, BlobTruth(targets, duration, source[order], t, xi[order])
 
 
 _WIDE = (1280, 720)
-_LISSAJOUS = Lissajous((639.5, 359.5), (420, 240), (0.6143, 0.7927), (0.5, -0.3), spin=4.0)
+_LISSAJOUS = LissajousMotion((639.5, 359.5), (420, 240), (0.6143, 0.7927), (0.5, -0.3), spin=4.0)
 Scene = tuple[list[Target], tuple[int, int], float, float]  # targets, size, duration, noise
 
 
@@ -461,23 +461,26 @@ def _noise(ratio: float | int = 1.0, rate: float | int = 1e5) -> Scene:
 
 
 def _growing(rate: float | int = 1e5) -> Scene:
-    motion = Approach((1.0, 0.4), distance=17.0, speed=8.0, extent=(0.24, 0.16), theta=0.4)
+    motion = ApproachMotion((1.0, 0.4), distance=17.0, speed=8.0, extent=(0.24, 0.16), theta=0.4)
     return [Target(motion, rate)], _WIDE, 1.5, 0.0
 
 
 def _ttc(rate: float | int = 5e4, ratio: float | int = 0.1) -> Scene:
     # 20 m to 8 m in 3.45 s, from 1.6 to 5.36 m/s.
     lights = [
-        Approach((x, 0.3), 20.0, 1.6, extent=(0.4, 0.3), acceleration=1.09) for x in (-0.7, 0.7)
+        ApproachMotion((x, 0.3), 20.0, 1.6, extent=(0.4, 0.3), acceleration=1.09)
+        for x in (-0.7, 0.7)
     ]
     return [Target(light, rate) for light in lights], _WIDE, 3.45, float(2 * rate * ratio)
 
 
 def _cars(rate: float | int = 2e4, ratio: float | int = 0.1) -> Scene:
     targets = []
-    for lane, distance, speed, acceleration in CARS:
+    for lane, distance, speed, acceleration in CAR_MOTIONS:
         for x in (lane - 0.7, lane + 0.7):
-            light = Approach((x, 0.8), distance, speed, (0.2, 0.15), acceleration=acceleration)
+            light = ApproachMotion(
+                (x, 0.8), distance, speed, (0.2, 0.15), acceleration=acceleration
+            )
             targets.append(Target(light, rate))
     return targets, _WIDE, 2.0, float(6 * rate * ratio)
 
@@ -494,7 +497,9 @@ def _crossing(
 ) -> Scene:
     x, y, half = 639.5, 359.5, 0.3 * speed
     targets = [
-        Target(Line((x - s * half, y - s * offset / 2), (s * speed, 0.0), theta=0.3 * s), rate)
+        Target(
+            LinearMotion((x - s * half, y - s * offset / 2), (s * speed, 0.0), theta=0.3 * s), rate
+        )
         for s in (1, -1)
     ]
     return targets, _WIDE, 0.6, 0.0
@@ -510,7 +515,7 @@ def _flock(
     targets = []
     for k in range(count):
         phase = 2 * math.pi * k / count
-        motion = Circle(
+        motion = CircularMotion(
             (639.5, 359.5), 220 + 60 * (k % 2), 2.0, phase, size=(6.0, 4.0), theta=phase
         )
         hidden = ((-1.0, k * stagger),) if k * stagger > 0 else ()
@@ -527,7 +532,7 @@ def _walk(
 
 
 # Of `_cars`, left, in front, right: offset (m), distance (m), speed (m/s), acceleration (m/s^2).
-CARS = ((-3.2, 22.0, 2.0, 2.0), (0.0, 18.0, 0.5, 0.0), (3.0, 14.0, 3.5, 0.0))
+CAR_MOTIONS = ((-3.2, 22.0, 2.0, 2.0), (0.0, 18.0, 0.5, 0.0), (3.0, 14.0, 3.5, 0.0))
 
 _SCENES: dict[str, Callable[..., Scene]] = {
     "lissajous": _lissajous,
@@ -544,7 +549,7 @@ _SCENES: dict[str, Callable[..., Scene]] = {
 BLOB_SCENES = tuple(_SCENES)
 
 
-def blob_scene(name: str, seed: int = 0, **settings: Any) -> tuple[Recording, Truth]:
+def blob_scene(name: str, seed: int = 0, **settings: Any) -> tuple[Recording, BlobTruth]:
     """Simulate a scene of `BLOB_SCENES` by name.
 
     - lissajous: one blob of (10, 5) px, to 2000 px/s, turning at 4 rad/s, 1.5 s (rate, noise);

@@ -19,7 +19,7 @@ from jaxevent.codegen import njit_noalloc
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
-from jaxevent.simulate.scenes import Source
+from jaxevent.simulate.scenes import IntensitySource
 
 _BLOCK_SAMPLES = 32
 _MAX_STEP_S, _MIN_STEP_S = 4e-3, 1e-4  # between samples
@@ -100,7 +100,7 @@ SENSORS = {
 
 
 def simulate(
-    source: Source, sensor: Sensor | None = None, seed: int = 0, name: str = "simulated"
+    source: IntensitySource, sensor: Sensor | None = None, seed: int = 0, name: str = "simulated"
 ) -> Recording:
     """Record a source with a sensor; deterministic in `seed`.
 
@@ -197,8 +197,8 @@ def frame_times(duration: float | int, sensor: Sensor) -> NDArray[np.int64]:
 
 
 def expose(
-    light: Callable[[float], NDArray],
-    stamps: NDArray[np.int64],
+    intensity_at: Callable[[float], NDArray],
+    stamps_us: NDArray[np.int64],
     sensor: Sensor,
     rng: np.random.Generator,
     gain: NDArray[np.float64] | None = None,
@@ -206,8 +206,8 @@ def expose(
     """Expose frames.
 
     Args:
-        light: A function from a time (s) to linear intensity (...), grey or colour.
-        stamps: (frames,) mid-exposure times, us.
+        intensity_at: A function from a time (s) to linear intensity (...), grey or colour.
+        stamps_us: (frames,) mid-exposure times, us.
         sensor: The sensor.
         rng: Source of noise.
         gain: (frames,) gains; None: by automatic exposure, or 1.
@@ -218,11 +218,11 @@ def expose(
     response = sensor_response(sensor)
     within = (np.arange(sensor.exposure_samples) + 0.5) / sensor.exposure_samples - 0.5
     images, gains, factor = [], [], 1.0
-    for k, stamp in enumerate(stamps):
+    for k, stamp in enumerate(stamps_us):
         if gain is not None:
             factor = float(gain[k])
         times = stamp * 1e-6 + within * sensor.exposure
-        mean = np.mean([light(float(t)) for t in times], axis=0)
+        mean = np.mean([intensity_at(float(t)) for t in times], axis=0)
         if math.isfinite(sensor.full_well):
             # Poisson, by its normal limit: electrons gain sqrt(electrons), full_well at mean = 1.
             mean = mean + rng.normal(size=mean.shape) * np.sqrt(mean / sensor.full_well)
@@ -248,7 +248,7 @@ def _truth_times(
 
 
 def _samples(
-    source: Source, sensor: Sensor, name: str
+    source: IntensitySource, sensor: Sensor, name: str
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield blocks of times (us) and ln(I + dark_offset) (samples, pixels); ends are shared.
 
@@ -299,7 +299,7 @@ class _NoiseEvents(NamedTuple):
 
 
 def _simulate_events(
-    source: Source,
+    source: IntensitySource,
     sensor: Sensor,
     thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
     rngs: tuple[np.random.Generator, np.random.Generator],

@@ -5,8 +5,8 @@
     truth.depth(0.2)   # (height, width) in m
 
 Camera axes are x to the right, y down, z forward; the world's are the camera's at time 0. Pixel
-centres are whole numbers. `frame_events` is the generator of the egomotion thesis: events are
-differences of images 50 us apart.
+centres are whole numbers. `simulate_frame_events` is the generator of the egomotion thesis: events
+are differences of images 50 us apart.
 """
 
 import dataclasses
@@ -223,7 +223,7 @@ def make_texture(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Patch:
+class FlatPatch:
     """A flat, opaque ellipse or rectangle.
 
     Its axes are the world's x and y, turned by the rotation vector `turn`.
@@ -247,7 +247,7 @@ class _Rays(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class World:
+class BoxWorld:
     """The inside of a box, in which the camera is, and patches in it.
 
     All walls have the same texture, which fades near their edges. Patches hide the walls, and each
@@ -258,7 +258,7 @@ class World:
     lower: Three  # m
     upper: Three
     texture: Texture
-    patches: tuple[Patch, ...] = ()
+    patches: tuple[FlatPatch, ...] = ()
 
     seen = RenamedAttribute("render")
 
@@ -306,7 +306,7 @@ class World:
 
     @staticmethod
     def _draw_patch(
-        patch: Patch, rays: _Rays, level: NDArray[np.float64], depth: NDArray[np.float64]
+        patch: FlatPatch, rays: _Rays, level: NDArray[np.float64], depth: NDArray[np.float64]
     ) -> None:
         """Draw a patch over `level` and `depth` (n,)."""
         centre, ray, length, pixel = rays
@@ -348,7 +348,7 @@ def _smooth_step(a: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MovingCamera:
-    """A camera in a world, a `Source` for `simulate`, with the truth of its motion.
+    """A camera in a world, an `IntensitySource` for `simulate`, with the truth of its motion.
 
     Times of the truth are integers (us) or floats (s) from 0 to the duration.
 
@@ -357,7 +357,7 @@ class MovingCamera:
             the image.
     """
 
-    world: World
+    world: BoxWorld
     motion: CameraMotion
     size: tuple[int, int] = (240, 180)  # width, height, px
     focal: float | int = 200.0  # px, of a lens without distortion, centred in the image
@@ -474,7 +474,7 @@ def _room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
 
 def _scatter_patches(
     rng: np.random.Generator, kinds: Sequence[str], count: int, half: tuple[float, float]
-) -> tuple[Patch, ...]:
+) -> tuple[FlatPatch, ...]:
     """Scatter patches at 1.4 to 3 m within 75 degrees of the axis, the farthest first.
 
     Their half axes are `half` times their distance.
@@ -498,7 +498,9 @@ def _scatter_patches(
         tx, ty, tz = turn.as_rotvec().tolist()
         base = float(rng.choice([-0.7, -0.4, 0.4, 0.7]))
         patches.append(
-            Patch((x, y, z), (a, b), textures[k % len(textures)], base, (tx, ty, tz), k % 2 == 0)
+            FlatPatch(
+                (x, y, z), (a, b), textures[k % len(textures)], base, (tx, ty, tz), k % 2 == 0
+            )
         )
     return tuple(patches)
 
@@ -596,7 +598,7 @@ def motion_scene(
             x, y = (factor * mean_speed * direction).tolist()
             return x, y
 
-        world = World(
+        world = BoxWorld(
             (-50, -50, -1), (50, 50, 2), make_texture(texture or "noise", 2 / focal, texture_seed)
         )
         moved = {
@@ -614,7 +616,7 @@ def motion_scene(
                 if name == "shapes"
                 else _scatter_patches(rng, ("noise", "shapes"), 24, (0.1, 0.24))
             )
-        world = World(*room, patches)
+        world = BoxWorld(*room, patches)
         if name == "rotation":
             moved = _draw_motion(rng, motion, 0.0, 2.0 if speed is None else float(speed))
         else:
@@ -624,7 +626,7 @@ def motion_scene(
     return simulate_motion(source, sensor, seed, f"{name} {motion}"), source
 
 
-def frame_events(
+def simulate_frame_events(
     flow: NDArray[np.float64],
     image: NDArray[np.float64] | None = None,
     *,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from jaxevent.deprecated import warn_renamed
+from jaxevent.deprecated import renamed_names, warn_renamed
 from jaxevent.errors import InputError
 
 # Signed distance (px) of points x, y from a shape's edge, negative inside; distances are of the
@@ -44,10 +44,10 @@ def _cross(x: NDArray, y: NDArray, r: float) -> NDArray:
     return np.minimum(bar, post)
 
 
-SHAPES: tuple[Distance, ...] = (_disc, _box, _triangle, _diamond, _cross)
+OBJECT_SHAPES: tuple[Distance, ...] = (_disc, _box, _triangle, _diamond, _cross)
 
 
-class Surface(NamedTuple):
+class MovingSurface(NamedTuple):
     """The background or an object, with a texture that moves with it."""
 
     distance: Distance | None  # None: everywhere
@@ -66,7 +66,7 @@ class Surface(NamedTuple):
 
     def place(self, t: float | int) -> NDArray[np.floating]:
         """Return `position`; the old name of the method."""
-        warn_renamed("Surface.place", "Surface.position")
+        warn_renamed("MovingSurface.place", "MovingSurface.position")
         return self.position(t)
 
     def velocity(self, t: float | int) -> NDArray[np.floating]:
@@ -105,8 +105,8 @@ class Surface(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Objects:
-    """Five textured objects before a moving background: a `Source` whose optical flow is known.
+class MovingObjects:
+    """Five textured objects before a moving background, an `IntensitySource` with known flow.
 
     A disc, a box, a triangle, a diamond and a cross swing about different points, sideways and up
     and down at different rates, so that they are always accelerated. The speed of each, its root
@@ -199,14 +199,19 @@ class Objects:
         return moves, hidden
 
     @functools.cached_property
-    def surfaces(self) -> tuple[Surface, ...]:
+    def surfaces(self) -> tuple[MovingSurface, ...]:
         """The background and the objects, from far to near."""
         rng = np.random.default_rng(self.seed)
         size = np.array(self.size, float)
-        shapes: list[Distance | None] = [None, *(SHAPES[k] for k in rng.permutation(len(SHAPES)))]
+        shapes: list[Distance | None] = [
+            None,
+            *(OBJECT_SHAPES[k] for k in rng.permutation(len(OBJECT_SHAPES))),
+        ]
         # Middles about a ring, from where all objects come across one another.
-        angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(len(SHAPES)) / len(SHAPES)
-        lights = rng.permutation(np.linspace(0.3, 0.7, len(SHAPES)))
+        angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(len(OBJECT_SHAPES)) / len(
+            OBJECT_SHAPES
+        )
+        lights = rng.permutation(np.linspace(0.3, 0.7, len(OBJECT_SHAPES)))
         surfaces = []
         for k, shape in enumerate(shapes):
             swing = size * rng.uniform(0.15, 0.25, 2)
@@ -218,7 +223,7 @@ class Objects:
                 turn = np.array([np.cos(angles[k - 1]), np.sin(angles[k - 1])])
                 middle, light, contrast = middle + 0.22 * size * turn, lights[k - 1], 0.2
             surfaces.append(
-                Surface(
+                MovingSurface(
                     shape,
                     float(size.min() * rng.uniform(0.12, 0.2)),
                     middle,
@@ -247,3 +252,6 @@ def _texture(rng: np.random.Generator) -> NDArray[np.floating]:
         grain = gaussian_filter(rng.normal(size=noise.shape), deviation, mode="wrap")
         noise += weight * grain / grain.std()
     return spline_filter(noise / noise.std(), 3, mode="grid-wrap")
+
+
+__getattr__ = renamed_names(__name__)

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter, uniform_filter
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Times, microseconds
 
 Speed = Literal["slow", "fast"]
 
 # px/s at the image centre; the speed varies by a third about it.
-SPEEDS = {"slow": 30.0, "fast": 300.0}
+PAN_SPEEDS_PX_S = {"slow": 30.0, "fast": 300.0}
 
 # The lens: a Gaussian point spread, and a wide one, its glare, with a part of the light.
 _BLUR_PX, _GLARE_PX, _GLARE_SHARE = 1.1, 12.0, 2e-4
@@ -51,7 +52,7 @@ def parse_seconds(times: Times, duration: float | int) -> NDArray[np.float64]:
 
 
 @runtime_checkable
-class Source(Protocol):
+class IntensitySource(Protocol):
     """A scene for the simulated sensor."""
 
     @property
@@ -245,7 +246,10 @@ _SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
     "tunnel": (_tunnel, 0.13),
 }
 SCENES = tuple(_SCENES)
-FITTING, TESTING = SCENES[:2], SCENES[2:]  # for fits of parameters, and for held-out scores
+FITTING_SCENES, TESTING_SCENES = (
+    SCENES[:2],
+    SCENES[2:],
+)  # for fits of parameters, and for held-out scores
 
 
 def scene(
@@ -296,7 +300,7 @@ def scene(
 
 @dataclasses.dataclass(frozen=True)
 class Pan:
-    """A camera that moves over a panorama: a `Source`.
+    """A camera that moves over a panorama: an `IntensitySource`.
 
     The heading swings by 2 rad about left or right within 1.6 s and the speed by a third, 20 to
     40 px/s ("slow") or 200 to 400 px/s ("fast"), or about a number given in px/s; the camera rolls
@@ -318,7 +322,7 @@ class Pan:
     def __post_init__(self) -> None:
         if self.panorama.ndim != 2 or not (self.panorama > 0).all():
             raise InputError("a panorama needs positive intensities of shape (height, width)")
-        if self.speed not in SPEEDS and not (
+        if self.speed not in PAN_SPEEDS_PX_S and not (
             isinstance(self.speed, float | int) and 0 <= self.speed < np.inf
         ):
             raise InputError(
@@ -353,7 +357,7 @@ class Pan:
         t = np.linspace(0, self.duration, max(8, int(self.duration * 200)))
         bearing, swing, _, phase = self._phases
         bearing = 0.0 if bearing < np.pi else np.pi
-        mean = SPEEDS[self.speed] if isinstance(self.speed, str) else self.speed
+        mean = PAN_SPEEDS_PX_S[self.speed] if isinstance(self.speed, str) else self.speed
         speed = mean * (1 + np.sin(2 * np.pi * t / 1.1 + phase) / 3)
         heading = bearing + 2 * np.sin(2 * np.pi * t / 1.6 + swing)
         velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
@@ -376,3 +380,6 @@ class Pan:
             for part in (self._torus > 1, self._torus < 0.05)
         )
         return places[np.argmax(np.min([bright, dark, 1 - bright - dark], axis=0))]
+
+
+__getattr__ = renamed_names(__name__)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from jaxevent.camera import Response, SCurve, Values
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, require
 from jaxevent.recording import Recording
 from jaxevent.simulate.hybrid import Sensor, expose, frame_times, simulate
@@ -48,8 +49,8 @@ class _CroppedResponse(Response):
 
 
 @dataclasses.dataclass(frozen=True)
-class Clip:
-    """Video frames as a `Source`; light changes linearly from each frame to the next.
+class VideoClip:
+    """Video frames as an `IntensitySource`; light changes linearly from each frame to the next.
 
     Objects fade between frames rather than move, so video of motion above a pixel or two per frame
     needs a higher rate. Darkness is half the light of level 1, never 0.
@@ -150,7 +151,7 @@ def from_video(
         raise InputError(f"{path}: there is no such file or folder; correct the path")
     read = _read_folder if path.is_dir() else _read_video
     images, found = read(path, max_size, rate, start, stop)
-    clip = Clip(images, found * speed, (255 - cut) / 255)
+    clip = VideoClip(images, found * speed, (255 - cut) / 255)
     sensor = dataclasses.replace(sensor, response=_CroppedResponse(curve, cut / (255 - cut)))
     recording = simulate(clip, sensor, seed, path.stem)
     stamps = frame_times(clip.duration, sensor)
@@ -258,3 +259,6 @@ def _read_folder(
                 raise InputError(f"{file}: is not a readable image; remove it") from error
 
     return _stack(path, read(), max_size), found
+
+
+__getattr__ = renamed_names(__name__)

@@ -19,7 +19,7 @@ from jaxevent.cli import main
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 from jaxevent.runs.evaluate import evaluate
-from jaxevent.simulate import Circle, Target, simulate_blobs
+from jaxevent.simulate import CircularMotion, Target, simulate_blobs
 
 
 @functools.cache
@@ -187,7 +187,7 @@ def test_the_likelihood_has_its_gradient(golden):
 @pytest.mark.slow
 def test_targets_may_be_born_too():
     """Two dots, found on the grid and followed in single steps until the events end."""
-    circles = [Circle((x, 32.0), 4.0, 10.0, size=(2.0, 2.0)) for x in (24.0, 72.0)]
+    circles = [CircularMotion((x, 32.0), 4.0, 10.0, size=(2.0, 2.0)) for x in (24.0, 72.0)]
     dots = [Target(circle, 2e4) for circle in circles]
     recording, truth = simulate_blobs(dots, (96, 64), 0.06, 0, 2)
     small = {"lambda0": 5.0, "gate_min": 8.0, "n_birth": 10.0}

@@ -15,7 +15,7 @@ from jaxevent.show import track_figures as pictures
 from jaxevent.show.images import video_writer
 from jaxevent.show.track_figures import write_track_plot
 from jaxevent.show.track_tables import STATE_COLUMNS, track_writer
-from jaxevent.simulate.blobs import CARS, blob_scene
+from jaxevent.simulate.blobs import CAR_MOTIONS, blob_scene
 
 RNG = np.random.default_rng
 INVERSE_TTC = jax.jit(quantities.inverse_ttc)
@@ -81,7 +81,7 @@ def test_three_cars_tell_their_times_to_contact():
     tracks = blob.constant_velocity.estimate(recording, params, seeds=seeds, progress=False)
     target_of = np.concatenate([one.id for one in tracks.events()])
     t = np.concatenate([one.t for one in tracks.events()])
-    for car, (_, distance, speed, acceleration) in enumerate(CARS):
+    for car, (_, distance, speed, acceleration) in enumerate(CAR_MOTIONS):
         pair = 2 * car, 2 * car + 1
         times = t[np.isin(target_of, pair)]
         assert len(times) > 0.95 * 2 * 2e3 * truth.duration
@@ -276,7 +276,9 @@ def test_range_from_size():
 
 @pytest.mark.parametrize("shape", ["ring", "disc", "uniform"])
 def test_size_factors_are_those_of_sampled_events(shape):
-    target = simulate.Target(simulate.Line((100, 100), (50.0, 0.0), size=(7, 7)), 2e5, shape=shape)
+    target = simulate.Target(
+        simulate.LinearMotion((100, 100), (50.0, 0.0), size=(7, 7)), 2e5, shape=shape
+    )
     _, truth = simulate.simulate_blobs([target], (300, 200), 1.0)
     offset = truth.xi - truth(truth.t)[:, 0, :2]
     diameter = 2 * np.hypot(*offset.T).max()
@@ -324,7 +326,7 @@ def tracks(seed=0, T=12, N=2):
 
 
 def still(size=(120, 80)):
-    target = simulate.Target(simulate.Line((40, 30), size=(6, 3), theta=0.5), 2e4)
+    target = simulate.Target(simulate.LinearMotion((40, 30), size=(6, 3), theta=0.5), 2e4)
     return simulate.simulate_blobs([target], size, 1.0, seed=1)[0]
 
 

@@ -13,7 +13,7 @@ from jaxevent.estimator import Estimator
 from jaxevent.methods import find, names
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.fit import fit
-from jaxevent.simulate import Line, Target, simulate_blobs
+from jaxevent.simulate import LinearMotion, Target, simulate_blobs
 
 METHOD = "own_blob:student"
 PARAMS = {"events_per_step": 8, "lambda0": 4.0, "Q_v": 1e4, "P0_v": 1e4}
@@ -24,7 +24,7 @@ TABLE = ", ".join(f"{name} = {value}" for name, value in PARAMS.items())
 def folder(tmp_path_factory):
     """A blob that moves along a line for 0.02 s, 800 events, and its path."""
     folder = tmp_path_factory.mktemp("own")
-    line = Line((20, 20), (500, 100), size=(3.0, 3.0))
+    line = LinearMotion((20, 20), (500, 100), size=(3.0, 3.0))
     recording, truth = simulate_blobs([Target(line, 4e4)], (60, 40), 0.02, seed=3)
     jaxevent.save(recording, folder / "a.h5")
     times = np.arange(1000, 19_000, 1000)

@@ -40,7 +40,7 @@ from jaxevent.blob.track import StepEvents, TrackBuffer, predict_and_gate
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.recording import Events, Recording
-from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
+from jaxevent.simulate.blobs import CircularMotion, LinearMotion, Target, simulate_blobs
 
 SMALL = (128, 96)
 
@@ -53,7 +53,8 @@ def scene(targets, duration=0.4, noise=2e3, seed=0):
 def crossed():
     """Two targets that pass through each other, their paths, and what is found of them."""
     targets = [
-        Target(Line((64 - s * 40, 48.0), (s * 200.0, 0.0), size=(4.0, 3.0)), 2e4) for s in (1, -1)
+        Target(LinearMotion((64 - s * 40, 48.0), (s * 200.0, 0.0), size=(4.0, 3.0)), 2e4)
+        for s in (1, -1)
     ]
     recording, truth = scene(targets)
     return recording, truth, blob.find(recording, progress=False)
@@ -97,7 +98,7 @@ def test_what_the_user_sets_wins_over_what_is_found(crossed):
 
 @pytest.mark.slow
 def test_noise_and_hot_pixels_are_no_targets():
-    hot = [Target(Line((x, 40.0), size=(0.01, 0.01)), 2e3) for x in (20.0, 90.0)]
+    hot = [Target(LinearMotion((x, 40.0), size=(0.01, 0.01)), 2e3) for x in (20.0, 90.0)]
     recording, _ = scene(hot, noise=2e4, seed=3)
     found = blob.find(recording, progress=False)
     assert len(found) == 0 and found.hot_pixels == 2
@@ -108,9 +109,10 @@ def test_noise_and_hot_pixels_are_no_targets():
 
 @pytest.mark.slow
 def test_a_ring_and_a_pair_of_edges_are_one_target_each():
-    ring = [Target(Line((44, 48), (100.0, 0.0), size=(25, 25)), 2e4, "ring")]
+    ring = [Target(LinearMotion((44, 48), (100.0, 0.0), size=(25, 25)), 2e4, "ring")]
     edges = [
-        Target(Line((x, 48), (120.0, 0.0), size=(9.0, 0.6), theta=np.pi / 2), 1e4) for x in (20, 40)
+        Target(LinearMotion((x, 48), (120.0, 0.0), size=(9.0, 0.6), theta=np.pi / 2), 1e4)
+        for x in (20, 40)
     ]
     for targets, middle, size, duration in ((ring, 44, 25, 0.4), (edges, 30, 10, 0.5)):
         recording, truth = scene(targets, duration)
@@ -167,7 +169,7 @@ def test_a_small_piece_that_goes_along_is_of_the_larger_one():
 def test_two_that_begin_together_and_part_are_two():
     """Where cells are coarse, they are one blob until they are far apart."""
     starts = [((60.0, 40.0), (-90.0, 0.0)), ((70.0, 44.0), (90.0, 5.0))]
-    targets = [Target(Line(p, v, size=(4.0, 3.0)), 2e4) for p, v in starts]
+    targets = [Target(LinearMotion(p, v, size=(4.0, 3.0)), 2e4) for p, v in starts]
     recording, truth = scene(targets, 0.6)
     found = blob.find(recording, progress=False)
     assert len(found) == 2
@@ -408,7 +410,9 @@ def test_a_track_that_hops_from_a_lamp_is_the_lamp_s_if_it_is_mostly_there(leave
 
 @pytest.mark.slow
 def test_a_lamp_behind_a_target_is_no_target():
-    recording, truth = scene([Target(Circle((64, 48), 30, 5.0, 0.0, size=(3.0, 2.5)), 1e4)], 1.0)
+    recording, truth = scene(
+        [Target(CircularMotion((64, 48), 30, 5.0, 0.0, size=(3.0, 2.5)), 1e4)], 1.0
+    )
     t, xi, on = lamp(np.random.default_rng(1), [94.0, 48.0], 100.0, 1.0, 4000)
     x, y = np.rint(xi).T.astype(np.uint16)
     e, us = recording.events, np.rint(1e6 * t).astype(np.int64)
@@ -423,7 +427,7 @@ def test_a_lamp_behind_a_target_is_no_target():
 
 
 def test_background_is_that_without_the_targets():
-    swinging = Target(Circle((64, 48), 25, 12.0, size=(3.0, 3.0)), 2e4)
+    swinging = Target(CircularMotion((64, 48), 25, 12.0, size=(3.0, 3.0)), 2e4)
     recording, _ = scene([swinging], 1.0, noise=2e4)
     stream = Stream(recording, 0, 1_000_000)
     rate = measure_background(stream).rate

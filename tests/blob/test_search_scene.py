@@ -17,7 +17,7 @@ from jaxevent.blob.search.scene import (
 )
 from jaxevent.blob.search.stream import Stream
 from jaxevent.recording import Events, Recording
-from jaxevent.simulate.blobs import Circle, Line, Target, simulate_blobs
+from jaxevent.simulate.blobs import CircularMotion, LinearMotion, Target, simulate_blobs
 
 FRAME, DURATION = (128, 96), 0.8
 SIZE = np.array(FRAME)
@@ -62,7 +62,7 @@ def seen_by_a_moving_camera(recording, seed=0, rate=1e6, maps=maps, begin=0.0):
 
 
 def before_noise(targets, seed=0, noise=2e3):
-    far = Target(Line((-500.0, -500.0), size=(1.0, 1.0)), 1.0)  # never seen
+    far = Target(LinearMotion((-500.0, -500.0), size=(1.0, 1.0)), 1.0)  # never seen
     return simulate_blobs([*targets, far], FRAME, DURATION, noise, seed)
 
 
@@ -124,7 +124,7 @@ def test_what_another_depth_does_is_no_own_way():
 @pytest.mark.slow
 def test_only_what_goes_its_own_way_is_a_target():
     """While the camera moves, and before it begins to."""
-    own = Circle((64, 48), 28, 8.0, size=(4.0, 3.0))
+    own = CircularMotion((64, 48), 28, 8.0, size=(4.0, 3.0))
     recording, truth = before_noise([Target(own, 3e4)])
     found = blob.find(seen_by_a_moving_camera(recording, begin=0.3), progress=False)
     assert found.camera_moves and "the camera moves" in found.summary()
@@ -170,7 +170,9 @@ def test_targets_that_go_together_are_no_scene():
     rng = np.random.default_rng(2)
     places = np.stack(np.meshgrid(np.arange(-30, 128, 24), np.arange(8, 110, 24)), -1)
     targets = [
-        Target(Line(tuple(p + rng.uniform(-5, 5, 2)), (30.0, -4.0), size=(1.5, 1.2)), 1500.0)
+        Target(
+            LinearMotion(tuple(p + rng.uniform(-5, 5, 2)), (30.0, -4.0), size=(1.5, 1.2)), 1500.0
+        )
         for p in places.reshape(-1, 2)
     ]
     recording, _ = before_noise(targets)

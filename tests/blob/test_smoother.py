@@ -13,7 +13,7 @@ from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
-from jaxevent.simulate import Line, Target, simulate_blobs
+from jaxevent.simulate import LinearMotion, Target, simulate_blobs
 
 Q_P, Q_V, P0_P, P0_V, STILL = 30.0, 2e5, 20.0, 4e4, 0.02
 PAUSE = 40_000, 90_000  # us, without events
@@ -125,9 +125,9 @@ def three():
     """Two targets that come and go at different times in background events, and one that stays."""
     rec, truth = simulate_blobs(
         [
-            Target(Line((20, 30), (300, 50), size=(4, 2), theta=0.5), 8e3),
-            Target(Line((90, 20), (0, 400), size=(3, 3)), 8e3, dropouts=((0.0, 0.03),)),
-            Target(Line((130, 90), (-200, 0), size=(3, 2)), 8e3, dropouts=((0.05, 0.1),)),
+            Target(LinearMotion((20, 30), (300, 50), size=(4, 2), theta=0.5), 8e3),
+            Target(LinearMotion((90, 20), (0, 400), size=(3, 3)), 8e3, dropouts=((0.0, 0.03),)),
+            Target(LinearMotion((130, 90), (-200, 0), size=(3, 2)), 8e3, dropouts=((0.05, 0.1),)),
         ],
         (160, 120),
         0.1,

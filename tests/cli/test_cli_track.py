@@ -24,7 +24,7 @@ from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import tracks as written
 from jaxevent.show.track_figures import track_colour
 from jaxevent.show.track_tables import STATE_COLUMNS
-from jaxevent.simulate import Line, Target, simulate_blobs
+from jaxevent.simulate import LinearMotion, Target, simulate_blobs
 
 WIDTH, HEIGHT = 120, 80
 SEEDS = [(30.0, 30.0, 6.0), (80.0, 50.0, 6.0)]
@@ -38,8 +38,8 @@ SETTINGS = "events_per_step = 8\nQ_v = 1e4\nP0_v = 1e4\n"
 def two() -> Recording:
     """Two blobs that move slowly apart, from 0 to 0.05 s."""
     targets = [
-        Target(Line((30, 30), (-100, 0), size=(4.0, 2.0)), 4e4),
-        Target(Line((80, 50), (100, 20), size=(3.0, 3.0)), 4e4),
+        Target(LinearMotion((30, 30), (-100, 0), size=(4.0, 2.0)), 4e4),
+        Target(LinearMotion((80, 50), (100, 20), size=(3.0, 3.0)), 4e4),
     ]
     return simulate_blobs(targets, (WIDTH, HEIGHT), 0.05, seed=1)[0]
 

@@ -207,24 +207,24 @@ def third(x):
 def test_a_module_of_text_is_made_again_from_damaged_files(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path))
     text = TEXT.format(number=0.25)
-    module = kernel_module.make_module(text)
+    module = kernel_module.compile_module(text)
     assert module.third.ctypes(6) == 2.25
     path = Path(module.__file__)
     (compiled,) = files_of(path.parent)
     content = path.read_bytes(), compiled.read_bytes()
-    assert kernel_module.make_module(text).third.cache_hits == 1
+    assert kernel_module.compile_module(text).third.cache_hits == 1
     for spoilt in (path, compiled):
         spoilt.write_bytes(spoilt.read_bytes()[:100])
-    assert kernel_module.make_module(text).third.ctypes(6) == 2.25
+    assert kernel_module.compile_module(text).third.ctypes(6) == 2.25
     assert path.read_bytes() == content[0]
-    assert kernel_module.make_module(text).third.cache_hits == 1
+    assert kernel_module.compile_module(text).third.cache_hits == 1
 
 
 def test_what_numba_does_not_compile_is_left_to_xla(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path))
     text = TEXT.format(number="new_in_no_release")
     with pytest.warns(UserWarning, match="left to XLA"), pytest.raises(TranslationError):
-        kernel_module.make_module(text)
+        kernel_module.compile_module(text)
 
 
 def _double(x):

@@ -73,7 +73,7 @@ def printed(code: str) -> str:
     ],
 )
 def test_private_interfaces_are_those_of_known_releases(version, known):
-    assert support.is_tested(version) == known
+    assert support.is_tested_release(version) == known
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from numba.core import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-from jaxevent.codegen.write import block
+from jaxevent.codegen.write import arithmetic_block
 
 LINES = """
 v1:f = read numbers k 1
@@ -67,7 +67,7 @@ address: Any = intrinsic(pointer)
 
 
 def test_a_block_computes_what_its_lines_say():
-    operation = block(types.float64, "numbers:p k:i x:f y:f", LINES, RESULTS)
+    operation = arithmetic_block(types.float64, "numbers:p k:i x:f y:f", LINES, RESULTS)
 
     @numba.njit
     def compute(numbers, k, x, y):
@@ -80,13 +80,13 @@ def test_a_block_computes_what_its_lines_say():
 
 def test_what_is_not_a_number_compares_as_in_ieee():
     lines = "\n".join(f"v{k}:b = {how} x x" for k, how in enumerate(("lt", "ge", "eq", "ne")))
-    operation = block(types.float64, "x:f", lines, "v0 v1 v2 v3")
+    operation = arithmetic_block(types.float64, "x:f", lines, "v0 v1 v2 v3")
     assert numba.njit(lambda x: operation((x,)))(math.nan) == (False, False, False, True)
 
 
 def test_reads_are_converted_to_the_kind_of_the_block():
     lines = "v1:f = read cells k 0\nv2:i = read counts k 1\nv3:b = read counts k 0"
-    operation = block(types.float64, "cells:p counts:p k:i", lines, "v1 v2 v3")
+    operation = arithmetic_block(types.float64, "cells:p counts:p k:i", lines, "v1 v2 v3")
 
     @numba.njit
     def compute(cells, counts, k):

@@ -5,8 +5,8 @@ import pytest
 
 from jaxevent import Events, Frames, InputError, Recording, blend
 from jaxevent.camera import PinholeCamera, SCurve
+from jaxevent.io.images import BAYER_PATTERNS
 from jaxevent.reconstruction.colour import (
-    PATTERNS,
     apply_chrominance,
     chrominance,
     colour_video,
@@ -180,7 +180,7 @@ def channel_images(parts):
     return {name: part.frames.images for name, part in parts.items()}
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", BAYER_PATTERNS)
 def test_colours_survive_splitting_and_joining(pattern):
     y, x = np.mgrid[:8, :10]
     rgb = np.stack([0.1 + 0.02 * x + 0.03 * y, 0.9 - 0.05 * x + 0.01 * y, 0.04 * y], -1)[None]
@@ -194,7 +194,7 @@ def test_colours_survive_splitting_and_joining(pattern):
     np.testing.assert_allclose(join_channels(channel_images(parts), pattern), even, rtol=1e-15)
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", BAYER_PATTERNS)
 def test_joining_keeps_what_the_sites_read(pattern):
     images = np.random.default_rng(2).random((2, 6, 8), np.float32)
     parts = split_channels(sensor(images), pattern)
@@ -203,7 +203,7 @@ def test_joining_keeps_what_the_sites_read(pattern):
     np.testing.assert_allclose(mosaic(rgb, pattern), images, rtol=1e-6)
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", BAYER_PATTERNS)
 def test_every_event_goes_to_the_channel_of_its_site(pattern):
     recording = sensor(np.zeros((1, 6, 8), np.uint8))
     parts = split_channels(recording, pattern)

@@ -28,9 +28,9 @@ from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
     NormalEquations,
     PackedImages,
-    solve,
+    solve_normal_equations,
 )
-from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
+from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.recording import Frames
 from jaxevent.simulate import Sensor, simulate
 
@@ -116,7 +116,7 @@ def test_equations_are_solved():
     across, down = weights[0], weights[1]
     smooth = np.array([2, 2, 3, 3], np.float32)
     ridge = np.array([0.1, 0.1, 0.5, 0.5], np.float32)
-    d = solve(NormalEquations(N, b, across, down, smooth, ridge), p, 60)
+    d = solve_normal_equations(NormalEquations(N, b, across, down, smooth, ridge), p, 60)
 
     size = rows * columns
     laplacian = np.zeros((size, size))
@@ -194,11 +194,11 @@ def warped_case():
 @pytest.mark.slow
 def test_images_along_trajectories():
     L, V, clear, s, paths = warped_case()
-    quick = warp.warp(L, V, clear, s, paths)
-    pure = jax.jit(warp.warp_jax)(L, V, clear, s, paths)
+    quick = warp.warp_images(L, V, clear, s, paths)
+    pure = jax.jit(warp.warp_images_jax)(L, V, clear, s, paths)
     for one, other in zip(quick, pure, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
-    Y, X = (np.asarray(v) for v in warp.positions(jnp.asarray(paths), jnp.asarray(s)))
+    Y, X = (np.asarray(v) for v in warp.path_positions(jnp.asarray(paths), jnp.asarray(s)))
     for k in range(3):
         at = [Y[k], X[k]]
         expected = map_coordinates(V[k], at, order=1, mode="nearest")
@@ -228,7 +228,7 @@ def still(L, V=0.01):
 @pytest.mark.slow
 def test_robust_mean_is_that_of_jax():
     L, V, clear, s, paths = warped_case()
-    along = warp.warp(L, V, clear, s, paths)
+    along = warp.warp_images(L, V, clear, s, paths)
     L[0, 4:9, 5:12] += 1.0  # a thing in front
     # Activity is what changes between frames; where none follows, or is before, up to the target.
     purely = jax.jit(robust_mean.robust_mean_jax)
@@ -246,8 +246,8 @@ def only(name, beyond="none"):
     """Return params that choose one candidate; `beyond` where frames are on one side alone."""
     chosen = []
     for one in (name, beyond):
-        rows = np.zeros((len(FALLBACKS), len(FEATURES) + 1))
-        rows[:, -1] = [40.0 if one == other else -40.0 for other in FALLBACKS]
+        rows = np.zeros((len(FALLBACK_SOURCES), len(FEATURE_NAMES) + 1))
+        rows[:, -1] = [40.0 if one == other else -40.0 for other in FALLBACK_SOURCES]
         chosen.append(rows.ravel().tolist())
     return Params(choice=chosen[0], choice_beyond=chosen[1])
 
@@ -268,7 +268,7 @@ def test_what_differs_is_hidden():
     np.testing.assert_allclose(np.asarray(fused.sources).sum(0), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", FALLBACKS)
+@pytest.mark.parametrize("name", FALLBACK_SOURCES)
 def test_other_candidates_can_be_chosen(name):
     L = moved((3.0, 1.0), (0, 0), np.linspace(-1, 1, 9), 20, 24)
     at = make_layout(9, 2, 1, 5)
@@ -287,7 +287,7 @@ def test_other_candidates_can_be_chosen(name):
     mild = Params(choice=(np.array(only(name).choice) / 10).tolist())
     V = np.full_like(L, 0.01)
     V[:, 5, 7] = 9.0
-    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + FALLBACKS.index(name)]
+    share = np.asarray(fuse(mild, L, V, still(L), at).sources)[3 + FALLBACK_SOURCES.index(name)]
     assert share[5, 7] < 0.03 and np.delete(share, 5, 0).min() > 0.97
 
 
@@ -406,12 +406,12 @@ def test_parts_of_the_image_that_share_a_course():
     pace = np.array([1.0, 2, 3, 2, 1, 0, 0, 0.5])
     texture = rng.uniform(50, 500, (1, 9, 1))
     together = rng.poisson(texture * pace, (3, 9, 8)).astype(float)
-    assert instants.common_share(together) == instants.MAX_EVENT_SHARE
+    assert instants.common_motion_fraction(together) == instants.MAX_EVENT_SHARE
     alone = rng.poisson(texture * rng.permuted(np.tile(pace, (3, 9, 1)), axis=2)).astype(float)
-    assert instants.common_share(alone) < 0.1
+    assert instants.common_motion_fraction(alone) < 0.1
     even = rng.poisson(texture * np.ones(8), (3, 9, 8)).astype(float)
-    assert instants.common_share(even) < 0.2
-    assert instants.common_share(np.zeros((1, 9, 8))) == 0
+    assert instants.common_motion_fraction(even) < 0.2
+    assert instants.common_motion_fraction(np.zeros((1, 9, 8))) == 0
 
 
 def test_trajectories_on_another_clock():
@@ -480,11 +480,11 @@ def constrain(params, L, P, case, samples):
 def test_an_exposure_is_the_mean_along_trajectories():
     L, adjacent, adjacent_frames, paths = exposed()
     I0 = float(Params().I0)
-    smeared = jax.jit(exposures.smear_jax)
+    smeared = jax.jit(exposures.blur_by_motion_jax)
     D = jax.jit(exposures.exposure_displacements, static_argnums=2)(adjacent, paths, 15)
     B, shares = smeared(L, D)
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
-    Y, X = (np.asarray(v) for v in warp.positions(jnp.asarray(paths), jnp.asarray(adjacent.s)))
+    Y, X = (np.asarray(v) for v in warp.path_positions(jnp.asarray(paths), jnp.asarray(adjacent.s)))
     for k in range(2):
         seen = map_coordinates(adjacent_frames.intensity[k].reshape(18, 23), [Y[k], X[k]], order=3)
         expected = np.log(seen + I0)  # exp L is I + I0, path_index mean is that of I, plus I0
@@ -494,7 +494,7 @@ def test_an_exposure_is_the_mean_along_trajectories():
     rng = np.random.default_rng(1)
     q, dL = np.zeros((2, 18, 23), np.float32), np.zeros((18, 23), np.float32)
     q[:, 7:11, 8:14], dL[5:13, 6:16] = rng.normal(size=(2, 4, 6)), rng.normal(size=(8, 10))
-    back = exposures.smear_adjoint(q, np.asarray(shares), np.asarray(D))
+    back = exposures.blur_by_motion_adjoint(q, np.asarray(shares), np.asarray(D))
     slope = jax.jvp(lambda L: smeared(L, D)[0], (jnp.asarray(L),), (jnp.asarray(dL),))[1]
     np.testing.assert_allclose((back * dL).sum(), (q * slope).sum(), rtol=0.1)
 
@@ -663,7 +663,7 @@ def test_variance_and_flow_are_true():
 def test_sources_are_shares():
     shares = video().sources(np.array([200_000]))
     assert shares["before"].shape == (1, 40, 48)
-    total = sum(shares[name] for name in fusion.SOURCES)
+    total = sum(shares[name] for name in fusion.SOURCE_NAMES)
     np.testing.assert_allclose(total, 1, atol=1e-4)
     assert shares["visible_before"].mean() > 0.5
 
@@ -857,7 +857,7 @@ def test_derivatives_of_motion_keep_the_residual():
     )
     same, dp = step(*change)
     np.testing.assert_array_equal(same, p)
-    balance, h = jax.jit(normal_equations.residual), 1e-3
+    balance, h = jax.jit(normal_equations.normal_equation_residual), 1e-3
 
     def slope(dp):
         ends = [
@@ -917,7 +917,7 @@ def test_blurring_is_scipys():
 
 def test_variance_features_of_frames_on_one_side():
     X, known = (
-        np.random.default_rng(3).normal(-4, 1, (len(FEATURES) + 1, 1, 3)),
+        np.random.default_rng(3).normal(-4, 1, (len(FEATURE_NAMES) + 1, 1, 3)),
         np.array([[0, 0.5, 1]]),
     )
     given = jnp.asarray(X), jnp.asarray(known)
@@ -928,11 +928,13 @@ def test_variance_features_of_frames_on_one_side():
         np.asarray(fusion.variance_features(*given, jnp.asarray(True), jnp.asarray(away)))
         for away in (1, 3, 0.5)
     )
-    apart, twice = (FEATURES.index(name) for name in ("from_each_other", "seen_twice"))
-    squares = np.exp(X[apart]) - fusion.MIN_SQUARE
-    np.testing.assert_allclose(np.exp(once[apart]) - fusion.MIN_SQUARE, known * squares, atol=1e-7)
+    apart, twice = (FEATURE_NAMES.index(name) for name in ("from_each_other", "seen_twice"))
+    squares = np.exp(X[apart]) - fusion.MIN_SQUARED_DIFFERENCE
     np.testing.assert_allclose(
-        np.exp(far[apart]) - fusion.MIN_SQUARE, 3 * known * squares, atol=1e-7
+        np.exp(once[apart]) - fusion.MIN_SQUARED_DIFFERENCE, known * squares, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        np.exp(far[apart]) - fusion.MIN_SQUARED_DIFFERENCE, 3 * known * squares, atol=1e-7
     )
     np.testing.assert_array_equal(near, once)
     np.testing.assert_allclose(once[twice], known * X[twice])

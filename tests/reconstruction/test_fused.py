@@ -30,7 +30,7 @@ from test_reconstruction import (
 import jaxevent
 from jaxevent import codegen
 from jaxevent.codegen import functions
-from jaxevent.codegen.derivative import Directions
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.graph import ParameterProgram, evaluate_jaxpr, evaluate_nodes
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.compensated.images import instant_smoother
@@ -86,7 +86,7 @@ def test_expressions_of_a_filter_are_its_functions(name):
     method, random = jaxevent.METHODS[name], np.random.default_rng(0)
     params = params_of(method, **{"weighting": "linear", **ALL})
     fixed = {"clock_offset": np.asarray(0.0), "present": np.asarray(1.0)}
-    known = Directions().inputs(params, fixed | {"response": np.linspace(0, 1, 256)})
+    known = DerivativeDirections().inputs(params, fixed | {"response": np.linspace(0, 1, 256)})
     kind = filter_program.KernelKind(False, np.dtype(float), 8208)
     trace = filter_program.trace_filter(method, known, kind)
     program = filter_program.translate_filter(trace, known, kind)
@@ -156,7 +156,7 @@ def test_smoothers_of_one_kernel_equal_the_scan(monkeypatch):
     monkeypatch.setattr(codegen, "N_THREADS", 1)
     np.testing.assert_array_equal(images("numba").mean, mean)
     # Bands of three rows each.
-    monkeypatch.setattr(bands, "STRIDES", (5 * 13,))
+    monkeypatch.setattr(bands, "BAND_STRIDES", (5 * 13,))
     np.testing.assert_allclose(images("numba").mean, mean, rtol=1e-9, atol=1e-9)
 
 
@@ -192,7 +192,7 @@ def test_bands_and_cores_do_not_change_a_bit(monkeypatch):
 
     whole = images()
     # Bands of three rows each: the events of two of them are neighbours of other bands.
-    monkeypatch.setattr(bands, "STRIDES", (5 * 13,))
+    monkeypatch.setattr(bands, "BAND_STRIDES", (5 * 13,))
     layout = bands.BandLayout.of(11, 9)
     assert layout is not None and len(layout.edges) == 4
     np.testing.assert_array_equal(images(), whole)
@@ -225,7 +225,7 @@ def test_stored_events_are_checked_while_they_are_divided(tmp_path):
 
 @pytest.mark.slow
 def test_images_that_are_held_are_not_written_over(monkeypatch):
-    monkeypatch.setattr(bands, "IMAGE_PIXELS", 2 * 11 * 9)  # two images at once
+    monkeypatch.setattr(bands, "MAX_PASS_PIXELS", 2 * 11 * 9)  # two images at once
     recording = random_recording(7, 900, 5, size=(11, 9), exposure=0)
     times = np.linspace(recording.start, recording.stop, 9).astype(np.int64)
     params = params_of(jaxevent.high_pass, **PARAMS)

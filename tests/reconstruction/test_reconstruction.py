@@ -235,11 +235,11 @@ def test_many_frames_and_uneven_pixels_in_windows(monkeypatch):
         image.reshape(expected[0].shape), expected[0], rtol=1e-12, atol=1e-12
     )
     np.testing.assert_allclose(variance.reshape(expected[1].shape), expected[1], rtol=1e-12)
-    monkeypatch.setattr(video, "MAX_STARTS", 8)
+    monkeypatch.setattr(video, "MAX_WINDOW_STARTS", 8)
     small = jaxevent.akf.estimate(recording, params, window_events=400)
     np.testing.assert_allclose(look(small, times), expected, rtol=1e-12, atol=1e-12)
     # More windows than states are kept: some images are filtered to from further back.
-    assert len(small._starts) <= video.MAX_STARTS < 5_000 / 400
+    assert len(small._starts) <= video.MAX_WINDOW_STARTS < 5_000 / 400
     for i in (3, 17, 11):
         again = [image[0] for image in look(small, times[i])]
         np.testing.assert_allclose(again, [e[i] for e in expected], rtol=1e-12, atol=1e-12)

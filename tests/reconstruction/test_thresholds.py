@@ -84,9 +84,9 @@ def test_deviations_are_those_of_single_regressions():
     rng = np.random.default_rng(0)
     rest, on, off = rng.normal(size=(3, 6, 5))
     changes = thresholds.LogChanges(rest, on, off, rng.uniform(0.5, 2, (6, 5)))
-    found = thresholds.regress(changes, 0.3)
+    found = thresholds.regress_deviations(changes, 0.3)
     for k in range(5):
-        W = np.diag(1 / (changes.V[:, k] + rest[:, k] ** 2 / thresholds.TAIL))
+        W = np.diag(1 / (changes.V[:, k] + rest[:, k] ** 2 / thresholds.HUBER_SQUARE))
         X = np.stack([on[:, k], off[:, k]], 1)
         left = np.linalg.inv(X.T @ W @ X + np.eye(2) / 0.3**2)
         np.testing.assert_allclose(found.d[:, k], left @ X.T @ W @ rest[:, k], rtol=1e-10)
@@ -99,8 +99,10 @@ def test_what_halves_agree_in_is_the_spread():
     on, off = rng.uniform(0, 1, (2, 8, 20_000))
     rest = true[0] * on - true[1] * off + 0.1 * rng.normal(size=on.shape)
     changes = thresholds.LogChanges(rest, on, -off, np.full(on.shape, 0.01))
-    halves = [thresholds.regress(changes.select(rows), 0.1) for rows in (slice(4), slice(4, 8))]
-    assert thresholds.estimate_sigma(*halves) == pytest.approx(0.07, rel=0.1)
+    halves = [
+        thresholds.regress_deviations(changes.select(rows), 0.1) for rows in (slice(4), slice(4, 8))
+    ]
+    assert thresholds.estimate_deviation_sigma(*halves) == pytest.approx(0.07, rel=0.1)
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from pyarrow import parquet
 import jaxevent
 from jaxevent import cli
 from jaxevent.methods import METHODS
-from jaxevent.reconstruction.video import BATCH
+from jaxevent.reconstruction.video import N_BATCH_IMAGES
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.scores import MEASURE_FUNCTIONS, score
@@ -297,7 +297,7 @@ def test_images_are_read_piece_by_piece():
     row = score(small(width=80, height=60, frames=stored), METHODS["last-frame"])
     whole = score(long(0), METHODS["last-frame"])
     assert untimed([row]) == untimed([whole])
-    assert Stored.most <= 2 * BATCH  # of 30 given and 30 hidden ones
+    assert Stored.most <= 2 * N_BATCH_IMAGES  # of 30 given and 30 hidden ones
 
 
 def wait_for(count: int, tasks: Path, process: subprocess.Popen, what: str = "finished") -> None:

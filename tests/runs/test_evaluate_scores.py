@@ -21,7 +21,7 @@ from jaxevent.runs.scores import Sample
 from jaxevent.show.page import page, picture
 from jaxevent.show.tables import markdown_table, short_names
 from jaxevent.simulate import blob_scene, motion_scene
-from jaxevent.simulate.blobs import Approach, Target, simulate_blobs
+from jaxevent.simulate.blobs import ApproachMotion, Target, simulate_blobs
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def cars(tmp_path_factory):
     """Two lights of one car, and all that is known of them."""
     folder = tmp_path_factory.mktemp("cars")
     lights = [
-        Target(Approach((x, 0.3), 14.0, 3.5, (0.2, 0.15), centre=(160, 100)), 1e4)
+        Target(ApproachMotion((x, 0.3), 14.0, 3.5, (0.2, 0.15), centre=(160, 100)), 1e4)
         for x in (-0.7, 0.7)
     ]
     recording, truth = simulate_blobs(lights, (320, 240), 0.4, 4e3, 3)

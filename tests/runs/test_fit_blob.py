@@ -20,7 +20,7 @@ from jaxevent.recording import Recording
 from jaxevent.runs.blob import FAMILY
 from jaxevent.runs.blob_positions import read_positions
 from jaxevent.runs.fit import fit
-from jaxevent.simulate import Circle, Target, simulate_blobs
+from jaxevent.simulate import CircularMotion, Target, simulate_blobs
 
 SPEED = 900.0  # px/s
 # A filter that compiles fast.
@@ -35,7 +35,7 @@ START = {
 @functools.cache
 def simulated(seed: int) -> tuple[Recording, np.ndarray]:
     """A blob on a circle for 0.16 s, 16,000 events; and its path, t, x and y in steps of 1 ms."""
-    circle = Circle((60, 45), 25, SPEED / 25, size=(4.0, 3.0))
+    circle = CircularMotion((60, 45), 25, SPEED / 25, size=(4.0, 3.0))
     recording, truth = simulate_blobs([Target(circle, 1e5)], (120, 90), 0.16, 1e3, seed)
     t = np.arange(1, 160) * 1e-3
     return recording, np.c_[t, truth(t)[:, 0, :2]]

@@ -12,7 +12,7 @@ import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.methods import METHODS, names
 from jaxevent.runs.fit_config import Task, read_plan
-from jaxevent.simulate import Circle, Target, motion_scene, simulate_blobs
+from jaxevent.simulate import CircularMotion, Target, motion_scene, simulate_blobs
 from jaxevent.tuning import loss_and_grad, optimise
 
 # Of each method a number whose gradient is not 0 in its recording; by default c_on.
@@ -36,7 +36,7 @@ HEAD = {
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("methods")
     jaxevent.save(moving(), folder / "reconstruction.h5")
-    circle = Circle((60, 45), 5, 100.0, size=(4.0, 3.0))
+    circle = CircularMotion((60, 45), 5, 100.0, size=(4.0, 3.0))
     jaxevent.save(
         simulate_blobs([Target(circle, 2e4)], (120, 90), 0.02, 0.0, 0)[0], folder / "blob.h5"
     )

@@ -10,16 +10,20 @@ from jaxevent.errors import InputError
 SIZE = (400, 300)
 CENTRE = (200, 150)
 MOTIONS = {
-    "lissajous": sim.Lissajous(CENTRE, (90, 60), (1.3, 2.1), (0.4, 1.0), theta=0.3, spin=-3.0),
-    "line": sim.Line((50, 60), (220.0, -31.0), spin=1.0),
-    "circle": sim.Circle(CENTRE, 70, 5.0, 0.7),
-    "approach": sim.Approach((0.3, -0.2), 6.0, 2.0, (0.3, 0.2), 500.0, CENTRE, acceleration=1.5),
+    "lissajous": sim.LissajousMotion(
+        CENTRE, (90, 60), (1.3, 2.1), (0.4, 1.0), theta=0.3, spin=-3.0
+    ),
+    "line": sim.LinearMotion((50, 60), (220.0, -31.0), spin=1.0),
+    "circle": sim.CircularMotion(CENTRE, 70, 5.0, 0.7),
+    "approach": sim.ApproachMotion(
+        (0.3, -0.2), 6.0, 2.0, (0.3, 0.2), 500.0, CENTRE, acceleration=1.5
+    ),
     "walk": sim.RandomWalk((200, 150, 80, -40, 9, 6, 0.2, 1), 1.0, Q_v=1e4, Q_q=9.0, seed=2),
 }
 
 
 def still(**settings):
-    values = {"motion": sim.Line(CENTRE, size=(9, 5), theta=0.6), "rate": 5e4, **settings}
+    values = {"motion": sim.LinearMotion(CENTRE, size=(9, 5), theta=0.6), "rate": 5e4, **settings}
     return sim.Target(**values)
 
 
@@ -94,7 +98,7 @@ def test_events_are_rounded_to_pixels_and_microseconds():
 
 
 def test_labels_say_which_target_made_an_event():
-    far = sim.Line((330, 250), size=(3, 3))
+    far = sim.LinearMotion((330, 250), size=(3, 3))
     recording, truth = sim.simulate_blobs(
         [still(), still(motion=far, rate=2e4)], SIZE, 0.5, noise=3e4
     )
@@ -264,11 +268,11 @@ def test_impossible_settings_are_named():
     with pytest.raises(InputError, match="no target"):
         sim.simulate_blobs([], SIZE, 0.2)
     with pytest.raises(InputError, match="size of target 0"):
-        run(still(motion=sim.Line(CENTRE, size=(3, 0))))
+        run(still(motion=sim.LinearMotion(CENTRE, size=(3, 0))))
     with pytest.raises(InputError, match="size of target 0"):  # reaches the camera
         run(still(motion=dataclasses.replace(MOTIONS["approach"], speed=50.0)))
     with pytest.raises(InputError, match="no event"):
-        run(still(motion=sim.Line((-900, 0))))
+        run(still(motion=sim.LinearMotion((-900, 0))))
     with pytest.raises(InputError, match="8 values"):
         sim.RandomWalk((0, 0), 1.0)
     with pytest.raises(InputError, match="not possible"):

@@ -39,7 +39,7 @@ def test_poses_integrate_the_twist():
 
 def test_truth_from_the_recorded_poses():
     box = sim.make_texture("noise", 0.05)
-    world = sim.World((-5, -5, -5), (5, 5, 5), box)
+    world = sim.BoxWorld((-5, -5, -5), (5, 5, 5), box)
     for motion, tolerance in ((sim.CameraMotion(SWINGING.mean), 1e-6), (SWINGING, 2e-2)):
         source = sim.MovingCamera(world, motion, SIZE, 50, duration=0.3)
         twists = from_poses(source.poses())
@@ -81,7 +81,7 @@ def test_images_fit_poses_and_depth():
 
 def test_planar_velocity():
     motion = sim.planar_motion((100, -60), 2, 200, slope=(30, 20), amplitude=(40, 10), phase=0.4)
-    world = sim.World((-9, -9, -1), (9, 9, 2), sim.make_texture("noise", 0.01))
+    world = sim.BoxWorld((-9, -9, -1), (9, 9, 2), sim.make_texture("noise", 0.01))
     source = sim.MovingCamera(world, motion, SIZE)
     t = np.array([0.0, 0.13, 0.5])
     wave = np.sin(2 * np.pi * 2 * t + 0.4)[:, None]
@@ -113,7 +113,7 @@ def test_events_of_a_moving_wave_are_on_time():
     grain, swing, f, depth, speed = 0.01, 0.6, 200, 2.0, 150.0
     texels = np.arange(512)
     level = np.broadcast_to(swing * np.sin(2 * np.pi * texels / 64), (512, 512))
-    world = sim.World((-50, -50, -1), (50, 50, depth), sim.Texture(level, grain))
+    world = sim.BoxWorld((-50, -50, -1), (50, 50, depth), sim.Texture(level, grain))
     motion = sim.planar_motion((speed, 0), depth, f, slope=(100, 0))
     source = sim.MovingCamera(world, motion, (12, 3), f, 0.5)
     events = sim.simulate_motion(source).events
@@ -196,7 +196,7 @@ def test_noise_comes_from_the_sensor():
 def test_frame_generator_against_interpolated_images():
     image = np.random.default_rng(8).normal(size=(9, 11))
     flow = np.array([[0.8, 0.6], [1.0, 0.0], [-0.3, 1.7], [0.0, -1.0]])
-    recording, truth = sim.frame_events(flow, image, size=(10, 7), threshold=0.4, seed=3)
+    recording, truth = sim.simulate_frame_events(flow, image, size=(10, 7), threshold=0.4, seed=3)
     np.testing.assert_allclose(truth, flow * 20_000)
     path = np.concatenate([np.zeros((1, 2)), np.cumsum(flow, axis=0)])
     y, x = np.mgrid[:7, :10]
@@ -218,14 +218,14 @@ def test_frame_generator_against_interpolated_images():
 
 def test_frame_generator_noise_and_seeds():
     flow = np.tile([0.8, 0.0], (20, 1))
-    first, _ = sim.frame_events(flow, seed=1)
-    again, _ = sim.frame_events(flow, seed=1)
+    first, _ = sim.simulate_frame_events(flow, seed=1)
+    again, _ = sim.simulate_frame_events(flow, seed=1)
     np.testing.assert_array_equal(first.events.x, again.events.x)
     assert 0.05 < len(first.events) / (20 * 32 * 32) < 0.9
-    still, _ = sim.frame_events(np.zeros((20, 2)), noise=0.1, seed=1)
+    still, _ = sim.simulate_frame_events(np.zeros((20, 2)), noise=0.1, seed=1)
     assert abs(len(still.events) - 2048) < 5 * np.sqrt(2048)
     with pytest.raises(InputError, match="no event"):
-        sim.frame_events(np.zeros((20, 2)))
+        sim.simulate_frame_events(np.zeros((20, 2)))
 
 
 def test_what_is_not_possible():
@@ -240,9 +240,12 @@ def test_what_is_not_possible():
     with pytest.raises(InputError, match="slope of a camera's motion"):
         sim.CameraMotion(SWINGING.mean, slope=(np.nan, 0, 0, 0, 0, 0))
     with pytest.raises(InputError, match="finite px/frame"):
-        sim.frame_events(np.zeros(3))
+        sim.simulate_frame_events(np.zeros(3))
     source = sim.MovingCamera(
-        sim.World((-1, -1, -1), (1, 1, 1), sim.make_texture("noise", 0.1)), SWINGING, (16, 12), 20
+        sim.BoxWorld((-1, -1, -1), (1, 1, 1), sim.make_texture("noise", 0.1)),
+        SWINGING,
+        (16, 12),
+        20,
     )
     with pytest.raises(InputError, match="known from 0"):
         source.twist(0.6)

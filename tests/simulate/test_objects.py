@@ -11,7 +11,7 @@ import jaxevent
 from jaxevent import cli
 from jaxevent.camera import UnknownResponse
 from jaxevent.runs.evaluate import evaluate
-from jaxevent.simulate import SENSORS, Objects, simulate
+from jaxevent.simulate import SENSORS, MovingObjects, simulate
 
 # Whether a point (x, y) from the middle lies in the shape of radius r.
 INSIDE = {
@@ -21,10 +21,10 @@ INSIDE = {
     "_diamond": lambda x, y, r: abs(x) + abs(y) < r,
     "_cross": lambda x, y, r: max(abs(x), abs(y)) < r and min(abs(x), abs(y)) < r / 3,
 }
-SMALL = Objects(size=(48, 40), seed=4)
+SMALL = MovingObjects(size=(48, 40), seed=4)
 
 
-def oracle(objects: Objects, number: int, t: float, x: int, y: int, fine: int = 16):
+def oracle(objects: MovingObjects, number: int, t: float, x: int, y: int, fine: int = 16):
     """The share of a pixel that an object covers, by points in it, and its intensity there."""
     surface = objects.surfaces[number]
     inside = INSIDE[surface.distance.__name__]
@@ -81,7 +81,7 @@ def test_farther_objects_are_hidden():
 
 
 def test_displacement_integrates_the_flow():
-    objects, t0, t1 = Objects(seed=2), 0.31, 0.36
+    objects, t0, t1 = MovingObjects(seed=2), 0.31, 0.36
     moves, hidden = objects.displacement(t0, t1)
     steps = np.linspace(t0, t1, 401)
     middles = (steps[1:] + steps[:-1]) / 2
@@ -108,7 +108,7 @@ def test_displacement_integrates_the_flow():
 
 
 def test_flow_is_that_of_the_surface_at_a_pixel():
-    objects = Objects(seed=3, speed=60, spread=0.5)
+    objects = MovingObjects(seed=3, speed=60, spread=0.5)
     for t in (0.0, 0.8):
         number = objects.visible(t)
         for k, surface in enumerate(objects.surfaces):
@@ -121,7 +121,7 @@ def test_flow_is_that_of_the_surface_at_a_pixel():
 def test_speeds_are_those_asked_for():
     t = np.linspace(0, 60, 3_000)
     for seed in range(3):
-        objects = Objects(seed=seed, speed=50, spread=0.3)
+        objects = MovingObjects(seed=seed, speed=50, spread=0.3)
         speeds = [
             np.sqrt(np.mean(np.sum([surface.velocity(float(s)) ** 2 for s in t], axis=1)))
             for surface in objects.surfaces
@@ -129,15 +129,15 @@ def test_speeds_are_those_asked_for():
         assert speeds[0] == pytest.approx(20, rel=0.03)
         assert all(0.97 * 35 < speed < 1.03 * 65 for speed in speeds[1:])
         assert np.ptp(speeds[1:]) > 3
-    still = Objects(seed=2, background=0).surfaces
+    still = MovingObjects(seed=2, background=0).surfaces
     assert not still[0].velocity(0.3).any() and still[1].velocity(0.3).any()
-    resting = Objects(seed=1, speed=0)
+    resting = MovingObjects(seed=1, speed=0)
     np.testing.assert_array_equal(resting.intensity(0.0), resting.intensity(0.7))
 
 
 def test_a_sensor_records_them():
     sensor = dataclasses.replace(SENSORS["davis"], frame_rate=25, response=UnknownResponse())
-    objects = Objects(size=(64, 48), duration=0.3, seed=5)
+    objects = MovingObjects(size=(64, 48), duration=0.3, seed=5)
     recording = simulate(objects, sensor, seed=5).check()
     assert len(recording.frames) == 8 and len(recording.events) > 1000
     images = np.asarray(recording.frames.images)
@@ -146,9 +146,9 @@ def test_a_sensor_records_them():
     assert np.abs(images[0] / 255 - truth).mean() < 0.01
     at = float(recording.extra["hdr_t"][0]) * 1e-6
     np.testing.assert_allclose(recording.extra["hdr"][0], objects.intensity(at), atol=1e-6)
-    same = Objects(size=(64, 48), duration=0.3, seed=5).intensity(0.1)
+    same = MovingObjects(size=(64, 48), duration=0.3, seed=5).intensity(0.1)
     np.testing.assert_array_equal(same, objects.intensity(0.1))
-    assert not np.array_equal(same, Objects(size=(64, 48), seed=6).intensity(0.1))
+    assert not np.array_equal(same, MovingObjects(size=(64, 48), seed=6).intensity(0.1))
 
 
 @pytest.mark.parametrize(
@@ -156,12 +156,12 @@ def test_a_sensor_records_them():
 )
 def test_objects_that_are_not_possible(wrong):
     with pytest.raises(jaxevent.InputError, match="objects of .* are not possible; give"):
-        Objects(**wrong)
+        MovingObjects(**wrong)
 
 
 def test_a_background_that_is_not_possible():
     with pytest.raises(jaxevent.InputError, match="background of -1 times .* give a number"):
-        Objects(background=-1)
+        MovingObjects(background=-1)
 
 
 @pytest.mark.slow

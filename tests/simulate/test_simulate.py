@@ -247,7 +247,9 @@ def test_perfect_events_reconstruct_what_the_frames_resolve():
 
 def test_scenes_span_what_they_say_and_differ():
     panoramas = {name: sim.scene(name, size=(240, 160)) for name in sim.SCENES}
-    assert len(panoramas) >= 6 and set(sim.FITTING) | set(sim.TESTING) == set(panoramas)
+    assert len(panoramas) >= 6 and set(sim.FITTING_SCENES) | set(sim.TESTING_SCENES) == set(
+        panoramas
+    )
     for name, panorama in panoramas.items():
         assert panorama.shape == (160, 240)
         darkest, brightest = np.quantile(panorama, [0.001, 0.999])

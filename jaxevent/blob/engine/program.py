@@ -32,14 +32,14 @@ from jaxevent.blob.track import (
 from jaxevent.codegen.graph import Graph, ParameterProgram, TranslationError, constant_value
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
-    ELEMENTS,
+    ELEMENT_AXIS_LENGTH,
     TracedFunction,
     TracedProgram,
-    name_leaves,
-    name_numbers,
+    named_leaves,
+    number_names,
     translate_function,
 )
-from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, ModuleWriter
 
 MAX_OPERATIONS = 4000  # of a module; beyond, numba compiles longer than XLA's scan takes
 
@@ -227,7 +227,7 @@ def trace_track(
 
     own = {name: shape() for name in overrides}
     track = jax.eval_shape(make_track, params, own, shape(2), shape(), time, flag)
-    M = 1 if single else ELEMENTS
+    M = 1 if single else ELEMENT_AXIS_LENGTH
     batch = jax.eval_shape(EventBatch, shape(M, 2), shape(M), shape(M))
     owner = shape(M, 2, kind=np.int32) if has_owners else None
     events = jax.eval_shape(StepEvents, time, batch, shape(M, kind=bool), owner)
@@ -237,7 +237,10 @@ def trace_track(
     predicted = jax.eval_shape(steps.measurement, params, **at_stop)["evidence.predicted"]
     evidence = jax.eval_shape(TrackEvidence, predicted, flag, flag)
     update = {"track": track, "events": events, "prediction": prediction, "weight": shape(M)}
-    weights = {"inside": shape(ELEMENTS, kind=bool), "log_likelihood": shape(ELEMENTS)}
+    weights = {
+        "inside": shape(ELEMENT_AXIS_LENGTH, kind=bool),
+        "log_likelihood": shape(ELEMENT_AXIS_LENGTH),
+    }
     decide = {**at_stop, "frame": shape(2), "evidence": evidence}
     functions = {
         "init": (steps.init, {"track": track, "xi": shape(2), "size": shape()}, True),
@@ -263,11 +266,11 @@ def _make_layout(trees: Mapping[str, Any]) -> Layout:
     reals = {name: k for k, name in enumerate(loop.REAL_NAMES)}
     integers = {name: k for k, name in enumerate(loop.INTEGER_NAMES)}
     for name, tree in trees.items():
-        for leaf_name, leaf in name_leaves(name, tree).items():
-            if ELEMENTS in leaf.shape:
+        for leaf_name, leaf in named_leaves(name, tree).items():
+            if ELEMENT_AXIS_LENGTH in leaf.shape:
                 continue
             columns = reals if leaf.dtype.kind == "f" else integers
-            for number in name_numbers(leaf_name, leaf):
+            for number in number_names(leaf_name, leaf):
                 columns.setdefault(number, len(columns))
     return Layout(reals, integers)
 
@@ -312,7 +315,7 @@ def _weight_texts(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _step_lines(
-    writer: Writer, program: TrackProgram, function: TracedFunction, stores: dict[str, str]
+    writer: ModuleWriter, program: TrackProgram, function: TracedFunction, stores: dict[str, str]
 ) -> list[str]:
     """Write a step of one event, which updates the track or leaves it unchanged.
 
@@ -320,32 +323,32 @@ def _step_lines(
     """
     truth, cases = function.results["touched.0"], []
     for line, value in (("if {}:", True), ("else:", False)):
-        case = program.graph.suppose(function.results, truth, value)
+        case = program.graph.assume_truth(function.results, truth, value)
         changed = {k: n for k, n in case.items() if k.startswith("track.") and n.args != (k,)}
         if value:
             changed["touched.0"] = program.graph.constant(True)
         if changed:
             cases.append((line, changed))
     cases.append(("if count:", {"prediction.near.0": function.results["prediction.near.0"]}))
-    return writer.branches(truth, cases, stores)
+    return writer.write_branches(truth, cases, stores)
 
 
 def write_track(program: TrackProgram) -> ModuleText:
     """Write the module of a track's functions."""
     read, write = _event_texts(program.single)
     places, stores = program.layout.places() | read, program.layout.stores() | write
-    writer, texts = Writer(program, places), []
+    writer, texts = ModuleWriter(program, places), []
     for name, function in program.functions.items():
         results = function.results
         if name == "weights_alone":
             writer.addresses, to = _weight_texts("row", "i")
-            lines = writer.lines([*results.values()], 8)
-            lines += [f"        {to[k].format(writer.name(n))}" for k, n in results.items()]
+            lines = writer.write_lines([*results.values()], 8)
+            lines += [f"        {to[k].format(writer.node_name(n))}" for k, n in results.items()]
             writer.loops.append(ALONE_TEXT.format(body="\n".join(lines)))
             lines = ["    alone_0(work, numbers, row, size, count)"]
         elif name == "weights":
             writer.addresses, to = _weight_texts(f"{TRACKS} + {ROWS_PER_TRACK} * k", "row")
-            lines = writer.body(name, function, to, TRACK_LOOP)
+            lines = writer.write_body(name, function, to, TRACK_LOOP)
         elif name == "step" and program.single:
             writer.addresses = places
             lines = _step_lines(writer, program, function, stores)
@@ -356,9 +359,11 @@ def write_track(program: TrackProgram) -> ModuleText:
                 for key, text in stores.items()
                 if key in results and results[key].args != (key,)
             }
-            lines = writer.body(name, function, changed, EVENT_LOOP)
+            lines = writer.write_body(name, function, changed, EVENT_LOOP)
         texts.append(program.layout.function(name, lines))
-    return writer.module("Functions of one track (`jaxevent.blob.engine`).", texts, program.layout)
+    return writer.write_module(
+        "Functions of one track (`jaxevent.blob.engine`).", texts, program.layout
+    )
 
 
 def trace_readout(
@@ -391,14 +396,16 @@ def write_readout(program: TracedProgram) -> ModuleText:
     work = {"dt.0": ("work", "row", m.DT), "silence.0": ("work", "row", m.SILENCE)}
     for name, size in (("x", 8), ("P", 64)):
         work |= {f"{name}.{k}": ("work", "row", outputs[name] + k) for k in range(size)}
-    writer, texts = Writer(program, program.layout.places() | work), []
+    writer, texts = ModuleWriter(program, program.layout.places() | work), []
     for name, function in program.functions.items():
         store = {}
         for key in function.results:
             what, number = key.split(".")
             store[key] = f"work[{outputs[what] + int(number)}] = {{}}"
-        texts.append(program.layout.function(name, writer.body(name, function, store)))
-    return writer.module("Readout of a track (`jaxevent.blob.engine`).", texts, program.layout)
+        texts.append(program.layout.function(name, writer.write_body(name, function, store)))
+    return writer.write_module(
+        "Readout of a track (`jaxevent.blob.engine`).", texts, program.layout
+    )
 
 
 def find_blocks(program: TracedProgram) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

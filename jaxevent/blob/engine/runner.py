@@ -19,7 +19,7 @@ from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Segment
 from jaxevent.blob.track import TrackBuffer
 from jaxevent.codegen.graph import evaluate_jaxpr
-from jaxevent.codegen.trace import name_leaves, name_numbers
+from jaxevent.codegen.trace import named_leaves, number_names
 
 
 @functools.lru_cache(maxsize=16)
@@ -68,10 +68,10 @@ class KernelRunner:
         self._kernel = loop.TrackKernel(compiler.functions, compiler.numbers, config)
         layout = compiler.layout
         self._columns: list[tuple[bool, NDArray[np.int64], tuple[int, ...], np.dtype]] = []
-        for name, leaf in name_leaves("track", compiler.track).items():
+        for name, leaf in named_leaves("track", compiler.track).items():
             real = leaf.dtype.kind == "f"
             places = layout.reals if real else layout.integers
-            columns = np.array([places[number] for number in name_numbers(name, leaf)], np.int64)
+            columns = np.array([places[number] for number in number_names(name, leaf)], np.int64)
             self._columns.append((real, columns, leaf.shape, leaf.dtype))
 
     def __reduce__(self) -> tuple[Any, ...]:

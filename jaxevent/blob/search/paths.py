@@ -215,8 +215,8 @@ def _insert_owner(owner: Any, cost: Any, k: int, new: float) -> None:
 def fit_velocity_noise(t: NDArray, m: NDArray, R: NDArray, unit: float | int) -> float:
     """Fit the velocity noise of a path by maximum likelihood.
 
-    Constant-velocity Kalman filters with the noises of `TRIED_VELOCITY_NOISES` predict each mean from
-    those before.
+    Constant-velocity Kalman filters with the noises of `TRIED_VELOCITY_NOISES` predict each
+    mean from the means before.
 
     Args:
         t: (windows,) s, times.

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
-    ELEMENTS,
+    ELEMENT_AXIS_LENGTH,
     TracedFunction,
     TracedProgram,
-    name_leaves,
-    name_numbers,
+    named_leaves,
+    number_names,
     translate_function,
 )
-from jaxevent.codegen.write import Address, ElementLoop, ModuleText, Writer
+from jaxevent.codegen.write import Address, ElementLoop, ModuleText, ModuleWriter
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.particle_filter import engine_loop, filtering, likelihood
@@ -189,9 +189,9 @@ class FunctionTracer:
     ) -> Any:
         """Give each number of a tree a cell or a row, and return the tree's shapes."""
         leaves = []
-        for name, leaf in name_leaves(key, tree).items():
-            names = name_numbers(name, leaf)
-            of_all = ELEMENTS in leaf.shape
+        for name, leaf in named_leaves(key, tree).items():
+            names = number_names(name, leaf)
+            of_all = ELEMENT_AXIS_LENGTH in leaf.shape
             if translated is not None and of_all:
                 nodes = [translated.results[number] for number in names]
                 of_all = any(node.level == Level.ELEMENT for node in nodes)
@@ -206,7 +206,7 @@ class FunctionTracer:
                 where.setdefault(number, len(set(where.values())))
                 if leaf.dtype == bool:
                     self.booleans.add(number)
-            leaves.append(leaf if of_all or ELEMENTS not in leaf.shape else self.shape())
+            leaves.append(leaf if of_all or ELEMENT_AXIS_LENGTH not in leaf.shape else self.shape())
         return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def _of_all(self, node: Node) -> Node:
@@ -234,7 +234,7 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
         raise TranslationError('likelihood = "literal"')
     tracer = FunctionTracer(params, model, dtype)
     shape, d = tracer.shape, model.dimension
-    cloud, each, flag = shape(ELEMENTS, d), shape(ELEMENTS), shape(kind=bool)
+    cloud, each, flag = shape(ELEMENT_AXIS_LENGTH, d), shape(ELEMENT_AXIS_LENGTH), shape(kind=bool)
     # Classes that check their fields take shapes in a trace.
     state, timing, event, of_batch = jax.eval_shape(
         lambda cloud, each, flag, one, two, four: (
@@ -308,7 +308,7 @@ def write(program: TracedProgram) -> ModuleText:
     """Write the text of a program's module."""
     layout = program.layout
     places, stores = layout.places(), layout.stores()
-    writer, out = Writer(program, places), []
+    writer, out = ModuleWriter(program, places), []
 
     def body(name: str, indent: int = 4, loop: ElementLoop = LANE_LOOP) -> str:
         function = program.functions[name]
@@ -317,7 +317,7 @@ def write(program: TracedProgram) -> ModuleText:
             for key, node in function.results.items()
             if node.op != "input" or places[node.args[0]] != places[key]
         }
-        return "\n".join(writer.body(name, function, changed, loop, indent))
+        return "\n".join(writer.write_body(name, function, changed, loop, indent))
 
     for name in ("predict", "reweight", "restart"):
         out.append(FUNCTION_TEXT.format(name=name, body=body(name, loop=PARTICLE_LOOP)))
@@ -340,7 +340,7 @@ def write(program: TracedProgram) -> ModuleText:
             )
         )
     about = "The functions of voting (`jaxevent.egomotion.particle_filter.engine`)."
-    return writer.module(about, out, layout)
+    return writer.write_module(about, out, layout)
 
 
 _kernels = KernelCache(ModelFunctions, write, max_nodes=MAX_OPERATIONS)

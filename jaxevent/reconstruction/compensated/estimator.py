@@ -34,7 +34,7 @@ from jaxevent.reconstruction.compensated.exposures import (
     constrain_image_jax,
 )
 from jaxevent.reconstruction.compensated.fusion import (
-    SOURCES,
+    SOURCE_NAMES,
     FusedImage,
     ReferenceImages,
     after_weight,
@@ -47,18 +47,18 @@ from jaxevent.reconstruction.compensated.images import (
     BrightnessPrior,
     FrameBrightness,
     InstantImages,
+    gaussian_smooth,
     instant_smoother,
     smooth_at_target,
-    smooth_part,
 )
 from jaxevent.reconstruction.compensated.instants import (
     TIME_CLOCK,
     Instants,
     Schedule,
     fit_motion_clock,
-    measure_speed,
+    measure_image_speed,
     merge_instants,
-    padded_count,
+    pad_instant_count,
 )
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
@@ -91,25 +91,25 @@ from jaxevent.reconstruction.compensated.trajectories import (
 from jaxevent.reconstruction.compensated.warp import (
     interpolate_paths,
     interpolate_paths_jax,
-    positions,
-    sample,
+    path_positions,
+    sample_bilinear,
     squared_reach,
-    warp,
-    warp_jax,
+    warp_images,
+    warp_images_jax,
 )
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
-from jaxevent.reconstruction.frames import Clock, FrameImages, Timing, time_span
+from jaxevent.reconstruction.frames import FrameClock, FrameImages, Timing, time_span
 from jaxevent.reconstruction.video import ImageSequence
-from jaxevent.reconstruction.windows import WINDOW_EVENTS, prepare
+from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
 
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
 N_CACHED_ANCHORS = 2
-TARGET_STEPS = 2  # with which a target's motion is found at half resolution
-MAX_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
+N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
+MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
@@ -160,7 +160,7 @@ def make_schedule(
     Raises:
         InputError: If images are not finite with these parameters.
     """
-    clock = Clock.of(recording, Timing.of(params))
+    clock = FrameClock.of(recording, Timing.of(params))
     # The first whole microsecond at which a frame is the one before.
     frames = np.ceil(clock.mid).astype(np.int64) + clock.origin
     first, last = time_span(recording, params.clock_offset)
@@ -171,7 +171,7 @@ def make_schedule(
         order = np.argsort(times, kind="stable")
         return images(times[order])[0][np.argsort(order, kind="stable")]
 
-    speed = measure_speed(logs, first + inner.astype(np.int64), max(lag, 400))
+    speed = measure_image_speed(logs, first + inner.astype(np.int64), max(lag, 400))
     if not math.isfinite(speed):
         raise InputError(
             f"{recording.name}: with these parameters images at single instants are not finite; "
@@ -298,7 +298,7 @@ class TrajectoryEstimator:
         L, V, clear = self.images(instants.t)
         if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
             return L, V, clear, None
-        smooth = smooth_part(L)
+        smooth = gaussian_smooth(L)
         return L - smooth, V, clear, smooth
 
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
@@ -339,7 +339,7 @@ class TrajectoryEstimator:
         """Take a few steps at half resolution, on the clock on which images agree better."""
 
         def improved(clock: Instants, p: NDArray[np.float32]) -> NDArray[np.float32]:
-            for _ in range(TARGET_STEPS):
+            for _ in range(N_TARGET_STEPS):
                 p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
             return p
 
@@ -351,7 +351,7 @@ class TrajectoryEstimator:
             return instants, found
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
-        if cost(instants, found) < MAX_COST_RATIO * cost(timed, other):
+        if cost(instants, found) < MAX_CLOCK_COST_RATIO * cost(timed, other):
             return instants, found
         return timed, other
 
@@ -398,7 +398,7 @@ def compare_images(
     """
     instants, L, V, clear, *_ = target
     paths = target.paths
-    warped = warp(L, V, np.asarray(clear, np.float32), instants.s, paths)
+    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
     layout = make_layout(instants, clear, len(instants))
     mean = robust_mean(params, L, warped, layout)
     return mean, reference_images(L, V, warped, layout, squared_reach(paths))
@@ -469,8 +469,8 @@ def make_trajectory_estimator(
 @jax.jit
 def _carry(images: Array, s: Array, paths: Array) -> Array:
     """Read images (n, h, w, channels) at s (n,) along trajectories."""
-    Y, X = positions(paths, s)
-    return jax.vmap(lambda one: sample(one, Y, X), -1, -1)(images)
+    Y, X = path_positions(paths, s)
+    return jax.vmap(lambda one: sample_bilinear(one, Y, X), -1, -1)(images)
 
 
 _visibility = jax.jit(visibility)
@@ -502,7 +502,7 @@ class CompensatedVideo(ImageSequence[Params]):
         recording: Recording,
         params: Params,
         *,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         motion: FlowSource | None = None,
         refine: bool = True,
         progress: bool | None = None,
@@ -593,8 +593,8 @@ class CompensatedVideo(ImageSequence[Params]):
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
-            L, M = L - smooth_part(L), M - smooth_part(M)
-        warped = warp(L, V, clear, s, target.paths)
+            L, M = L - gaussian_smooth(L), M - gaussian_smooth(M)
+        warped = warp_images(L, V, clear, s, target.paths)
         carried = _carry(np.asarray(images, np.float32), s, target.paths)
         return np.asarray(carried), np.asarray(_visibility(self.params, M, warped))
 
@@ -632,7 +632,7 @@ class CompensatedVideo(ImageSequence[Params]):
             where the frame next to the target shows the point, 0 where it is hidden.
         """
         found = [fused for _, fused in self._targets(times, extrapolate)]
-        shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCES)}
+        shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCE_NAMES)}
         shares["visible_before"] = [one.visible[0] for one in found]
         shares["visible_after"] = [one.visible[1] for one in found]
         return {name: np.stack(images).astype(np.float32) for name, images in shares.items()}
@@ -683,9 +683,9 @@ class MotionCompensation(ImageEstimator[Params]):
             self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
-        trajectories = make_trajectory_estimator(recording, params, WINDOW_EVENTS)
+        trajectories = make_trajectory_estimator(recording, params, MAX_WINDOW_EVENTS)
         chosen = [trajectories.schedule(t) for t in wanted.tolist()]
-        count = padded_count(max(len(one) for one in chosen))
+        count = pad_instant_count(max(len(one) for one in chosen))
         every = merge_instants(chosen)
         features, instants = prepare(recording, every, Timing.of(params), filtering=False)
         factors = trajectories.images.factors
@@ -742,12 +742,12 @@ class MotionCompensation(ImageEstimator[Params]):
         @jax.checkpoint
         def one(target: PreparedTarget) -> tuple[Array, Array]:
             rows, layout, p, path_index, exposures, steady, brightness = target
-            smooth = (1 - steady) * smooth_part(L[rows])
+            smooth = (1 - steady) * gaussian_smooth(L[rows])
             images = (L[rows] - smooth, V[rows], clear[rows])
             if self.through_motion:
                 p = self._with_derivative(params, images, layout, p)
             paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
-            warped = warp_jax(*images, layout.s, paths)
+            warped = warp_images_jax(*images, layout.s, paths)
             fused = fuse(params, *images[:2], warped, layout, squared_reach(paths))
             if out.samples is not None:
                 at = exposures.frame

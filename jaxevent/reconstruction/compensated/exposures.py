@@ -33,20 +33,20 @@ from jaxevent.reconstruction.compensated.robust_mean import (
 )
 from jaxevent.reconstruction.compensated.warp import (
     bilinear_cell,
-    displacements,
-    is_inside,
-    positions,
-    sample,
+    is_in_image,
+    path_displacements,
+    path_positions,
+    sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import Clock, Timing
+from jaxevent.reconstruction.frames import FrameClock, Timing
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
 from jaxevent.recording import Recording
 
-N_STEPS = 4
-BLURRED_PX = 0.5  # motion within an exposure, below which the frame counts as sharp
-DISAGREEMENT_PX = 0.5  # by which points that met within an exposure may move differently
-MAX_SAMPLE_PX = 2.0  # motion from one sample of an exposure to the next
+N_CONSTRAINT_STEPS = 4
+MIN_BLUR_PX = 0.5  # motion within an exposure, below which the frame counts as sharp
+MAX_DISAGREEMENT_PX = 0.5  # by which points that met within an exposure may move differently
+MAX_SAMPLE_SPACING_PX = 2.0  # motion from one sample of an exposure to the next
 SAMPLE_COUNTS = (3, 7, 15, 31)  # of an exposure; few numbers, so that few programs are compiled
 SPEED_MARGIN = 2.0  # times the measured speed, for which exposures are sampled
 
@@ -85,11 +85,13 @@ class _ClippedSide(NamedTuple):
     bound: Float[Array, "n h w"]
 
 
-def choose_samples(moved: float) -> int:
+def choose_sample_count(motion_px: float) -> int:
     """Choose the number of samples of an exposure in which points move that far (px)."""
-    if moved < BLURRED_PX:
+    if motion_px < MIN_BLUR_PX:
         return 1
-    return next((n for n in SAMPLE_COUNTS if n * MAX_SAMPLE_PX >= moved), SAMPLE_COUNTS[-1])
+    return next(
+        (n for n in SAMPLE_COUNTS if n * MAX_SAMPLE_SPACING_PX >= motion_px), SAMPLE_COUNTS[-1]
+    )
 
 
 class FrameExposures:
@@ -106,11 +108,11 @@ class FrameExposures:
     """
 
     def __init__(self, recording: Recording, params: Params, speed: float):
-        clock = Clock.of(recording, Timing.of(params))
+        clock = FrameClock.of(recording, Timing.of(params))
         self.mid = np.ceil(clock.mid).astype(np.int64) + clock.origin
         self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
         moved = SPEED_MARGIN * speed * 2e-6 * float(self._half.max(initial=0))
-        samples = choose_samples(moved) if params.deblur else 1
+        samples = choose_sample_count(moved) if params.deblur else 1
         wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
         self.samples = samples if params.integrate and wanted else None
 
@@ -133,7 +135,7 @@ class FrameExposures:
         )
 
 
-def smear_jax(L: Array, D: Array) -> tuple[Array, Array]:
+def blur_by_motion_jax(L: Array, D: Array) -> tuple[Array, Array]:
     """Average an image over exposures; differentiable.
 
     Args:
@@ -147,17 +149,17 @@ def smear_jax(L: Array, D: Array) -> tuple[Array, Array]:
     n, j = D.shape[:2]
     y, x = jnp.arange(h)[:, None], jnp.arange(w)
     Y, X = (y - D[..., 1]).reshape(-1, h, w), (x - D[..., 0]).reshape(-1, h, w)
-    moved = sample(jnp.broadcast_to(L, (n * j, h, w)), Y, X).reshape(n, j, h, w)
+    moved = sample_bilinear(jnp.broadcast_to(L, (n * j, h, w)), Y, X).reshape(n, j, h, w)
     return jax.scipy.special.logsumexp(moved, axis=1) - np.log(j), jax.nn.softmax(moved, axis=1)
 
 
-def smear_adjoint_jax(error: Array, shares: Array, D: Array) -> Array:
+def blur_by_motion_adjoint_jax(error: Array, shares: Array, D: Array) -> Array:
     """Bring errors (n, h, w) of B back to the points of L that it averaged: (h, w)."""
     n, j, h, w = shares.shape
     y, x = jnp.arange(h)[:, None], jnp.arange(w)
     Y, X = (y + D[..., 1]).reshape(-1, h, w), (x + D[..., 0]).reshape(-1, h, w)
     parts = (error[:, None] * shares).reshape(-1, h, w)
-    return sample(parts, Y, X).sum(0)
+    return sample_bilinear(parts, Y, X).sum(0)
 
 
 @njit_noalloc
@@ -198,15 +200,15 @@ def _smear_adjoint(begin, end, error, shares, D, out):
             out[y, x] = total
 
 
-def smear(L: NDArray, D: NDArray) -> tuple[NDArray, NDArray]:
-    """Average an image over exposures, as `smear_jax` does."""
+def blur_by_motion(L: NDArray, D: NDArray) -> tuple[NDArray, NDArray]:
+    """Average an image over exposures, as `blur_by_motion_jax` does."""
     B, shares = np.empty((len(D), *L.shape), np.float32), np.empty(D.shape[:-1], np.float32)
     run_over_rows(_smear, len(L), L, D, B, shares)
     return B, shares
 
 
-def smear_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
-    """Bring errors of B back to the points of L, as `smear_adjoint_jax` does."""
+def blur_by_motion_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
+    """Bring errors of B back to the points of L, as `blur_by_motion_adjoint_jax` does."""
     out = np.empty(error.shape[1:], np.float32)
     run_over_rows(_smear_adjoint, len(out), error, shares, D, out)
     return out
@@ -216,8 +218,8 @@ def exposure_displacements(exposures: AdjacentExposures, paths: Array, samples: 
     """Return D (n, samples, h, w, 2), px, along paths (h, w, 4)."""
     s, half = jnp.asarray(exposures.s), jnp.asarray(exposures.half)
     at = s[:, None] + half[:, None] * ((jnp.arange(samples) + 0.5) / samples * 2 - 1)
-    whole = displacements(paths, at.reshape(-1)).reshape(*at.shape, *paths.shape[:2], 2)
-    return whole - displacements(paths, s)[:, None]
+    whole = path_displacements(paths, at.reshape(-1)).reshape(*at.shape, *paths.shape[:2], 2)
+    return whole - path_displacements(paths, s)[:, None]
 
 
 def _motion_disagreement(D: Array) -> Array:
@@ -231,7 +233,7 @@ def _motion_disagreement(D: Array) -> Array:
     for j in (0, -1):
         own = D[:, j]
         Y, X = y - own[..., 1], x - own[..., 0]
-        there = jnp.stack([sample(own[..., c], Y, X) for c in (0, 1)], -1)
+        there = jnp.stack([sample_bilinear(own[..., c], Y, X) for c in (0, 1)], -1)
         found = jnp.maximum(found, jnp.sqrt(((there - own) ** 2).sum(-1) + 1e-12))
     return found
 
@@ -250,17 +252,17 @@ def _frame_evidence(
     """Return the evidence of frames; B is what they would show of the image."""
     exposures, frames, paths = model
     _, h, w = B.shape
-    Y, X = positions(paths, jnp.asarray(exposures.s))
+    Y, X = path_positions(paths, jnp.asarray(exposures.s))
     light = jnp.asarray(frames.intensity) + params.I0
     at_target = jnp.asarray(exposures.s)[:, None, None] == 0
-    inside = is_inside(Y, X, h, w) * jnp.asarray(exposures.present)[:, None, None]
+    inside = is_in_image(Y, X, h, w) * jnp.asarray(exposures.present)[:, None, None]
     inside = inside * jnp.where(at_target, 1, fused.visible)
     moved = jnp.sqrt(((D[:, -1] - D[:, 0]) ** 2).sum(-1) + 1e-12)
-    blurred = jnp.clip((moved - BLURRED_PX) / BLURRED_PX, 0, 1)
-    blurred = blurred / (1 + (_motion_disagreement(D) / DISAGREEMENT_PX) ** 2)
+    blurred = jnp.clip((moved - MIN_BLUR_PX) / MIN_BLUR_PX, 0, 1)
+    blurred = blurred / (1 + (_motion_disagreement(D) / MAX_DISAGREEMENT_PX) ** 2)
 
     def read(values: Array) -> Array:
-        return sample(values.reshape(-1, h, w), Y, X)
+        return sample_bilinear(values.reshape(-1, h, w), Y, X)
 
     # A clipped pixel acts as the Gaussian that gives the moments of the truncated one.
     side = read(clipped_side(params, frames)) * inside * params.one_sided
@@ -311,16 +313,16 @@ def constrain_image_jax(
     """
     D = exposure_displacements(model.exposures, model.paths, samples)
     L, P = fused.L.astype(D.dtype), fused.P.astype(D.dtype)
-    evidence = _frame_evidence(params, model, D, smear_jax(L, D)[0], fused)
+    evidence = _frame_evidence(params, model, D, blur_by_motion_jax(L, D)[0], fused)
 
     def step(image: Array, _: None) -> tuple[Array, None]:
-        B, shares = smear_jax(image, D)
+        B, shares = blur_by_motion_jax(image, D)
         pull, information = _pull_and_information(params, evidence, B)
-        pull = (L - image) / P + smear_adjoint_jax(pull, shares, D)
+        pull = (L - image) / P + blur_by_motion_adjoint_jax(pull, shares, D)
         return image + pull / (1 / P + information), None
 
-    image, _ = jax.lax.scan(step, L, None, length=N_STEPS)
-    P = P + params.smear * _squared_blur(evidence, image, smear_jax(image, D)[0])
+    image, _ = jax.lax.scan(step, L, None, length=N_CONSTRAINT_STEPS)
+    P = P + params.smear * _squared_blur(evidence, image, blur_by_motion_jax(image, D)[0])
     return dataclasses.replace(fused, L=image, P=P)
 
 
@@ -339,13 +341,13 @@ def constrain_image(
     """Fit an image to exposures and clipped pixels, as `constrain_image_jax` does."""
     L, P = _single(fused.L), _single(fused.P)
     D = _single(_compiled_displacements(model.exposures, model.paths, samples))
-    B, _ = smear(L, D)
+    B, _ = blur_by_motion(L, D)
     evidence, image = _compiled_evidence(params, model, D, B, fused), L
-    for _ in range(N_STEPS):
-        B, shares = smear(image, D)
+    for _ in range(N_CONSTRAINT_STEPS):
+        B, shares = blur_by_motion(image, D)
         pull, information = map(_single, _compiled_pull(params, evidence, B))
-        back = smear_adjoint(pull, shares, D)
+        back = blur_by_motion_adjoint(pull, shares, D)
         image = image + ((L - image) / P + back) / (1 / P + information)
-    B, _ = smear(image, D)
+    B, _ = blur_by_motion(image, D)
     P = P + _single(params.smear) * _single(_compiled_squared_blur(evidence, image, B))
     return dataclasses.replace(fused, L=jnp.asarray(image), P=jnp.asarray(P))

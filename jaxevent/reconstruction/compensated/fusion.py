@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.estimator import ShortRepr
-from jaxevent.reconstruction.compensated.images import smooth_part
-from jaxevent.reconstruction.compensated.params import FALLBACKS, FEATURES, Params
+from jaxevent.reconstruction.compensated.images import gaussian_smooth
+from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.reconstruction.compensated.robust_mean import (
     InstantLayout,
     RobustMean,
@@ -31,15 +31,15 @@ from jaxevent.reconstruction.compensated.robust_mean import (
 from jaxevent.reconstruction.compensated.warp import WarpedImages
 from jaxevent.reconstruction.features import Numeric
 
-SOURCES = ("before", "after", "events", *FALLBACKS)
-MIN_SQUARE = 1e-4  # (ln I)^2, below which features do not distinguish differences
+SOURCE_NAMES = ("before", "after", "events", *FALLBACK_SOURCES)
+MIN_SQUARED_DIFFERENCE = 1e-4  # (ln I)^2, below which features do not distinguish differences
 # (ln I)^2, the variance of frames in place from which the fallbacks hardly count beside the mean
 # along trajectories: a clipped pixel is known by what was clear elsewhere. Of 0.04, 0.1 and 0.25
 # chosen on cut recordings of the scenes that HDR parameters are fitted to. The same of one frame,
 # where frames are on one side alone: of 0.1, 0.03 and 0.01 chosen with the last images of slow pans
 # of the scenes that are scored in view, where clipped pixels had most of the error.
 CLIPPED_VARIANCE, CLIPPED_VARIANCE_BEYOND = 0.1, 0.03
-STATIONARY_PX = 0.25  # motion over all instants of a point that stays in its place
+MAX_STATIONARY_PX = 0.25  # motion over all instants of a point that stays in its place
 NOISE_EVENT_SIGMA_PX = 4.0  # of the Gaussian around a pixel in which a noise event is alone
 
 
@@ -121,7 +121,7 @@ class FusedImage(ShortRepr):
 
     L: Float[Array, "h w"]
     P: Float[Array, "h w"]  # its variance, (ln I)^2
-    sources: Float[Array, "5 h w"]  # shares of `SOURCES`; their sum is 1
+    sources: Float[Array, "5 h w"]  # shares of `SOURCE_NAMES`; their sum is 1
     visible: Float[Array, "2 h w"]  # 1 where the frame before, after, sees the point, else 0
 
 
@@ -130,7 +130,7 @@ class FusionFeatures(ShortRepr):
 
     candidates: Float[Array, "3 h w"]  # log intensity along trajectories, smoothed, blended
     in_place: Float[Array, "h w"]  # 1 where the frames in place show the point, 0 where clipped
-    features: Float[Array, "features h w"]  # `FEATURES`, mostly logarithms, and 1
+    features: Float[Array, "features h w"]  # `FEATURE_NAMES`, mostly logarithms, and 1
     shares: Float[Array, "3 h w"]  # of the mean along trajectories: frames before, after, events
     visible: Float[Array, "2 h w"]  # as in `FusedImage`
     image_variance: Float[Array, "h w"]  # of single images along trajectories
@@ -175,7 +175,10 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
         "activity": blur_jax(mean.activity, 1.5),
     }
     linear = ("seen", "seen_twice")
-    X = [features[n] if n in linear else jnp.log(features[n] + MIN_SQUARE) for n in FEATURES]
+    X = [
+        features[n] if n in linear else jnp.log(features[n] + MIN_SQUARED_DIFFERENCE)
+        for n in FEATURE_NAMES
+    ]
     beyond = jnp.asarray(images.beyond)
     clipped = jnp.where(beyond > 0, CLIPPED_VARIANCE_BEYOND, CLIPPED_VARIANCE)
     squared_reach = jnp.asarray(images.squared_reach, jnp.float32)
@@ -188,7 +191,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
         image_variance=mean.image_variance,
         beyond=beyond,
         rest=jnp.asarray(images.rest, jnp.float32),
-        stationary=1 / (1 + (squared_reach / STATIONARY_PX**2) ** 2),
+        stationary=1 / (1 + (squared_reach / MAX_STATIONARY_PX**2) ** 2),
         intervals_away=jnp.asarray(images.intervals_away),
     )
 
@@ -210,16 +213,18 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     """
     X, beyond = given.features, given.beyond > 0
     weights = jnp.where(beyond, params.choice_beyond, params.choice)
-    logits = jnp.tensordot(weights.reshape(len(FALLBACKS), -1), X, 1) + jnp.log(given.in_place)
+    logits = jnp.tensordot(weights.reshape(len(FALLBACK_SOURCES), -1), X, 1) + jnp.log(
+        given.in_place
+    )
     # At rest events are noise, which the smoother in place adds up.
-    logits = logits.at[0].add(jnp.log(jnp.maximum(1 - given.rest, MIN_SQUARE)))
+    logits = logits.at[0].add(jnp.log(jnp.maximum(1 - given.rest, MIN_SQUARED_DIFFERENCE)))
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(logits[:1]), logits]), axis=0)
-    quiet = MIN_SQUARE / jnp.exp(X[FEATURES.index("activity")])
+    quiet = MIN_SQUARED_DIFFERENCE / jnp.exp(X[FEATURE_NAMES.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
     # with those around the target.
     q = _shift_weight(q, given.stationary * given.in_place * quiet, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
-    alone = smooth_part(quiet, NOISE_EVENT_SIGMA_PX)
+    alone = gaussian_smooth(quiet, NOISE_EVENT_SIGMA_PX)
     q = _shift_weight(q, given.rest * jnp.maximum(quiet, alone), 2)
     features = variance_features(X, given.in_place, beyond, given.intervals_away)
     weights = jnp.where(beyond, params.doubt_beyond, params.doubt)
@@ -247,9 +252,11 @@ def variance_features(X: Array, in_place: Array, beyond: Array, intervals_away: 
         (features, h, w).
     """
     part = jnp.where(beyond, in_place, 1)
-    difference, both = (FEATURES.index(name) for name in ("from_each_other", "seen_twice"))
-    squares = (jnp.exp(X[difference]) - MIN_SQUARE) * part * jnp.maximum(intervals_away, 1)
-    adapted = jnp.where(beyond, jnp.log(squares + MIN_SQUARE), X[difference])
+    difference, both = (FEATURE_NAMES.index(name) for name in ("from_each_other", "seen_twice"))
+    squares = (
+        (jnp.exp(X[difference]) - MIN_SQUARED_DIFFERENCE) * part * jnp.maximum(intervals_away, 1)
+    )
+    adapted = jnp.where(beyond, jnp.log(squares + MIN_SQUARED_DIFFERENCE), X[difference])
     return X.at[difference].set(adapted).at[both].multiply(part)
 
 

@@ -30,22 +30,22 @@ from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
-from jaxevent.reconstruction.compensated.warp import positions, sample
+from jaxevent.reconstruction.compensated.warp import path_positions, sample_bilinear
 from jaxevent.reconstruction.features import FrameFeatures, Numeric
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
 from jaxevent.recording import Recording
 
 N_CACHED_IMAGES = 96  # of instants, in a video
-SMOOTH_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
-MIN_CHANGE = 0.05  # ln I, between frames that are not steady
-BLOCK_PX = 16  # over which the change of pixels without events is a median
+SMOOTH_PART_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
+MIN_UNSTEADY_CHANGE = 0.05  # ln I, between frames that are not steady
+MEDIAN_BLOCK_PX = 16  # over which the change of pixels without events is a median
 MIN_BLOCK_PIXELS, MIN_BLOCKS = 8, 4  # without events
-MAX_FRAMES = 8  # on either side, from which the variance of brightness is estimated
+MAX_BRIGHTNESS_FRAMES = 8  # on either side, from which the variance of brightness is estimated
 # Of independent brightnesses of variance v two differ by 2 v, squared, and one from the mean of two
 # others by 3 v / 2.
-MIDPOINT_FACTOR = 0.75
-UNCLIPPED_GREY = (0.02, 0.98)  # grey values of pixels that are not clipped
+MIDPOINT_VARIANCE_FACTOR = 0.75
+UNCLIPPED_GREY_RANGE = (0.02, 0.98)  # grey values of pixels that are not clipped
 
 
 class FrameLevels(NamedTuple):
@@ -143,9 +143,9 @@ def _averages(size: int, sigma: float) -> NDArray[np.float32]:
 
 
 @full_precision
-def smooth_part(L: Any, sigma: float = SMOOTH_SIGMA_PX) -> Any:
-    """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma` px."""
-    return _averages(L.shape[-2], sigma) @ L @ _averages(L.shape[-1], sigma).T
+def gaussian_smooth(L: Any, sigma_px: float = SMOOTH_PART_SIGMA_PX) -> Any:
+    """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma_px` px."""
+    return _averages(L.shape[-2], sigma_px) @ L @ _averages(L.shape[-1], sigma_px).T
 
 
 class BrightnessPrior(NamedTuple):
@@ -173,8 +173,8 @@ def smooth_at_target(
         The smooth part (h, w) and its variance (h, w), (ln I)^2.
     """
     nearest = jnp.asarray(smooth)[layout.before][None]
-    Y, X = positions(jnp.asarray(paths), jnp.asarray(layout.s)[layout.before][None])
-    beyond = sample(nearest, Y, X)[0] + prior.offset
+    Y, X = path_positions(jnp.asarray(paths), jnp.asarray(layout.s)[layout.before][None])
+    beyond = sample_bilinear(nearest, Y, X)[0] + prior.offset
     difference = smooth[layout.after] - smooth[layout.before]
     variance = jnp.maximum(weight * (1 - weight) * difference**2, prior.variance)
     one_sided = layout.before == layout.after
@@ -195,15 +195,15 @@ class FrameBrightness:
         self._images = FrameImages(recording, np.dtype(np.float32))
         self._changes: dict[int, float] = {}
 
-    def is_steady(self, first: int, last: int) -> bool:
+    def is_steady(self, first_us: int, last_us: int) -> bool:
         """Return whether all frames between two times (us), included, are equally bright."""
-        low = int(np.searchsorted(self._mid, first, "left"))
-        high = int(np.searchsorted(self._mid, last, "right"))
-        return all(abs(self._change(k)) < MIN_CHANGE for k in range(low, high - 1))
+        low = int(np.searchsorted(self._mid, first_us, "left"))
+        high = int(np.searchsorted(self._mid, last_us, "right"))
+        return all(abs(self._change(k)) < MIN_UNSTEADY_CHANGE for k in range(low, high - 1))
 
-    def prior(self, t: int) -> BrightnessPrior:
+    def prior(self, t_us: int) -> BrightnessPrior:
         """Return the prior of the brightness at a time (us)."""
-        return BrightnessPrior(np.float32(self.variance(t)), np.float32(self._offset(t)))
+        return BrightnessPrior(np.float32(self.variance(t_us)), np.float32(self._offset(t_us)))
 
     def _offset(self, t: int) -> float:
         """Return the brightness (ln I) to add to the nearest frame, beyond the frames; else 0."""
@@ -216,29 +216,34 @@ class FrameBrightness:
         else:
             change, next_change = -self._change(len(mid) - 2), self._change(len(mid) - 3)
             distance, interval = t - mid[-1], mid[-1] - mid[-2]
-        if abs(change) < MIN_CHANGE or abs(next_change) >= MIN_CHANGE:
+        if abs(change) < MIN_UNSTEADY_CHANGE or abs(next_change) >= MIN_UNSTEADY_CHANGE:
             return 0.0
         return change * min(1.0, float(distance / interval))
 
-    def variance(self, t: int) -> float:
+    def variance(self, t_us: int) -> float:
         """Return the variance (ln I)^2 of the brightness at a time (us).
 
         It is 0 at the frames and largest halfway between two, and beyond the last and the first.
         """
-        right = int(np.searchsorted(self._mid, t, "right"))
-        left = int(np.searchsorted(self._mid, t, "left"))
-        low, high = max(left - MAX_FRAMES, 0), min(right + MAX_FRAMES, len(self._mid))
+        right = int(np.searchsorted(self._mid, t_us, "right"))
+        left = int(np.searchsorted(self._mid, t_us, "left"))
+        low, high = (
+            max(left - MAX_BRIGHTNESS_FRAMES, 0),
+            min(right + MAX_BRIGHTNESS_FRAMES, len(self._mid)),
+        )
         if left < right or high - low < 2:
             return 0.0
-        mid = (self._mid[low:high] - t) * 1e-6
+        mid = (self._mid[low:high] - t_us) * 1e-6
         level = np.cumsum([0.0, *(self._change(k) for k in range(low, high - 1))])
         between = low < right < high
         if high - low > 2:
             w = (mid[1:-1] - mid[:-2]) / (mid[2:] - mid[:-2])
             error, factor = level[1:-1] - (1 - w) * level[:-2] - w * level[2:], 1.0
         else:
-            error, factor = level[1:], MIDPOINT_FACTOR if between else 1.0
-        variance = factor * float((np.where(np.abs(error) < MIN_CHANGE, 0, error) ** 2).mean())
+            error, factor = level[1:], MIDPOINT_VARIANCE_FACTOR if between else 1.0
+        variance = factor * float(
+            (np.where(np.abs(error) < MIN_UNSTEADY_CHANGE, 0, error) ** 2).mean()
+        )
         if not between:
             return variance
         w = -mid[left - 1 - low] / (mid[right - low] - mid[left - 1 - low])
@@ -255,18 +260,20 @@ class FrameBrightness:
         source, size = self._recording.events, (self._recording.height, self._recording.width)
         begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
         grey, intensity, _, _ = self._images.read(slice(frame, frame + 2), 2)
-        black, white = UNCLIPPED_GREY
+        black, white = UNCLIPPED_GREY_RANGE
         unclipped = ((grey > black) & (grey < white)).all(0).reshape(size)
         events = source[begin:end]
         counts = np.zeros(size, np.float32)
         np.add.at(counts, (events.y, events.x), 1)
         quiet = unclipped & (uniform_filter(counts, 3) < 1 / 18)
         change = np.diff(np.log(intensity + self._I0), axis=0).reshape(size)
-        h, w = (length // BLOCK_PX for length in size)
+        h, w = (length // MEDIAN_BLOCK_PX for length in size)
 
         def blocks(image: NDArray) -> NDArray:
-            cut = image[: h * BLOCK_PX, : w * BLOCK_PX].reshape(h, BLOCK_PX, w, BLOCK_PX)
-            return cut.swapaxes(1, 2).reshape(h * w, BLOCK_PX**2)
+            cut = image[: h * MEDIAN_BLOCK_PX, : w * MEDIAN_BLOCK_PX].reshape(
+                h, MEDIAN_BLOCK_PX, w, MEDIAN_BLOCK_PX
+            )
+            return cut.swapaxes(1, 2).reshape(h * w, MEDIAN_BLOCK_PX**2)
 
         changes = [
             float(np.median(values[chosen]))

@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from jaxevent.recording import Recording
 
 GRID_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # distances of instants from the target
-STEP_PX = 0.6  # motion within a step of the grid
+GRID_STEP_PX = 0.6  # motion within a step of the grid
 MAX_FRAME_MOTION_PX = 6.0  # between the target and a frame beyond the nearest ones
 MIN_FRAMES, MAX_FRAMES = 2, 8  # on either side of the target
 FIRST_HORIZON_STEPS = 2.2  # the horizon at which motion is first sought
-REST_RATE = 0.1  # of the mean rate of events, below which a scene is at rest
-COUNT_MULTIPLE = 4  # numbers of instants are multiples, to compile few shapes
-MIN_STEP_US = 200
+MAX_REST_RATE = 0.1  # of the mean rate of events, below which a scene is at rest
+INSTANT_COUNT_MULTIPLE = 4  # numbers of instants are multiples, to compile few shapes
+MIN_GRID_STEP_US = 200
 
 MAX_EVENT_SHARE = 0.9  # of the clock: time never stands still
-N_SEGMENTS = 8  # of a recording, in which parts of the image are compared
-SEGMENT_FRAMES = 4  # intervals of frames, the length of a segment
+N_RATE_SEGMENTS = 8  # of a recording, in which parts of the image are compared
+SEGMENT_FRAME_INTERVALS = 4  # intervals of frames, the length of a segment
 N_PARTS, N_BINS = 4, 16  # of the image along each axis, and of a segment
 N_CACHED_TIMES = 4096  # times whose number of earlier events is remembered
 MIN_RATE_DEVIATION = 0.05  # deviations of the rate, as a part of it, that do not matter
@@ -53,39 +53,43 @@ class MotionClock:
         counts = np.array([self.count_before(t) for t in times.tolist()], float)
         return (1 - self.event_share) * elapsed + self.event_share * self.event_interval * counts
 
-    def relative_rate(self, begin: int, end: int) -> float:
+    def relative_rate(self, begin_us: int, end_us: int) -> float:
         """Return the rate of events between two times (us), in units of the mean rate."""
-        if not (self.event_interval and end > begin):
+        if not (self.event_interval and end_us > begin_us):
             return 1.0
-        count = self.count_before(end) - self.count_before(begin)
-        return count * self.event_interval / (end - begin)
+        count = self.count_before(end_us) - self.count_before(begin_us)
+        return count * self.event_interval / (end_us - begin_us)
 
 
 TIME_CLOCK = MotionClock(lambda _: 0, 0, 0.0, 0.0)
 
 
-def fit_motion_clock(recording: Recording, span: tuple[int, int], interval: int) -> MotionClock:
+def fit_motion_clock(
+    recording: Recording, span_us: tuple[int, int], frame_interval_us: int
+) -> MotionClock:
     """Fit the motion clock of a recording.
 
     Args:
         recording: The recording.
-        span: First and last time with data, us.
-        interval: Time between frames, us.
+        span_us: First and last time with data, us.
+        frame_interval_us: Time between frames, us.
 
     Returns:
         The clock.
     """
-    first, last = span
-    length = min(SEGMENT_FRAMES * interval, last - first)
-    begins = np.linspace(first, last - length, N_SEGMENTS).astype(np.int64)
+    first, last = span_us
+    length = min(SEGMENT_FRAME_INTERVALS * frame_interval_us, last - first)
+    begins = np.linspace(first, last - length, N_RATE_SEGMENTS).astype(np.int64)
     counts = [_count_parts(recording, int(begin), length) for begin in np.unique(begins)]
     event_interval = (recording.stop - recording.start) / max(len(recording.events), 1)
     # Targets share instants, and formats that are decoded are slow to search.
     count_before = functools.lru_cache(N_CACHED_TIMES)(recording.events.index)
-    return MotionClock(count_before, first, event_interval, common_share(np.stack(counts)))
+    return MotionClock(
+        count_before, first, event_interval, common_motion_fraction(np.stack(counts))
+    )
 
 
-def common_share(counts: NDArray[np.floating]) -> float:
+def common_motion_fraction(counts: NDArray[np.floating]) -> float:
     """Estimate how far the parts of the image move in common.
 
     Returns the slope of a regression: of the deviation of a part's rate of events from a constant
@@ -135,15 +139,15 @@ class Instants:
     # 0 where frames are on both sides.
     rest: float = 0.0
 
-    def relative_times(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+    def relative_times(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
         """Convert times (us) to those of `s`."""
-        both = self.clock(np.append(times, self.t[self.target]))
+        both = self.clock(np.append(times_us, self.t[self.target]))
         return (both[:-1] - both[-1]) * 1e-6 / self.unit
 
-    def clock_rate(self, span: int) -> float:
-        """Return the change of `s` per second, over `span` us before and after the target."""
-        begin, end = self.relative_times(self.t[self.target] + np.array([-span, span]))
-        return float(end - begin) / (2e-6 * span)
+    def clock_rate(self, span_us: int) -> float:
+        """Return the change of `s` per second, over `span_us` us before and after the target."""
+        begin, end = self.relative_times(self.t[self.target] + np.array([-span_us, span_us]))
+        return float(end - begin) / (2e-6 * span_us)
 
     def with_clock(self, clock: MotionClock) -> "Instants":
         """Put the instants on another clock."""
@@ -176,16 +180,22 @@ class Schedule:
 
     def __init__(
         self,
-        frames: NDArray[np.int64],
-        span: tuple[int, int],
-        speed: float,
+        frame_times_us: NDArray[np.int64],
+        span_us: tuple[int, int],
+        speed_px_s: float,
         clock: MotionClock = TIME_CLOCK,
     ):
-        self.frames, self.span, self.clock = frames, span, clock
-        gap = float(np.median(np.diff(frames))) if len(frames) > 1 else float(span[1] - span[0])
-        self.speed = speed = max(speed, 1e-3)
-        self.step = max(round(min(STEP_PX / speed * 1e6, gap / 2)), MIN_STEP_US)  # us
-        self.max_distance = MAX_FRAME_MOTION_PX / speed * 1e6  # us, of further frames
+        self.frames, self.span, self.clock = frame_times_us, span_us, clock
+        gap = (
+            float(np.median(np.diff(frame_times_us)))
+            if len(frame_times_us) > 1
+            else float(span_us[1] - span_us[0])
+        )
+        self.speed = speed_px_s = max(speed_px_s, 1e-3)
+        self.step = max(
+            round(min(GRID_STEP_PX / speed_px_s * 1e6, gap / 2)), MIN_GRID_STEP_US
+        )  # us
+        self.max_distance = MAX_FRAME_MOTION_PX / speed_px_s * 1e6  # us, of further frames
 
     def __call__(self, t: int) -> Instants:
         """Choose the instants of the target at a time (us)."""
@@ -208,7 +218,7 @@ class Schedule:
         rest = 0.0
         if len(nearest) == 1 and left == right:
             rate = self.clock.relative_rate(*sorted((int(times[nearest[0]]), t)))
-            rest = 1 / (1 + (rate / REST_RATE) ** 2)
+            rest = 1 / (1 + (rate / MAX_REST_RATE) ** 2)
         return Instants(times, target, before, after, s, unit, horizon, self.clock, rest)
 
     def _near_frames(self, t: int) -> set[int]:
@@ -235,8 +245,8 @@ class Schedule:
         return {at for at in grid if low < at < high and abs(at - t) > step // 2}
 
 
-def measure_speed(
-    images: Callable[[NDArray[np.int64]], NDArray], times: NDArray[np.int64], lag: int
+def measure_image_speed(
+    images: Callable[[NDArray[np.int64]], NDArray], times_us: NDArray[np.int64], lag_us: int
 ) -> float:
     """Measure the speed of the moving points in the smoother's images.
 
@@ -245,15 +255,15 @@ def measure_speed(
 
     Args:
         images: A function from times (T,), us, to images (T, h, w) of log intensity.
-        times: (times,) us.
-        lag: Time between the images of a pair, us.
+        times_us: (times,) us.
+        lag_us: Time between the images of a pair, us.
 
     Returns:
         The speed, px/s.
     """
     while True:
-        both = images(np.concatenate([times, times + lag]))
-        early, late = both[: len(times)], both[len(times) :]
+        both = images(np.concatenate([times_us, times_us + lag_us]))
+        early, late = both[: len(times_us)], both[len(times_us) :]
         mean = np.pad((early + late) / 2, [(0, 0), (1, 1), (1, 1)], mode="edge")
         gx = (mean[:, 1:-1, 2:] - mean[:, 1:-1, :-2]) / 2
         gy = (mean[:, 2:, 1:-1] - mean[:, :-2, 1:-1]) / 2
@@ -265,9 +275,9 @@ def measure_speed(
         weight = weight * (steepness > 1e-4)  # of blocks steeper than 1 % per px
         flow = product / np.maximum(steepness, 1e-4)
         moved = float((weight * flow).sum() / max(float(weight.sum()), 1e-12))
-        if moved < 2 or lag < 1000:
-            return moved / lag * 1e6
-        lag //= 2
+        if moved < 2 or lag_us < 1000:
+            return moved / lag_us * 1e6
+        lag_us //= 2
 
 
 def _block_means(images: NDArray) -> NDArray:
@@ -275,9 +285,9 @@ def _block_means(images: NDArray) -> NDArray:
     return images[:, :h, :w].reshape(len(images), h // 4, 4, w // 4, 4).mean((2, 4))
 
 
-def padded_count(count: int) -> int:
+def pad_instant_count(count: int) -> int:
     """Return the number to which a target's instants are padded."""
-    return -(-count // COUNT_MULTIPLE) * COUNT_MULTIPLE
+    return -(-count // INSTANT_COUNT_MULTIPLE) * INSTANT_COUNT_MULTIPLE
 
 
 def merge_instants(targets: Sequence[Instants]) -> NDArray[np.int64]:

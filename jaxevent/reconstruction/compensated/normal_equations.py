@@ -29,15 +29,15 @@ from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     RowScratch,
     bilinear_weights,
-    gradient,
+    gradient_at_pixel,
     gradient_jax,
     interpolate_path,
     interpolate_paths_jax,
-    is_inside,
+    is_in_image,
     locate_points,
-    pad_edge,
-    positions,
-    sample,
+    pad_edges,
+    path_positions,
+    sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
 
@@ -99,10 +99,10 @@ class PackedImages(NamedTuple):
         Returns:
             Images with weights.
         """
-        return cls(pixels, s, np.exp(-2 * (s / horizon_of(s)) ** 2).astype(np.float32))
+        return cls(pixels, s, np.exp(-2 * (s / max_instant_distance(s)) ** 2).astype(np.float32))
 
 
-def horizon_of(s: NDArray[np.float32]) -> np.float32:
+def max_instant_distance(s: NDArray[np.float32]) -> np.float32:
     """Return the largest distance of instants s (K,) from the target."""
     return np.float32(max(float(np.abs(s).max()), 1e-3))
 
@@ -116,40 +116,42 @@ class TrajectorySamples(NamedTuple):
 
 
 @njit_noalloc_inlined
-def fill_information(V, inside, floor, W):
+def fill_information(variances, inside, variance_floor, out_information):
     """Write the information of values.
 
     Args:
-        V: (points,) their variances, (ln I)^2.
+        variances: (points,) their variances, (ln I)^2.
         inside: (points,) 1, or 0 beyond the image's border.
-        floor: Variance to add, (ln I)^2.
-        W: (points,) output, the information.
+        variance_floor: Variance to add, (ln I)^2.
+        out_information: (points,) output, the information.
     """
     one = np.float32(1)
-    for i in range(len(V)):
-        W[i] = one / (V[i] + floor) if inside[i] > 0 else OUTSIDE_INFORMATION
+    for i in range(len(variances)):
+        out_information[i] = (
+            one / (variances[i] + variance_floor) if inside[i] > 0 else OUTSIDE_INFORMATION
+        )
 
 
 @njit_noalloc_inlined
-def robust_means(values, W, near, nu, out):
+def robust_means(values, information, initial_weights, nu, out_means):
     """Write robust means of values.
 
     First the near instants determine the mean; then all of them.
 
     Args:
         values: (K, points) values.
-        W: (K, points) their information.
-        near: (K,) weights of the instants to begin with.
+        information: (K, points) their information.
+        initial_weights: (K,) weights of the instants to begin with.
         nu: Standardised squared residual beyond which weights fall.
-        out: Output, the weights R (K, points) and means (points,), and scratch (2, points).
+        out_means: Output, the weights R (K, points) and means (points,), and scratch (2, points).
     """
-    R, means, sums = out
+    R, means, sums = out_means
     one, total, mean = np.float32(1), sums[0], sums[1]
     for turn in range(3):
         for i in range(len(means)):
             total[i], mean[i] = np.float32(0), np.float32(0)
         for k in range(len(values)):
-            level, info, weight, early = values[k], W[k], R[k], near[k]
+            level, info, weight, early = values[k], information[k], R[k], initial_weights[k]
             if turn == 0:
                 for i in range(len(means)):
                     weight[i] = info[i] * early
@@ -279,7 +281,7 @@ def _linearise(begin, end, samples, scratch, out):
         below = min(2 * i + 2, h)
         for y in range(2 * i, below):
             for x in range(w):
-                gx, gy = gradient(M, y, x)
+                gx, gy = gradient_at_pixel(M, y, x)
                 grad_M[0, x], grad_M[1, x] = gx, gy
                 sums[14, x] += np.sqrt(gx * gx + gy * gy)
             _add_pixels(samples, y, grad_M, own, sums)
@@ -348,7 +350,7 @@ def linearise(
     run_over_rows(_linearise, shape[0], samples, scratch, entries)
     blurred = np.empty((*shape, 14), np.float32)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
-    horizon = horizon_of(samples.s)
+    horizon = max_instant_distance(samples.s)
     weights = np.zeros((2, *shape), np.float32)
     _weigh_differences(p, entries[..., 14], horizon, cost, weights)
     squared = horizon * horizon
@@ -457,7 +459,9 @@ class _SolverScratch(NamedTuple):
         return cls._make([*single, np.zeros((3, 4, 4))])
 
 
-def solve(eq: NormalEquations, p: NDArray[np.float32], iterations: int = 12) -> NDArray[np.float32]:
+def solve_normal_equations(
+    eq: NormalEquations, p: NDArray[np.float32], iterations: int = 12
+) -> NDArray[np.float32]:
     """Solve the normal equations by conjugate gradients, preconditioned by the nodes' own blocks.
 
     Args:
@@ -569,7 +573,7 @@ def _average_pixels(pixels: Array) -> Array:
 def _smooth_nodes_jax(nodes: Array) -> Array:
     """Blur nodes by (1, 6, 1) / 8."""
     for axis in (0, 1):
-        padded, size = pad_edge(nodes, axis, 1), nodes.shape[axis]
+        padded, size = pad_edges(nodes, axis, 1), nodes.shape[axis]
         a, b, c = (jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(3))
         nodes = (a + 6 * b + c) / 8
     return nodes
@@ -589,10 +593,10 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
     """
     L, V, s, present = images
     count, h, w = L.shape
-    Y, X = (one.astype(p.dtype) for one in positions(interpolate_paths_jax(p, h, w), s))
-    inside = is_inside(Y, X, h, w)
+    Y, X = (one.astype(p.dtype) for one in path_positions(interpolate_paths_jax(p, h, w), s))
+    inside = is_in_image(Y, X, h, w)
     gx, gy = gradient_jax(L)
-    L, V, gx, gy = (sample(image, Y, X) for image in (L, V, gx, gy))
+    L, V, gx, gy = (sample_bilinear(image, Y, X) for image in (L, V, gx, gy))
     W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
     s = s[:, None, None]
     R = W * jnp.exp(-2 * s**2)
@@ -629,7 +633,7 @@ def _pull(eq: NormalEquations, q: Array) -> Array:
     return eq.smooth * rough + eq.ridge * q
 
 
-def residual(p: Array, images: MotionImages, cost: CostParams) -> Array:
+def normal_equation_residual(p: Array, images: MotionImages, cost: CostParams) -> Array:
     """Return the right-hand side of the normal equations, which vanishes at convergence.
 
     Args:
@@ -686,7 +690,7 @@ def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
 
     def times(dp: Array) -> Array:
         """Return A dp."""
-        return -jax.jvp(lambda q: residual(q, images, cost), (p,), (dp,))[1]
+        return -jax.jvp(lambda q: normal_equation_residual(q, images, cost), (p,), (dp,))[1]
 
     def solve_all(product: Callable[[Array], Array], right: Array) -> Array:
         def precondition(other: Array) -> Array:
@@ -694,7 +698,9 @@ def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
 
         return bicgstab(product, right, tol=1e-5, maxiter=BICGSTAB_ITERATIONS, M=precondition)[0]
 
-    _, dF = jax.jvp(lambda *data: residual(p, *data), (images, cost), tuple(changes_of_data))
+    _, dF = jax.jvp(
+        lambda *data: normal_equation_residual(p, *data), (images, cost), tuple(changes_of_data)
+    )
     return p, jax.lax.custom_linear_solve(times, dF, solve_all, solve_all)
 
 

@@ -4,7 +4,7 @@ from jaxevent.parameters import Choice, Number, Positive, UnitInterval
 from jaxevent.reconstruction import smoother
 
 # Features of a pixel that decide between the candidates; `fusion.fusion_features` computes them.
-FEATURES = (
+FEATURE_NAMES = (
     "fused",
     "scatter",
     "smoothed",
@@ -22,10 +22,10 @@ FEATURES = (
     "near_from_blend",
     "activity",
 )
-FALLBACKS = ("smoothed", "blend")  # candidates beside the mean along trajectories
+FALLBACK_SOURCES = ("smoothed", "blend")  # candidates beside the mean along trajectories
 
-# A weight of every feature and a constant, for each of `FALLBACKS`; and the same for the logarithm
-# of the result's variance. Those called beyond are for times after the last frame and before the
+# A weight of every feature and a constant, for each of `FALLBACK_SOURCES`; and the same for the
+# logarithm of the result's variance. Those called beyond are for times after the last frame and before the
 # first. Fitted as experiments/studies/weights_of_the_fusion.md says.
 # fmt: off
 CHOICE_WEIGHTS = (

@@ -15,17 +15,18 @@ from jaxevent.reconstruction.compensated.instants import Instants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     WarpedImages,
-    gradient,
+    gradient_at_pixel,
     gradient_jax,
-    pad_edge,
+    pad_edges,
 )
 from jaxevent.reconstruction.features import Numeric
 
 SCATTER_TOLERANCE = 3.0  # squared residual of an instant that scatter hardly counts
 OUTSIDE_VARIANCE = 1e6  # (ln I)^2, beyond the image's border
-EXPECTED_SQUARE = 0.6  # squared difference of an image from the mean, in units of its variance
+# Squared difference of an image from the mean, in units of its variance.
+EXPECTED_SQUARED_RESIDUAL = 0.6
 RESIDUAL_SIGMA_PX, SCATTER_SIGMA_PX = 1.5, 2.0  # of the Gaussians that gather them
-N_NEAR = 5  # instants without frame next to the target
+N_NEAR_INSTANTS = 5  # instants without frame next to the target
 
 
 class InstantLayout(NamedTuple):
@@ -60,7 +61,7 @@ def make_layout(instants: Instants, clear: NDArray, count: int) -> InstantLayout
     target, other = instants.target, instants.after
     order = np.argsort(np.abs(instants.t - instants.t[target]), kind="stable")
     near = np.zeros(len(instants), bool)
-    near[[k for k in order if k == target or not framed[k]][:N_NEAR]] = True
+    near[[k for k in order if k == target or not framed[k]][:N_NEAR_INSTANTS]] = True
     near[target] = True
     if instants.before == other:
         other = next((k for k in order if framed[k] and k not in (target, other)), other)
@@ -90,27 +91,27 @@ class RobustMean(NamedTuple):
     image_variance: Float[Numeric, "h w"]  # mean of the images, as in M, 0 of frames unclipped
 
 
-def gaussian_taps(sigma: float) -> NDArray[np.float32]:
-    """Return the taps of a Gaussian of `sigma` px, an odd number."""
-    reach = int(np.ceil(3 * sigma))
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+def gaussian_taps(sigma_px: float) -> NDArray[np.float32]:
+    """Return the taps of a Gaussian of `sigma_px` px, an odd number."""
+    reach = int(np.ceil(3 * sigma_px))
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
     return (taps / taps.sum()).astype(np.float32)
 
 
-def blur_jax(image: Array, sigma: float) -> Array:
+def blur_jax(image: Array, sigma_px: float) -> Array:
     """Blur the last two axes by a Gaussian; differentiable.
 
     Args:
         image: (..., h, w).
-        sigma: Standard deviation, px.
+        sigma_px: Standard deviation, px.
 
     Returns:
         (..., h, w).
     """
-    taps = gaussian_taps(sigma)
+    taps = gaussian_taps(sigma_px)
     for axis in (image.ndim - 2, image.ndim - 1):
         size = image.shape[axis]
-        padded = pad_edge(image, axis, len(taps) // 2)
+        padded = pad_edges(image, axis, len(taps) // 2)
         moved = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(len(taps))]
         image = functools.reduce(
             jnp.add, [float(tap) * one for tap, one in zip(taps, moved, strict=True)]
@@ -179,7 +180,7 @@ def robust_mean_jax(
     M = (R * warped.L).sum(0) / total
     # Of all instants but the plainly hidden ones, whatever the tolerance.
     plain = present / variance / (1 + (residual / SCATTER_TOLERANCE) ** 2)
-    excess = (plain * ((warped.L - M) ** 2 - EXPECTED_SQUARE * variance)).sum(0)
+    excess = (plain * ((warped.L - M) ** 2 - EXPECTED_SQUARED_RESIDUAL * variance)).sum(0)
     weight = blur_jax((plain * eta).sum(0), SCATTER_SIGMA_PX)
     scatter = jnp.maximum(blur_jax(excess, SCATTER_SIGMA_PX) / weight, 0)
     W = W * warped.inside
@@ -224,45 +225,45 @@ def visibility(
 
 
 @njit_noalloc_inlined
-def blur_along_x(row, taps, padded, out):
+def blur_along_x(row, taps, padded_scratch, out_row):
     """Blur a row; the image's border goes on.
 
     Args:
         row: (w,) the row.
         taps: (n,) the filter, n odd.
-        padded: (w + n,) scratch.
-        out: (w,) output.
+        padded_scratch: (w + n,) scratch.
+        out_row: (w,) output.
     """
     w, reach = len(row), len(taps) // 2
     for x in range(reach):
-        padded[x] = row[0]
-        padded[w + reach + x] = row[w - 1]
+        padded_scratch[x] = row[0]
+        padded_scratch[w + reach + x] = row[w - 1]
     for x in range(w):
-        padded[reach + x] = row[x]
-        out[x] = np.float32(0)
+        padded_scratch[reach + x] = row[x]
+        out_row[x] = np.float32(0)
     for i in range(len(taps)):
         tap = taps[i]
         for x in range(w):
-            out[x] += tap * padded[i + x]
+            out_row[x] += tap * padded_scratch[i + x]
 
 
 @njit_noalloc_inlined
-def blur_along_y(image, y, taps, out):
+def blur_along_y(image, y, taps, out_row):
     """Blur an image along y, for one of its rows.
 
     Args:
         image: (h, w) the image.
         y: The row.
         taps: (n,) the filter, n odd.
-        out: (w,) output.
+        out_row: (w,) output.
     """
     h, w = image.shape
     for x in range(w):
-        out[x] = np.float32(0)
+        out_row[x] = np.float32(0)
     for i in range(len(taps)):
         row, tap = image[min(max(y + i - len(taps) // 2, 0), h - 1)], taps[i]
         for x in range(w):
-            out[x] += tap * row[x]
+            out_row[x] += tap * row[x]
 
 
 @njit_noalloc
@@ -277,17 +278,17 @@ def _blur_down(begin, end, image, taps, out):
         blur_along_y(image, y, taps, out[y])
 
 
-def blur_image(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+def blur_image(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
     """Blur an image by a Gaussian, in loops.
 
     Args:
         image: (h, w).
-        sigma: Standard deviation, px.
+        sigma_px: Standard deviation, px.
 
     Returns:
         (h, w).
     """
-    taps = gaussian_taps(sigma)
+    taps = gaussian_taps(sigma_px)
     half, out = np.empty_like(image), np.empty_like(image)
     scratch = row_scratch(len(image), image.shape[1] + len(taps))
     run_over_rows(_blur_across, len(image), image, taps, scratch, half)
@@ -351,7 +352,7 @@ def _update_mean(begin, end, inputs, scratch, turn, means):
     for y in range(begin, end):
         steepness = scratch.steepness[y]
         for x in range(w):
-            gx, gy = gradient(before, y, x)
+            gx, gy = gradient_at_pixel(before, y, x)
             steepness[x] = gx * gx + gy * gy
             total[x], mean[x] = np.float32(0), np.float32(0)
         for k in range(count):
@@ -420,7 +421,7 @@ def _add_excess(inputs, k, y, residual, variance, sums):
     M, excess, weight = sums
     one, tolerance = np.float32(1), np.float32(SCATTER_TOLERANCE)
     L, clear = inputs.warped.L[k, y], inputs.warped.clear[k, y]
-    expected = np.float32(EXPECTED_SQUARE)
+    expected = np.float32(EXPECTED_SQUARED_RESIDUAL)
     for x in range(len(L)):
         eta = inputs.information + (one - inputs.information) * clear[x]
         ratio = residual[x] / tolerance

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.stream import DeadTime, Stream, count_before, event_weights
+from jaxevent.reconstruction.stream import DeadTime, EventStream, count_before_edges, event_weights
 from jaxevent.recording import Recording
 
-N_CHANGES = 8  # between pairs of images that are evenly spaced over a recording
+N_IMAGE_PAIRS = 8  # between pairs of images that are evenly spaced over a recording
 MAX_FRAME_INTERVALS = 4  # between the images of a pair
-MIN_EVENTS = 40.0  # per pixel in all changes together; with fewer nothing is learned
-EXPECTED_SIGMA = 0.1  # standard deviation of d, before it is known
-MIN_SIGMA = 0.05  # of d; pixels that differ less are averaged by the fusion as well
-AROUND_SIGMA_PX = 4.0  # of the Gaussian over the pixels that one is compared with
+MIN_EVENTS_PER_PIXEL = 40.0  # per pixel in all changes together; with fewer nothing is learned
+EXPECTED_DEVIATION_SIGMA = 0.1  # standard deviation of d, before it is known
+MIN_DEVIATION_SIGMA = 0.05  # of d; pixels that differ less are averaged by the fusion as well
+NEIGHBOURHOOD_SIGMA_PX = 4.0  # of the Gaussian over the pixels that one is compared with
 HUBER_SQUARE = 5.0  # standardised squares beyond which changes count less
-FACTOR_BOUNDS = (0.5, 2.0)  # on the common threshold
+COMMON_FACTOR_BOUNDS = (0.5, 2.0)  # on the common threshold
 
 ImageFunction = Callable[[int], tuple[NDArray, NDArray]]  # log intensity, variance at a time (us)
 
@@ -54,51 +54,53 @@ class ThresholdDeviations(NamedTuple):
     remaining: NDArray[np.floating]  # part of their prior variance that is left, 0..1
 
 
-def regress(changes: LogChanges, mismatch: float) -> ThresholdDeviations:
+def regress_deviations(changes: LogChanges, prior_sigma: float) -> ThresholdDeviations:
     """Estimate the deviations d by robust ridge regression of every pixel.
 
     Args:
         changes: The changes.
-        mismatch: Prior standard deviation of d.
+        prior_sigma: Prior standard deviation of d.
 
     Returns:
         The deviations.
     """
     rest, on, off, V = changes
     W = 1 / (V + rest**2 / HUBER_SQUARE)
-    A = (W * on * on).sum(0) + mismatch**-2
+    A = (W * on * on).sum(0) + prior_sigma**-2
     B = (W * on * off).sum(0)
-    C = (W * off * off).sum(0) + mismatch**-2
+    C = (W * off * off).sum(0) + prior_sigma**-2
     a, b = (W * on * rest).sum(0), (W * off * rest).sum(0)
     det = A * C - B * B
     d = np.stack([C * a - B * b, A * b - B * a]) / det
-    return ThresholdDeviations(d, np.stack([C, A]) / det / mismatch**2)
+    return ThresholdDeviations(d, np.stack([C, A]) / det / prior_sigma**2)
 
 
-def local_deviation(found: ThresholdDeviations, size: tuple[int, int]) -> ThresholdDeviations:
+def subtract_local_mean(
+    deviations: ThresholdDeviations, image_shape: tuple[int, int]
+) -> ThresholdDeviations:
     """Subtract the mean of the pixels around: errors of the scene's motion are common to these."""
-    d = found.d.reshape(2, *size)
-    smooth = gaussian_filter(d, (0, AROUND_SIGMA_PX, AROUND_SIGMA_PX))
-    return found._replace(d=(d - smooth).reshape(found.d.shape))
+    d = deviations.d.reshape(2, *image_shape)
+    smooth = gaussian_filter(d, (0, NEIGHBOURHOOD_SIGMA_PX, NEIGHBOURHOOD_SIGMA_PX))
+    return deviations._replace(d=(d - smooth).reshape(deviations.d.shape))
 
 
-def estimate_sigma(one: ThresholdDeviations, other: ThresholdDeviations) -> float:
+def estimate_deviation_sigma(first: ThresholdDeviations, second: ThresholdDeviations) -> float:
     """Estimate the standard deviation of d from two regressions on different changes.
 
     Each finds the part 1 - `remaining` of d, with independent errors.
     """
-    found = ((1 - one.remaining) * (1 - other.remaining)).sum().clip(1e-12)
-    return float(np.sqrt(max((one.d * other.d).sum() / found, 0.0)))
+    found = ((1 - first.remaining) * (1 - second.remaining)).sum().clip(1e-12)
+    return float(np.sqrt(max((first.d * second.d).sum() / found, 0.0)))
 
 
 def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int, int]]:
     """Return begins and ends (us) of changes that do not overlap."""
     first, last = span
     assert recording.frames is not None
-    lag = (last - first) // N_CHANGES
+    lag = (last - first) // N_IMAGE_PAIRS
     if len(recording.frames) > 1:
         lag = min(lag, MAX_FRAME_INTERVALS * int(np.median(np.diff(recording.frames.t))))
-    begins = np.linspace(first, last - lag, N_CHANGES).astype(np.int64)
+    begins = np.linspace(first, last - lag, N_IMAGE_PAIRS).astype(np.int64)
     return [(t, t + lag) for t in begins.tolist()]
 
 
@@ -107,35 +109,37 @@ def _count_events(recording: Recording, begin: int, end: int, rho: float) -> NDA
     source = recording.events
     # With enough events before the begin to know the gaps of nearly all pixels.
     rows = slice(source.index(2 * begin - end), source.index(end))
-    stream = Stream.of(source[rows], recording.width)
+    stream = EventStream.of(source[rows], recording.width)
     pixels = recording.width * recording.height
     weight = event_weights(stream, np.full(pixels, recording.start), DeadTime(rho, False))
-    before, after = count_before(stream, weight, np.array([begin, end]), np.zeros((2, pixels)))
+    before, after = count_before_edges(
+        stream, weight, np.array([begin, end]), np.zeros((2, pixels))
+    )
     return after - before
 
 
 def learn_thresholds(
-    recording: Recording, params: Params, span: tuple[int, int], images: ImageFunction
+    recording: Recording, params: Params, span_us: tuple[int, int], images: ImageFunction
 ) -> NDArray[np.float32] | None:
     """Learn the ON and OFF thresholds of every pixel.
 
     Args:
         recording: The recording.
         params: Parameters of `mc`.
-        span: First and last time with data, us.
+        span_us: First and last time with data, us.
         images: A function from a time (us) to log intensity and its variance, of any shape.
 
     Returns:
         (2, pixels) factors on the common thresholds. None where events are too few, or where both
-        halves of the changes do not have deviations above `MIN_SIGMA` in common.
+        halves of the changes do not have deviations above `MIN_DEVIATION_SIGMA` in common.
     """
     c_on, c_off = float(params.c_on), float(params.c_off)
-    if not params.learn or span[1] - span[0] < N_CHANGES:
+    if not params.learn or span_us[1] - span_us[0] < N_IMAGE_PAIRS:
         return None
-    times = _change_times(recording, span)
+    times = _change_times(recording, span_us)
     rho = 1e6 * float(params.rho_ref)  # us
     counts = np.stack([_count_events(recording, *pair, rho) for pair in times], 1)
-    if counts.sum((0, 1)).mean() < MIN_EVENTS:
+    if counts.sum((0, 1)).mean() < MIN_EVENTS_PER_PIXEL:
         return None
     known = {t: images(t) for t in sorted({t for pair in times for t in pair})}
     rest = np.stack([(known[b][0] - known[a][0]).ravel() for a, b in times])
@@ -145,11 +149,16 @@ def learn_thresholds(
     drift = float(params.sigma_bg) ** 2 * np.array([(b - a) * 1e-6 for a, b in times])[:, None]
     changes = LogChanges(rest - on - off, on, off, P + steps + drift + c_on * c_off / 3)
     size = (recording.height, recording.width)
-    halves = (slice(0, N_CHANGES // 2), slice(N_CHANGES // 2, None))
-    found = estimate_sigma(
-        *(local_deviation(regress(changes.select(half), EXPECTED_SIGMA), size) for half in halves)
+    halves = (slice(0, N_IMAGE_PAIRS // 2), slice(N_IMAGE_PAIRS // 2, None))
+    found = estimate_deviation_sigma(
+        *(
+            subtract_local_mean(
+                regress_deviations(changes.select(half), EXPECTED_DEVIATION_SIGMA), size
+            )
+            for half in halves
+        )
     )
-    if not found > MIN_SIGMA:
+    if not found > MIN_DEVIATION_SIGMA:
         return None
-    factors = 1 + local_deviation(regress(changes, found), size).d
-    return factors.clip(*FACTOR_BOUNDS).astype(np.float32)
+    factors = 1 + subtract_local_mean(regress_deviations(changes, found), size).d
+    return factors.clip(*COMMON_FACTOR_BOUNDS).astype(np.float32)

@@ -31,11 +31,11 @@ from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
     PackedImages,
     fill_information,
-    horizon_of,
     linearise,
+    max_instant_distance,
     robust_means,
     sample_trajectories,
-    solve,
+    solve_normal_equations,
 )
 from jaxevent.reconstruction.compensated.robust_mean import (
     blur_along_x,
@@ -47,7 +47,7 @@ from jaxevent.reconstruction.compensated.warp import (
     bilinear_cell,
     bilinear_weights,
     blend_nodes,
-    gradient,
+    gradient_at_pixel,
     interpolate_paths,
     locate_points,
     resize_nodes,
@@ -56,13 +56,13 @@ from jaxevent.reconstruction.compensated.warp import (
 MAX_STEP_PX = np.float32(1.5)  # at the horizon
 HALVING_TAPS = np.array([1, 4, 6, 4, 1], np.float32) / np.float32(16)
 # A pixel's own path, and those around it.
-NEIGHBOURS = np.array(
+NEIGHBOUR_OFFSETS = np.array(
     [(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
 )
 # Least gain in cost per instant for which a pixel takes another path. With less, pixels of one
 # surface take what noise prefers. Set on pans of HDR scenes for fitting, on objects of seeds that
 # are not scored, and on the first half of slider_depth.
-MIN_GAIN = np.float32(0.1)
+MIN_COST_GAIN = np.float32(0.1)
 MIN_PATH_DIFFERENCE_PX = np.float32(0.5)  # at the farthest instant, between paths to compare
 
 
@@ -101,7 +101,7 @@ def _pack(begin, end, L, V, out):
             for x in range(w):
                 out[k, y, x, 0] = L[k, y, x]
                 out[k, y, x, 1] = V[k, y, x]
-                out[k, y, x, 2], out[k, y, x, 3] = gradient(L[k], y, x)
+                out[k, y, x, 2], out[k, y, x, 3] = gradient_at_pixel(L[k], y, x)
 
 
 @njit_noalloc
@@ -122,7 +122,7 @@ def _halve(begin, end, images, scratch, out):
                 out[k, y, x] = total
 
 
-def halve(images: NDArray[np.float32]) -> NDArray[np.float32]:
+def halve_resolution(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur images (K, h, w) and keep every second pixel: half the resolution, rounded up."""
     count, h, w = images.shape
     out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
@@ -149,7 +149,7 @@ class ImagePyramid:
         while len(self._packed) <= level:
             if len(self._levels) == len(self._packed):
                 L, V = self._levels[-1]
-                self._levels.append((halve(L), halve(V) * self._factor))
+                self._levels.append((halve_resolution(L), halve_resolution(V) * self._factor))
             self._packed.append(pack_images(*self._levels[len(self._packed)]))
         return self._packed[level]
 
@@ -205,9 +205,13 @@ def gauss_newton_step(
     Returns:
         (rows, columns, 4) the new trajectories, px.
     """
-    d = solve(linearise(sample_trajectories(images, p, cost), p, cost), p)
+    d = solve_normal_equations(linearise(sample_trajectories(images, p, cost), p, cost), p)
     rows, columns, channels = p.shape
-    out, flat, horizon = np.empty_like(p), (rows, columns * channels), horizon_of(images.s)
+    out, flat, horizon = (
+        np.empty_like(p),
+        (rows, columns * channels),
+        max_instant_distance(images.s),
+    )
     longest = MAX_STEP_PX / np.repeat([horizon, horizon * horizon / 4], 2).astype(np.float32)
     scratch = np.empty(flat, np.float32), np.empty((3, flat[1] + 2 * channels), np.float32)
     _move(p.reshape(flat), d.reshape(flat), longest, scratch, out.reshape(flat))
@@ -298,12 +302,12 @@ class NodeTrajectories(NamedTuple):
     p: NDArray[np.float32]  # (rows, columns, 4), in pixels of that resolution
     level: int  # 0: full resolution
 
-    def at_level(self, level: int, size: tuple[int, int]) -> "NodeTrajectories":
+    def at_level(self, level: int, image_shape: tuple[int, int]) -> "NodeTrajectories":
         """Convert to another resolution.
 
         Args:
             level: 0 for full resolution, 1 for half of it, and so on.
-            size: Height and width of the full image, px.
+            image_shape: Height and width of the full image, px.
 
         Returns:
             The trajectories at that level.
@@ -312,7 +316,7 @@ class NodeTrajectories(NamedTuple):
         while now != level:
             finer = now > level
             now += -1 if finer else 1
-            p = resize_nodes(p, node_shape(*size, now), finer)
+            p = resize_nodes(p, node_shape(*image_shape, now), finer)
         return NodeTrajectories(p, level)
 
 
@@ -564,13 +568,15 @@ def select_paths(
         (h, w) flat indices of the pixels whose paths are taken, row by row.
     """
     h, w, _ = paths.shape
-    min_gain = np.float32(MIN_GAIN * len(images.s))
+    min_gain = np.float32(MIN_COST_GAIN * len(images.s))
     path_index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     for spacing, distance, sigma in searches:
         some = paths.reshape(-1, 4)[path_index[::spacing, ::spacing]]
         taps, shape = gaussian_taps(sigma), some.shape[:2]
-        inputs = _SearchInputs(images, some, spacing, NEIGHBOURS * distance, cost, taps, min_gain)
-        costs = np.empty((len(NEIGHBOURS), *shape), np.float32)
+        inputs = _SearchInputs(
+            images, some, spacing, NEIGHBOUR_OFFSETS * distance, cost, taps, min_gain
+        )
+        costs = np.empty((len(NEIGHBOUR_OFFSETS), *shape), np.float32)
         scratch = _SearchScratch.allocate(shape, len(images.s), len(taps))
         run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
         out = np.empty_like(path_index)

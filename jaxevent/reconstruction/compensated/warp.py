@@ -47,7 +47,7 @@ class RowScratch(NamedTuple):
 
 
 @njit_noalloc_inlined
-def gradient(image, y, x):
+def gradient_at_pixel(image, y, x):
     """Return the gradient along x and y at a pixel; five taps, exact up to degree 4."""
     h, w = image.shape
     up, down, up2, down2 = max(y - 1, 0), min(y + 1, h - 1), max(y - 2, 0), min(y + 2, h - 1)
@@ -58,18 +58,18 @@ def gradient(image, y, x):
     return gx * twelfth, gy * twelfth
 
 
-def pad_edge(images: Array, axis: int, size: int) -> Array:
-    """Pad images by `size` copies of the border at both ends of an axis."""
+def pad_edges(images: Array, axis: int, n_pixels: int) -> Array:
+    """Pad images by `n_pixels` copies of the border at both ends of an axis."""
     widths = [(0, 0)] * images.ndim
-    widths[axis] = (size, size)
+    widths[axis] = (n_pixels, n_pixels)
     return jnp.pad(images, widths, mode="edge")
 
 
 def gradient_jax(images: Array) -> tuple[Array, Array]:
-    """Return the gradients of images (..., h, w) along x and y, as `gradient` does."""
+    """Return the gradients of images (..., h, w) along x and y, as `gradient_at_pixel` does."""
 
     def along(axis: int) -> Array:
-        padded, size = pad_edge(images, axis, 2), images.shape[axis]
+        padded, size = pad_edges(images, axis, 2), images.shape[axis]
         a, b, _, d, e = (jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(5))
         return (8 * (d - b) - e + a) / 12
 
@@ -95,24 +95,24 @@ def bilinear_weights(fx, fy):
 
 
 @njit_noalloc_inlined
-def blend_nodes(p, cell, out):
+def blend_nodes(p, cell, out_path):
     """Write the four numbers of a path between the nodes (rows, columns, 4) of a cell."""
     j, i, j1, i1, fx, fy = cell
     for c in range(4):
         top = p[i, j, c] + fx * (p[i, j1, c] - p[i, j, c])
         bottom = p[i1, j, c] + fx * (p[i1, j1, c] - p[i1, j, c])
-        out[c] = top + fy * (bottom - top)
+        out_path[c] = top + fy * (bottom - top)
 
 
 @njit_noalloc_inlined
-def interpolate_path(p, at_y, at_x, out):
+def interpolate_path(p, node_y, node_x, out_path):
     """Write the path at a place between nodes, which is given in units of nodes."""
     rows, columns, _ = p.shape
-    at_y = min(max(at_y, np.float32(0)), np.float32(rows - 1))
-    at_x = min(max(at_x, np.float32(0)), np.float32(columns - 1))
-    i, j = int(at_y), int(at_x)
+    node_y = min(max(node_y, np.float32(0)), np.float32(rows - 1))
+    node_x = min(max(node_x, np.float32(0)), np.float32(columns - 1))
+    i, j = int(node_y), int(node_x)
     i1, j1 = min(i + 1, rows - 1), min(j + 1, columns - 1)
-    blend_nodes(p, (j, i, j1, i1, at_x - np.float32(j), at_y - np.float32(i)), out)
+    blend_nodes(p, (j, i, j1, i1, node_x - np.float32(j), node_y - np.float32(i)), out_path)
 
 
 @njit_noalloc
@@ -126,18 +126,18 @@ def _resample(begin, end, p, scale, factor, out):
                 out[i, j, c] *= factor
 
 
-def interpolate_paths(p: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+def interpolate_paths(p: NDArray[np.float32], image_shape: tuple[int, int]) -> NDArray[np.float32]:
     """Interpolate the paths of nodes to all pixels.
 
     Args:
         p: (rows, columns, 4) paths of nodes, px.
-        size: Height and width of the image, px.
+        image_shape: Height and width of the image, px.
 
     Returns:
         (h, w, 4) paths of pixels, px.
     """
-    out = np.empty((*size, 4), np.float32)
-    run_over_rows(_resample, size[0], p, np.float32(2), np.float32(1), out)
+    out = np.empty((*image_shape, 4), np.float32)
+    run_over_rows(_resample, image_shape[0], p, np.float32(2), np.float32(1), out)
     return out
 
 
@@ -163,21 +163,21 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
     """Interpolate the paths of nodes to all pixels, as `interpolate_paths` does."""
     Y = jnp.broadcast_to(jnp.arange(height)[:, None] / 2 - 0.25, (4, height, width))
     X = jnp.broadcast_to(jnp.arange(width) / 2 - 0.25, (4, height, width))
-    return jnp.moveaxis(sample(jnp.moveaxis(p, -1, 0), Y, X), 0, -1)
+    return jnp.moveaxis(sample_bilinear(jnp.moveaxis(p, -1, 0), Y, X), 0, -1)
 
 
 @njit_noalloc_inlined
-def locate_points(y, s, size, count, row):
+def locate_points(y, s, image_shape, n_points, scratch_row):
     """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
 
-    `row` holds the parts of a `RowScratch` for one row.
+    `scratch_row` holds the parts of a `RowScratch` for one row.
     """
-    h, w = size
-    path, x, pixel, part, inside = row
+    h, w = image_shape
+    path, x, pixel, part, inside = scratch_row
     one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     right, bottom = np.float32(w - 1), np.float32(h - 1)
     last_x, last_y = np.int32(max(w - 2, 0)), np.int32(max(h - 2, 0))
-    for i in range(count):
+    for i in range(n_points):
         X = x[i] + (path[0, i] + path[2, i] * s) * s
         Y = y + (path[1, i] + path[3, i] * s) * s
         here = (X >= -half) & (X <= right + half) & (Y >= -half) & (Y <= bottom + half)
@@ -257,7 +257,7 @@ def _warp(begin, end, inputs, scratch, cubic, out):
             _read_bilinear(clear[k], pixel, part, out.clear[k, y])
 
 
-def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> WarpedImages:
+def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> WarpedImages:
     """Read images along the paths of pixels.
 
     Args:
@@ -277,7 +277,7 @@ def warp(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> 
     return out
 
 
-def displacements(paths: Array, s: Array) -> Array:
+def path_displacements(paths: Array, s: Array) -> Array:
     """Return the displacements (K, h, w, 2) along x and y (px) of paths (h, w, 4) at s (K,)."""
     s = s[:, None, None, None]
     return (paths[..., :2] + paths[..., 2:] * s) * s
@@ -288,14 +288,14 @@ def squared_reach(paths: Numeric) -> Numeric:
     return ((abs(paths[..., :2]) + abs(paths[..., 2:])) ** 2).sum(-1)
 
 
-def positions(paths: Array, s: Array) -> tuple[Array, Array]:
+def path_positions(paths: Array, s: Array) -> tuple[Array, Array]:
     """Return y and x, (K, h, w) each, of the points of paths (h, w, 4) at s (K,)."""
     height, width, _ = paths.shape
-    moved = displacements(paths, s)
+    moved = path_displacements(paths, s)
     return jnp.arange(height)[:, None] + moved[..., 1], jnp.arange(width) + moved[..., 0]
 
 
-def sample(images: Array, Y: Array, X: Array) -> Array:
+def sample_bilinear(images: Array, Y: Array, X: Array) -> Array:
     """Read images (K, h, w) at the points Y and X (K, ...) of each, bilinear; differentiable."""
     _, h, w = images.shape
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
@@ -309,17 +309,17 @@ def sample(images: Array, Y: Array, X: Array) -> Array:
     return (1 - fy) * top + fy * bottom
 
 
-def is_inside(Y: Array, X: Array, height: int, width: int) -> Array:
+def is_in_image(Y: Array, X: Array, height: int, width: int) -> Array:
     """Return which points lie in an image of that size."""
     return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
 
 
-def warp_jax(L: Array, V: Array, clear: Array, s: Array, paths: Array) -> WarpedImages:
+def warp_images_jax(L: Array, V: Array, clear: Array, s: Array, paths: Array) -> WarpedImages:
     """Read images along the paths of pixels, as `warp` does; differentiable."""
     _, h, w = L.shape
-    Y, X = positions(paths, s)
-    inside = is_inside(Y, X, h, w)
-    V, clear = sample(V, Y, X), sample(clear, Y, X)
+    Y, X = path_positions(paths, s)
+    inside = is_in_image(Y, X, h, w)
+    V, clear = sample_bilinear(V, Y, X), sample_bilinear(clear, Y, X)
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
     y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
     x0 = jnp.minimum(X.astype(int), max(w - 2, 0))

@@ -16,20 +16,20 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.graph import TranslationError
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.frames import FrameImages, Timing
-from jaxevent.reconstruction.stream import Stream, StreamState, event_weights
+from jaxevent.reconstruction.stream import EventStream, StreamState, event_weights
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
 
-NEVER = 1 << 45  # us, longer than any recording and within an event's bits
+NEVER_US = 1 << 45  # us, longer than any recording and within an event's bits
 # Pixels of a band and its border. A dozen numbers each fill half a megabyte, of a second-level
 # cache of one; each number begins a cache line further than a power of two. Where derivatives lie
 # beside them the smaller bands are a tenth faster.
-STRIDES = (8208, 16400, 32784, 65488)
-STRIDES_WITH_DERIVATIVES = (4112, *STRIDES)
-MIN_ROWS = 6  # the two rows of a border are read for nothing
-WINDOW_FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
-IMAGE_PIXELS = 1 << 22  # made in one pass, 9 bytes each
-N_BUFFERS = 2  # the last images are held while the next ones are made
+BAND_STRIDES = (8208, 16400, 32784, 65488)
+BAND_STRIDES_WITH_DERIVATIVES = (4112, *BAND_STRIDES)
+MIN_BAND_ROWS = 6  # the two rows of a border are read for nothing
+MAX_WINDOW_FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
+MAX_PASS_PIXELS = 1 << 22  # made in one pass, 9 bytes each
+N_IMAGE_BUFFERS = 2  # the last images are held while the next ones are made
 
 
 class Bands(NamedTuple):
@@ -66,12 +66,12 @@ class ImageBuffers(NamedTuple):
 
     @classmethod
     def empty(
-        cls, times: int, pixels: int, dtype: np.dtype, outputs: int = 0, lanes: int = 0
+        cls, n_times: int, n_pixels: int, dtype: np.dtype, n_outputs: int = 0, n_lanes: int = 0
     ) -> "ImageBuffers":
-        """Make buffers for some times, with derivatives of `outputs` images."""
-        mean, variance = (np.empty((times, pixels), dtype) for _ in range(2))
-        valid = np.empty((times, pixels), np.uint8)
-        return cls(mean, variance, valid, np.zeros((times, pixels, outputs, lanes), dtype))
+        """Make buffers for some times, with derivatives of `n_outputs` images."""
+        mean, variance = (np.empty((n_times, n_pixels), dtype) for _ in range(2))
+        valid = np.empty((n_times, n_pixels), np.uint8)
+        return cls(mean, variance, valid, np.zeros((n_times, n_pixels, n_outputs, n_lanes), dtype))
 
 
 class BufferPool:
@@ -81,11 +81,11 @@ class BufferPool:
     """
 
     def __init__(self, pixels: int, dtype: np.dtype):
-        self.times = max(1, IMAGE_PIXELS // pixels)
+        self.times = max(1, MAX_PASS_PIXELS // pixels)
         self._pixels, self._dtype = pixels, dtype
         self._sets: list[tuple[NDArray, ...]] = []
 
-    def take(self, times: int) -> ImageBuffers:
+    def take(self, n_times: int) -> ImageBuffers:
         """Take memory for some images, which nothing else writes until they are released."""
         free = [arrays for arrays in self._sets if _count_references(arrays) == _UNUSED]
         arrays: tuple[NDArray, ...]
@@ -93,10 +93,10 @@ class BufferPool:
             arrays = free[0]
         else:
             arrays = tuple(ImageBuffers.empty(self.times, self._pixels, self._dtype)[:3])
-            self._sets = [*self._sets, arrays][-N_BUFFERS:]
-        mean, variance, valid = (array[:times] for array in arrays)
+            self._sets = [*self._sets, arrays][-N_IMAGE_BUFFERS:]
+        mean, variance, valid = (array[:n_times] for array in arrays)
         return ImageBuffers(
-            mean, variance, valid, np.empty((times, self._pixels, 0, 0), self._dtype)
+            mean, variance, valid, np.empty((n_times, self._pixels, 0, 0), self._dtype)
         )
 
 
@@ -124,9 +124,9 @@ class BandLayout:
             TranslationError: The sensor is too wide for a band.
         """
         rows, stride = 0, 0
-        for stride in STRIDES_WITH_DERIVATIVES if derivatives else STRIDES:
+        for stride in BAND_STRIDES_WITH_DERIVATIVES if derivatives else BAND_STRIDES:
             rows = stride // (width + 2) - 2
-            if rows >= min(MIN_ROWS, height):
+            if rows >= min(MIN_BAND_ROWS, height):
                 break
         if rows < min(3, height):  # a row borders on one other band at most
             raise TranslationError(f"a sensor {width} pixels wide")
@@ -143,8 +143,8 @@ class BandLayout:
         stored: EventColumns,
         weight: NDArray,
         width: int,
-        origin: int,
-        memory: NDArray[np.int64],
+        origin_us: int,
+        out_events: NDArray[np.int64],
     ) -> Bands | None:
         """Divide events among the bands, in order of time.
 
@@ -154,14 +154,16 @@ class BandLayout:
             stored: The events, which are checked.
             weight: Events that each one stands for; empty: one.
             width: Width of the sensor, px.
-            origin: Time from which to count, us.
-            memory: Where the bands' events are written if they fit.
+            origin_us: Time from which to count, us.
+            out_events: Where the bands' events are written if they fit.
 
         Returns:
             The bands, or None if the events are not in order or not on the sensor.
         """
-        origin, height = origin - stored.offset, int(self.edges[-1])
-        if len(stored.t) and (stored.t[0] < origin - NEVER or stored.t[-1] > origin + NEVER):
+        origin_us, height = origin_us - stored.offset, int(self.edges[-1])
+        if len(stored.t) and (
+            stored.t[0] < origin_us - NEVER_US or stored.t[-1] > origin_us + NEVER_US
+        ):
             return None
         counts = np.zeros(1 << 16, np.int64)
         _count_rows(stored.y, counts)
@@ -171,11 +173,11 @@ class BandLayout:
         low, high = np.maximum(self.edges[:-1] - 1, 0), np.minimum(self.edges[1:] + 1, height)
         first = np.concatenate([[0], np.cumsum(before[high] - before[low])])
         total = int(first[-1])
-        events = memory if len(memory) >= total else np.empty(total + total // 4, np.int64)
+        events = out_events if len(out_events) >= total else np.empty(total + total // 4, np.int64)
         weights = np.empty(total if len(weight) else 0, weight.dtype)
         bands = Bands(events, weights, first, self.edges, width, self.stride)
         in_order = _partition(
-            stored, weight, self._rows(width), origin, first.astype(np.uint64), bands
+            stored, weight, self._rows(width), origin_us, first.astype(np.uint64), bands
         )
         return bands if in_order else None
 
@@ -262,14 +264,14 @@ class PartitionedRecording:
         factors: NDArray[np.floating] | None = None,
     ):
         self.layout = BandLayout.of(recording.width, recording.height, filtering and events is None)
-        if recording.stop - recording.start >= NEVER:
+        if recording.stop - recording.start >= NEVER_US:
             raise TranslationError("a recording of over a year")
         whole = max(len(recording.events), 1)
         self.recording, self._factors = recording, factors
         self.windows = WindowedRecording(
             recording, timing, filtering=filtering, events=whole if events is None else events
         )
-        self.windows.frames = max(8, WINDOW_FRAME_PIXELS // self.windows.pixels)
+        self.windows.frames = max(8, MAX_WINDOW_FRAME_PIXELS // self.windows.pixels)
         if events is None:
             self.windows.frames = len(self.windows.clock) + 2
         self.images = FrameImages(recording, self.dtype)
@@ -298,15 +300,17 @@ class PartitionedRecording:
             "response": self._response,
         }
 
-    def partition(self, state: StreamState, begin: int, end: int) -> tuple[Bands, StreamState]:
+    def partition(
+        self, state: StreamState, begin_row: int, end_row: int
+    ) -> tuple[Bands, StreamState]:
         """Divide the events of a range of rows among the bands.
 
         Bands that were made before are overwritten.
 
         Args:
             state: State of the stream before or at the first row.
-            begin: First row.
-            end: Row after the last.
+            begin_row: First row.
+            end_row: Row after the last.
 
         Returns:
             The bands, and the state at the first row.
@@ -315,15 +319,15 @@ class PartitionedRecording:
         weight = np.empty(0, self.dtype)
         plain = state.context_last is None and self._factors is None
         if plain and isinstance(source, ColumnSource):
-            self._stored = source.columns(slice(begin, end), self._stored)
+            self._stored = source.columns(slice(begin_row, end_row), self._stored)
             bands = None if self._stored is None else self._bands_of(self._stored, weight)
             if bands is not None:
                 return bands, state
-        events = source[begin:end]  # raises `InputError` for what is not valid
+        events = source[begin_row:end_row]  # raises `InputError` for what is not valid
         if state.context_last is not None:
-            state = windows.move_context(state, begin)
+            state = windows.move_context(state, begin_row)
             assert state.context_last is not None
-            stream = Stream.of(events, self.recording.width)
+            stream = EventStream.of(events, self.recording.width)
             weight = event_weights(stream, state.context_last.copy(), windows.dead).astype(
                 self.dtype
             )
@@ -336,7 +340,7 @@ class PartitionedRecording:
         bands = self._bands_of(checked, weight)
         if bands is None:  # somebody changed arrays after they were checked
             name = self.recording.name
-            events.check(self.recording.width, self.recording.height, name, begin)
+            events.check(self.recording.width, self.recording.height, name, begin_row)
             raise InputError(f"{name}: events changed while they were read; make a new recording")
         return bands, state
 
@@ -347,58 +351,60 @@ class PartitionedRecording:
             self._events = bands.events
         return bands
 
-    def frames(self, used: slice) -> FrameRows:
+    def frames(self, frame_range: slice) -> FrameRows:
         """Return a range of the frames, as loops read them."""
         clock, frames = self.windows.clock, self.recording.frames
-        left, mid, right = (e[used].astype(float) for e in (clock.left, clock.mid, clock.right))
+        left, mid, right = (
+            e[frame_range].astype(float) for e in (clock.left, clock.mid, clock.right)
+        )
         images, values = np.zeros((0, 1), np.uint8), np.zeros((0, 0, 1), self.dtype)
         if frames is not None and len(clock):
-            images = np.asarray(frames[used].images)
+            images = np.asarray(frames[frame_range].images)
             images = np.ascontiguousarray(images.reshape(len(images), -1))
             if images.dtype.kind == "f":
                 values = self.images.values(images)
                 images = np.zeros((0, 1), np.uint8)
-        gain = self.recording.gain[used].astype(self.dtype)
-        return FrameRows(images, self._tables, values, gain, left, mid, right, used.start)
+        gain = self.recording.gain[frame_range].astype(self.dtype)
+        return FrameRows(images, self._tables, values, gain, left, mid, right, frame_range.start)
 
 
 # Compilers take several numbers at once where no place can be negative: in parts from 0 on.
 @njit_noalloc_inlined
-def copy(cells, to, of, count):
+def copy_field(cells, out_begin, in_begin, count):
     """Copy some numbers from one place to another."""
-    out, given = cells[to : to + count], cells[of : of + count]
+    out, given = cells[out_begin : out_begin + count], cells[in_begin : in_begin + count]
     for z in range(len(out)):
         out[z] = given[z]
 
 
 @njit_noalloc_inlined
-def fill(cells, at, count, value):
+def fill_field(cells, out_begin, count, value):
     """Set some numbers to one value."""
-    out = cells[at : at + count]
+    out = cells[out_begin : out_begin + count]
     for z in range(len(out)):
         out[z] = value
 
 
 @njit_noalloc_inlined
-def ceil_time(time):
+def ceil_to_us(time_us):
     """Round a time up: events earlier than this whole number of us are before it."""
-    return np.int64(np.ceil(time))
+    return np.int64(np.ceil(time_us))
 
 
 @njit_noalloc_inlined
-def load_image(frames, kind, k, bands, band, field):
+def load_frame_image(frames, table_kind, frame, bands, band, out_field):
     """Write grey values (kind 0), intensities or certainties of frame k into a field."""
-    gain, width = frames.gain[k], bands.width
-    is_plain = kind != 1 or gain == 1  # divisions take longest
+    gain, width = frames.gain[frame], bands.width
+    is_plain = table_kind != 1 or gain == 1  # divisions take longest
     for line in range(bands.edges[band], bands.edges[band + 1]):
         z, pixel = (line - bands.edges[band] + 1) * (width + 2) + 1, line * width
-        out = field[z : z + width]
+        out = out_field[z : z + width]
         if len(frames.values) == 0:
-            table, levels = frames.tables[kind], frames.images[k, pixel : pixel + width]
+            table, levels = frames.tables[table_kind], frames.images[frame, pixel : pixel + width]
             for column in range(len(out)):
                 out[column] = table[levels[column]]
         else:
-            given = frames.values[kind, k, pixel : pixel + width]
+            given = frames.values[table_kind, frame, pixel : pixel + width]
             for column in range(len(out)):
                 out[column] = given[column]
         if not is_plain:
@@ -407,11 +413,11 @@ def load_image(frames, kind, k, bands, band, field):
 
 
 @njit_noalloc_inlined
-def find(events, begin, end, time):
+def find_first_event(events, begin, end, time_us):
     """Find the first of a band's events, from begin to end, that is not before a time."""
     while begin < end:
         middle = (begin + end) >> 1
-        if events[middle] >> 17 < time:
+        if events[middle] >> 17 < time_us:
             begin = middle + 1
         else:
             end = middle
@@ -419,17 +425,17 @@ def find(events, begin, end, time):
 
 
 @njit_noalloc_inlined
-def count_events(bands, band, span, cells, on, off):
+def count_band_events(bands, band, span_us, cells, on_field, off_field):
     """Count each pixel's ON and OFF events with span[0] <= t < span[1] into two fields."""
     events, weights, stride, end = bands.events, bands.weights, bands.stride, bands.first[band + 1]
-    weighted, (left, right) = len(weights) > 0, span
-    fill(cells, on, stride, 0.0)
-    fill(cells, off, stride, 0.0)
-    for i in range(find(events, bands.first[band], end, left), end):
+    weighted, (left, right) = len(weights) > 0, span_us
+    fill_field(cells, on_field, stride, 0.0)
+    fill_field(cells, off_field, stride, 0.0)
+    for i in range(find_first_event(events, bands.first[band], end, left), end):
         event = events[i]
         if event >> 17 >= right:
             break
-        z = np.uint64(((event >> 1) & 0xFFFF) + (on if event & 1 else off))
+        z = np.uint64(((event >> 1) & 0xFFFF) + (on_field if event & 1 else off_field))
         cells[z] += weights[i] if weighted else 1
 
 
@@ -444,15 +450,18 @@ class ExposureSums(NamedTuple):
 
 
 @njit_noalloc_inlined
-def sum_exposure_segments(bands, band, frames, k, cells, sums):
+def sum_exposure_segments(bands, band, frames, frame, cells, sums):
     """Add up what the segments of constant brightness of frame k's exposure say, into fields."""
     events, weights, stride = bands.events, bands.weights, bands.stride
     excess, numbers, totals, counts, bound = sums
     begin, end = bands.first[band], bands.first[band + 1]
-    left, mid, right = frames.left[k], frames.mid[k], frames.right[k]
+    left, mid, right = frames.left[frame], frames.mid[frame], frames.right[frame]
     length = right - left
-    a, b = find(events, begin, end, ceil_time(left)), find(events, begin, end, ceil_time(right))
-    middle = find(events, begin, end, ceil_time(mid))
+    a, b = (
+        find_first_event(events, begin, end, ceil_to_us(left)),
+        find_first_event(events, begin, end, ceil_to_us(right)),
+    )
+    middle = find_first_event(events, begin, end, ceil_to_us(mid))
     if length <= 0 or a == b:
         return
     added = counts[2]

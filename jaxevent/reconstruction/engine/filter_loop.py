@@ -13,24 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, run_over_rows
-from jaxevent.codegen.derivative import Directions, parse_derivative
+from jaxevent.codegen.derivative import DerivativeDirections, parse_derivative
 from jaxevent.codegen.module import CompiledProgram
 from jaxevent.reconstruction.engine.bands import (
-    NEVER,
+    NEVER_US,
     Bands,
     ExposureSums,
     FrameRows,
     ImageBuffers,
     PartitionedRecording,
-    copy,
-    count_events,
-    fill,
-    find,
-    load_image,
+    copy_field,
+    count_band_events,
+    fill_field,
+    find_first_event,
+    load_frame_image,
     sum_exposure_segments,
 )
 from jaxevent.reconstruction.engine.filter_program import (
-    N_ROWS,
+    N_PIECE_FRAMES,
     FieldPlaces,
     FilterFunctions,
     FilterMethod,
@@ -41,7 +41,7 @@ from jaxevent.reconstruction.engine.filter_program import (
     variants,
 )
 from jaxevent.reconstruction.features import allocate_aligned
-from jaxevent.reconstruction.frames import Clock, rates
+from jaxevent.reconstruction.frames import FrameClock, interval_rates
 from jaxevent.reconstruction.stream import StreamState
 
 
@@ -74,50 +74,50 @@ class BandedWindow(NamedTuple):
         """Start of the window, us."""
         return -math.inf if self.start is None else float(self.start)
 
-    def contains(self, time: int) -> bool:
+    def contains(self, time_us: int) -> bool:
         """Return whether a time (us) is in the window."""
-        return self.begins <= time and (self.stop is None or time < self.stop)
+        return self.begins <= time_us and (self.stop is None or time_us < self.stop)
 
 
 def cut_window(
-    recording: PartitionedRecording, start: int | None, state: StreamState
+    recording: PartitionedRecording, start_us: int | None, state: StreamState
 ) -> BandedWindow:
     """Cut the window that begins at a time, and divide its events among the bands.
 
     Args:
         recording: The recording.
-        start: Start of the window, us; None: the recording's.
+        start_us: Start of the window, us; None: the recording's.
         state: State of the stream at the end of the window before.
     """
     windows, source = recording.windows, recording.recording.events
-    stop = windows.stop_after(start)
-    rows = [0 if start is None else source.index(start)]
+    stop = windows.choose_stop(start_us)
+    rows = [0 if start_us is None else source.index(start_us)]
     rows.append(len(source) if stop is None else source.index(stop))
-    used = windows.clock.used(start, stop)
-    bands, state = recording.partition(state, *windows.context_of(used, *rows))
-    line = make_timeline(windows.clock, start, stop, recording.recording.gain, recording.dtype)
-    return BandedWindow(start, stop, bands, line, recording.frames(used), state)
+    used = windows.clock.frames_within(start_us, stop)
+    bands, state = recording.partition(state, *windows.extend_to_exposures(used, *rows))
+    line = make_timeline(windows.clock, start_us, stop, recording.recording.gain, recording.dtype)
+    return BandedWindow(start_us, stop, bands, line, recording.frames(used), state)
 
 
 def make_timeline(
-    clock: Clock, start: int | None, stop: int | None, gain: NDArray, dtype: np.dtype
+    clock: FrameClock, start_us: int | None, stop_us: int | None, gain: NDArray, dtype: np.dtype
 ) -> Timeline:
     """Make the timeline of a window.
 
     Args:
         clock: Times of the frames.
-        start: Start of the window, us; None: without bound.
-        stop: End of the window.
+        start_us: Start of the window, us; None: without bound.
+        stop_us: End of the window.
         gain: (frames,) gain of each frame.
         dtype: Kind of real numbers.
     """
-    begin = -NEVER if start is None else start - clock.origin
-    end = NEVER if stop is None else stop - clock.origin
+    begin = -NEVER_US if start_us is None else start_us - clock.origin
+    end = NEVER_US if stop_us is None else stop_us - clock.origin
     bounds = np.unique(np.ceil(np.concatenate([clock.breaks, clock.mid])).astype(np.int64))
     times = np.concatenate([[begin], bounds[(bounds > begin) & (bounds < end)]]).astype(np.int64)
     piece = np.searchsorted(clock.breaks, times, "right")
     before = np.searchsorted(clock.mid, times, "right") - 1
-    frame = np.asarray(clock.frame(piece))
+    frame = np.asarray(clock.frame_of_piece(piece))
     # Positions of a piece, and of the frame before its points, among the frames that it rests on.
     first = np.maximum(frame - 1, 0)
     at = np.stack([piece - clock.first_piece(1) * first, np.maximum(before, 0) - first], 1)
@@ -137,10 +137,10 @@ def _intervals(breaks: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
         return np.zeros(len(at)), np.zeros(len(at))
     inside = (at >= 0) & (at < len(breaks) - 1)
     k = np.where(inside, at, 0)
-    return np.where(inside, breaks[k], 0.0), np.where(inside, rates(breaks)[k], 0.0)
+    return np.where(inside, breaks[k], 0.0), np.where(inside, interval_rates(breaks)[k], 0.0)
 
 
-def _uniform_inputs(clock: Clock, frame: int, gain: NDArray) -> NDArray:
+def _uniform_inputs(clock: FrameClock, frame: int, gain: NDArray) -> NDArray:
     """Return gains and rates of a piece of `frame`: fields of `FrameFeatures` of three frames."""
     first = max(frame - 1, 0)
     used = slice(first, min(len(clock), max(frame, 0) + 2))
@@ -154,21 +154,21 @@ def _uniform_inputs(clock: Clock, frame: int, gain: NDArray) -> NDArray:
     breaks = clock.breaks[clock.first_piece(first) :]
     return np.concatenate(
         [
-            padded(gain[used], N_ROWS, 0, 1.0),
-            padded(1e6 * rates(breaks), n_pieces(clock.exposed), 1, 0.0),
-            padded(1e6 * rates(clock.mid[used]), N_ROWS, 0, 0.0),
+            padded(gain[used], N_PIECE_FRAMES, 0, 1.0),
+            padded(1e6 * interval_rates(breaks), n_pieces(clock.exposed), 1, 0.0),
+            padded(1e6 * interval_rates(clock.mid[used]), N_PIECE_FRAMES, 0, 0.0),
         ]
     )
 
 
 # Kinds of steps, and their arguments; fields are places in `cells`.
-MOVE = 0  # to a field, from another
-LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
-FILL = 2  # a field, with half of a number
-SUM = 3  # into a column of `WindowInputs.totals`, the segments of a frame's exposure
-COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
+STEP_MOVE = 0  # to a field, from another
+STEP_LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
+STEP_FILL = 2  # a field, with half of a number
+STEP_SUM = 3  # into a column of `WindowInputs.totals`, the segments of a frame's exposure
+STEP_COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
 
-NO_FRAME = -9
+NO_PREVIOUS_FRAME = -9
 
 
 class EntrySteps(NamedTuple):
@@ -179,7 +179,7 @@ class EntrySteps(NamedTuple):
 
 
 def entry_steps(
-    places: FieldPlaces, line: Timeline, frames: FrameRows, enter: tuple[int, int]
+    places: FieldPlaces, timeline: Timeline, frames: FrameRows, entry_point: tuple[int, int]
 ) -> EntrySteps:
     """List the steps at the beginning of each interval of a window.
 
@@ -188,18 +188,22 @@ def entry_steps(
 
     Args:
         places: Places of the fields.
-        line: Timeline of the window.
+        timeline: Timeline of the window.
         frames: Frames of the window.
-        enter: Interval in which the window is entered, with no frame known, and the time, us since
-            the recording's start; the steps of the intervals before are left out.
+        entry_point: Interval in which the window is entered, with no frame known, and the time, us
+            since the recording's start; the steps of the intervals before are left out.
     """
-    first, now = enter
-    ends, before, found = np.zeros(len(line.start) + 1, np.int64), NO_FRAME, list[Any]()
-    entry = _FrameEntry(places, frames, line.opening)
-    for interval in range(first, len(line.start)):
-        frame = int(line.frame[interval])
+    first, now = entry_point
+    ends, before, found = (
+        np.zeros(len(timeline.start) + 1, np.int64),
+        NO_PREVIOUS_FRAME,
+        list[Any](),
+    )
+    entry = _FrameEntry(places, frames, timeline.opening)
+    for interval in range(first, len(timeline.start)):
+        frame = int(timeline.frame[interval])
         if frame != before:
-            time = now if interval == first else int(line.start[interval])
+            time = now if interval == first else int(timeline.start[interval])
             found += entry.steps(frame, before, time)
         before, ends[interval + 1] = frame, len(found)
     steps = np.zeros((len(found), 5), np.int64)
@@ -226,7 +230,7 @@ class _FrameEntry:
         follows = frame == before + 1
         if follows and frame >= 2:
             for to, of in places.shifted.tolist():
-                yield MOVE, to * places.stride, of * places.stride
+                yield STEP_MOVE, to * places.stride, of * places.stride
         fresh = 0 if not follows else 3 if frame == 0 else 2
         for row in range(fresh, 3):
             yield from self._images(base + row - number, row, rows)
@@ -255,21 +259,21 @@ class _FrameEntry:
         for kind in range(3):
             field = int(places.image[kind, row]) * stride
             if field >= 0 and row < rows:
-                yield LOAD, field, kind, k
+                yield STEP_LOAD, field, kind, k
             elif field >= 0 and rows > 0:
-                yield MOVE, field, int(places.image[kind, row - 1]) * stride
+                yield STEP_MOVE, field, int(places.image[kind, row - 1]) * stride
             elif field >= 0:
-                yield FILL, field, int(kind < 2)
+                yield STEP_FILL, field, int(kind < 2)
         for total in places.total[:, row].tolist():
-            yield FILL, total * stride, 0
+            yield STEP_FILL, total * stride, 0
         if len(places.total) and row < rows:
-            yield SUM, row, k
+            yield STEP_SUM, row, k
 
     def _count(self, fields: NDArray[np.int64], left: int, right: int) -> Iterator[tuple[int, ...]]:
         """List the step that counts ON and OFF events with left <= t < right."""
         if fields[0] >= 0:
             on, off = (fields * self.places.stride).tolist()
-            yield COUNT, on, off, left, right
+            yield STEP_COUNT, on, off, left, right
 
 
 class BandMemory(NamedTuple):
@@ -305,20 +309,20 @@ def _take_steps(steps, begin, end, given, band, memory):
         kind, at, of, left, right = (
             steps[i, 0], steps[i, 1], steps[i, 2], steps[i, 3], steps[i, 4]
         )  # fmt: skip
-        if kind == MOVE:
-            copy(cells, at, of, stride)
-        elif kind == LOAD:
-            load_image(frames, of, left, bands, band, cells[at : at + stride])
-        elif kind == FILL:
-            fill(cells, at, stride, 0.5 * of)
-        elif kind == SUM:
+        if kind == STEP_MOVE:
+            copy_field(cells, at, of, stride)
+        elif kind == STEP_LOAD:
+            load_frame_image(frames, of, left, bands, band, cells[at : at + stride])
+        elif kind == STEP_FILL:
+            fill_field(cells, at, stride, 0.5 * of)
+        elif kind == STEP_SUM:
             sums = ExposureSums(
                 given.functions.excess, given.numbers, given.totals[:, at], memory.counts[band],
                 memory.bound[band],
             )  # fmt: skip
             sum_exposure_segments(bands, band, frames, of, cells, sums)
         else:
-            count_events(bands, band, (left, right), cells, at, of)
+            count_band_events(bands, band, (left, right), cells, at, of)
 
 
 class PassRequest(NamedTuple):
@@ -350,7 +354,10 @@ def filter_events(begin, end, given, memory, request):
         last, scratch = memory.last[band].ctypes, memory.scratch[band].ctypes
         i, s, entering = place[0], place[1], enter[0] >= 0
         if entering:
-            i, s = find(bands.events, first[band], finish, np.int64(enter[1])), np.int64(enter[0])
+            i, s = (
+                find_first_event(bands.events, first[band], finish, np.int64(enter[1])),
+                np.int64(enter[0]),
+            )
         while True:
             if entering:
                 _take_steps(steps, ends[s], ends[s + 1], given, band, memory)
@@ -415,7 +422,7 @@ class FilterPasses:
         method: FilterMethod,
         params: Any,
         clock_offset: Any,
-        directions: Directions = Directions(),  # noqa: B008
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
         self.recording, self._method = recording, method
         self.kind = KernelKind(
@@ -489,7 +496,7 @@ class FilterPasses:
         self._memory.last[:] = 0
         line, fields, memory = window.line, self.fields, self._memory
         interval = int(np.searchsorted(line.start, 0, "right")) - 1
-        self.run(window, -NEVER, enter=(interval, 0))
+        self.run(window, -NEVER_US, enter=(interval, 0))
         uniform, addresses = line.uniform[interval], fields.addresses()
         position = {
             "weight.0": -line.begin[interval] * line.rate[interval],
@@ -513,14 +520,14 @@ class FilterPasses:
                 fields.of_bands(name, memory.cells, memory.whole)[:] = values
             elif derivative[0] in fields.states:
                 records[:, :, fields.states[derivative[0]] + derivative[1]] = values
-        self.run(window, -NEVER, enter=(0, -NEVER))
+        self.run(window, -NEVER_US, enter=(0, -NEVER_US))
 
     def resume(self, window: BandedWindow, states: PixelStates, now: int) -> None:
         """Enter a later window at its beginning (us since the recording's start)."""
         memory = self._memory
         memory.cells[:, : states.cells.shape[1]] = states.cells
         memory.whole[:], memory.last[:] = states.whole, states.last
-        self.run(window, -NEVER, enter=(0, now))
+        self.run(window, -NEVER_US, enter=(0, now))
 
     def copy_states(self) -> PixelStates:
         """Copy the state, without derivatives."""

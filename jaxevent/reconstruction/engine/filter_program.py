@@ -1,9 +1,10 @@
 """Kernels of filters: functions of one pixel, traced, translated and written as a module.
 
 What a method says within a piece rests on three frames: the one whose left edge the piece counts
-events from, the one before and the one after (`Clock.used`; windows rely on it too). So a piece is
-a window of its own with three rows of tables, and where a point lies in it is known when the
-program is written: one `Variant` for the beginning, and for every piece and frame after it.
+events from, the one before and the one after (`FrameClock.frames_within`; windows rely on it too).
+So a piece is a window of its own with three rows of tables, and where a point lies in it is known
+when the program is written: one `Variant` for the beginning, and for every piece and frame after
+it.
 """
 
 import dataclasses
@@ -17,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen.derivative import (
+    DerivativeDirections,
     Derivatives,
-    Directions,
     collect_derivatives,
     derivative_name,
     parse_derivative,
@@ -31,31 +32,31 @@ from jaxevent.codegen.graph import (
     ParameterProgram,
     TranslationError,
     constant_value,
-    dependencies,
     evaluate_nodes,
+    find_dependencies,
 )
 from jaxevent.codegen.module import CompiledProgram, KernelCache
 from jaxevent.codegen.trace import (
-    KINDS,
-    Constant,
-    ParameterValue,
-    Trace,
-    Translation,
+    KIND_BY_DTYPE,
+    ConstantArray,
+    JaxprTranslator,
+    ParameterArray,
+    TracedJaxpr,
     Value,
     trace_function,
 )
-from jaxevent.codegen.write import Address, ModuleText, Writer
+from jaxevent.codegen.write import Address, ModuleText, ModuleWriter
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
 
-N_ROWS = 3  # frames that a piece rests on
+N_PIECE_FRAMES = 3  # frames that a piece rests on
 NO_IMAGE_WIDTH = 104_729  # one pixel is no image: a function that makes one of it fails
 # Inputs of the traced functions. Counts are [ON and OFF, rows].
 IMAGE_FIELDS = ("grey", "intensity", "certainty")
 COUNT_FIELDS = ("span", "head", "tail")
-UNIFORM = ("gain", "weight_rate", "blend_rate")  # equal for all pixels
-SEGMENT = ("segment_cell", "share", "edge", "segment_on", "segment_off")
-POINT = ("weight", "blend", "on", "off", "piece", "frame")
-EVENT = ("since", "near", "polarity")
+UNIFORM_INPUTS = ("gain", "weight_rate", "blend_rate")  # equal for all pixels
+SEGMENT_INPUTS = ("segment_cell", "share", "edge", "segment_on", "segment_off")
+POINT_INPUTS = ("weight", "blend", "on", "off", "piece", "frame")
+EVENT_INPUTS = ("since", "near", "polarity")
 
 
 @runtime_checkable
@@ -89,7 +90,7 @@ class KernelKind(NamedTuple):
     exposed: bool  # whether exposures are known
     dtype: np.dtype  # of real numbers
     stride: int  # pixels of a band, with its border
-    directions: Directions = Directions()
+    directions: DerivativeDirections = DerivativeDirections()
 
 
 class Variant(NamedTuple):
@@ -112,15 +113,15 @@ def variants(exposed: bool) -> list[Variant]:
 
 def n_pieces(exposed: bool) -> int:
     """Return the number of pieces that three frames make."""
-    return 2 * N_ROWS + 1 if exposed else N_ROWS + 1
+    return 2 * N_PIECE_FRAMES + 1 if exposed else N_PIECE_FRAMES + 1
 
 
-def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind) -> Trace:
+def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind) -> TracedJaxpr:
     """Trace a method at one pixel, between three frames.
 
     Args:
         method: The filter.
-        known: See `Directions.inputs`.
+        known: See `DerivativeDirections.inputs`.
         kind: Properties of the recording, and derivatives that are wanted.
 
     Returns:
@@ -136,25 +137,29 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         return jax.ShapeDtypeStruct(shape, kind)
 
     whole = np.dtype(jnp.result_type(int))
-    given: dict[str, Any] = {name: array(N_ROWS, 1) for name in IMAGE_FIELDS}
-    given |= {"gain": array(N_ROWS), "weight_rate": array(n_pieces(exposed))}
-    given |= {"blend_rate": array(N_ROWS), "before": array(2, 1), "rows": array(3, kind=np.int32)}
-    given |= {"span": array(2, N_ROWS, 1)}
+    given: dict[str, Any] = {name: array(N_PIECE_FRAMES, 1) for name in IMAGE_FIELDS}
+    given |= {"gain": array(N_PIECE_FRAMES), "weight_rate": array(n_pieces(exposed))}
+    given |= {
+        "blend_rate": array(N_PIECE_FRAMES),
+        "before": array(2, 1),
+        "rows": array(3, kind=np.int32),
+    }
+    given |= {"span": array(2, N_PIECE_FRAMES, 1)}
     if exposed:
-        given |= {"head": array(2, N_ROWS, 1), "tail": array(2, N_ROWS, 1)}
-        given |= dict.fromkeys(SEGMENT[1:], array(1))
+        given |= {"head": array(2, N_PIECE_FRAMES, 1), "tail": array(2, N_PIECE_FRAMES, 1)}
+        given |= dict.fromkeys(SEGMENT_INPUTS[1:], array(1))
         given["segment_cell"] = array(1, kind=np.int32)
-    given |= dict.fromkeys((*POINT, *EVENT), array())
+    given |= dict.fromkeys((*POINT_INPUTS, *EVENT_INPUTS), array())
     given |= {name: array(kind=whole) for name in ("piece", "frame", "polarity")}
 
     def frame_features(v: dict[str, Any]) -> FrameFeatures:
-        segments = Segments(*(v[name] for name in SEGMENT)) if exposed else None
+        segments = Segments(*(v[name] for name in SEGMENT_INPUTS)) if exposed else None
         made: dict[str, Any] = {f.name: v.get(f.name) for f in dataclasses.fields(FrameFeatures)}
         made |= {"segments": segments, "width": NO_IMAGE_WIDTH}
         return FrameFeatures(**made)
 
     def image_points(v: dict[str, Any], counted: bool) -> ImagePoints:
-        weight, blend, on, off = (v[name][None, None] for name in POINT[:4])
+        weight, blend, on, off = (v[name][None, None] for name in POINT_INPUTS[:4])
         none = jnp.zeros((1, 1), weight.dtype)
         counts = (on, off) if counted else (none, none)
         return ImagePoints(weight, blend, *counts, v["piece"][None], v["frame"][None], none[0])
@@ -175,7 +180,7 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         )
         first = start(params, frame_model, v)
         after, mean, variance = method.step_and_readout(
-            params, frame, state, **{name: v[name] for name in EVENT}
+            params, frame, state, **{name: v[name] for name in EVENT_INPUTS}
         )
         return {"start": first, "state": after, "mean": mean, "variance": variance}
 
@@ -197,7 +202,7 @@ class FilterProgram:
     host: ParameterProgram
     dtype: np.dtype
     exposed: bool
-    directions: Directions
+    directions: DerivativeDirections
     tables: list[list[Node]]  # of each variant: what its slots hold
     start: list[dict[str, Node]]  # of each variant: the state at the start, by name
     state: dict[str, Node]  # after an event, by name
@@ -241,7 +246,7 @@ class FilterProgram:
         return dict(zip(start, made, strict=True))
 
 
-class PixelTranslation(Translation):
+class PixelTranslator(JaxprTranslator):
     """Translation of functions of one pixel.
 
     Look-ups of tables at a point become nodes "slot", numbered in order; what they hold is
@@ -274,7 +279,7 @@ class PixelTranslation(Translation):
     def _sum_over_segments(self, values: list[Value]) -> NDArray:
         """Translate sums [..., cells] of updates [..., 1]."""
         start, cells, updates = values
-        if not isinstance(start, Constant) or start.value.any():
+        if not isinstance(start, ConstantArray) or start.value.any():
             raise TranslationError("a sum that begins with numbers")
         index, added = np.ravel(self.nodes(cells)), self.nodes(updates)
         ours = len(index) == 1 and index[0].args == ("segment_cell.0",) and added.shape[-1:] == (1,)
@@ -295,12 +300,12 @@ class PixelTranslation(Translation):
         return self.graph.input(f"total.{self.excess.index(node)}.{row}", "f", Level.TABLE)
 
 
-def translate_filter(trace: Trace, known: tuple[Any, ...], kind: KernelKind) -> FilterProgram:
+def translate_filter(trace: TracedJaxpr, known: tuple[Any, ...], kind: KernelKind) -> FilterProgram:
     """Translate a traced method; see `trace_filter`.
 
     Args:
         trace: The traced method.
-        known: See `Directions.inputs`.
+        known: See `DerivativeDirections.inputs`.
         kind: Properties of the recording, and derivatives that are wanted.
 
     Raises:
@@ -313,10 +318,10 @@ def translate_filter(trace: Trace, known: tuple[Any, ...], kind: KernelKind) -> 
     values: list[Value] = []
     for k, leaf in enumerate(jax.tree.leaves(known)):
         number = host.add_input(np.asarray(leaf))
-        values.append(ParameterValue(number, k not in moving, k >= first_seed))
+        values.append(ParameterArray(number, k not in moving, k >= first_seed))
     tables, starts, outs, excess, changes = [], [], None, [], set[Node]()
     for variant in variants(exposed):
-        translation = PixelTranslation(graph, host)
+        translation = PixelTranslator(graph, host)
         last = 1 if variant.is_first(exposed) else 2  # the row that is a frame and has none after
         inputs = [_input(graph, *item, variant, last) for item in trace.inputs.items()]
         results = trace.translate(translation, [*values, *inputs])
@@ -351,17 +356,17 @@ def _input(
 ) -> Value:
     """Return an input of the traced function, an array of nodes."""
     if name in ("piece", "frame"):
-        return Constant(np.asarray(getattr(variant, name)), at_point=True)
+        return ConstantArray(np.asarray(getattr(variant, name)), at_point=True)
     level = Level.POINT
     if name in (*IMAGE_FIELDS, *COUNT_FIELDS, "before"):
         level = Level.TABLE
-    elif name in UNIFORM:
+    elif name in UNIFORM_INPUTS:
         level = Level.PIECE
-    out, kind = np.empty(leaf.shape, object), KINDS[leaf.dtype.kind]
+    out, kind = np.empty(leaf.shape, object), KIND_BY_DTYPE[leaf.dtype.kind]
     # What happens after the last frame is not known.
     counted = last if name == "span" else last + 1
     for number, place in enumerate(np.ndindex(*leaf.shape)):
-        row = number % N_ROWS
+        row = number % N_PIECE_FRAMES
         if name in IMAGE_FIELDS:
             number = min(row, last)
         if name in COUNT_FIELDS and row >= counted:
@@ -376,7 +381,7 @@ def _input(
 def _substitute(results: dict[str, Node], known: dict[Node, Node], graph: Graph) -> Any:
     """Put other nodes in place of some, and simplify what uses them."""
     new = dict(known)
-    for node in dependencies([*results.values()]):
+    for node in find_dependencies([*results.values()]):
         arguments = [a for a in node.args if isinstance(a, Node)]
         if node not in new and any(new.get(a, a) is not a for a in arguments):
             args = tuple(new.get(a, a) if isinstance(a, Node) else a for a in node.args)
@@ -385,7 +390,7 @@ def _substitute(results: dict[str, Node], known: dict[Node, Node], graph: Graph)
 
 
 def _slots(results: dict[str, Node]) -> list[Node]:
-    return [node for node in dependencies([*results.values()]) if node.op == "slot"]
+    return [node for node in find_dependencies([*results.values()]) if node.op == "slot"]
 
 
 def _fill_slots(results: dict[str, Node], table: list[Node], graph: Graph) -> dict[str, Node]:
@@ -465,7 +470,7 @@ class PixelFields:
             of_kind[name] = len(of_kind)
         cells |= {"on.0": len(cells), "off.0": len(cells) + 1}
         slots, known = {}, dict[Any, str]()
-        for node in dependencies(program.results()):
+        for node in find_dependencies(program.results()):
             if node.op == "slot":
                 if node.kind != "f":
                     raise TranslationError("a table that is not of real numbers")
@@ -477,16 +482,16 @@ class PixelFields:
         for variant, table in enumerate(program.tables):
             wanted += [table[k] for k in slots]
             wanted += [node for *_, node in program.table_derivatives(variant)]
-        used = {n.args[0].partition(".")[0] for n in dependencies(wanted) if n.op == "input"}
+        used = {n.args[0].partition(".")[0] for n in find_dependencies(wanted) if n.op == "input"}
         names = ["before.0", "before.1"] if "before" in used else []
         for name in IMAGE_FIELDS:
-            names += [f"{name}.{row}" for row in range(N_ROWS) if name in used]
+            names += [f"{name}.{row}" for row in range(N_PIECE_FRAMES) if name in used]
         for name in COUNT_FIELDS:
-            n_rows = N_ROWS - 1 if name == "span" else N_ROWS
-            rows = [p * N_ROWS + row for p in range(2) for row in range(n_rows)]
+            n_rows = N_PIECE_FRAMES - 1 if name == "span" else N_PIECE_FRAMES
+            rows = [p * N_PIECE_FRAMES + row for p in range(2) for row in range(n_rows)]
             names += [f"{name}.{row}" for row in rows if name in used]
         sums = len(program.excess)
-        names += [f"total.{k}.{row}" for k in range(sums) for row in range(N_ROWS)]
+        names += [f"total.{k}.{row}" for k in range(sums) for row in range(N_PIECE_FRAMES)]
         cells |= {name: len(cells) + k for k, name in enumerate(names)}
         changes = [] if program.derivatives is None else program.derivatives.changes
         lanes = program.directions.lanes
@@ -520,13 +525,15 @@ class PixelFields:
 
     def addresses(self) -> dict[Any, str | Address]:
         """Return the addresses of a pixel's inputs, or texts that read them, by name."""
-        sizes = zip(UNIFORM, (N_ROWS, n_pieces(self.exposed), N_ROWS), strict=True)
+        sizes = zip(
+            UNIFORM_INPUTS, (N_PIECE_FRAMES, n_pieces(self.exposed), N_PIECE_FRAMES), strict=True
+        )
         uniform = [f"{name}.{k}" for name, size in sizes for k in range(size)]
         found: dict[Any, str | Address] = {n: ("uniform", "at", k) for k, n in enumerate(uniform)}
         found |= {name: ("cells", "z", at * self.stride) for name, at in self.cells.items()}
         found |= {name: ("whole", "z", at * self.stride) for name, at in self.whole.items()}
         found |= {slot: found[name] for slot, name in self.slots.items()}
-        for name in (*SEGMENT[1:], *EVENT, "weight", "blend"):
+        for name in (*SEGMENT_INPUTS[1:], *EVENT_INPUTS, "weight", "blend"):
             found[f"{name}.0"] = name.removeprefix("segment_")
         return found
 
@@ -538,11 +545,11 @@ class PixelFields:
             return np.array([self.cells.get(name, -1) for name in names], np.int64)
 
         def rows(name: str, first: int = 0) -> NDArray[np.int64]:
-            return of(*(f"{name}.{first + row}" for row in range(N_ROWS)))
+            return of(*(f"{name}.{first + row}" for row in range(N_PIECE_FRAMES)))
 
         image = np.stack([rows(name) for name in IMAGE_FIELDS])
-        span, head, tail = (np.stack([rows(n), rows(n, N_ROWS)]) for n in COUNT_FIELDS)
-        total = np.full((self.sums, N_ROWS), -1)
+        span, head, tail = (np.stack([rows(n), rows(n, N_PIECE_FRAMES)]) for n in COUNT_FIELDS)
+        total = np.full((self.sums, N_PIECE_FRAMES), -1)
         for k in range(self.sums):
             total[k] = rows(f"total.{k}")
         every = np.concatenate([image, total, span, head, tail])
@@ -554,7 +561,7 @@ class PixelFields:
         )  # fmt: skip
 
 
-EVENTS = """
+EVENTS_TEMPLATE = """
 @cfunc(I(CELLS, WHOLE, NUMBERS, WHOLE, CELLS, I, I, I, I, I, I, I, D, D, D, D, CELLS), **OPTIONS)
 def events(
     cells, whole, last, stream, weights, weighted, i, end, till, first_own, last_own, padded,
@@ -592,7 +599,7 @@ def events(
     return i
 """
 
-IMAGES = """
+IMAGES_TEMPLATE = """
 @cfunc(
     types.void(
         CELLS, WHOLE, NUMBERS, I, I, I, D, D, D, CELLS, CELLS, CELLS, MARKS, CELLS, CELLS, I, I
@@ -620,14 +627,14 @@ def images(
 """
 
 TABLE_PIXELS = 256  # whose derivatives are computed side by side before they go into records
-TABLES = f"""
+TABLES_TEMPLATE = f"""
 @cfunc(types.void(I, CELLS, I, I, CELLS, CELLS, I, CELLS), **OPTIONS)
 def tables(variant, cells, begin, end, numbers, uniform, at, scratch):
     for first in range(begin, end, {TABLE_PIXELS}):
         pixels = min(end - first, {TABLE_PIXELS})
 """
 
-EXCESS = """
+EXCESS_TEMPLATE = """
 @cfunc(types.void(D, D, F, F, CELLS, CELLS), **OPTIONS)
 def excess(share64, edge64, on, off, numbers, out):
     share, edge = REAL(share64), REAL(edge64)
@@ -641,24 +648,24 @@ def write_filter(program: FilterProgram, stride: int) -> ModuleText:
     Raises:
         TranslationError: A number of the piece is not looked up at a point.
     """
-    if any(n.level == Level.PIECE for n in dependencies(program.results())):
+    if any(n.level == Level.PIECE for n in find_dependencies(program.results())):
         raise TranslationError("a number of the piece that is not looked up at a point")
     fields = PixelFields.of(program, stride)
-    writer = Writer(program, fields.addresses())
+    writer = ModuleWriter(program, fields.addresses())
     size = len(fields.cells) * stride
     writer.constants = [f"STRIDE, RECORDS, RECORD = {stride}, {size}, {fields.record}"]
     _define_sums(program, writer, fields)
     parts = [
         write(program, writer, fields) for write in (_write_events, _write_images, _write_tables)
     ]
-    lines = writer.lines(program.excess, 4)
-    lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(program.excess)]
-    parts.append(EXCESS.format(lines="\n".join(lines)))
+    lines = writer.write_lines(program.excess, 4)
+    lines += [f"    out[{k}] = {writer.node_name(node)}" for k, node in enumerate(program.excess)]
+    parts.append(EXCESS_TEMPLATE.format(lines="\n".join(lines)))
     about = "The functions of a filter (`jaxevent.reconstruction.engine`)."
-    return writer.module(about, parts, fields, program.dtype)
+    return writer.write_module(about, parts, fields, program.dtype)
 
 
-def _define_sums(program: FilterProgram, writer: Writer, fields: PixelFields) -> None:
+def _define_sums(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> None:
     """Define the sums of vectors by which derivatives follow events and make images."""
     derivatives, lanes = program.derivatives, fields.lanes
     if derivatives is None:
@@ -678,30 +685,32 @@ def _define_sums(program: FilterProgram, writer: Writer, fields: PixelFields) ->
                 for node, k in derivatives.factors[name]
             )
             sums.append((place, terms))
-        writer.constants.append(f"{function} = vector_sums({lanes}, {tuple(sums)})")
+        writer.constants.append(f"{function} = make_vector_sums({lanes}, {tuple(sums)})")
 
 
-def _write_events(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
+def _write_events(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     addresses, factors = fields.addresses(), program.factors(*fields.states)
-    out = writer.lines([*program.state.values(), *factors], 12)
+    out = writer.write_lines([*program.state.values(), *factors], 12)
     for name, node in program.state.items():
         if node.op != "input" or node.args != (name,):
             pointer, _, offset = addresses[name]
-            out.append(f"            {pointer}[{offset} + z] = {writer.name(node)}")
+            out.append(f"            {pointer}[{offset} + z] = {writer.node_name(node)}")
     if fields.states:
-        given = "".join(f"{writer.name(node)}, " for node in factors)
+        given = "".join(f"{writer.node_name(node)}, " for node in factors)
         out.append("            record = RECORDS + z * RECORD")
         out.append(f"            follow(cells, record, cells, record, numbers, ({given}))")
-    return EVENTS.format(step="\n".join(out), on=fields.cells["on.0"], off=fields.cells["off.0"])
+    return EVENTS_TEMPLATE.format(
+        step="\n".join(out), on=fields.cells["on.0"], off=fields.cells["off.0"]
+    )
 
 
-def _write_images(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
+def _write_images(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     """Write images, and row by row, after the factors of their derivatives, these."""
     factors, derivatives = program.factors(*fields.outputs), []
-    lines = writer.lines([program.mean, program.variance, *factors], 12)
+    lines = writer.write_lines([program.mean, program.variance, *factors], 12)
     if fields.outputs:
         lines += [
-            f"            scratch[{k} * width + column] = {writer.name(node)}"
+            f"            scratch[{k} * width + column] = {writer.node_name(node)}"
             for k, node in enumerate(factors)
         ]
         given = "".join(f"scratch[{k} * width + column], " for k in range(len(factors)))
@@ -711,16 +720,16 @@ def _write_images(program: FilterProgram, writer: Writer, fields: PixelFields) -
             "            place = (at + row * width + column) * size",
             f"            show(derivatives, place, cells, record, numbers, ({given}))",
         ]
-    return IMAGES.format(
+    return IMAGES_TEMPLATE.format(
         since=len(factors),
         show="\n".join(lines),
-        mean=writer.name(program.mean),
-        variance=writer.name(program.variance),
+        mean=writer.node_name(program.mean),
+        variance=writer.node_name(program.variance),
         derivatives="\n".join(derivatives),
     )
 
 
-def _write_tables(program: FilterProgram, writer: Writer, fields: PixelFields) -> str:
+def _write_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     """Write what a piece says, for the pixels from begin to end."""
     stored = {k: fields.cells[name] for k, name in fields.slots.items() if name == f"slot{k}"}
     out, changes = list[str](), []
@@ -728,18 +737,22 @@ def _write_tables(program: FilterProgram, writer: Writer, fields: PixelFields) -
         changes = program.table_derivatives(variant)
         out.append(f"        if variant == {variant}:")
         out += ["            for i in range(pixels):", "                z = first + i"]
-        out += writer.lines([*(table[k] for k in stored), *(node for *_, node in changes)], 16)
+        out += writer.write_lines(
+            [*(table[k] for k in stored), *(node for *_, node in changes)], 16
+        )
         for k, at in stored.items():
-            out.append(f"                cells[{at} * STRIDE + z] = {writer.name(table[k])}")
+            out.append(f"                cells[{at} * STRIDE + z] = {writer.node_name(table[k])}")
         for j, (*_, node) in enumerate(changes):
-            out.append(f"                scratch[{j * TABLE_PIXELS} + i] = {writer.name(node)}")
+            out.append(
+                f"                scratch[{j * TABLE_PIXELS} + i] = {writer.node_name(node)}"
+            )
     if changes:
         out.append("        for i in range(pixels):")
         out.append("            record = RECORDS + (first + i) * RECORD")
     for j, (k, lane, _) in enumerate(changes):
         place = f"record + {fields.vectors[k] + lane}"
         out.append(f"            cells[{place}] = scratch[{j * TABLE_PIXELS} + i]")
-    return TABLES + "\n".join([*out, ""])
+    return TABLES_TEMPLATE + "\n".join([*out, ""])
 
 
 _kernels = KernelCache(FilterFunctions, write_filter)

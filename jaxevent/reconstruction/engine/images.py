@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from jaxevent import dispatch
 from jaxevent.codegen import run_over_rows
-from jaxevent.codegen.derivative import Directions
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.module import choose_backend, make_kernel
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision, has_accelerator
@@ -33,7 +33,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.reconstruction.engine.bands import (
-    NEVER,
+    NEVER_US,
     BufferPool,
     ImageBuffers,
     PartitionedRecording,
@@ -54,17 +54,22 @@ from jaxevent.reconstruction.engine.smoother_loop import (
     read_images,
     smooth_frames,
 )
-from jaxevent.reconstruction.engine.smoother_program import LATER, LINK, STATE, SmoothingMethod
+from jaxevent.reconstruction.engine.smoother_program import (
+    LATER_FIELDS,
+    LINK_FIELDS,
+    STATE_FIELDS,
+    SmoothingMethod,
+)
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import Clock, Timing
+from jaxevent.reconstruction.frames import FrameClock, Timing
 from jaxevent.reconstruction.stream import StreamState
-from jaxevent.reconstruction.video import MAX_STARTS, ImageSequence, P
+from jaxevent.reconstruction.video import MAX_WINDOW_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
 
-WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
-SEGMENT_EVENTS = 1 << 22  # 8 bytes each
-SEGMENT_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
+MAX_WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
+MAX_SEGMENT_EVENTS = 1 << 22  # 8 bytes each
+MAX_SEGMENT_FRAME_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
 IS_SYNCHRONOUS = dispatch.use_synchronous_dispatch()  # so that programs may call kernels
 
 
@@ -101,7 +106,7 @@ class FilterVideo(ImageSequence[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = WINDOW_EVENTS,
+        window_events: int = MAX_WINDOW_EVENTS,
         progress: bool | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
@@ -113,7 +118,7 @@ class FilterVideo(ImageSequence[P]):
         self._buffers = BufferPool(self._partitioned.windows.pixels, self.dtype)
         self._begins = [WindowStart(None, self._partitioned.windows.initial(), None)]
         self._open: BandedWindow | None = None
-        self._done = -NEVER  # the time up to which the open window is passed over
+        self._done = -NEVER_US  # the time up to which the open window is passed over
 
     @property
     def dtype(self) -> np.dtype:
@@ -159,7 +164,7 @@ class FilterVideo(ImageSequence[P]):
         if all(b.start != window.stop for b in self._begins):
             self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
             if (
-                len(self._begins) > MAX_STARTS
+                len(self._begins) > MAX_WINDOW_STARTS
             ):  # the first one, the last one, and half of the others
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
         return begin
@@ -172,13 +177,13 @@ class FilterVideo(ImageSequence[P]):
             self._passes.init(window)
         else:
             self._passes.resume(window, begin.states, begin.start - self._partitioned.origin)
-        self._open, self._done = window, -NEVER
+        self._open, self._done = window, -NEVER_US
         return window
 
 
-def _make_segments(clock: Clock, recording: Recording, events: int) -> list[Segment]:
+def _make_segments(clock: FrameClock, recording: Recording, events: int) -> list[Segment]:
     """Divide frames into segments of so many events, one frame at least."""
-    most = max(6, SEGMENT_PIXELS // (recording.width * recording.height))
+    most = max(6, MAX_SEGMENT_FRAME_PIXELS // (recording.width * recording.height))
     rows = [recording.events.index(int(np.ceil(t)) + clock.origin) for t in clock.mid]
     rows.append(len(recording.events))
     found, begin = list[Segment](), 0
@@ -194,7 +199,7 @@ class SmootherVideo(ImageSequence[P]):
     """Images of a smoother, made by a kernel; as `Video` in all else.
 
     Of every frame of a segment its message and the state before it are stored, of all other
-    segments only how the message of later frames passes through them (`LINK`).
+    segments only how the message of later frames passes through them (`LINK_FIELDS`).
 
     Args:
         estimator: The smoother.
@@ -214,7 +219,7 @@ class SmootherVideo(ImageSequence[P]):
         recording: Recording,
         params: P,
         *,
-        window_events: int = SEGMENT_EVENTS,
+        window_events: int = MAX_SEGMENT_EVENTS,
         progress: bool | None = None,
         factors: NDArray[np.floating] | None = None,
     ):
@@ -268,14 +273,14 @@ class SmootherVideo(ImageSequence[P]):
         if self._open is not None and self._open[0] == place:
             return self._open[1]
         self._open = None  # so that two are never held at once
-        for name, values in zip(STATE, self._states[place], strict=True):
+        for name, values in zip(STATE_FIELDS, self._states[place], strict=True):
             self._field(name)[:] = values
         given = self._filter(place, False)
         self._smooth(place, given)
         return given
 
     def _smooth(self, place: int, given: SegmentInputs) -> None:
-        for name, values in zip(LATER, self._later[place], strict=True):
+        for name, values in zip(LATER_FIELDS, self._later[place], strict=True):
             self._field(name)[:] = values
         self._over_bands(smooth_frames, given, self._memory)
         self._open = place, given
@@ -300,11 +305,11 @@ class SmootherVideo(ImageSequence[P]):
             total=last + 1, desc="look ahead", unit="stretch", progress=self.progress
         ) as shown:
             for place in range(last + 1):
-                states.append(fields(STATE))
-                for k, name in enumerate(LINK):
+                states.append(fields(STATE_FIELDS))
+                for k, name in enumerate(LINK_FIELDS):
                     self._field(name)[:] = k == 0
                 given = self._filter(place, last > 0)
-                links.append(fields(LINK))
+                links.append(fields(LINK_FIELDS))
                 shown.update()
         assert given is not None
         later = [np.zeros_like(states[0])]
@@ -319,7 +324,7 @@ def _serves(devices: Sequence[Any]) -> bool:
     return jnp.result_type(float) == np.float32 and len(devices) < 2
 
 
-def video_from_kernel(
+def make_kernel_video(
     kind: Callable[..., ImageSequence[P]],
     method: Any,
     recording: Recording,
@@ -381,7 +386,7 @@ class ImageKernel(abc.ABC):
         self._times = times - self.recording.origin
         self._arguments = method, recording, times, params
         self._turns = TurnLock(f"images of {recording.name}")
-        self._passes: dict[Directions, Any] = {}
+        self._passes: dict[DerivativeDirections, Any] = {}
         dead = params.without_gradient()
         numbers = [
             (leaf, k)
@@ -389,7 +394,7 @@ class ImageKernel(abc.ABC):
             if getattr(path[-1], "key", "point") not in {"point", *dead}
             for k in range(np.size(value))
         ]
-        self.check(params, Directions(tuple(numbers), ("mean", "variance")))
+        self.check(params, DerivativeDirections(tuple(numbers), ("mean", "variance")))
         self.number = next(_numbers)
         _image_kernels[self.number] = self
 
@@ -405,7 +410,11 @@ class ImageKernel(abc.ABC):
     def _key(self) -> tuple:
         return self.method, self.pixels, self.dtype.name
 
-    def passes_of(self, params: Any, directions: Directions = Directions()) -> Any:  # noqa: B008
+    def passes_of(
+        self,
+        params: Any,
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
+    ) -> Any:
         """Return the passes for some derivatives, which go on with these parameters.
 
         Args:
@@ -423,7 +432,7 @@ class ImageKernel(abc.ABC):
         return self._passes[directions]
 
     @abc.abstractmethod
-    def check(self, params: Any, directions: Directions) -> None:
+    def check(self, params: Any, directions: DerivativeDirections) -> None:
         """Raise `TranslationError` unless there are kernels for images and derivatives.
 
         Args:
@@ -432,7 +441,9 @@ class ImageKernel(abc.ABC):
         """
 
     @abc.abstractmethod
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+    def make(
+        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+    ) -> ImageBuffers:
         """Make images and their derivatives.
 
         Args:
@@ -445,7 +456,7 @@ class ImageKernel(abc.ABC):
         """
 
     def images(
-        self, rows: NDArray, params: Any, directions: Directions
+        self, rows: NDArray, params: Any, directions: DerivativeDirections
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Make images at some of the times.
 
@@ -476,12 +487,14 @@ class FilterImages(ImageKernel):
         super().__init__(method, recording, times, params)
         self._window = cut_window(self.recording, None, self.recording.windows.initial())
 
-    def check(self, params: Any, directions: Directions) -> None:
+    def check(self, params: Any, directions: DerivativeDirections) -> None:
         kind = self.passes_of(params).kind._replace(directions=directions)
         fixed = self.recording.fixed_inputs(self.clock_offset)
         check_filter_kernel(self.method, params, fixed, kind)
 
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+    def make(
+        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+    ) -> ImageBuffers:
         passes = self.passes_of(params, directions)
         passes.init(self._window)
         images = passes.image_buffers(len(times), self.pixels)
@@ -500,10 +513,12 @@ class SmootherImages(ImageKernel):
         self._whole = Segment(0, len(passes.clock))
         self._bands, _ = passes.partition(self._whole, self.recording.windows.initial())
 
-    def check(self, params: Any, directions: Directions) -> None:
+    def check(self, params: Any, directions: DerivativeDirections) -> None:
         SmootherPasses(self.recording, self.method, params, self.clock_offset, directions)
 
-    def make(self, times: NDArray[np.int64], params: Any, directions: Directions) -> ImageBuffers:
+    def make(
+        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+    ) -> ImageBuffers:
         passes = self.passes_of(params, directions)
         images, image_times = passes.image_buffers(len(times)), passes.image_times(times, 0)
         given = passes.inputs(self._whole, self._bands, np.zeros(passes.layout.bands, np.int64))
@@ -525,7 +540,7 @@ def _smooth_bands(
     except queue.Empty:
         memory = passes.memory(1, len(given.line.mid))
     program = passes.kernel.program
-    later = [n for leaf in LATER for n in (f"{leaf}.0", *program.derivatives(f"{leaf}.0"))]
+    later = [n for leaf in LATER_FIELDS for n in (f"{leaf}.0", *program.derivatives(f"{leaf}.0"))]
     for band in range(begin, end):
         passes.field(memory, "given.0")[:] = passes.fractions[band]
         filter_frames(band, band + 1, given, memory, True, False)
@@ -580,7 +595,7 @@ def _rebuild(kernel: ImageKernel, rows: NDArray) -> KernelImages:
     return KernelImages(np.asarray(kernel.number, np.int32), rows, kernel)
 
 
-def images_from_kernel(
+def make_kernel_images(
     kind: type[ImageKernel],
     method: Any,
     recording: Recording,
@@ -624,7 +639,7 @@ def images_from_kernel(
 
 
 def _evaluate(
-    tree: Any, directions: Directions, number: Any, rows: Any, leaves: list[Any]
+    tree: Any, directions: DerivativeDirections, number: Any, rows: Any, leaves: list[Any]
 ) -> tuple[NDArray, ...]:
     kernel = _image_kernels[int(number)]
     params = jax.tree.unflatten(tree, [np.asarray(leaf) for leaf in leaves])
@@ -637,7 +652,7 @@ def _call_kernel(
 ) -> Any:
     kernel, outputs = about
     leaves, tree = jax.tree.flatten(params)
-    directions = Directions(numbers, outputs if numbers else Directions().of)
+    directions = DerivativeDirections(numbers, outputs if numbers else DerivativeDirections().of)
     shape = len(rows), kernel.pixels
     shapes = [jax.ShapeDtypeStruct(shape, kind) for kind in (kernel.dtype, kernel.dtype, bool)]
     if numbers:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
-from jaxevent.codegen.derivative import Directions
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.reconstruction.engine.bands import (
     BandLayout,
     Bands,
@@ -21,24 +21,24 @@ from jaxevent.reconstruction.engine.bands import (
     FrameRows,
     ImageBuffers,
     PartitionedRecording,
-    ceil_time,
-    count_events,
-    find,
-    load_image,
+    ceil_to_us,
+    count_band_events,
+    find_first_event,
+    load_frame_image,
     sum_exposure_segments,
 )
 from jaxevent.reconstruction.engine.filter_program import IMAGE_FIELDS, KernelKind
 from jaxevent.reconstruction.engine.smoother_program import (
-    COUNTS,
-    LATER,
-    STATE,
-    WORK,
+    COUNT_FIELDS,
+    LATER_FIELDS,
+    STATE_FIELDS,
+    WORK_FIELDS,
     SmootherFunctions,
     SmootherProgram,
     SmoothingMethod,
     smoother_kernel,
 )
-from jaxevent.reconstruction.frames import Clock
+from jaxevent.reconstruction.frames import FrameClock
 from jaxevent.reconstruction.stream import StreamState
 
 
@@ -168,7 +168,7 @@ def _seek_last(given, band, time, last):
     for z in range(len(last.rate)):
         last.rate[z] = 0
     a, b = given.bands.first[band], given.bands.first[band + 1]
-    begin = find(given.bands.events, a, b, time - given.reach)
+    begin = find_first_event(given.bands.events, a, b, time - given.reach)
     return _advance_last(given, begin, b, time, last)
 
 
@@ -184,8 +184,8 @@ def _add_partial_events(out, fields, time, last, sign):
 
 @njit_noalloc_inlined
 def _count_between(given, band, span, cells, fields, last):
-    """Count events as `count_events` does, with changes spread over time."""
-    count_events(given.bands, band, span, cells, fields[0], fields[1])
+    """Count events as `count_band_events` does, with changes spread over time."""
+    count_band_events(given.bands, band, span, cells, fields[0], fields[1])
     left, right = span
     if len(given.rates) > 0 and right > left:
         i = _seek_last(given, band, left, last)
@@ -214,7 +214,7 @@ def _load_frame(band, k, given, cells, last, begin):
     stride = places.stride
     for kind in range(3):
         at = places.image[kind] * stride
-        load_image(frames, kind, k, bands, band, cells[at : at + stride])
+        load_frame_image(frames, kind, k, bands, band, cells[at : at + stride])
     if not places.exposed:
         return
     for total in places.total:
@@ -227,7 +227,7 @@ def _load_frame(band, k, given, cells, last, begin):
     sum_exposure_segments(bands, band, frames, k, cells, sums)
     if places.inside >= 0:
         inside = places.inside * stride
-        span = ceil_time(frames.left[k]), ceil_time(frames.right[k])
+        span = ceil_to_us(frames.left[k]), ceil_to_us(frames.right[k])
         _count_between(given, band, span, cells, (inside, inside), last)
 
 
@@ -312,7 +312,7 @@ def _count_since(given, band, to, begin, cells, scratch):
     if f != known:
         for z in range(2 * stride):
             so_far[z] = 0
-        i = find(events, bands.first[band], b, mid)
+        i = find_first_event(events, bands.first[band], b, mid)
         if is_spread:
             _seek_last(given, band, mid, last)
             _add_partial_events(so_far, (0, stride), mid, last, -1.0)
@@ -334,7 +334,7 @@ def _count_until(given, band, now, cells, last):
     """Count the events after a time (us) until the middle of the first frame."""
     counts, stride, mid = given.places.counts, given.places.stride, given.line.mid[0]
     fields = counts[0] * stride, counts[1] * stride
-    count_events(given.bands, band, (now + 1, mid), cells, fields[0], fields[1])
+    count_band_events(given.bands, band, (now + 1, mid), cells, fields[0], fields[1])
     if len(given.rates) > 0 and mid > now:
         i = _seek_last(given, band, now + 1, last)
         _add_partial_events(cells, fields, now, last, -1.0)
@@ -386,7 +386,7 @@ class Segment(NamedTuple):
     end: int
 
 
-def _make_timeline(clock: Clock, segment: Segment) -> FrameTimeline:
+def _make_timeline(clock: FrameClock, segment: Segment) -> FrameTimeline:
     begin, end = segment
     mid = clock.mid[max(begin - 1, 0) : end + 1]
     gap = np.diff(mid)
@@ -406,14 +406,14 @@ def _make_timeline(clock: Clock, segment: Segment) -> FrameTimeline:
 
 def _places(program: SmootherProgram, stride: int, exposed: bool) -> SmootherPlaces:
     def of(*names: str) -> NDArray[np.int64]:
-        return np.array([WORK.index(name) for name in names], np.int64)
+        return np.array([WORK_FIELDS.index(name) for name in names], np.int64)
 
     total = [program.work.index(name) for name in ("total.0", *program.derivatives("total.0"))]
-    inside = WORK.index("inside") if program.uses("inside.0") else -1
+    inside = WORK_FIELDS.index("inside") if program.uses("inside.0") else -1
     censored = program.functions["frame"].results != program.functions["clipped"].results
     return SmootherPlaces(
         stride, len(program.work), len(program.row), of(*IMAGE_FIELDS), np.array(total, np.int64),
-        inside, WORK.index("side"), of(*COUNTS[:4]), exposed, censored,
+        inside, WORK_FIELDS.index("side"), of(*COUNT_FIELDS[:4]), exposed, censored,
     )  # fmt: skip
 
 
@@ -451,7 +451,7 @@ class SmootherPasses:
         method: SmoothingMethod,
         params: Any,
         clock_offset: Any,
-        directions: Directions = Directions(),  # noqa: B008
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
         self.recording, self.dtype, self._method = recording, recording.dtype, method
         self.clock, self.layout = recording.windows.clock, recording.layout
@@ -476,7 +476,7 @@ class SmootherPasses:
         """Make memory for so many bands and frames of each, [bands, ...]."""
         places = self.places
         memory = np.zeros((bands, (places.work + frames * places.row) * places.stride), self.dtype)
-        for name in (*IMAGE_FIELDS, *STATE, *LATER):
+        for name in (*IMAGE_FIELDS, *STATE_FIELDS, *LATER_FIELDS):
             self.field(memory, f"{name}.0")[:] = 0.5  # where there are no pixels, too
         return memory
 

@@ -1,8 +1,8 @@
 """Kernels of smoothers: functions of one pixel, traced, translated and written as a module.
 
 A smoother has functions of one pixel by name (`Smoother.pixel_functions`). They read and write the
-pixel's numbers: those of the frame that a pass has come to (`WORK`), and those that are stored for
-every frame (`ROW`, and what images need beside them).
+pixel's numbers: those of the frame that a pass has come to (`WORK_FIELDS`), and those that are
+stored for every frame (`ROW_FIELDS`, and what images need beside them).
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen.derivative import (
-    Directions,
+    DerivativeDirections,
     derivative_name,
     parse_derivative,
     with_derivatives,
@@ -26,29 +26,47 @@ from jaxevent.codegen.graph import (
     ParameterProgram,
     TranslationError,
     constant_value,
-    dependencies,
+    find_dependencies,
 )
 from jaxevent.codegen.module import CompiledProgram, KernelCache
-from jaxevent.codegen.trace import TracedFunction, name_leaves, translate_function
-from jaxevent.codegen.write import Address, ModuleText, Writer
-from jaxevent.reconstruction.engine.filter_program import EXCESS, IMAGE_FIELDS, KernelKind
+from jaxevent.codegen.trace import TracedFunction, named_leaves, translate_function
+from jaxevent.codegen.write import Address, ModuleText, ModuleWriter
+from jaxevent.reconstruction.engine.filter_program import EXCESS_TEMPLATE, IMAGE_FIELDS, KernelKind
 from jaxevent.reconstruction.video import ImageMethod
 
-COUNTS = ("on", "off", "around_on", "around_off", "given")
-STATE, LATER = ("state.m", "state.P"), ("later.h", "later.J")
-LINK = tuple(f"link.{name}" for name in "AbChJ")
-WORK = (*IMAGE_FIELDS, "total", "inside", "side", *COUNTS, *STATE, *LATER, *LINK)
-ROW = ("moved_on", "moved_off", "past.m", "past.P", "message.h", "message.J")
+COUNT_FIELDS = ("on", "off", "around_on", "around_off", "given")
+STATE_FIELDS, LATER_FIELDS = ("state.m", "state.P"), ("later.h", "later.J")
+LINK_FIELDS = tuple(f"link.{name}" for name in "AbChJ")
+WORK_FIELDS = (
+    *IMAGE_FIELDS,
+    "total",
+    "inside",
+    "side",
+    *COUNT_FIELDS,
+    *STATE_FIELDS,
+    *LATER_FIELDS,
+    *LINK_FIELDS,
+)
+ROW_FIELDS = ("moved_on", "moved_off", "past.m", "past.P", "message.h", "message.J")
 
 # Trees of numbers that have derivatives by parameters.
-MOVING = ("total", "state", "later", "moved_on", "moved_off", "past", "message", "info")
+DIFFERENTIATED_TREES = (
+    "total",
+    "state",
+    "later",
+    "moved_on",
+    "moved_off",
+    "past",
+    "message",
+    "info",
+)
 # Derivatives that do not depend on their own value before.
 NEVER_CARRIED = tuple(
     f"sensitivities['{name}']" for name in ("total", "moved_on", "moved_off", "info")
 )
 
 # Numbers that are equal for all pixels, by function.
-UNIFORM = {
+UNIFORM_INPUTS = {
     "frame": ("gain", "exists"),
     "clipped": ("gain", "exists"),
     "move": ("seconds",),
@@ -93,7 +111,7 @@ class SmootherProgram:
     work: tuple[str, ...]  # numbers of the frame that a pass has come to
     row: tuple[str, ...]  # numbers that are stored for every frame
     dtype: np.dtype
-    directions: Directions
+    directions: DerivativeDirections
 
     def derivatives(self, number: str) -> list[str]:
         """Return the names of a number's derivatives."""
@@ -102,12 +120,12 @@ class SmootherProgram:
     def uses(self, number: str) -> bool:
         """Return whether the functions read a number."""
         nodes = [n for f in self.functions.values() for n in f.results.values()]
-        return any(n.op == "input" and n.args == (number,) for n in dependencies(nodes))
+        return any(n.op == "input" and n.args == (number,) for n in find_dependencies(nodes))
 
 
 def _select_moving(made: dict[str, Any]) -> dict[str, Any]:
     """Select the results of a function that have derivatives."""
-    moving = {key: tree for key, tree in made.items() if key in MOVING}
+    moving = {key: tree for key, tree in made.items() if key in DIFFERENTIATED_TREES}
     if "image" in made:
         moving |= {"mean": made["image"].mean, "variance": made["image"].covariance}
     return moving
@@ -120,7 +138,7 @@ def translate_smoother(
 
     Args:
         method: The smoother.
-        known: See `Directions.inputs`.
+        known: See `DerivativeDirections.inputs`.
         kind: Properties of the recording, and derivatives that are wanted.
 
     Raises:
@@ -135,7 +153,7 @@ def translate_smoother(
     def tree(*names: str) -> dict[str, Any]:
         return dict.fromkeys(names, shape)
 
-    counts, moved, seconds = tree(*COUNTS), tree("moved_on", "moved_off"), tree("seconds")
+    counts, moved, seconds = tree(*COUNT_FIELDS), tree("moved_on", "moved_off"), tree("seconds")
     given: dict[str, Any] = tree(*IMAGE_FIELDS, "gain", "exists", "total", "inside")
     held = jax.eval_shape(method.pixel_state_spec, shape)
     state, message = held["state"], held["message"]
@@ -162,7 +180,7 @@ def translate_smoother(
     for name, values in wanted.items():
         function = functions[name]
         if directions.numbers:
-            moving = {key: tree for key, tree in values.items() if key in MOVING}
+            moving = {key: tree for key, tree in values.items() if key in DIFFERENTIATED_TREES}
             function = with_derivatives(function, _select_moving)
             values = {**values, "sensitivities": directions.shapes(moving)}
         made[name] = translate_function(
@@ -172,10 +190,10 @@ def translate_smoother(
             results = made[name].results.items()
             zeros = {key for key, node in results if constant_value(node) == 0}
             dead |= {key for key in zeros if key.startswith(NEVER_CARRIED)}
-    work = tuple(f"{name}.0" for name in WORK)
-    row = tuple(f"{name}.0" for name in (*ROW, *name_leaves("info", info)))
+    work = tuple(f"{name}.0" for name in WORK_FIELDS)
+    row = tuple(f"{name}.0" for name in (*ROW_FIELDS, *named_leaves("info", info)))
     program = SmootherProgram(made, host, work, row, kind.dtype, directions)
-    moving = [n for n in work if n.partition(".")[0] in MOVING]
+    moving = [n for n in work if n.partition(".")[0] in DIFFERENTIATED_TREES]
     work_derivatives = [s for n in moving for s in program.derivatives(n)]
     row_derivatives = [s for n in row for s in program.derivatives(n) if s not in dead]
     return dataclasses.replace(
@@ -183,18 +201,18 @@ def translate_smoother(
     )
 
 
-PIXELS = """
+PIXELS_TEMPLATE = """
 
 @cfunc(types.void(CELLS, CELLS, I, I, I, D, D, D), **OPTIONS)
 def {name}(cells, numbers, row, begin, end, a, b, c):
     u0, u1, u2 = REAL(a), REAL(b), REAL(c)
 {loops}
 """
-PIXELS_LOOP = """    for z in range(begin, end):
+PIXELS_LOOP_TEMPLATE = """    for z in range(begin, end):
         k = row + z
 {lines}"""
 
-IMAGES = """
+IMAGES_TEMPLATE = """
 
 @cfunc(
     types.void(CELLS, CELLS, I, I, I, I, D, D, D, CELLS, CELLS, MARKS, CELLS, I, I), **OPTIONS
@@ -207,7 +225,7 @@ def {name}(
         first = at + line * width
 {loops}
 """
-IMAGES_LOOP = """        for column in range(width):
+IMAGES_LOOP_TEMPLATE = """        for column in range(width):
             z = (line + 1) * padded + 1 + column
             k = row + z
 {lines}"""
@@ -220,9 +238,9 @@ def write_smoother(program: SmootherProgram, stride: int) -> ModuleText:
         for index, names in (("z", program.work), ("k", program.row))
         for i, name in enumerate(names)
     }
-    writer, parts = Writer(program, addresses), list[str]()
+    writer, parts = ModuleWriter(program, addresses), list[str]()
     for name, function in program.functions.items():
-        uniform = {f"{n}.0": f"u{i}" for i, n in enumerate(UNIFORM.get(name, ()))}
+        uniform = {f"{n}.0": f"u{i}" for i, n in enumerate(UNIFORM_INPUTS.get(name, ()))}
         if "here.0" in uniform:
             uniform["here.0"] += " != 0"
         segment = {f"{n}.0": n for n in ("share", "edge", "on", "off")}
@@ -232,19 +250,19 @@ def write_smoother(program: SmootherProgram, stride: int) -> ModuleText:
             parts.append(_write_images(name, program, writer))
         elif name == "excess":
             totals = [results[n] for n in ("total.0", *program.derivatives("total.0"))]
-            lines = writer.lines(totals, 4)
-            lines += [f"    out[{k}] = {writer.name(node)}" for k, node in enumerate(totals)]
-            parts.append(EXCESS.format(lines="\n".join(lines)))
+            lines = writer.write_lines(totals, 4)
+            lines += [f"    out[{k}] = {writer.node_name(node)}" for k, node in enumerate(totals)]
+            parts.append(EXCESS_TEMPLATE.format(lines="\n".join(lines)))
         else:
             stored = {n: addresses[n] for n in results if n in addresses}
             targets = {n: "{}[{} + {}]".format(*address) for n, address in stored.items()}
-            loops = _write_loops(results, targets, writer, PIXELS_LOOP, 8)
-            parts.append(PIXELS.format(name=name, loops=loops))
+            loops = _write_loops(results, targets, writer, PIXELS_LOOP_TEMPLATE, 8)
+            parts.append(PIXELS_TEMPLATE.format(name=name, loops=loops))
     about = "The functions of a smoother (`jaxevent.reconstruction.engine`)."
-    return writer.module(about, parts, None, program.dtype)
+    return writer.write_module(about, parts, None, program.dtype)
 
 
-def _write_images(name: str, program: SmootherProgram, writer: Writer) -> str:
+def _write_images(name: str, program: SmootherProgram, writer: ModuleWriter) -> str:
     """Write a function of images, and of their derivatives."""
     results, directions = program.functions[name].results, program.directions
     arrays = {"mean": "mean", "covariance": "variance", "valid": "valid"}
@@ -253,11 +271,13 @@ def _write_images(name: str, program: SmootherProgram, writer: Writer) -> str:
         for d, derivative in enumerate(program.derivatives(f"{output}.0")):
             place = k * directions.lanes + d
             targets[derivative] = f"derivatives[(first + column) * size + {place}]"
-    return IMAGES.format(name=name, loops=_write_loops(results, targets, writer, IMAGES_LOOP, 12))
+    return IMAGES_TEMPLATE.format(
+        name=name, loops=_write_loops(results, targets, writer, IMAGES_LOOP_TEMPLATE, 12)
+    )
 
 
 def _write_loops(
-    results: dict[str, Node], targets: dict[str, str], writer: Writer, loop: str, indent: int
+    results: dict[str, Node], targets: dict[str, str], writer: ModuleWriter, loop: str, indent: int
 ) -> str:
     """Write loops over pixels that store results: derivatives, one direction each, then the rest.
 
@@ -270,9 +290,9 @@ def _write_loops(
         groups.setdefault(derivative[1] if derivative else len(targets), []).append(key)
     out = []
     for _, keys in sorted(groups.items()):
-        lines = writer.lines([results[key] for key in keys], indent)
+        lines = writer.write_lines([results[key] for key in keys], indent)
         for key in keys:
-            value = writer.name(results[key])
+            value = writer.node_name(results[key])
             value = f"np.uint8({value})" if results[key].kind == "b" else value
             lines.append(f"{' ' * indent}{targets[key]} = {value}")
         out.append(loop.format(lines="\n".join(lines)))
