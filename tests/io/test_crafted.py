@@ -49,7 +49,7 @@ def test_strings_are_found_wherever_blocks_of_the_search_end(tmp_path, monkeypat
     endless.write_bytes(content)
     bad = endless, crafted.hdf5_string_of_gigabytes(tmp_path)
     for block in range(65, 200, 5):
-        monkeypatch.setattr(hdf5_files, "_BLOCK", block)
+        monkeypatch.setattr(hdf5_files, "_BLOCK_BYTES", block)
         hdf5_files.search_heaps.__wrapped__(good, ())
         for path in bad:
             refuses(

@@ -560,7 +560,7 @@ def test_stored_events_are_those_in_memory(recording, compression, data):
 def test_plain_h5py_reads_the_layout(recording, block):
     """ms_to_idx by its definition, whatever the size of the blocks that were copied."""
     with folder() as path, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hdf5, "_BLOCK", block)
+        patch.setattr(hdf5, "_BLOCK_EVENTS", block)
         save(recording, path / "a.h5")
         with File(path / "a.h5") as file:
             assert file.attrs["format"] == "jaxevent" and file.attrs["version"] == 1
@@ -593,7 +593,7 @@ def test_gzip_is_smaller(tmp_path):
 
 
 def test_dense_millisecond_and_missing_table(tmp_path, monkeypatch):
-    monkeypatch.setattr(hdf5, "_CHUNK", 16)
+    monkeypatch.setattr(hdf5, "_CHUNK_VALUES", 16)
     recording = random_recording(7, events=3000)
     recording.events.t[500:2500] = recording.events.t[500] // 1000 * 1000 + np.arange(2000) // 4
     recording.events.t.sort()
@@ -626,7 +626,7 @@ def test_dsec_layout(tmp_path):
 
 
 def test_stored_events_are_saved_at_constant_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(hdf5, "_BLOCK", 1 << 13)
+    monkeypatch.setattr(hdf5, "_BLOCK_EVENTS", 1 << 13)
     save(random_recording(9, events=400_000, parts=False), tmp_path / "a.h5")
     stored = load(tmp_path / "a.h5", in_memory=False)
     tracemalloc.start()

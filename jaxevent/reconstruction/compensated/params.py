@@ -25,8 +25,8 @@ FEATURE_NAMES = (
 FALLBACK_SOURCES = ("smoothed", "blend")  # candidates beside the mean along trajectories
 
 # A weight of every feature and a constant, for each of `FALLBACK_SOURCES`; and the same for the
-# logarithm of the result's variance. Those called beyond are for times after the last frame and before the
-# first. Fitted as experiments/studies/weights_of_the_fusion.md says.
+# logarithm of the result's variance. Those called beyond are for times after the last frame and
+# before the first. Fitted as experiments/studies/weights_of_the_fusion.md says.
 # fmt: off
 CHOICE_WEIGHTS = (
     0.796, 0.089, 0.222, 0.939, 0.532, -3.802, -3.169, 0.234, -0.268, -0.368, 0.687, 0.136,
