@@ -129,6 +129,7 @@ class PartwiseLoss(Protocol):
         ...
 
 
+# Seven positional arguments, in the order of `optimise`.
 def confidence_intervals(
     loss: Loss,
     start: Parameters,

@@ -282,6 +282,7 @@ def begin(
     return Run(position)
 
 
+# Seven positional arguments: users pass them so.
 def optimise(
     loss: Loss,
     params: P,

@@ -1,5 +1,6 @@
 """The site builds without a warning, its examples run, its tables are those of the code."""
 
+import importlib
 import os
 import re
 import runpy
@@ -87,3 +88,14 @@ def test_every_page_is_in_the_navigation():
     nav = (ROOT / "mkdocs.yml").read_text()
     for page in DOCS.rglob("*.md"):
         assert page.relative_to(DOCS).as_posix() in nav
+
+
+def test_pages_of_the_reference_show_names_that_exist():
+    pattern = re.compile(r"^::: ([\w.]+)\n    options: \{.*?members: \[(.*?)\]", re.M)
+    shown = [
+        found for page in (DOCS / "api").glob("*.md") for found in pattern.findall(page.read_text())
+    ]
+    assert len(shown) > 10
+    for module, members in shown:
+        known = vars(importlib.import_module(module))
+        assert {name.strip() for name in members.split(",")} <= known.keys(), module
