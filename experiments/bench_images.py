@@ -30,7 +30,12 @@ from jaxevent.blob import moment
 from jaxevent.egomotion import voting
 from jaxevent.io import load, save
 from jaxevent.io.hdf5_files import search_heaps
-from jaxevent.reconstruction.filtering import FrameModel, Observation, PixelState, Trajectory
+from jaxevent.reconstruction.filtering import (
+    FilteredTrajectory,
+    FrameModel,
+    Observation,
+    PixelState,
+)
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import LinearMotion, Target, motion_scene, simulate_blobs
@@ -146,7 +151,7 @@ def filter_seconds(recording: Recording) -> float:
     @jax.jit
     def scan(params, tiles, last, state):
         path = jaxevent.akf.scan(params, KnownFrames(), tiles, state)
-        return Trajectory(KnownFrames(), state, path).at(last), path
+        return FilteredTrajectory(KnownFrames(), state, path).at(last), path
 
     pixels = WIDTH * HEIGHT
     first = PixelState(jax.numpy.zeros(pixels), jax.numpy.full(pixels, 0.09))
