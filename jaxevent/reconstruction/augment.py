@@ -91,7 +91,7 @@ def integrate_counts(params: FrameParams, on: Array, off: Array) -> Array:
 def event_change(params: FrameParams, polarity: Array, since: Array) -> Array:
     """Return the change of log intensity that one event reports.
 
-    With a dead time rho an event stands for dt / (dt - rho) events, at most 3 (`Timing`).
+    With a dead time rho an event stands for dt / (dt - rho) events, at most 3 (`EventTiming`).
 
     Args:
         params: Thresholds, ln I, and dead time `rho_ref`, s.

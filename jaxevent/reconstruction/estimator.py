@@ -14,7 +14,7 @@ from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
 from jaxevent.reconstruction.engine.images import make_kernel_images, make_kernel_video
 from jaxevent.reconstruction.features import Features, ReadOut
-from jaxevent.reconstruction.frames import Timing, time_span
+from jaxevent.reconstruction.frames import EventTiming, time_span
 from jaxevent.reconstruction.live import LiveVideo
 from jaxevent.reconstruction.video import ImageSequence, P, Video
 from jaxevent.reconstruction.windows import prepare
@@ -256,7 +256,7 @@ class PixelEstimator(ImageEstimator[P]):
         self.check_clocks(recording, params)
         if not extrapolate:
             self.check_span(recording, times, params)
-        return prepare(recording, times, Timing.of(params), filtering=self.is_event_driven)
+        return prepare(recording, times, EventTiming.of(params), filtering=self.is_event_driven)
 
     def estimate(
         self, recording: Recording, params: P | None = None, **options: Any

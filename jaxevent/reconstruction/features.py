@@ -104,7 +104,7 @@ class ImagePoints(Points):
         return values.at[self.piece].get(mode="clip")[:, None]
 
 
-class Tiles(ShortRepr):
+class EventTiles(ShortRepr):
     """Events of a window; slots without an event have polarity 0 and change nothing.
 
     On several devices the last axis of the arrays is cut into blocks of `MIN_TILE_LANES`. The
@@ -120,7 +120,7 @@ class Tiles(ShortRepr):
     polarity: Int[Numeric, "tiles *slots"]  # +1, -1, or 0 where there is no event
     mesh: Mesh | None = eqx.field(static=True, default=None)
 
-    def over(self, mesh: Mesh) -> "Tiles":
+    def over(self, mesh: Mesh) -> "EventTiles":
         """Shard the lanes over a mesh whose size divides `MIN_TILE_LANES`."""
 
         def put(leaf: Any, spec: PartitionSpec) -> Any:
@@ -149,7 +149,7 @@ class Tiles(ShortRepr):
         Nothing passes between devices but, backwards, the sum of derivatives by `replicated`.
 
         Args:
-            function: Function of `Tiles` and other pytrees that returns arrays (tiles, slots).
+            function: Function of `EventTiles` and other pytrees that returns arrays (tiles, slots).
             *replicated: Further arguments, whole on every device.
 
         Returns:
@@ -158,7 +158,7 @@ class Tiles(ShortRepr):
         if self.mesh is None:
             return function(self, *replicated)
 
-        def run_shard(tiles: Tiles, *replicated: Any) -> Any:
+        def run_shard(tiles: EventTiles, *replicated: Any) -> Any:
             def flatten(leaf: Array, spec: PartitionSpec) -> Array:
                 return leaf.reshape(*leaf.shape[:-2], -1) if len(spec) else leaf
 
@@ -176,7 +176,7 @@ class Tiles(ShortRepr):
         )(self, *replicated)
 
 
-class Segments(eqx.Module):
+class ExposureSegments(eqx.Module):
     """Events inside exposures: each bounds one segment of constant brightness (EDI)."""
 
     frame_cell: Int[Numeric, " segments"]  # frame * pixels + pixel
@@ -203,7 +203,7 @@ class FrameFeatures(ShortRepr):
     before: Float[Numeric, "2 pixels"]
     head: Float[Numeric, "2 frames pixels"] | None  # None where no exposure is known
     tail: Float[Numeric, "2 frames pixels"] | None
-    segments: Segments | None
+    segments: ExposureSegments | None
     weight_rate: Float[Numeric, " pieces"]  # d weight / dt of each piece, 1/s
     blend_rate: Float[Numeric, " frames"]  # d blend / dt after each frame, 1/s
     present: Float[Numeric, ""]  # 1, or 0 if the recording has no frames
@@ -260,7 +260,7 @@ class Features(EventCounts):
     """A window of a recording, prepared for `run`."""
 
     frames: FrameFeatures
-    tiles: Tiles | None  # None for estimators that do not pass over single events
+    tiles: EventTiles | None  # None for estimators that do not pass over single events
     start: ImagePoints  # every pixel at the recording's start
     last: Int[Numeric, " pixels"]  # the slot of each pixel's last event, -1 if it has none
 

@@ -27,12 +27,12 @@ from jaxevent.reconstruction.estimator import KernelEstimator, P
 from jaxevent.reconstruction.features import (
     N_TILE_SLOTS,
     TILE_SHAPES,
+    EventTiles,
     Features,
     FrameFeatures,
     Numeric,
     Points,
     ReadOut,
-    Tiles,
 )
 
 UNROLLED_RANKS = 8  # of a tile, that a GPU passes over at once
@@ -81,7 +81,7 @@ class Event(eqx.Module):
 
 
 class LaneBlock(eqx.Module):
-    """Kind and first lane of tiles (`features.Tiles`)."""
+    """Kind and first lane of tiles (`features.EventTiles`)."""
 
     kind: Int[Array, " tiles"]
     lane: Int[Array, " tiles"]
@@ -100,7 +100,7 @@ class FrameModel(eqx.Module):
         return self(points).level
 
 
-class Trajectory(ShortRepr):
+class FilteredTrajectory(ShortRepr):
     """A filtered window: enough to read an image at any time inside it."""
 
     frame_model: FrameModel
@@ -244,7 +244,7 @@ class Filter(KernelEstimator[P]):
 
     def run(
         self, params: P, features: Features, state: Any = None, future: None = None
-    ) -> tuple[Trajectory, Any]:
+    ) -> tuple[FilteredTrajectory, Any]:
         """Filter a window; see `PixelEstimator.run`.
 
         Args:
@@ -261,12 +261,12 @@ class Filter(KernelEstimator[P]):
         if state is None:
             state = self.init_from_frames(params, frame_model, features.start)
         if features.tiles is None:
-            return Trajectory(frame_model, state, None), state
+            return FilteredTrajectory(frame_model, state, None), state
         path = self.scan(params, frame_model, features.tiles, state)
-        trajectory = Trajectory(frame_model, state, path)
+        trajectory = FilteredTrajectory(frame_model, state, path)
         return trajectory, trajectory.at(jnp.asarray(features.last))
 
-    def scan(self, params: P, frame_model: FrameModel, tiles: Tiles, state: Any) -> Any:
+    def scan(self, params: P, frame_model: FrameModel, tiles: EventTiles, state: Any) -> Any:
         """Filter the events of tiles.
 
         Args:
@@ -281,7 +281,7 @@ class Filter(KernelEstimator[P]):
         path = tiles.map_shards(self._scan, params, frame_model, state)
         return jax.tree.map(jnp.ravel, path)
 
-    def _scan(self, tiles: Tiles, params: P, frame_model: FrameModel, state: Any) -> Any:
+    def _scan(self, tiles: EventTiles, params: P, frame_model: FrameModel, state: Any) -> Any:
         """Return the states after every event of one device's tiles, (tiles, slots)."""
         frame = frame_model(tiles.points)
         events = Event(
@@ -291,7 +291,7 @@ class Filter(KernelEstimator[P]):
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
         return _filter_lanes(self, params, events, lanes, block)
 
-    def read(self, params: P, trajectory: Trajectory, out: ReadOut) -> Estimate:
+    def read(self, params: P, trajectory: FilteredTrajectory, out: ReadOut) -> Estimate:
         out = out.at_dead_time(params.rho_ref)
         before = trajectory.at(jnp.asarray(out.slot))
         since, frame = jnp.asarray(out.since), trajectory.frame_model(out.points)

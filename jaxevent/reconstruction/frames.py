@@ -8,14 +8,19 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit
 from jaxevent.codegen.graph import evaluate_function
-from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments, allocate_aligned
+from jaxevent.reconstruction.features import (
+    ExposureSegments,
+    FrameFeatures,
+    ImagePoints,
+    allocate_aligned,
+)
 from jaxevent.reconstruction.stream import EdgeCounts, EventStream
 from jaxevent.recording import Recording
 
 MIN_SEGMENT_CAPACITY = 1 << 14  # for which memory is allocated; eightfold until it suffices
 
 
-class Timing(NamedTuple):
+class EventTiming(NamedTuple):
     """Parameters of every estimator that preparation compares event times with, s.
 
     An event after the gap dt at its pixel stands for min(dt / (dt - rho_ref), 3) events: what
@@ -32,7 +37,7 @@ class Timing(NamedTuple):
     spread: float = 0.0
 
     @classmethod
-    def of(cls, params: Any) -> "Timing":
+    def of(cls, params: Any) -> "EventTiming":
         """Read an estimator's parameters, rounded to 10 ns: float32 has 7.5 ms as 7500 us too."""
         return cls(**{n: round(float(getattr(params, n, 0.0)), 8) for n in cls._fields})
 
@@ -82,7 +87,7 @@ class FrameClock:
     origin: int  # us, the recording's start
 
     @classmethod
-    def of(cls, recording: Recording, timing: Timing) -> "FrameClock":
+    def of(cls, recording: Recording, timing: EventTiming) -> "FrameClock":
         """Read the times of a recording's frames."""
         offset = round(timing.clock_offset * 1e8) / 100
         frames, origin = recording.frames, recording.start
@@ -249,7 +254,7 @@ def make_frame_features(
     rows: NDArray[np.int32],
     counts: EdgeCounts,
     *,
-    segments: Segments | None,
+    segments: ExposureSegments | None,
     capacity: int,
 ) -> FrameFeatures:
     """Prepare a range of frames.
@@ -301,7 +306,7 @@ def make_segments(
     weight: NDArray,
     counts: EdgeCounts,
     dtype: np.dtype,
-) -> Segments:
+) -> ExposureSegments:
     """Cut the exposures of a range of frames into segments of constant brightness.
 
     Args:
@@ -335,7 +340,7 @@ def make_segments(
         if parts:
             field[:total] = np.concatenate([part[f] for part in parts])
         fields.append(field)
-    return Segments(*fields)
+    return ExposureSegments(*fields)
 
 
 def make_start_points(clock: FrameClock, n_pixels: int, dtype: np.dtype) -> ImagePoints:
@@ -357,7 +362,8 @@ def make_start_points(clock: FrameClock, n_pixels: int, dtype: np.dtype) -> Imag
 def _cut_exposure(stream, weight, middle, row, edges, count):
     """Cut one exposure into segments; events from row `middle` on lie after its middle.
 
-    Returns the fields of `Segments`, one number for each event. `count` is (2, pixels) of zeros.
+    Returns the fields of `ExposureSegments`, one number for each event. `count` is (2, pixels) of
+    zeros.
     """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     n, pixels = len(t), count.shape[1]

@@ -28,7 +28,7 @@ MAX_HELD_FRAMES = 32  # before what is settled is dropped
 
 
 @renamed_methods(dropping="drop_before", grown="append")
-class TailImages:
+class RecentImages:
     """An `ImageSource` that holds the last images only."""
 
     def __init__(self, images: NDArray, dropped: int = 0):
@@ -45,13 +45,13 @@ class TailImages:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         raise IndexError("frames that are gone cannot be read")
 
-    def append(self, image: NDArray) -> "TailImages":
+    def append(self, image: NDArray) -> "RecentImages":
         """Return the images with one more at the end."""
-        return TailImages(np.concatenate([self.images, image[None]]), self.dropped)
+        return RecentImages(np.concatenate([self.images, image[None]]), self.dropped)
 
-    def drop_before(self, row: int) -> "TailImages":
+    def drop_before(self, row: int) -> "RecentImages":
         """Return the images without those before a row."""
-        return TailImages(self.images[max(row - self.dropped, 0) :].copy(), row)
+        return RecentImages(self.images[max(row - self.dropped, 0) :].copy(), row)
 
 
 class LiveVideo:
@@ -142,14 +142,14 @@ class LiveVideo:
         one.check(r.width, r.height, "the frame added")
         known = r.frames
         if known is None:
-            frames = dataclasses.replace(one, images=TailImages(np.asarray(one.images)))
+            frames = dataclasses.replace(one, images=RecentImages(np.asarray(one.images)))
         else:
             if t <= known.t[-1]:
                 raise InputError(
                     f"the frame added is at {t} us, not after the one before at {known.t[-1]} us; "
                     "add them in order of time"
                 )
-            assert isinstance(known.images, TailImages)
+            assert isinstance(known.images, RecentImages)
             frames = Frames(
                 np.append(known.t, t),
                 known.images.append(np.asarray(image)),
@@ -192,7 +192,7 @@ class LiveVideo:
         tail, frames = self._events, self._recording.frames
         waiting = tail.count - tail.dropped
         held_frames = 0
-        if frames is not None and isinstance(frames.images, TailImages):
+        if frames is not None and isinstance(frames.images, RecentImages):
             held_frames = len(frames.images.images)
         if waiting < 2 * self.window_events and held_frames < MAX_HELD_FRAMES:
             return
@@ -202,7 +202,7 @@ class LiveVideo:
         row, first_frame = video.settle(self._expects_frames)
         if row > tail.dropped:
             tail.drop(row)
-        if frames is not None and isinstance(frames.images, TailImages):
+        if frames is not None and isinstance(frames.images, RecentImages):
             if first_frame > frames.images.dropped:
                 images = frames.images.drop_before(first_frame)
                 self._recording = dataclasses.replace(

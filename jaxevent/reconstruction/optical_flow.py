@@ -20,7 +20,7 @@ from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
-from jaxevent.reconstruction.frames import FrameClock, FrameImages, Timing
+from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages
 from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -57,17 +57,17 @@ class FramePair(NamedTuple):
     forward: NDArray[np.float32]
     backward: NDArray[np.float32]
 
-    def at(self, share: float | int) -> NDArray[np.floating]:
-        """Return the image at a fraction `share` of the time from one frame to the other."""
-        s = float(share)
+    def at(self, time_fraction: float | int) -> NDArray[np.floating]:
+        """Return the image at a fraction of the time from one frame to the other."""
+        s = float(time_fraction)
         if s == 0:
             return self.before
         moved = _warp(self.before, s * self.forward), _warp(self.after, (1 - s) * self.backward)
         return (1 - s) * moved[0] + s * moved[1]
 
-    def flow(self, share: float | int) -> NDArray[np.floating]:
+    def flow(self, time_fraction: float | int) -> NDArray[np.floating]:
         """Return the flow (H, W, 2) at a fraction of the time, px from frame to frame."""
-        return (1 - share) * self.forward - share * self.backward
+        return (1 - time_fraction) * self.forward - time_fraction * self.backward
 
 
 def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.floating]:
@@ -142,7 +142,7 @@ class FlowVideo(ImageSequence[Params]):
         progress: bool | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
-        self._clock = FrameClock.of(recording, Timing.of(params))
+        self._clock = FrameClock.of(recording, EventTiming.of(params))
         self._dtype = np.dtype(jnp.result_type(float))
         self._images = FrameImages(recording, self._dtype)
         self._pair: tuple[int, FramePair] | None = None  # with the number of its first frame
@@ -255,7 +255,7 @@ class Flow(ImageEstimator[Params]):
         params = self.Params() if params is None else params
         if not extrapolate:
             self.check_span(recording, times, params)
-        clock = FrameClock.of(recording, Timing.of(params))
+        clock = FrameClock.of(recording, EventTiming.of(params))
         images = FrameImages(recording, np.dtype(jnp.result_type(float)))
         frames = _read_frames(images, clock, slice(0, len(clock)))
         return frames, _locate(clock, np.atleast_1d(microseconds(times)))

@@ -1,7 +1,7 @@
 """Counts over the stream of events, and the state that passes from window to window.
 
-With a dead time an event stands for more than one (`frames.Timing`): counts are then weighted. With
-`DeadTime.derivative` all counts are derivatives by the dead time, in 1/s.
+With a dead time an event stands for more than one (`frames.EventTiming`): counts are then weighted.
+With `DeadTime.derivative` all counts are derivatives by the dead time, in 1/s.
 """
 
 import dataclasses

@@ -20,7 +20,7 @@ from jaxevent.reconstruction.features import (
     N_TILE_SLOTS,
     TILE_SHAPES,
     EventPoints,
-    Tiles,
+    EventTiles,
     allocate_aligned,
 )
 from jaxevent.reconstruction.frames import FrameTimes
@@ -58,7 +58,7 @@ class SlotMap(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class TileLayout:
     """Tile, rank and lane of each event of a window."""
 
     slot_map: SlotMap
@@ -68,7 +68,7 @@ class Layout:
     ordinary: bool  # whether the first rung sufficed
 
     @classmethod
-    def of(cls, counts: NDArray[np.int32], n_events: int) -> "Layout":
+    def of(cls, counts: NDArray[np.int32], n_events: int) -> "TileLayout":
         """Lay out a window.
 
         Args:
@@ -196,7 +196,7 @@ class TileKind(NamedTuple):
 
 
 class TileArrays(NamedTuple):
-    """The arrays of `Tiles` that `_fill` writes: two per tile, the others [tiles, slots]."""
+    """The arrays of `EventTiles` that `_fill` writes: two per tile, the others [tiles, slots]."""
 
     kind: NDArray[np.int32]
     lane: NDArray[np.int32]
@@ -211,7 +211,7 @@ class TileArrays(NamedTuple):
     polarity: NDArray[np.int8]
 
     @classmethod
-    def allocate(cls, tiles: int, memory: TileMemory) -> "TileArrays":
+    def allocate(cls, n_tiles: int, memory: TileMemory) -> "TileArrays":
         """Allocate a number of tiles, none of them used.
 
         `_fill` clears what used tiles leave empty, unused tiles are skipped. (Derivatives are taken
@@ -220,10 +220,10 @@ class TileArrays(NamedTuple):
         reals = dict.fromkeys(("since", "near", "weight", "blend", "on", "off"), memory.dtype)
         kinds = reals | {"piece_cell": np.int32, "frame_cell": np.int32, "polarity": np.int8}
         return cls(
-            np.full(tiles, len(TILE_SHAPES), np.int32),
-            np.zeros(tiles, np.int32),
+            np.full(n_tiles, len(TILE_SHAPES), np.int32),
+            np.zeros(n_tiles, np.int32),
             **{
-                name: memory.array(name, (tiles, N_TILE_SLOTS), kind)
+                name: memory.array(name, (n_tiles, N_TILE_SLOTS), kind)
                 for name, kind in kinds.items()
             },
         )
@@ -243,7 +243,7 @@ class LaneStates(NamedTuple):
 
 def make_tiles(
     stream: EventStream,
-    layout: Layout,
+    layout: TileLayout,
     times: FrameTimes,
     counts: BaseCounts,
     state: StreamState,
@@ -251,7 +251,7 @@ def make_tiles(
     dead: DeadTime,
     capacity: int,
     memory: TileMemory,
-) -> Tiles:
+) -> EventTiles:
     """Write the events of a window into tiles.
 
     Args:
@@ -277,7 +277,7 @@ def make_tiles(
         _sort_events(pool, stream, layout, first, state.near, inputs)
         _fill_tiles(pool, layout, first, inputs, state.last, out)
     points = EventPoints(out.weight, out.blend, out.on, out.off, out.piece_cell, out.frame_cell)
-    return Tiles(
+    return EventTiles(
         layout.lane_pixels(), out.kind, out.lane, points, out.since, out.near, out.polarity
     )
 
@@ -285,7 +285,7 @@ def make_tiles(
 def _sort_events(
     pool: ThreadPoolExecutor,
     stream: EventStream,
-    layout: Layout,
+    layout: TileLayout,
     first: NDArray[np.int64],
     latest: NDArray[np.int64],
     inputs: TileInputs,
@@ -305,7 +305,7 @@ def _sort_events(
 
 def _fill_tiles(
     pool: ThreadPoolExecutor,
-    layout: Layout,
+    layout: TileLayout,
     first: NDArray[np.int64],
     inputs: TileInputs,
     last: NDArray[np.int64],

@@ -23,7 +23,7 @@ from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import Features, ReadOut, make_pixel_mesh, shard_over_pixels
-from jaxevent.reconstruction.frames import Timing
+from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import (
     MAX_WINDOW_EVENTS,
@@ -372,7 +372,7 @@ class Video(ImageSequence[P]):
         self._batch = N_DEVICE_BATCH_IMAGES if has_accelerator() else N_BATCH_IMAGES
         self._windows = WindowedRecording(
             recording,
-            Timing.of(params),
+            EventTiming.of(params),
             filtering=estimator.is_event_driven,
             events=window_events,
             reuse=True,

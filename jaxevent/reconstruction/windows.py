@@ -26,9 +26,9 @@ from jaxevent.reconstruction.features import (
     allocate_aligned,
 )
 from jaxevent.reconstruction.frames import (
+    EventTiming,
     FrameClock,
     FrameImages,
-    Timing,
     make_frame_features,
     make_segments,
     make_start_points,
@@ -46,7 +46,7 @@ from jaxevent.reconstruction.stream import (
     event_weights,
     update_last_times,
 )
-from jaxevent.reconstruction.tiles import Layout, SlotMap, TileMemory, make_tiles
+from jaxevent.reconstruction.tiles import SlotMap, TileLayout, TileMemory, make_tiles
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 MAX_WINDOW_EVENTS = 1 << 20
@@ -243,7 +243,7 @@ class WindowedRecording:
     def __init__(
         self,
         recording: Recording,
-        timing: Timing = Timing(),  # noqa: B008
+        timing: EventTiming = EventTiming(),  # noqa: B008
         *,
         filtering: bool = True,
         events: int = MAX_WINDOW_EVENTS,
@@ -427,18 +427,18 @@ class WindowedRecording:
     def _stream(self, events: Events) -> EventStream:
         return EventStream.of(events, self.recording.width)
 
-    def _layout(self, events: Events) -> Layout | None:
+    def _layout(self, events: Events) -> TileLayout | None:
         if not self.filtering:
             return None
         counts = count_events_per_pixel(events.x, events.y, self.recording.width, self.pixels)
-        return Layout.of(counts, self.events)
+        return TileLayout.of(counts, self.events)
 
     def _window(
         self,
         start: int | None,
         stop: int | None,
         events: WindowEvents,
-        layout: Layout | None,
+        layout: TileLayout | None,
         before: StreamState,
     ) -> tuple[EventWindow, Features]:
         clock, used = self.clock, self.clock.frames_within(start, stop)
@@ -525,7 +525,7 @@ def sorted_times(times: Times) -> NDArray[np.int64]:
 def prepare(
     recording: Recording,
     times: Times,
-    timing: Timing = Timing(),  # noqa: B008
+    timing: EventTiming = EventTiming(),  # noqa: B008
     *,
     filtering: bool = True,
 ) -> tuple[Features, ReadOut]:
@@ -553,7 +553,7 @@ def prepare(
         InputError: The times are not sorted, or the recording has too many frames.
     """
     times = sorted_times(times)
-    timing = Timing(*(round(float(v), 8) for v in timing))
+    timing = EventTiming(*(round(float(v), 8) for v in timing))
 
     def prepare_counts(derivative: bool) -> tuple[Features, ReadOut]:
         windows = WindowedRecording(recording, timing, filtering=filtering, derivative=derivative)

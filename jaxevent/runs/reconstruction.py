@@ -25,7 +25,7 @@ from jaxevent.parameters import Parameters
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, make_pixel_mesh, shard_over_pixels
-from jaxevent.reconstruction.frames import Timing
+from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import NAME, NOT_NEGATIVE, POSITIVE, check_choice, is_number
 from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
@@ -239,7 +239,7 @@ class Problem:
     `devices.REMOTE`.
 
     They are prepared when first asked for and again for params that differ in what preparation
-    fixes (`clock.Timing`). `weights` are those of dark, well exposed and bright pixels of HDR
+    fixes (`clock.EventTiming`). `weights` are those of dark, well exposed and bright pixels of HDR
     references, told apart by their `clip`; omitted, 1.
     """
 
@@ -260,7 +260,7 @@ class Problem:
         self._rooms = [
             max([int((part.split == s).sum()) for part, _ in self._jobs], default=0) for s in (0, 1)
         ]
-        self._last = LastBatches(Timing.of, self._prepare)
+        self._last = LastBatches(EventTiming.of, self._prepare)
 
     def __call__(self, params: FrameParams) -> Batches:
         """Batches to fit to, and batches to validate on."""

@@ -95,7 +95,7 @@ def test_motion_of_a_later_target():
     p = np.zeros((8, 10, 4), np.float32)
     p[..., 0], p[..., 2] = 0.2 * 2 * np.arange(10), 0.5  # px/s at s = 0: it grows with x
     p[..., 1] = -2.0
-    later = trajectories.advect(p, 0.4, 1.5)
+    later = trajectories.advect_nodes(p, 0.4, 1.5)
     # x + (0.2 x) s + 0.5 s^2 is where a point is; x is that of the target before.
     before = (2 * np.arange(10) - 0.5 * 0.4**2) / (1 + 0.2 * 0.4)
     expected = 1.5 * (0.2 * before + 2 * 0.5 * 0.4)
@@ -350,7 +350,7 @@ def test_instants_that_fill_up_change_nothing():
 
 def test_instants():
     frames = np.arange(10) * 40_000
-    choose = instants.Schedule(frames, (0, 360_000), 100.0)
+    choose = instants.InstantSchedule(frames, (0, 360_000), 100.0)
     assert choose.step == 6_000 and choose.max_distance == 60_000
     one = choose(133_333)
     assert one.t[one.target] == 133_333 and one.s[one.target] == 0
@@ -378,24 +378,24 @@ def test_a_clock_that_stops_with_the_scene():
     np.testing.assert_allclose(even, [0, 1000, 2000, 2000, 2000, 2500])
     np.testing.assert_allclose(clock(0.25)(times), 0.75 * times + 0.25 * apart * even)
     frames = np.arange(0, 440_000, 40_000)
-    choose = instants.Schedule(frames, (0, 400_000), 100.0, clock(0.9))
+    choose = instants.InstantSchedule(frames, (0, 400_000), 100.0, clock(0.9))
     one = choose(262_000)
     still = np.diff(one.s)[(one.t[:-1] >= 200_000) & (one.t[1:] <= 300_000)]
     steps = np.diff(one.t)[(one.t[:-1] >= 200_000) & (one.t[1:] <= 300_000)]
     np.testing.assert_allclose(still * one.unit, 0.1e-6 * steps, rtol=1e-3)
-    np.testing.assert_allclose(one.relative_times(one.t), one.s, atol=1e-6)
-    assert one.clock_rate(1000) * one.unit == pytest.approx(0.1)
+    np.testing.assert_allclose(one.to_relative_times(one.t), one.s, atol=1e-6)
+    assert one.relative_times_per_second(1000) * one.unit == pytest.approx(0.1)
     # At rest after the last frame and before the first; not between two, nor while things move.
     early, late = frames[:7], frames[7:]
     assert (
         one.rest == 0
-        and instants.Schedule(late, (0, 400_000), 100.0, clock(0.0))(262_000).rest > 0.9
+        and instants.InstantSchedule(late, (0, 400_000), 100.0, clock(0.0))(262_000).rest > 0.9
     )
-    assert instants.Schedule(early, (0, 400_000), 100.0, clock(0.9))(262_000).rest > 0.9
-    assert instants.Schedule(early, (0, 400_000), 100.0, clock(0.9))(390_000).rest < 0.05
+    assert instants.InstantSchedule(early, (0, 400_000), 100.0, clock(0.9))(262_000).rest > 0.9
+    assert instants.InstantSchedule(early, (0, 400_000), 100.0, clock(0.9))(390_000).rest < 0.05
     plain, timed = (
         one.with_clock(instants.TIME_CLOCK),
-        instants.Schedule(frames, (0, 400_000), 100.0)(262_000),
+        instants.InstantSchedule(frames, (0, 400_000), 100.0)(262_000),
     )
     np.testing.assert_array_equal(plain.s, timed.s)
     assert plain.unit == timed.unit

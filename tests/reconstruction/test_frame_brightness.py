@@ -110,7 +110,7 @@ def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
 
 def test_smooth_part():
     image = np.random.default_rng(5).normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
-    got, reach = images.gaussian_smooth(image), images.SMOOTH_PART_SIGMA_PX
+    got, reach = images.gaussian_blur(image), images.SMOOTH_PART_SIGMA_PX
     ones = gaussian_filter(np.ones((HEIGHT, WIDTH)), reach, mode="constant", truncate=8)
     for one, part in zip(image, got, strict=True):
         expected = gaussian_filter(one, reach, mode="constant", truncate=8) / ones
@@ -153,7 +153,7 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
 
     def error(image):
         L = np.log(image.reshape(HEIGHT, WIDTH) + 0.1)
-        detail = (L - level) - images.gaussian_smooth((L - level)[None])[0]
+        detail = (L - level) - images.gaussian_blur((L - level)[None])[0]
         return float((detail[HEIGHT // 2 + 4 : -4, 6:-6] ** 2).mean())
 
     video = mc.estimate(recording, params, progress=False)

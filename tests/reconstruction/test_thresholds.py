@@ -7,7 +7,7 @@ import pytest
 from jaxevent.reconstruction.compensated import thresholds
 from jaxevent.reconstruction.compensated.images import InstantSmoother
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.frames import Timing
+from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.reconstruction.windows import prepare
 from jaxevent.recording import Events, Frames, Recording
 
@@ -113,7 +113,7 @@ def test_weighted_events_are_those_of_other_thresholds(rho):
     at = np.array([123_000, 502_000])
     # Their noise is a part of thresholds, too.
     chosen = params(rho_ref=rho, sigma_event=0.0, share=0.0)
-    features, out = prepare(recording, at, Timing(rho_ref=rho), filtering=False)
+    features, out = prepare(recording, at, EventTiming(rho_ref=rho), filtering=False)
     smoother = InstantSmoother("smoother", Params)
 
     @jax.jit

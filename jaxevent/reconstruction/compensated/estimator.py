@@ -47,17 +47,17 @@ from jaxevent.reconstruction.compensated.images import (
     BrightnessPrior,
     FrameBrightness,
     InstantImages,
-    gaussian_smooth,
+    gaussian_blur,
     instant_smoother,
     smooth_at_target,
 )
 from jaxevent.reconstruction.compensated.instants import (
     TIME_CLOCK,
-    Instants,
-    Schedule,
+    InstantSchedule,
+    TargetInstants,
     fit_motion_clock,
     measure_image_speed,
-    merge_instants,
+    merge_instant_times,
     pad_instant_count,
 )
 from jaxevent.reconstruction.compensated.normal_equations import (
@@ -78,7 +78,7 @@ from jaxevent.reconstruction.compensated.thresholds import learn_thresholds
 from jaxevent.reconstruction.compensated.trajectories import (
     ImagePyramid,
     NodeTrajectories,
-    advect,
+    advect_nodes,
     change_clock,
     estimate_trajectories,
     gauss_newton_step,
@@ -99,7 +99,7 @@ from jaxevent.reconstruction.compensated.warp import (
 )
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
-from jaxevent.reconstruction.frames import FrameClock, FrameImages, Timing, time_span
+from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages, time_span
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
@@ -143,16 +143,16 @@ class PreparedTargets(ShortRepr):
         return self
 
 
-def make_schedule(
-    recording: Recording, params: Params, images: InstantImages, common: bool = True
-) -> Schedule:
+def make_instant_schedule(
+    recording: Recording, params: Params, images: InstantImages, use_motion_clock: bool = True
+) -> InstantSchedule:
     """Make the schedule of a recording, by the speed of its image.
 
     Args:
         recording: The recording.
         params: Parameters of `mc`.
         images: Images at instants.
-        common: Whether instants are on a clock that goes as fast as the scene moves.
+        use_motion_clock: Whether instants are on a clock that goes as fast as the scene moves.
 
     Returns:
         The schedule.
@@ -160,7 +160,7 @@ def make_schedule(
     Raises:
         InputError: If images are not finite with these parameters.
     """
-    clock = FrameClock.of(recording, Timing.of(params))
+    clock = FrameClock.of(recording, EventTiming.of(params))
     # The first whole microsecond at which a frame is the one before.
     frames = np.ceil(clock.mid).astype(np.int64) + clock.origin
     first, last = time_span(recording, params.clock_offset)
@@ -177,14 +177,16 @@ def make_schedule(
             f"{recording.name}: with these parameters images at single instants are not finite; "
             "choose some nearer the defaults"
         )
-    motion_clock = fit_motion_clock(recording, (first, last), 4 * lag) if common else TIME_CLOCK
-    return Schedule(frames, (first, last), speed, motion_clock)
+    motion_clock = (
+        fit_motion_clock(recording, (first, last), 4 * lag) if use_motion_clock else TIME_CLOCK
+    )
+    return InstantSchedule(frames, (first, last), speed, motion_clock)
 
 
 class TrajectoryEstimate(NamedTuple):
     """A target, the images at its instants, and the motion of its points."""
 
-    instants: Instants
+    instants: TargetInstants
     L: NDArray[np.float32]  # (K, h, w), log intensity
     V: NDArray[np.float32]  # (K, h, w), its variance
     clear: NDArray[np.float32]  # (K, h, w), 1 where a frame shows the pixel unclipped
@@ -286,26 +288,28 @@ class TrajectoryEstimator:
         start: InitialMotion | None = None,
     ):
         self.params, self.images, self.start = params, images, start
-        self.schedule = make_schedule(recording, params, images, common=start is None)
+        self.schedule = make_instant_schedule(
+            recording, params, images, use_motion_clock=start is None
+        )
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
-        self._anchors: collections.OrderedDict[int, tuple[Instants, NDArray[np.float32]]]
+        self._anchors: collections.OrderedDict[int, tuple[TargetInstants, NDArray[np.float32]]]
         self._anchors = collections.OrderedDict()
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
-    def _images(self, instants: Instants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
+    def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         """Return L, V and clear at instants, and the smooth part that is subtracted from L."""
         L, V, clear = self.images(instants.t)
         if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
             return L, V, clear, None
-        smooth = gaussian_smooth(L)
+        smooth = gaussian_blur(L)
         return L - smooth, V, clear, smooth
 
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
-    def _anchor(self, t: int) -> tuple[Instants, NDArray[np.float32]]:
+    def _anchor(self, t: int) -> tuple[TargetInstants, NDArray[np.float32]]:
         """Return the anchor next to a time (us), and its motion at half resolution."""
         first, last = self.schedule.span
         interval = ANCHOR_STEPS * self.schedule.step
@@ -323,27 +327,27 @@ class TrajectoryEstimator:
                 self._anchors.popitem(last=False)
         return self._anchors[at]
 
-    def _initial_motion(self, t: int, instants: Instants) -> NDArray[np.float32]:
+    def _initial_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32]:
         """Return the motion that a target starts from, at half resolution."""
         if self.start is not None:
             known = self.start(t, self.schedule.step, instants.unit)
             if known is not None:
-                return NodeTrajectories(known, 0).at_level(1, self.images.size).p
+                return NodeTrajectories(known, 0).at_level(1, self.images.image_shape).p
         anchor, p = self._anchor(t)
-        s = float(anchor.relative_times(np.array([t]))[0])
-        return advect(p, s, instants.unit / anchor.unit)
+        s = float(anchor.to_relative_times(np.array([t]))[0])
+        return advect_nodes(p, s, instants.unit / anchor.unit)
 
     def _improve(
-        self, pixels: NDArray[np.float32], instants: Instants, p: NDArray[np.float32]
-    ) -> tuple[Instants, NDArray[np.float32]]:
+        self, pixels: NDArray[np.float32], instants: TargetInstants, p: NDArray[np.float32]
+    ) -> tuple[TargetInstants, NDArray[np.float32]]:
         """Take a few steps at half resolution, on the clock on which images agree better."""
 
-        def improved(clock: Instants, p: NDArray[np.float32]) -> NDArray[np.float32]:
+        def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
             for _ in range(N_TARGET_STEPS):
                 p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
             return p
 
-        def cost(clock: Instants, p: NDArray[np.float32]) -> float:
+        def cost(clock: TargetInstants, p: NDArray[np.float32]) -> float:
             return robust_cost(PackedImages.of(pixels, clock.s), p, self._cost)
 
         found = improved(instants, p)
@@ -588,12 +592,12 @@ class CompensatedVideo(ImageSequence[Params]):
             The images (n, H, W, channels), and the visibility (n, H, W) of the points in each.
         """
         target, fused = self._target(to)
-        s = target.instants.relative_times(at).astype(np.float32)
+        s = target.instants.to_relative_times(at).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
-            L, M = L - gaussian_smooth(L), M - gaussian_smooth(M)
+            L, M = L - gaussian_blur(L), M - gaussian_blur(M)
         warped = warp_images(L, V, clear, s, target.paths)
         carried = _carry(np.asarray(images, np.float32), s, target.paths)
         return np.asarray(carried), np.asarray(_visibility(self.params, M, warped))
@@ -611,7 +615,7 @@ class CompensatedVideo(ImageSequence[Params]):
         """
         step = self.trajectories.schedule.step
         found = [
-            target.paths[..., :2] * np.float32(target.instants.clock_rate(step))
+            target.paths[..., :2] * np.float32(target.instants.relative_times_per_second(step))
             for target, _ in self._targets(times, extrapolate)
         ]
         return np.stack(found)
@@ -686,8 +690,8 @@ class MotionCompensation(ImageEstimator[Params]):
         trajectories = make_trajectory_estimator(recording, params, MAX_WINDOW_EVENTS)
         chosen = [trajectories.schedule(t) for t in wanted.tolist()]
         count = pad_instant_count(max(len(one) for one in chosen))
-        every = merge_instants(chosen)
-        features, instants = prepare(recording, every, Timing.of(params), filtering=False)
+        every = merge_instant_times(chosen)
+        features, instants = prepare(recording, every, EventTiming.of(params), filtering=False)
         factors = trajectories.images.factors
         if factors is not None:
             features, instants = features.scale_counts(factors), instants.scale_counts(factors)
@@ -742,7 +746,7 @@ class MotionCompensation(ImageEstimator[Params]):
         @jax.checkpoint
         def one(target: PreparedTarget) -> tuple[Array, Array]:
             rows, layout, p, path_index, exposures, steady, brightness = target
-            smooth = (1 - steady) * gaussian_smooth(L[rows])
+            smooth = (1 - steady) * gaussian_blur(L[rows])
             images = (L[rows] - smooth, V[rows], clear[rows])
             if self.through_motion:
                 p = self._with_derivative(params, images, layout, p)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc, run_over_rows
 from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped_weight
 from jaxevent.reconstruction.compensated.fusion import FusedImage
-from jaxevent.reconstruction.compensated.instants import Instants
+from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import (
     RESIDUAL_SIGMA_PX,
@@ -39,7 +39,7 @@ from jaxevent.reconstruction.compensated.warp import (
     sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import FrameClock, Timing
+from jaxevent.reconstruction.frames import EventTiming, FrameClock
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
 from jaxevent.recording import Recording
 
@@ -108,7 +108,7 @@ class FrameExposures:
     """
 
     def __init__(self, recording: Recording, params: Params, speed: float):
-        clock = FrameClock.of(recording, Timing.of(params))
+        clock = FrameClock.of(recording, EventTiming.of(params))
         self.mid = np.ceil(clock.mid).astype(np.int64) + clock.origin
         self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
         moved = SPEED_MARGIN * speed * 2e-6 * float(self._half.max(initial=0))
@@ -116,7 +116,7 @@ class FrameExposures:
         wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
         self.samples = samples if params.integrate and wanted else None
 
-    def __call__(self, t: int, instants: Instants) -> AdjacentExposures:
+    def __call__(self, t: int, instants: TargetInstants) -> AdjacentExposures:
         """Return the exposures next to a target at a time (us), whose instants are given."""
         after = int(np.searchsorted(self.mid, t, "right"))
         here = int(np.searchsorted(self.mid, t, "left"))
@@ -126,10 +126,10 @@ class FrameExposures:
             frame[far.argmax()], present[far.argmax()] = here, True
         frame = frame.clip(0, max(len(self.mid) - 1, 0)).astype(np.int32)
         mid, half = self.mid[frame], self._half[frame]
-        begin, end = instants.relative_times(mid - half), instants.relative_times(mid + half)
+        begin, end = instants.to_relative_times(mid - half), instants.to_relative_times(mid + half)
         return AdjacentExposures(
             frame,
-            np.where(present, instants.relative_times(mid), 0).astype(np.float32),
+            np.where(present, instants.to_relative_times(mid), 0).astype(np.float32),
             ((end - begin) / 2).astype(np.float32),
             present.astype(np.float32),
         )

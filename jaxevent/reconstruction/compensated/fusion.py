@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.estimator import ShortRepr
-from jaxevent.reconstruction.compensated.images import gaussian_smooth
+from jaxevent.reconstruction.compensated.images import gaussian_blur
 from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.reconstruction.compensated.robust_mean import (
     InstantLayout,
@@ -60,7 +60,7 @@ class ReferenceImages(NamedTuple):
     inside_after: Float[Numeric, "h w"]
     after_weight: Numeric  # of the frame after in the blend of the two
     beyond: Numeric  # 1 where frames are on one side of the target alone, else 0
-    rest: Numeric  # `Instants.rest`
+    rest: Numeric  # `TargetInstants.rest`
     squared_reach: Numeric | float  # px^2, (h, w) or (); see `warp.squared_reach`
     # Distance of the target from the nearest frame, in intervals from that to `other`, where frames
     # are on one side alone; else 1.
@@ -224,7 +224,7 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     # with those around the target.
     q = _shift_weight(q, given.stationary * given.in_place * quiet, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
-    alone = gaussian_smooth(quiet, NOISE_EVENT_SIGMA_PX)
+    alone = gaussian_blur(quiet, NOISE_EVENT_SIGMA_PX)
     q = _shift_weight(q, given.rest * jnp.maximum(quiet, alone), 2)
     features = variance_features(X, given.in_place, beyond, given.intervals_away)
     weights = jnp.where(beyond, params.doubt_beyond, params.doubt)

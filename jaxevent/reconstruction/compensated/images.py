@@ -114,7 +114,7 @@ class InstantImages:
         self._cache: collections.OrderedDict[int, Estimate] = collections.OrderedDict()
 
     @property
-    def size(self) -> tuple[int, int]:
+    def image_shape(self) -> tuple[int, int]:
         """Height and width, px."""
         return self._video.recording.height, self._video.recording.width
 
@@ -143,7 +143,7 @@ def _averages(size: int, sigma: float) -> NDArray[np.float32]:
 
 
 @full_precision
-def gaussian_smooth(L: Any, sigma_px: float = SMOOTH_PART_SIGMA_PX) -> Any:
+def gaussian_blur(L: Any, sigma_px: float = SMOOTH_PART_SIGMA_PX) -> Any:
     """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma_px` px."""
     return _averages(L.shape[-2], sigma_px) @ L @ _averages(L.shape[-1], sigma_px).T
 

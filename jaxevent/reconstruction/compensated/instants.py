@@ -53,7 +53,7 @@ class MotionClock:
         counts = np.array([self.count_before(t) for t in times.tolist()], float)
         return (1 - self.event_share) * elapsed + self.event_share * self.event_interval * counts
 
-    def relative_rate(self, begin_us: int, end_us: int) -> float:
+    def relative_event_rate(self, begin_us: int, end_us: int) -> float:
         """Return the rate of events between two times (us), in units of the mean rate."""
         if not (self.event_interval and end_us > begin_us):
             return 1.0
@@ -124,7 +124,7 @@ def _count_parts(recording: Recording, begin: int, length: int) -> NDArray[np.fl
 
 
 @dataclasses.dataclass(frozen=True)
-class Instants:
+class TargetInstants:
     """The instants of one target, sorted, and their times on a clock."""
 
     t: NDArray[np.int64]  # us
@@ -139,17 +139,17 @@ class Instants:
     # 0 where frames are on both sides.
     rest: float = 0.0
 
-    def relative_times(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    def to_relative_times(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
         """Convert times (us) to those of `s`."""
         both = self.clock(np.append(times_us, self.t[self.target]))
         return (both[:-1] - both[-1]) * 1e-6 / self.unit
 
-    def clock_rate(self, span_us: int) -> float:
+    def relative_times_per_second(self, span_us: int) -> float:
         """Return the change of `s` per second, over `span_us` us before and after the target."""
-        begin, end = self.relative_times(self.t[self.target] + np.array([-span_us, span_us]))
+        begin, end = self.to_relative_times(self.t[self.target] + np.array([-span_us, span_us]))
         return float(end - begin) / (2e-6 * span_us)
 
-    def with_clock(self, clock: MotionClock) -> "Instants":
+    def with_clock(self, clock: MotionClock) -> "TargetInstants":
         """Put the instants on another clock."""
         s, unit = _relative_times(clock, self.t, self.target)
         return dataclasses.replace(self, s=s, unit=unit, clock=clock)
@@ -168,7 +168,7 @@ def _relative_times(
     return (elapsed / unit).astype(np.float32), unit * 1e-6
 
 
-class Schedule:
+class InstantSchedule:
     """Chooses the instants of a target: frames around it, and a grid between the nearest two.
 
     Args:
@@ -197,7 +197,7 @@ class Schedule:
         )  # us
         self.max_distance = MAX_FRAME_MOTION_PX / speed_px_s * 1e6  # us, of further frames
 
-    def __call__(self, t: int) -> Instants:
+    def __call__(self, t: int) -> TargetInstants:
         """Choose the instants of the target at a time (us)."""
         frames = self.frames
         right = int(np.searchsorted(frames, t, "right"))  # of frames at t, none is left or right
@@ -217,9 +217,9 @@ class Schedule:
         horizon = float(min(max(first_step, float(far[min(4, len(far) - 1)])), 1))
         rest = 0.0
         if len(nearest) == 1 and left == right:
-            rate = self.clock.relative_rate(*sorted((int(times[nearest[0]]), t)))
+            rate = self.clock.relative_event_rate(*sorted((int(times[nearest[0]]), t)))
             rest = 1 / (1 + (rate / MAX_REST_RATE) ** 2)
-        return Instants(times, target, before, after, s, unit, horizon, self.clock, rest)
+        return TargetInstants(times, target, before, after, s, unit, horizon, self.clock, rest)
 
     def _near_frames(self, t: int) -> set[int]:
         """Return the times (us) of the frames to use around a time (us)."""
@@ -290,7 +290,7 @@ def pad_instant_count(count: int) -> int:
     return -(-count // INSTANT_COUNT_MULTIPLE) * INSTANT_COUNT_MULTIPLE
 
 
-def merge_instants(targets: Sequence[Instants]) -> NDArray[np.int64]:
+def merge_instant_times(targets: Sequence[TargetInstants]) -> NDArray[np.int64]:
     """Merge the times (us) of several targets, sorted and padded to a power of two by the last.
 
     Windows of a fit so share their programs, each of which takes 15 s to compile.

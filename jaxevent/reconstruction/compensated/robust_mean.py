@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.deprecated import renamed_names
-from jaxevent.reconstruction.compensated.instants import Instants
+from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     WarpedImages,
@@ -42,10 +42,10 @@ class InstantLayout(NamedTuple):
     # Index of the frame that `before` is compared with: `after`, and where frames are on one side
     # alone the next nearest; where there is none, `before`.
     other: Numeric
-    rest: Numeric = np.float32(0)  # (), `Instants.rest`
+    rest: Numeric = np.float32(0)  # (), `TargetInstants.rest`
 
 
-def make_layout(instants: Instants, clear: NDArray, count: int) -> InstantLayout:
+def make_layout(instants: TargetInstants, clear: NDArray, count: int) -> InstantLayout:
     """Lay out a target's instants as arrays.
 
     Args:

@@ -255,7 +255,7 @@ def change_clock(
     return np.einsum("ab,ijbc->ijac", change, paths).reshape(p.shape).astype(np.float32)
 
 
-class Stage(NamedTuple):
+class RefinementStage(NamedTuple):
     """Steps at some resolutions, with the instants within a horizon."""
 
     horizon: float  # in units of `s`
@@ -263,7 +263,7 @@ class Stage(NamedTuple):
     steps: int  # at each level
 
 
-def plan_stages(s: NDArray, first_horizon: float, coarsest: int = 4) -> list[Stage]:
+def plan_stages(s: NDArray, first_horizon: float, coarsest: int = 4) -> list[RefinementStage]:
     """Plan a search from no motion, whose horizon doubles until it has all instants.
 
     Args:
@@ -276,10 +276,10 @@ def plan_stages(s: NDArray, first_horizon: float, coarsest: int = 4) -> list[Sta
     """
     whole = float(np.abs(s).max())
     horizon = min(first_horizon, whole)
-    plan = [Stage(horizon, tuple(range(coarsest, 1, -1)), 3)]
+    plan = [RefinementStage(horizon, tuple(range(coarsest, 1, -1)), 3)]
     while plan[-1].horizon < whole * 0.999:
-        plan.append(Stage(min(plan[-1].horizon * 2, whole), (2, 1), 2))
-    return [*plan, Stage(whole, (1,), 2)]
+        plan.append(RefinementStage(min(plan[-1].horizon * 2, whole), (2, 1), 2))
+    return [*plan, RefinementStage(whole, (1,), 2)]
 
 
 def node_shape(height: int, width: int, level: int) -> tuple[int, int]:
@@ -321,7 +321,7 @@ class NodeTrajectories(NamedTuple):
 
 
 def estimate_trajectories(
-    pyramid: ImagePyramid, s: NDArray[np.float32], plan: list[Stage], cost: CostParams
+    pyramid: ImagePyramid, s: NDArray[np.float32], plan: list[RefinementStage], cost: CostParams
 ) -> NodeTrajectories:
     """Estimate trajectories from no motion, by all stages of a plan.
 
@@ -365,7 +365,7 @@ def _advect(begin, end, p, s, out):
                 out[i, j, c] += np.float32(2) * out[i, j, c + 2] * s
 
 
-def advect(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]:
+def advect_nodes(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]:
     """Carry trajectories to another target: those of the points that are visible there.
 
     Args:

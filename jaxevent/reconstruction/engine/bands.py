@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.graph import TranslationError
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.frames import FrameImages, Timing
+from jaxevent.reconstruction.frames import EventTiming, FrameImages
 from jaxevent.reconstruction.stream import EventStream, StreamState, event_weights
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
@@ -32,7 +32,7 @@ MAX_PASS_PIXELS = 1 << 22  # made in one pass, 9 bytes each
 N_IMAGE_BUFFERS = 2  # the last images are held while the next ones are made
 
 
-class Bands(NamedTuple):
+class EventBands(NamedTuple):
     """Events divided among bands, and the rows of each band."""
 
     events: NDArray[np.int64]  # time since the recording's start (us), place in the band, polarity
@@ -145,7 +145,7 @@ class BandLayout:
         width: int,
         origin_us: int,
         out_events: NDArray[np.int64],
-    ) -> Bands | None:
+    ) -> EventBands | None:
         """Divide events among the bands, in order of time.
 
         Every event is given to each band that it lies in or borders on.
@@ -175,7 +175,7 @@ class BandLayout:
         total = int(first[-1])
         events = out_events if len(out_events) >= total else np.empty(total + total // 4, np.int64)
         weights = np.empty(total if len(weight) else 0, weight.dtype)
-        bands = Bands(events, weights, first, self.edges, width, self.stride)
+        bands = EventBands(events, weights, first, self.edges, width, self.stride)
         in_order = _partition(
             stored, weight, self._rows(width), origin_us, first.astype(np.uint64), bands
         )
@@ -258,7 +258,7 @@ class PartitionedRecording:
     def __init__(
         self,
         recording: Recording,
-        timing: Timing,
+        timing: EventTiming,
         filtering: bool,
         events: int | None = None,
         factors: NDArray[np.floating] | None = None,
@@ -302,7 +302,7 @@ class PartitionedRecording:
 
     def partition(
         self, state: StreamState, begin_row: int, end_row: int
-    ) -> tuple[Bands, StreamState]:
+    ) -> tuple[EventBands, StreamState]:
         """Divide the events of a range of rows among the bands.
 
         Bands that were made before are overwritten.
@@ -344,7 +344,7 @@ class PartitionedRecording:
             raise InputError(f"{name}: events changed while they were read; make a new recording")
         return bands, state
 
-    def _bands_of(self, stored: EventColumns, weight: NDArray) -> Bands | None:
+    def _bands_of(self, stored: EventColumns, weight: NDArray) -> EventBands | None:
         width = self.recording.width
         bands = self.layout.partition(stored, weight, width, self.origin, self._events)
         if bands is not None:

@@ -17,7 +17,7 @@ from jaxevent.codegen.derivative import DerivativeDirections, parse_derivative
 from jaxevent.codegen.module import CompiledProgram
 from jaxevent.reconstruction.engine.bands import (
     NEVER_US,
-    Bands,
+    EventBands,
     ExposureSums,
     FrameRows,
     ImageBuffers,
@@ -64,7 +64,7 @@ class BandedWindow(NamedTuple):
 
     start: int | None  # us
     stop: int | None
-    bands: Bands
+    bands: EventBands
     line: Timeline
     frames: FrameRows
     context: StreamState  # of weighted events
@@ -291,7 +291,7 @@ class BandMemory(NamedTuple):
 class WindowInputs(NamedTuple):
     """Arguments of a pass over a window."""
 
-    bands: Bands
+    bands: EventBands
     line: Timeline
     steps: EntrySteps
     frames: FrameRows
@@ -336,15 +336,15 @@ class PassRequest(NamedTuple):
 
 
 @njit_noalloc
-def filter_events(begin, end, given, memory, request):
+def filter_events(begin, end, inputs, memory, request):
     """Pass over the events of some bands, and make images."""
     enter, until, times, images = request
-    bands, line, functions, steps = given.bands, given.line, given.functions, given.steps.step
-    first, edges, starts, ends = bands.first, bands.edges, line.start, given.steps.end
+    bands, line, functions, steps = inputs.bands, inputs.line, inputs.functions, inputs.steps.step
+    first, edges, starts, ends = bands.first, bands.edges, line.start, inputs.steps.end
     width, weighted = np.int64(bands.width), np.int64(len(bands.weights) > 0)
     padded, pixels, places = width + 2, images.mean.shape[1], memory.place
     size = np.int64(images.derivatives.shape[2] * images.derivatives.shape[3])
-    numbers, events, weights = given.numbers.ctypes, bands.events.ctypes, bands.weights.ctypes
+    numbers, events, weights = inputs.numbers.ctypes, bands.events.ctypes, bands.weights.ctypes
     mean, variance, valid = images.mean.ctypes, images.variance.ctypes, images.valid.ctypes
     derivatives, uniform = images.derivatives.ctypes, line.uniform.ctypes
     for band in range(begin, end):
@@ -360,7 +360,7 @@ def filter_events(begin, end, given, memory, request):
             )
         while True:
             if entering:
-                _take_steps(steps, ends[s], ends[s + 1], given, band, memory)
+                _take_steps(steps, ends[s], ends[s + 1], inputs, band, memory)
                 functions.tables(
                     line.variant[s], cells, padded, last_own, numbers, uniform,
                     s * line.uniform.shape[1], scratch,
@@ -430,9 +430,9 @@ class FilterPasses:
         )
         self._fixed = recording.fixed_inputs(clock_offset)
         self.kernel: CompiledProgram | None = None
-        self.use(params)
+        self.use_params(params)
 
-    def use(self, params: Any) -> None:
+    def use_params(self, params: Any) -> None:
         """Go on with other parameters."""
         kernel = filter_kernel(self._method, params, self._fixed, self.kind)
         if self.kernel is None or self.kernel.places is not kernel.places:
@@ -457,38 +457,38 @@ class FilterPasses:
     def run(
         self,
         window: BandedWindow,
-        until: int,
-        times: NDArray | None = None,
-        images: ImageBuffers | None = None,
-        enter: tuple[int, int] = (-1, 0),
+        until_us: int,
+        times_us: NDArray | None = None,
+        out_images: ImageBuffers | None = None,
+        entry_point: tuple[int, int] = (-1, 0),
     ) -> None:
         """Pass over the window's events before a time.
 
         Args:
             window: The window.
-            until: Time, us since the recording's start.
-            times: Sorted times of images before `until`, us since the recording's start.
-            images: Where the images are written.
-            enter: See `PassRequest`.
+            until_us: Time, us since the recording's start.
+            times_us: Sorted times of images before `until_us`, us since the recording's start.
+            out_images: Where the images are written.
+            entry_point: See `PassRequest`.
         """
         places, kernel = self.fields.places, self.kernel
         assert kernel is not None
-        if enter[0] >= 0:
-            self._steps = entry_steps(places, window.line, window.frames, enter)
+        if entry_point[0] >= 0:
+            self._steps = entry_steps(places, window.line, window.frames, entry_point)
         given = WindowInputs(
             window.bands, window.line, self._steps, window.frames, places.total, kernel.functions,
             kernel.numbers,
         )  # fmt: skip
-        if times is None or images is None:
-            times, images = np.empty(0, np.int64), self.image_buffers(0, 0)
+        if times_us is None or out_images is None:
+            times_us, out_images = np.empty(0, np.int64), self.image_buffers(0, 0)
         n_bands = self.recording.layout.bands
-        request = PassRequest(enter, until, times, images)
+        request = PassRequest(entry_point, until_us, times_us, out_images)
         run_over_rows(filter_events, n_bands, given, self._memory, request)
 
-    def image_buffers(self, times: int, pixels: int) -> ImageBuffers:
+    def image_buffers(self, n_times: int, n_pixels: int) -> ImageBuffers:
         """Make buffers for images, and for derivatives of those that have any."""
         return ImageBuffers.empty(
-            times, pixels, self.kind.dtype, len(self.fields.outputs), self.fields.lanes
+            n_times, n_pixels, self.kind.dtype, len(self.fields.outputs), self.fields.lanes
         )
 
     def init(self, window: BandedWindow) -> None:
@@ -496,7 +496,7 @@ class FilterPasses:
         self._memory.last[:] = 0
         line, fields, memory = window.line, self.fields, self._memory
         interval = int(np.searchsorted(line.start, 0, "right")) - 1
-        self.run(window, -NEVER_US, enter=(interval, 0))
+        self.run(window, -NEVER_US, entry_point=(interval, 0))
         uniform, addresses = line.uniform[interval], fields.addresses()
         position = {
             "weight.0": -line.begin[interval] * line.rate[interval],
@@ -520,14 +520,14 @@ class FilterPasses:
                 fields.of_bands(name, memory.cells, memory.whole)[:] = values
             elif derivative[0] in fields.states:
                 records[:, :, fields.states[derivative[0]] + derivative[1]] = values
-        self.run(window, -NEVER_US, enter=(0, -NEVER_US))
+        self.run(window, -NEVER_US, entry_point=(0, -NEVER_US))
 
-    def resume(self, window: BandedWindow, states: PixelStates, now: int) -> None:
+    def resume(self, window: BandedWindow, states: PixelStates, now_us: int) -> None:
         """Enter a later window at its beginning (us since the recording's start)."""
         memory = self._memory
         memory.cells[:, : states.cells.shape[1]] = states.cells
         memory.whole[:], memory.last[:] = states.whole, states.last
-        self.run(window, -NEVER_US, enter=(0, now))
+        self.run(window, -NEVER_US, entry_point=(0, now_us))
 
     def copy_states(self) -> PixelStates:
         """Copy the state, without derivatives."""

@@ -46,7 +46,7 @@ from jaxevent.codegen.trace import (
     trace_function,
 )
 from jaxevent.codegen.write import Address, ModuleText, ModuleWriter
-from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Segments
+from jaxevent.reconstruction.features import ExposureSegments, FrameFeatures, ImagePoints
 
 N_PIECE_FRAMES = 3  # frames that a piece rests on
 NO_IMAGE_WIDTH = 104_729  # one pixel is no image: a function that makes one of it fails
@@ -153,7 +153,7 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
     given |= {name: array(kind=whole) for name in ("piece", "frame", "polarity")}
 
     def frame_features(v: dict[str, Any]) -> FrameFeatures:
-        segments = Segments(*(v[name] for name in SEGMENT_INPUTS)) if exposed else None
+        segments = ExposureSegments(*(v[name] for name in SEGMENT_INPUTS)) if exposed else None
         made: dict[str, Any] = {f.name: v.get(f.name) for f in dataclasses.fields(FrameFeatures)}
         made |= {"segments": segments, "width": NO_IMAGE_WIDTH}
         return FrameFeatures(**made)

@@ -46,8 +46,8 @@ from jaxevent.reconstruction.engine.filter_loop import (
 )
 from jaxevent.reconstruction.engine.filter_program import check_filter_kernel
 from jaxevent.reconstruction.engine.smoother_loop import (
+    FrameSegment,
     ImageTimes,
-    Segment,
     SegmentInputs,
     SmootherPasses,
     filter_frames,
@@ -61,7 +61,7 @@ from jaxevent.reconstruction.engine.smoother_program import (
     SmoothingMethod,
 )
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import FrameClock, Timing
+from jaxevent.reconstruction.frames import EventTiming, FrameClock
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.video import MAX_WINDOW_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
@@ -111,7 +111,7 @@ class FilterVideo(ImageSequence[P]):
     ):
         super().__init__(estimator, recording, params, progress=progress)
         self._partitioned = PartitionedRecording(
-            recording, Timing.of(params), estimator.is_event_driven, window_events
+            recording, EventTiming.of(params), estimator.is_event_driven, window_events
         )
         # Divided for the parameters' own clock: the lag is exactly 0.
         self._passes = FilterPasses(self._partitioned, estimator, params, params.clock_offset)
@@ -181,16 +181,16 @@ class FilterVideo(ImageSequence[P]):
         return window
 
 
-def _make_segments(clock: FrameClock, recording: Recording, events: int) -> list[Segment]:
+def _make_segments(clock: FrameClock, recording: Recording, events: int) -> list[FrameSegment]:
     """Divide frames into segments of so many events, one frame at least."""
     most = max(6, MAX_SEGMENT_FRAME_PIXELS // (recording.width * recording.height))
     rows = [recording.events.index(int(np.ceil(t)) + clock.origin) for t in clock.mid]
     rows.append(len(recording.events))
-    found, begin = list[Segment](), 0
+    found, begin = list[FrameSegment](), 0
     while begin < len(clock):
         end = int(np.searchsorted(rows, rows[begin] + events, "right")) - 1
         end = min(max(end, begin + 1), begin + most, len(clock))
-        found.append(Segment(begin, end))
+        found.append(FrameSegment(begin, end))
         begin = end
     return found
 
@@ -226,7 +226,7 @@ class SmootherVideo(ImageSequence[P]):
         super().__init__(estimator, recording, params, progress=progress)
         self._method = estimator
         partitioned = PartitionedRecording(
-            recording, Timing.of(params), False, window_events, factors
+            recording, EventTiming.of(params), False, window_events, factors
         )
         self._passes = SmootherPasses(partitioned, estimator, params, params.clock_offset)
         self._segments = _make_segments(self._passes.clock, recording, window_events)
@@ -379,7 +379,9 @@ class ImageKernel(abc.ABC):
     passes_class: ClassVar[type]
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
-        self.recording = PartitionedRecording(recording, Timing.of(params), method.is_event_driven)
+        self.recording = PartitionedRecording(
+            recording, EventTiming.of(params), method.is_event_driven
+        )
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
         self.clock_offset = np.asarray(params.clock_offset)
@@ -410,7 +412,7 @@ class ImageKernel(abc.ABC):
     def _key(self) -> tuple:
         return self.method, self.pixels, self.dtype.name
 
-    def passes_of(
+    def passes_with_derivatives(
         self,
         params: Any,
         directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
@@ -428,7 +430,7 @@ class ImageKernel(abc.ABC):
             self._passes[directions] = self.passes_class(
                 self.recording, self.method, params, self.clock_offset, directions
             )
-        self._passes[directions].use(params)
+        self._passes[directions].use_params(params)
         return self._passes[directions]
 
     @abc.abstractmethod
@@ -442,12 +444,12 @@ class ImageKernel(abc.ABC):
 
     @abc.abstractmethod
     def make(
-        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+        self, times_us: NDArray[np.int64], params: Any, directions: DerivativeDirections
     ) -> ImageBuffers:
         """Make images and their derivatives.
 
         Args:
-            times: Sorted times, us since the recording's start.
+            times_us: Sorted times, us since the recording's start.
             params: Parameters of the method.
             directions: Numbers by which derivatives are taken.
 
@@ -488,17 +490,17 @@ class FilterImages(ImageKernel):
         self._window = cut_window(self.recording, None, self.recording.windows.initial())
 
     def check(self, params: Any, directions: DerivativeDirections) -> None:
-        kind = self.passes_of(params).kind._replace(directions=directions)
+        kind = self.passes_with_derivatives(params).kind._replace(directions=directions)
         fixed = self.recording.fixed_inputs(self.clock_offset)
         check_filter_kernel(self.method, params, fixed, kind)
 
     def make(
-        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+        self, times_us: NDArray[np.int64], params: Any, directions: DerivativeDirections
     ) -> ImageBuffers:
-        passes = self.passes_of(params, directions)
+        passes = self.passes_with_derivatives(params, directions)
         passes.init(self._window)
-        images = passes.image_buffers(len(times), self.pixels)
-        passes.run(self._window, int(times[-1]) + 1 if len(times) else 0, times, images)
+        images = passes.image_buffers(len(times_us), self.pixels)
+        passes.run(self._window, int(times_us[-1]) + 1 if len(times_us) else 0, times_us, images)
         return images
 
 
@@ -509,18 +511,18 @@ class SmootherImages(ImageKernel):
 
     def __init__(self, method: Any, recording: Recording, times: NDArray[np.int64], params: Any):
         super().__init__(method, recording, times, params)
-        passes = self.passes_of(params)
-        self._whole = Segment(0, len(passes.clock))
+        passes = self.passes_with_derivatives(params)
+        self._whole = FrameSegment(0, len(passes.clock))
         self._bands, _ = passes.partition(self._whole, self.recording.windows.initial())
 
     def check(self, params: Any, directions: DerivativeDirections) -> None:
         SmootherPasses(self.recording, self.method, params, self.clock_offset, directions)
 
     def make(
-        self, times: NDArray[np.int64], params: Any, directions: DerivativeDirections
+        self, times_us: NDArray[np.int64], params: Any, directions: DerivativeDirections
     ) -> ImageBuffers:
-        passes = self.passes_of(params, directions)
-        images, image_times = passes.image_buffers(len(times)), passes.image_times(times, 0)
+        passes = self.passes_with_derivatives(params, directions)
+        images, image_times = passes.image_buffers(len(times_us)), passes.image_times(times_us, 0)
         given = passes.inputs(self._whole, self._bands, np.zeros(passes.layout.bands, np.int64))
         run_over_rows(_smooth_bands, passes.layout.bands, passes, given, image_times, images)
         return images

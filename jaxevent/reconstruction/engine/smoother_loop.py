@@ -16,7 +16,7 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.reconstruction.engine.bands import (
     BandLayout,
-    Bands,
+    EventBands,
     ExposureSums,
     FrameRows,
     ImageBuffers,
@@ -77,7 +77,7 @@ class SegmentScratch(NamedTuple):
 class SegmentInputs(NamedTuple):
     """Arguments of passes over a segment of frames."""
 
-    bands: Bands
+    bands: EventBands
     line: FrameTimeline
     frames: FrameRows
     places: SmootherPlaces
@@ -106,21 +106,21 @@ class LastEvents(NamedTuple):
     rate: NDArray[np.float64]  # of its count until the next event, 1/us; of OFF events negative
 
 
-def spread_rates(bands: Bands, reach: int) -> NDArray[np.float64]:
+def spread_rates(bands: EventBands, reach_us: int) -> NDArray[np.float64]:
     """Return the rate at which a pixel's count grows from each event to the next.
 
-    An event is late: where no more than `reach` lies between two, the second's change is spread
-    over that time (`Timing`). Else the rate is 0, as after one at the recording's start.
+    An event is late: where no more than `reach_us` lies between two, the second's change is spread
+    over that time (`EventTiming`). Else the rate is 0, as after one at the recording's start.
 
     Args:
         bands: The events.
-        reach: Longest time over which a change is spread, us.
+        reach_us: Longest time over which a change is spread, us.
 
     Returns:
         (events,) rates, 1/us; of OFF events negative.
     """
     rates = np.zeros(bands.first[-1])
-    _fill_spread_rates(bands, reach, np.empty(bands.stride, np.int64), rates)
+    _fill_spread_rates(bands, reach_us, np.empty(bands.stride, np.int64), rates)
     return rates
 
 
@@ -250,49 +250,49 @@ def _measure_clipped(k, row, given, cells, begin, end):
 
 
 @njit_noalloc
-def filter_frames(begin, end, given, memory, starts, linked):
+def filter_frames(begin, end, inputs, memory, starts, linked):
     """Pass forwards over a segment of frames; its state is the one before the first frame.
 
     Afterwards it is that before the frame after the last. `starts`: the recording does here.
     """
-    bands, line, places, functions = given.bands, given.line, given.places, given.functions
-    numbers, stride, counts = given.numbers, places.stride, places.counts
+    bands, line, places, functions = inputs.bands, inputs.line, inputs.places, inputs.functions
+    numbers, stride, counts = inputs.numbers, places.stride, places.counts
     padded, fields = np.int64(bands.width + 2), (counts[0] * stride, counts[1] * stride)
-    above, last_events = given.scratch.sums[begin, :stride], _init_last(given.scratch, begin)
+    above, last_events = inputs.scratch.sums[begin, :stride], _init_last(inputs.scratch, begin)
     for band in range(begin, end):
-        cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
+        cells, rows = memory[inputs.slot[band]], bands.edges[band + 1] - bands.edges[band]
         first, last = padded, (rows + 1) * padded
         if starts:
             functions.start(cells.ctypes, numbers.ctypes, 0, first, last, 0.0, 0.0, 0.0)
         for k in range(len(line.mid)):
             row = np.int64((places.work + k * places.row) * stride)
-            _load_frame(band, k, given, cells, last_events, begin)
-            gain, seconds = np.float64(given.frames.gain[k]), line.seconds[k]
+            _load_frame(band, k, inputs, cells, last_events, begin)
+            gain, seconds = np.float64(inputs.frames.gain[k]), line.seconds[k]
             functions.frame(
                 cells.ctypes, numbers.ctypes, row, first, last, gain, line.exists[k], 0.0
             )
             if places.censored:
-                _measure_clipped(k, row, given, cells, first, last)
+                _measure_clipped(k, row, inputs, cells, first, last)
             span = line.mid[k], line.following[k]
-            _count_between(given, band, span, cells, fields, last_events)
-            _sum_neighbours(given, band, cells, above)
+            _count_between(inputs, band, span, cells, fields, last_events)
+            _sum_neighbours(inputs, band, cells, above)
             functions.move(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
             if linked:
                 functions.link(cells.ctypes, numbers.ctypes, row, first, last, seconds, 0.0, 0.0)
 
 
 @njit_noalloc
-def smooth_frames(begin, end, given, memory):
+def smooth_frames(begin, end, inputs, memory):
     """Pass backwards; the message of the frames after the segment is known at the next one."""
-    bands, line, places = given.bands, given.line, given.places
+    bands, line, places = inputs.bands, inputs.line, inputs.places
     padded = np.int64(bands.width + 2)
     for band in range(begin, end):
-        cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
+        cells, rows = memory[inputs.slot[band]], bands.edges[band + 1] - bands.edges[band]
         for j in range(len(line.mid)):
             k = len(line.mid) - 1 - j
             row = np.int64((places.work + k * places.row) * places.stride)
-            given.functions.back(
-                cells.ctypes, given.numbers.ctypes, row, padded, (rows + 1) * padded,
+            inputs.functions.back(
+                cells.ctypes, inputs.numbers.ctypes, row, padded, (rows + 1) * padded,
                 line.seconds[k], 0.0, 0.0,
             )  # fmt: skip
 
@@ -343,50 +343,51 @@ def _count_until(given, band, now, cells, last):
 
 
 @njit_noalloc
-def read_images(begin, end, given, memory, times, images):
+def read_images(begin, end, inputs, memory, times, out_images):
     """Make images at sorted times of a smoothed segment."""
-    bands, places, functions = given.bands, given.places, given.functions
-    numbers, stride = given.numbers, places.stride
-    width, pixels = np.int64(bands.width), images.mean.shape[1]
-    size = np.int64(images.derivatives.shape[2] * images.derivatives.shape[3])
-    padded, last = width + 2, _init_last(given.scratch, begin)
-    above, so_far = given.scratch.sums[begin, :stride], given.scratch.sums[begin, stride:]
+    bands, places, functions = inputs.bands, inputs.places, inputs.functions
+    numbers, stride = inputs.numbers, places.stride
+    width, pixels = np.int64(bands.width), out_images.mean.shape[1]
+    size = np.int64(out_images.derivatives.shape[2] * out_images.derivatives.shape[3])
+    padded, last = width + 2, _init_last(inputs.scratch, begin)
+    above, so_far = inputs.scratch.sums[begin, :stride], inputs.scratch.sums[begin, stride:]
     for band in range(begin, end):
-        cells, rows = memory[given.slot[band]], bands.edges[band + 1] - bands.edges[band]
+        cells, rows = memory[inputs.slot[band]], bands.edges[band + 1] - bands.edges[band]
         known, i = -1, np.int64(0)
         for image in range(len(times.time)):
             f, now = times.frame[image], times.time[image]
             row = np.int64((places.work + max(f, 0) * places.row) * stride)
             at = np.int64(image * pixels + bands.edges[band] * width)
             if f < 0:
-                _count_until(given, band, now, cells, last)
+                _count_until(inputs, band, now, cells, last)
             else:
-                i = _count_since(given, band, (f, now), (known, i), cells, (so_far, last))
+                i = _count_since(inputs, band, (f, now), (known, i), cells, (so_far, last))
                 known = f
-            _sum_neighbours(given, band, cells, above)
+            _sum_neighbours(inputs, band, cells, above)
             if f < 0:
                 functions.before(
                     cells.ctypes, numbers.ctypes, row, rows, width, padded,
-                    times.seconds[image], 0.0, 0.0, images.mean.ctypes, images.variance.ctypes,
-                    images.valid.ctypes, images.derivatives.ctypes, size, at,
+                    times.seconds[image], 0.0, 0.0,
+                    out_images.mean.ctypes, out_images.variance.ctypes,
+                    out_images.valid.ctypes, out_images.derivatives.ctypes, size, at,
                 )  # fmt: skip
             else:
                 functions.show(
                     cells.ctypes, numbers.ctypes, row, rows, width, padded,
                     times.elapsed[image], times.seconds[image], times.here[image],
-                    images.mean.ctypes, images.variance.ctypes, images.valid.ctypes,
-                    images.derivatives.ctypes, size, at,
+                    out_images.mean.ctypes, out_images.variance.ctypes, out_images.valid.ctypes,
+                    out_images.derivatives.ctypes, size, at,
                 )  # fmt: skip
 
 
-class Segment(NamedTuple):
+class FrameSegment(NamedTuple):
     """Frames that are smoothed together."""
 
     begin: int
     end: int
 
 
-def _make_timeline(clock: FrameClock, segment: Segment) -> FrameTimeline:
+def _make_timeline(clock: FrameClock, segment: FrameSegment) -> FrameTimeline:
     begin, end = segment
     mid = clock.mid[max(begin - 1, 0) : end + 1]
     gap = np.diff(mid)
@@ -461,21 +462,23 @@ class SmootherPasses:
         self._fixed = {name: fixed[name] for name in ("clock_offset", "response")}
         self._program: SmootherProgram | None = None
         self.spare: queue.SimpleQueue[NDArray] = queue.SimpleQueue()  # memory for bands
-        self.use(params)
+        self.use_params(params)
         sensor = recording.recording
         self.fractions = _neighbour_fractions(self.layout, sensor.width, sensor.height)
 
-    def use(self, params: Any) -> None:
+    def use_params(self, params: Any) -> None:
         """Go on with other parameters."""
         self.kernel = smoother_kernel(self._method, params, self._fixed, self.kind)
         if self._program is not self.kernel.program:
             self._program, self.spare = self.kernel.program, queue.SimpleQueue()
         self.places = _places(self.kernel.program, self.kind.stride, self.kind.exposed)
 
-    def memory(self, bands: int, frames: int) -> NDArray:
+    def memory(self, n_bands: int, n_frames: int) -> NDArray:
         """Make memory for so many bands and frames of each, [bands, ...]."""
         places = self.places
-        memory = np.zeros((bands, (places.work + frames * places.row) * places.stride), self.dtype)
+        memory = np.zeros(
+            (n_bands, (places.work + n_frames * places.row) * places.stride), self.dtype
+        )
         for name in (*IMAGE_FIELDS, *STATE_FIELDS, *LATER_FIELDS):
             self.field(memory, f"{name}.0")[:] = 0.5  # where there are no pixels, too
         return memory
@@ -485,7 +488,9 @@ class SmootherPasses:
         at, stride = self.kernel.program.work.index(number), self.places.stride
         return memory[:, at * stride : (at + 1) * stride]
 
-    def partition(self, segment: Segment, state: StreamState) -> tuple[Bands, StreamState]:
+    def partition(
+        self, segment: FrameSegment, state: StreamState
+    ) -> tuple[EventBands, StreamState]:
         """Divide the events around a segment of frames among the bands.
 
         Returns:
@@ -503,7 +508,9 @@ class SmootherPasses:
             rows[1] = source.index(int(np.ceil(last)) + clock.origin + reach)
         return self.recording.partition(state, *rows)
 
-    def inputs(self, segment: Segment, bands: Bands, slot: NDArray[np.int64]) -> SegmentInputs:
+    def inputs(
+        self, segment: FrameSegment, bands: EventBands, slot: NDArray[np.int64]
+    ) -> SegmentInputs:
         """Return the arguments of passes over a segment; each band has a `slot` of the memory."""
         reach, n, stride = self.recording.windows.reach, self.layout.bands, self.kind.stride
         scratch = SegmentScratch(
@@ -517,21 +524,21 @@ class SmootherPasses:
             spread_rates(bands, reach) if reach else np.empty(0), reach, scratch,
         )  # fmt: skip
 
-    def image_buffers(self, times: int) -> ImageBuffers:
+    def image_buffers(self, n_times: int) -> ImageBuffers:
         """Make buffers for images, and for derivatives of those that have any."""
         directions, pixels = self.kind.directions, self.recording.windows.pixels
         of = (len(directions.of), directions.lanes) if directions.numbers else (0, 0)
-        return ImageBuffers.empty(times, pixels, self.dtype, *of)
+        return ImageBuffers.empty(n_times, pixels, self.dtype, *of)
 
-    def frame_before(self, times: NDArray) -> NDArray[np.int64]:
+    def frame_before(self, times_us: NDArray) -> NDArray[np.int64]:
         """Return the frame before times (us since the recording's start), -1 before the first."""
-        return np.searchsorted(self.clock.mid, times.astype(float), "right") - 1
+        return np.searchsorted(self.clock.mid, times_us.astype(float), "right") - 1
 
-    def image_times(self, times: NDArray, begin: int) -> ImageTimes:
+    def image_times(self, times_us: NDArray, first_frame: int) -> ImageTimes:
         """Locate times that lie in a segment which begins with that frame."""
-        mid, frame = self.clock.mid, self.frame_before(times)
+        mid, frame = self.clock.mid, self.frame_before(times_us)
         behind, following = frame < 0, np.minimum(frame + 1, len(mid) - 1)
-        elapsed = np.where(behind, 0, 1e-6 * (times - mid[np.maximum(frame, 0)]))
-        left = np.where(frame + 1 < len(mid), 1e-6 * (mid[following] - times), 0)
+        elapsed = np.where(behind, 0, 1e-6 * (times_us - mid[np.maximum(frame, 0)]))
+        left = np.where(frame + 1 < len(mid), 1e-6 * (mid[following] - times_us), 0)
         here = (~behind & (elapsed < 1e-6)).astype(float)
-        return ImageTimes(times, np.where(behind, -1, frame - begin), elapsed, left, here)
+        return ImageTimes(times_us, np.where(behind, -1, frame - first_frame), elapsed, left, here)
