@@ -318,7 +318,7 @@ def test_general_motion_is_written_too(tmp_path):
         motion_of(known, ~lost), cloud=np.zeros((len(known.t), 3, 6)) + known.values[:, None]
     )
     output = pictures.Output(tmp_path / "out")
-    written = output.write(recording, motion, {}, lambda _: pictures.BlobTruth(known, "itself"))
+    written = output.write(recording, motion, {}, lambda _: pictures.Truth(known, "itself"))
     header, table = read_table(tmp_path / "out" / "motion.csv")
     names = ["tx", "ty", "tz", "wx", "wy", "wz"]
     assert header == ["t", *names, *(f"sigma_{name}" for name in names), "lost"]

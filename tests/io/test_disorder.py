@@ -33,7 +33,7 @@ def examined(t, pieces=1, **options):
 def mended(t, how, pieces=1):
     """Times, and the rows of the events in `t`, after a repair of blocks of events."""
     repair = disorder.parse_repair(how)
-    found = examined(t, pieces, bound=repair.bound)
+    found = examined(t, pieces, max_late_us=repair.bound)
     found.refuse_rest(repair, "here")
     rows = np.arange(len(t))
     blocks = [

@@ -149,8 +149,8 @@ def test_events_left_on_disk_need_no_memory(tmp_path):
     code = """
 import sys, tracemalloc
 from jaxevent.io import columns, decoded, load, tables
-decoded.BLOCK, columns.SAMPLE, tables.SAMPLE = 500, 500, 500
-tables._TEXT_BYTES, tables._TEXT_SAMPLE = 10_000, 8_000
+decoded.BLOCK_EVENTS = columns.SAMPLE_EVENTS = tables.SAMPLE_EVENTS = 500
+tables._TEXT_BLOCK_BYTES, tables._TEXT_SAMPLE_BYTES = 10_000, 8_000
 for path in sys.argv[1:]:
     for _ in range(2):
         tracemalloc.start()
