@@ -16,6 +16,7 @@ from jaxevent import cache, deprecated, dispatch, display
 if TYPE_CHECKING:
     from jaxevent import (
         blob,
+        calibration,
         camera,
         datasets,
         egomotion,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         show,
         simulate,
     )
+    from jaxevent.calibration import calibrate, check_consistency
     from jaxevent.errors import InputError, InputWarning
     from jaxevent.estimator import Estimate, Estimator
     from jaxevent.io import load, save
@@ -53,6 +55,7 @@ __version__ = "0.1.0"
 
 # Loaded when first used: the readers and the compiled preparation are slow to import.
 _HOMES = {
+    "jaxevent.calibration": ("calibrate", "check_consistency"),
     "jaxevent.errors": ("InputError", "InputWarning"),
     "jaxevent.estimator": ("Estimate", "Estimator"),
     "jaxevent.io": ("load", "save"),
@@ -69,7 +72,7 @@ _HOMES = {
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 _MODULES = {
-    **{name: name for name in ("blob", "camera", "datasets", "egomotion", "events")},
+    **{name: name for name in ("blob", "calibration", "camera", "datasets", "egomotion", "events")},
     **{name: name for name in ("metrics", "register", "show", "simulate")},
     "colour": "reconstruction.colour",
 }
@@ -90,9 +93,12 @@ __all__ = [
     "blend",
     "blob",
     "cache",
+    "calibrate",
+    "calibration",
     "camera",
     "cf",
     "cf_augmented",
+    "check_consistency",
     "colour",
     "datasets",
     "edi",

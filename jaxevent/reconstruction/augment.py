@@ -7,7 +7,7 @@ among the frames, `features.Points`) it looks the tables up.
 """
 
 import functools
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -16,10 +16,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.calibration import calibrate
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
+from jaxevent.recording import Recording
+
+
+T = TypeVar("T", bound="FrameParams")
 
 
 class FrameParams(Parameters):
@@ -42,6 +47,20 @@ class FrameParams(Parameters):
         gradient=False,
         most=1e6,
     )
+
+    @classmethod
+    def for_recording(cls: type[T], recording: Recording, **explicit: Any) -> T:
+        """Return parameters with the thresholds and the clock offset that a recording shows.
+
+        Args:
+            recording: Events and frames, which `jaxevent.calibrate` calibrates.
+            **explicit: Values that win over those found.
+
+        Returns:
+            The parameters.
+        """
+        I0 = float(cls(**explicit).I0)
+        return calibrate(recording, I0).params(cls, **explicit)
 
 
 class CertaintyParams(FrameParams):

@@ -1,0 +1,12 @@
+"""Calibration of a recording by itself: clock offset, contrast thresholds, noise and faults.
+
+calibration = jaxevent.calibrate(recording)
+params = calibration.params(jaxevent.akf.Params)
+findings = jaxevent.check_consistency(recording)
+"""
+
+from jaxevent.calibration.estimation import calibrate
+from jaxevent.calibration.faults import Fault, check_consistency
+from jaxevent.calibration.result import Calibration, CalibrationValue
+
+__all__ = ["CalibrationValue", "Calibration", "Fault", "calibrate", "check_consistency"]
