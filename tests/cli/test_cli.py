@@ -210,7 +210,16 @@ def test_help_and_version(capsys, monkeypatch):
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"jaxevent {jaxevent.__version__}\n"
     named = {"reconstruct": tuple(names("reconstruction")), "simulate": (*SCENES, *SENSORS)}
-    for command in ("demo", "info", "convert", "reconstruct", "evaluate", "fit", "simulate"):
+    for command in (
+        "demo",
+        "info",
+        "calibrate",
+        "convert",
+        "reconstruct",
+        "evaluate",
+        "fit",
+        "simulate",
+    ):
         with pytest.raises(SystemExit) as stop:
             cli.main([command, "--help"])
         assert stop.value.code == 0
