@@ -801,7 +801,7 @@ class MotionCompensation(ImageEstimator[Params]):
         """
         self.refuse_unknown({name: v for name, v in options.items() if name != "progress"})
         self.check_options(**options)
-        chosen = self.Params() if params is None else params
+        chosen = self.usual_params(recording) if params is None else params
         return CompensatedVideo(self, recording, chosen, **options)
 
 
