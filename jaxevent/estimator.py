@@ -297,7 +297,8 @@ class Estimator(abc.ABC, Generic[P]):
 
         Args:
             recording: Events, and frames if the estimator uses them.
-            params: Parameters; by default `Params()`.
+            params: Parameters; by default `Params()`, with what the recording shows of numbers in
+                `names_left_open`.
             **options: Options of the estimator, see `options`.
 
         Returns:

@@ -93,7 +93,7 @@ def describe_calibration(values: Any) -> str:
     notes: dict[str, list[str]] = {}
     for name, note in values.missing.items():
         notes.setdefault(note, []).append("clock" if name == "clock_offset" else name)
-    parts = [f"calibrated: {values}"] if values.found else []
+    parts = [f"calibrated: {values}" if values.found else "not calibrated"]
     parts += [f"{', '.join(names)} by default ({note})" for note, names in notes.items()]
     return f"{'; '.join(parts)} (jaxevent calibrate shows more; --no-calibrate turns it off)"
 

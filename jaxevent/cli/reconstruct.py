@@ -163,6 +163,7 @@ def run(
     colour: bool,
     out: Path,
 ) -> None:
+    from jaxevent.events.clocks import check_clocks
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.reconstruction.augment import calibrated_values
@@ -196,11 +197,12 @@ def run(
         estimator = find(usual, "reconstruction")
         table = _read_table(params, estimator, usual)
         values = estimator.Params.of(table)
+    names = estimator.names_left_open(table) if calibrate else ()
     if recording.frames is not None:
+        if names:
+            check_clocks(recording, values.clock_offset)
         _warn_of_faults(recording)
-    found = calibrated_values(
-        recording, values, estimator.names_left_open(table) if calibrate else ()
-    )
+    found = calibrated_values(recording, values, names)
     if found.found or found.missing:
         print(arguments.describe_calibration(found))
     values = values.replace(**found.found)

@@ -149,7 +149,7 @@ class ImageEstimator(Estimator[P]):
 
         Args:
             recording: Events and frames.
-            params: Parameters; the defaults if None.
+            params: Parameters; those of `usual_params` if None.
             **options: Options of the method.
 
         Returns:
@@ -288,7 +288,7 @@ class PixelEstimator(ImageEstimator[P]):
 
         Args:
             recording: Events and frames.
-            params: Parameters; the defaults if None.
+            params: Parameters; those of `usual_params` if None.
             **options: Options of `Video`.
 
         Returns:
@@ -352,7 +352,7 @@ class KernelEstimator(PixelEstimator[P]):
 
         Args:
             recording: Events and frames.
-            params: Parameters; the defaults if None.
+            params: Parameters; those of `usual_params` if None.
             compiler: "numba" or "xla", to demand one of the two.
             **options: Options of `Video`; those of `aks` include `factors`.
 

@@ -459,8 +459,8 @@ def _compute(
                 told = values_of(values)
         row = kind.score(recording, source, values, options, progress)
         sample = row.pop("sample", None)
-        told = row.pop("params", told)
-    row = {"recording": recording.name, "method": source.name, **row, "params": told}
+    row = {"recording": recording.name, "method": source.name, **row}
+    row.setdefault("params", told)
     return {"row": row, "picture": None if sample is None else picture(sample)}
 
 

@@ -268,7 +268,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             if rows is not None:
                 return _finished(rows, out, plan)
         sources = devices.on_all_processes(lambda: _sources(plan, progress))
-        plan = devices.on_all_processes(lambda: _calibrated(plan, sources))
+        plan = devices.on_all_processes(lambda: calibrated_plan(plan, sources))
         key = ""
         if out is not None or jax.process_count() > 1:
             key = devices.on_all_processes(plan.digest)
@@ -299,8 +299,16 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
     return fits
 
 
-def _calibrated(plan: Plan, sources: Sources) -> Plan:
-    """Return the plan with starts from the recordings."""
+def calibrated_plan(plan: Plan, sources: Sources) -> Plan:
+    """Return a plan whose fits start from what the recordings to fit show.
+
+    Args:
+        plan: The plan.
+        sources: Its recordings by split.
+
+    Returns:
+        The plan with other parameters to start from.
+    """
     tasks = [
         dataclasses.replace(task, params=task.goal.calibrate(sources, task.params, task.left_open))
         for task in plan.tasks

@@ -121,6 +121,7 @@ _SETTINGS: dict[str, Check] = {
     "rounds": NATURAL_CHECK,
     "batch": NATURAL_CHECK,
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+    "probe": (lambda value: isinstance(value, bool), "true or false"),
 }
 _COMMON: dict[str, Check] = {
     **_SETTINGS,

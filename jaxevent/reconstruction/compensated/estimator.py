@@ -790,7 +790,7 @@ class MotionCompensation(ImageEstimator[Params]):
 
         Args:
             recording: The recording.
-            params: Parameters; None: the defaults.
+            params: Parameters; None: those of `usual_params`.
             **options: Options of `CompensatedVideo`.
 
         Returns:
