@@ -495,7 +495,7 @@ def repeat(recording: Recording, times: int) -> Recording:
 
 def calibration_bench() -> tuple[dict[str, float], dict[str, float]]:
     """Measure calibration of a long recording: 30 M events, the packaged one end to end."""
-    recording = repeat(load(RECORDING_FILE), 90)
+    recording = repeat(load(str(RECORDING_FILE)), 90)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.h5"
         save(recording, path)

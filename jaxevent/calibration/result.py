@@ -154,4 +154,5 @@ class Calibration:
         Returns:
             The parameters.
         """
-        return kind(**self.select(kind.names_left_open(explicit)).found, **explicit)
+        found: dict[str, Any] = {**self.select(kind.names_left_open(explicit)).found}
+        return kind(**found, **explicit)

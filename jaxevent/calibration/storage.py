@@ -141,11 +141,11 @@ def decode(content: bytes) -> Calibration:
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         found = {name: archive[name] for name in archive.files}
     fields = json.loads(str(found.pop(_FIELDS)))
-    values = {
+    values: dict[str, Any] = {
         name: CalibrationValue(*value) if len(value) > 1 else value[0]
         for name, value in fields.items()
     }
-    return Calibration(**values, **found)
+    return Calibration(**{**values, **found})
 
 
 def format_toml(calibration: Calibration, I0: float, source: str) -> str:

@@ -86,7 +86,7 @@ def _figure(recording: Recording, path: Path) -> None:
         ("flow", "flow between frames"),
         ("mc", "mc, motion-compensated"),
     ):
-        method = find(name)
+        method: Any = find(name)
         try:
             values = method.usual_params(given)
             image, variance, _ = method.estimate(given, values)(frame_times(middle, values))
