@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,35 @@ class CalibrationValue(NamedTuple):
         return math.isfinite(self.value)
 
 
+class CalibratedValues(NamedTuple):
+    """Values that parameters take from a calibration.
+
+    | field | meaning |
+    |---|---|
+    | found | values by name |
+    | missing | notes of those that the data do not determine, by name |
+    """
+
+    found: dict[str, float]
+    missing: dict[str, str]
+
+    def __str__(self) -> str:
+        return ", ".join(format_calibrated(name, value) for name, value in self.found.items())
+
+
+def format_calibrated(name: str, value: float) -> str:
+    """Format a value of a calibration for a line, as "clock +7.8 ms".
+
+    Args:
+        name: Name of the parameter.
+        value: Its value.
+
+    Returns:
+        Words.
+    """
+    return f"clock {1e3 * value:+.1f} ms" if name == "clock_offset" else f"{name} {value:.3g}"
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Calibration:
     """Values that `calibrate` found in a recording.
@@ -55,20 +85,33 @@ class Calibration:
     offsets: NDArray[np.float64]
     correlations: NDArray[np.float64]
 
+    def values(self) -> dict[str, CalibrationValue]:
+        """Return all values with intervals, by name."""
+        return {name: v for name, v in vars(self).items() if isinstance(v, CalibrationValue)}
+
+    def select(self, names: Iterable[str]) -> CalibratedValues:
+        """Return the values of some names, and those that the data do not determine.
+
+        Args:
+            names: Names of fields, as of `Parameters.calibrated`.
+
+        Returns:
+            The values.
+        """
+        chosen = {name: getattr(self, name) for name in names}
+        return CalibratedValues(
+            {name: one.value for name, one in chosen.items() if one.is_identifiable},
+            {name: one.note for name, one in chosen.items() if not one.is_identifiable},
+        )
+
     def params(self, kind: type[Parameters], **explicit: Any) -> Any:
         """Return parameters of a method with the values that were found.
 
         Args:
             kind: Class of the parameters, as `jaxevent.akf.Params`.
-            **explicit: Values that win over those found.
+            **explicit: Values that win over those found; those of a preset do, too.
 
         Returns:
             The parameters.
         """
-        known = kind.settings()
-        found = {
-            name: getattr(self, name).value
-            for name in ("clock_offset", "c_on", "c_off")
-            if name in known and getattr(self, name).is_identifiable
-        }
-        return kind(**{**found, **explicit})
+        return kind(**self.select(kind.names_left_open(explicit)).found, **explicit)
