@@ -25,17 +25,17 @@ MIN_EVENTS = 4
 N_PARTS = 8  # of the pairs, each left out in turn for the error of the offset
 FAR_STEPS = 12  # lag at which events belong to other frames
 
-# Where a pixel of the events lies in the frames.
+# What brings events to the frames' pixels, and the same of the frames' changes, taken back.
 TRANSFORMS: Mapping[str, Callable[[NDArray], NDArray]] = MappingProxyType(
     {
         "": lambda image: image,
-        "the rows flipped": lambda image: image[::-1],
-        "the columns flipped": lambda image: image[:, ::-1],
+        "rows flipped": lambda image: image[::-1],
+        "columns flipped": lambda image: image[:, ::-1],
         "rows and columns flipped": lambda image: image[::-1, ::-1],
-        "x and y swapped": lambda image: image.T,
-        "x and y swapped and the columns flipped": lambda image: image.T[:, ::-1],
-        "x and y swapped and the rows flipped": lambda image: image.T[::-1],
-        "x and y swapped and both flipped": lambda image: image[::-1, ::-1].T,
+        "axes swapped": lambda image: image.T,
+        "axes swapped, then rows flipped": lambda image: image[::-1].T,
+        "axes swapped, then columns flipped": lambda image: image[:, ::-1].T,
+        "axes swapped, then rows and columns flipped": lambda image: image[::-1, ::-1].T,
     }
 )
 

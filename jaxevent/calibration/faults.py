@@ -174,7 +174,6 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
             "check the unit and the clock of both, or estimate the offset: jaxevent register",
         )  # fmt: skip
         if mismatch.is_disjoint:
-            yield from _check_brightness(sample, None)
             return
     agreement = measure_agreement(sample)
     yield from _check_brightness(sample, agreement)
@@ -209,14 +208,13 @@ def _check_relation(agreement: Agreement) -> Iterator[Fault]:
     found, significance = float(real[kind, lag]), float(abs(z[kind, lag]))
     name = list(TRANSFORMS)[kind]
     if found and (kind or found < 0) and abs(found) > MIN_ADVANTAGE * here:
-        inverse = "the opposite polarity" if found < 0 else ""
-        with_what = " and ".join(part for part in (name, inverse) if part)
+        inverse = "polarity inverted" if found < 0 else ""
+        changed = " and ".join(part for part in (name, inverse) if part)
         yield Fault(
             "flipped or swapped axes" if kind else "inverted polarity", significance, SIGMAS,
             f"events correlate with the changes of the frames by {here:.2f} at most, with "
-            f"{with_what} by {abs(found):.2f}",
-            f"give the events {with_what}"
-            + ("" if kind else ": p = ~p, or the file's other sign for ON"),
+            f"{changed} by {abs(found):.2f}",
+            f"make the recording of events with {changed}",
         )  # fmt: skip
     elif not found and agreement.activity > SIGMAS:
         yield Fault(
