@@ -60,6 +60,7 @@ DIFFERENCE_LOG_STEP = 0.02  # of differences, in logarithms, or in shares of a n
 MAX_TRUSTED_LOG_WIDTH = 2.0  # half widths in logarithms beyond which the curvature is not trusted
 MAX_RISE_RATIO = 4.0  # of a loss at an interval's ends and its rise by the curvature
 SMOOTHED_REACHES, N_SMOOTHED = (0.35, 0.7, 1.4, 2.8), 9  # unit steps, and points on such a line
+MIN_CURVATURE_ERRORS = 4.0  # of a smoothed loss, standard errors
 FIRST_SEARCH_STEP, MAX_DOUBLINGS, N_HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
 RUNAWAY_LOG_DISTANCE = math.log(10.0)  # distance from the start of a number that ran away
 BOUND_LOG_TOLERANCE = 0.25  # of a bound, in the same measure
@@ -373,10 +374,15 @@ def _smoothed_ends(
 ) -> list[float | None] | None:
     """Find the ends of the interval of a smoothed loss; None if it has no minimum near.
 
-    The line is the shortest that holds the interval.
+    The line is the shortest that holds the interval and tells the curvature to a quarter.
     """
     if sample.count < 3:
         return None
+
+    def standard_error(each: NDArray[np.float64]) -> float:
+        apart = (each - sample.shares @ each) * sample.shares
+        return math.sqrt(apart @ apart * sample.count / (sample.count - 1))
+
     for reach in SMOOTHED_REACHES:
         steps = np.linspace(-reach, reach, N_SMOOTHED)
         found = [objective(float(step)) for step in steps]
@@ -385,13 +391,11 @@ def _smoothed_ends(
             return None
         half_curvature, slope, _ = np.polyfit(steps, table, 2)
         H = 2 * sample.shares @ half_curvature
-        if not H > 0:
+        if not H > MIN_CURVATURE_ERRORS * standard_error(2 * half_curvature):
             continue
         lowest = -(sample.shares @ slope) / H
         each = slope + 2 * half_curvature * lowest
-        apart = (each - sample.shares @ each) * sample.shares
-        spread = math.sqrt(apart @ apart * sample.count / (sample.count - 1))
-        width = sample.quantile * spread / H
+        width = sample.quantile * standard_error(each) / H
         if abs(lowest) + width <= reach:
             return [lowest - width, lowest + width]
     return None
