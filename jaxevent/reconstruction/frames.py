@@ -1,6 +1,7 @@
 """The frames of a window: when they were taken, their values, and the events between them."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -245,6 +246,26 @@ class FrameImages:
             intensity[:n] /= gain[:n, None]
             intensity[n:] = intensity[n - 1]
         return grey, intensity, certainty, gain
+
+    def sample(self, frame_range: slice, step: int) -> NDArray:
+        """Read the intensities of every `step`-th row and column of a range of frames.
+
+        Args:
+            frame_range: Range of the recording's frames.
+            step: Step, px.
+
+        Returns:
+            (frames, rows, columns).
+        """
+        assert self.recording.frames is not None
+        images = np.asarray(self.recording.frames[frame_range].images)[:, ::step, ::step]
+        made = self.values(images)[1] if images.dtype.kind == "f" else self._levels[images]
+        return made / self._gain[frame_range, None, None]
+
+    @functools.cached_property
+    def _levels(self) -> NDArray:
+        """Intensity of every whole number of an image."""
+        return self.tables()[1]
 
 
 def make_frame_features(
