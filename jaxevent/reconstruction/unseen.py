@@ -1,13 +1,16 @@
-"""Changes of the brightness of a recording's frames that events do not show.
+"""Changes that events do not show: the flicker of frames, and movement below the thresholds.
 
 An exposure that adapts, or flicker, makes single frames brighter than those before and after. An
 image between frames may be brighter, too, and nothing determines it. So some frames are predicted
 from their two neighbours each, and the error that all pixels have in common is squared.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.events.tail import Tail
 from jaxevent.reconstruction.frames import FrameClock, FrameImages
 from jaxevent.recording import Recording
 
@@ -18,6 +21,32 @@ MIN_ERROR = 0.02  # intensity; less is motion or noise
 # Of independent brightnesses of variance v two differ by 2 v, squared, and one from the mean of two
 # others by 3 v / 2.
 PAIR_FACTOR = 0.75
+MOVING_RATE_HZ = 1.0  # events of a pixel, where half as much moves as at most
+
+
+class UnseenChange(NamedTuple):
+    """What a recording tells of changes without events."""
+
+    flicker: float  # variance of the intensity that all pixels of a frame share
+    movement: float  # how much of it moves, 0 to 1, by the mean rate of its events
+
+
+def measure_unseen_change(images: FrameImages, clock: FrameClock) -> UnseenChange:
+    """Measure what a recording tells of changes without events.
+
+    Args:
+        images: Frames of the recording.
+        clock: Their times.
+
+    Returns:
+        The measures; of a live recording, whose end is not known, no flicker and full movement.
+    """
+    recording = images.recording
+    if isinstance(recording.events, Tail):
+        return UnseenChange(0.0, 1.0)
+    seconds = (recording.stop - recording.start) * 1e-6
+    rate = len(recording.events) / (recording.width * recording.height * max(seconds, 1e-6))
+    return UnseenChange(measure_flicker(images, clock), rate / (rate + MOVING_RATE_HZ))
 
 
 def measure_flicker(images: FrameImages, clock: FrameClock) -> float:
