@@ -15,12 +15,15 @@ fewer than p + 2 parts, the covariance of a likelihood of n measurements, H^-1 /
 other losses then have no interval. H is found by differences of gradients with respect to the
 unconstrained numbers, so that an interval of a positive number is positive.
 
-The curvature is not used where it is not positive, where the interval would be wide, where the fit
-stopped away from the minimum, and where the loss is rough: at the ends of the interval its rise is
-not that by the curvature, within a factor of `MAX_RISE_RATIO`. There the loss itself is followed in
-both directions, with the other numbers held, until its rise is as large as at the ends of an
-interval by curvature: t / 2 standard errors of the rise's mean over parts. An end that is not found
-is open.
+The curvature is not used where it is not positive, where the interval would be wide, and where the
+fit stopped away from the minimum. There the loss itself is followed in both directions, with the
+other numbers held, until its rise is as large as at the ends of an interval by curvature: t / 2
+standard errors of the rise's mean over parts. An end that is not found is open.
+
+Neither holds where the loss is rough at the scale of the interval, so that derivatives tell nothing
+of its changes. There the loss of every part is smoothed: a parabola is fitted to it on a line as
+long as the interval or longer. The formula above, with its derivatives, gives an interval around
+its minimum.
 """
 
 import dataclasses
@@ -40,11 +43,13 @@ from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.parameters import MAX_VALUE, Number, Parameters, Positive
 from jaxevent.tuning import (
     MAX_FORWARD_PARAMETERS,
+    MIN_SKILL,
     Batches,
     Interval,
     Loss,
     PreparedBatches,
     evaluate_loss,
+    gradient_skill,
     loss_and_grad,
     map_batches,
     unit_step,
@@ -54,6 +59,8 @@ CONFIDENCE_LEVEL = 0.95
 DIFFERENCE_LOG_STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
 MAX_TRUSTED_LOG_WIDTH = 2.0  # half widths in logarithms beyond which the curvature is not trusted
 MAX_RISE_RATIO = 4.0  # of a loss at an interval's ends and its rise by the curvature
+SMOOTHED_REACHES, N_SMOOTHED = (0.35, 0.7, 1.4, 2.8), 9  # unit steps, and points on such a line
+MIN_CURVATURE_ERRORS = 4.0  # of a smoothed loss, standard errors
 FIRST_SEARCH_STEP, MAX_DOUBLINGS, N_HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
 RUNAWAY_LOG_DISTANCE = math.log(10.0)  # distance from the start of a number that ran away
 BOUND_LOG_TOLERANCE = 0.25  # of a bound, in the same measure
@@ -310,12 +317,15 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
     for k, ((name, index), number) in enumerate(zip(sample.places, numbers, strict=True)):
         settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_LOG_STEP)
         objective = functools.partial(_losses_at_step, sample, k, scales[k])
-        narrow = widths[k] < MAX_TRUSTED_LOG_WIDTH and settled
-        rough = narrow and _is_rough(sample, objective, widths[k], curvatures[k])
-        if narrow and not rough:
+        trusted = widths[k] < MAX_TRUSTED_LOG_WIDTH and settled
+        if trusted:
             ends = [-widths[k], widths[k]]
+            rough = _rises_otherwise(sample, objective, widths[k], curvatures[k])
         else:
             ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
+            rough = _has_no_skill(sample, k, scales[k], ends)
+        if rough:
+            ends = _smoothed_ends(sample, objective) or ends
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
@@ -329,19 +339,66 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
     return findings
 
 
-def _is_rough(
+def _rises_otherwise(
     sample: _Sample,
     objective: Callable[[float], NDArray[np.float64] | None],
     width: float,
     curvature: float,
 ) -> bool:
     """Return true if the loss at the ends of an interval is not what the curvature predicts."""
-    ends = [objective(sign * width) for sign in (-1.0, 1.0)]
-    rises = [sample.shares @ (values - sample.values) for values in ends if values is not None]
+    found = [objective(sign * width) for sign in (-1.0, 1.0)]
+    rises = [sample.shares @ (values - sample.values) for values in found if values is not None]
     if len(rises) < 2 or not np.isfinite(rises).all():
         return False
     ratio = float(np.mean(rises)) / (curvature * width**2 / 2)
     return not 1 / MAX_RISE_RATIO < ratio < MAX_RISE_RATIO
+
+
+def _has_no_skill(sample: _Sample, k: int, scale: float, ends: Sequence[float | None]) -> bool:
+    """Return true if the slope does not predict the changes of the loss inside an interval."""
+    if not all(end is not None and math.isfinite(end) for end in ends):
+        return False
+    low, high = (0.99 * float(end) for end in ends if end is not None)
+    steps, losses, slopes = [low, low / 2, 0.0, high / 2, high], [], []
+    for step in steps:
+        values = _losses_at_step(sample, k, scale, step)
+        at = sample.at.copy()
+        at[k] += step * scale
+        losses.append(math.nan if values is None else sample.shares @ values)
+        slopes.append(scale * sample.mean_slope(at)[k])
+    return gradient_skill(steps, losses, slopes) < MIN_SKILL
+
+
+def _smoothed_ends(
+    sample: _Sample, objective: Callable[[float], NDArray[np.float64] | None]
+) -> list[float | None] | None:
+    """Find the ends of the interval of a smoothed loss; None if it has no minimum near.
+
+    The line is the shortest that holds the interval and tells the curvature to a quarter.
+    """
+    if sample.count < 3:
+        return None
+
+    def standard_error(each: NDArray[np.float64]) -> float:
+        apart = (each - sample.shares @ each) * sample.shares
+        return math.sqrt(apart @ apart * sample.count / (sample.count - 1))
+
+    for reach in SMOOTHED_REACHES:
+        steps = np.linspace(-reach, reach, N_SMOOTHED)
+        found = [objective(float(step)) for step in steps]
+        table = np.array([value for value in found if value is not None])
+        if len(table) < N_SMOOTHED or not np.isfinite(table).all():
+            return None
+        half_curvature, slope, _ = np.polyfit(steps, table, 2)
+        H = 2 * sample.shares @ half_curvature
+        if not H > MIN_CURVATURE_ERRORS * standard_error(2 * half_curvature):
+            continue
+        lowest = -(sample.shares @ slope) / H
+        each = slope + 2 * half_curvature * lowest
+        width = sample.quantile * standard_error(each) / H
+        if abs(lowest) + width <= reach:
+            return [lowest - width, lowest + width]
+    return None
 
 
 def _widths(sample: _Sample, scales: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

@@ -717,10 +717,11 @@ class _Loop:
                 steps, [losses[k] for k in inside], [slope(names, step) for step in steps]
             )
 
-        if skill(list(raw)) >= MIN_SKILL:
+        together = skill(list(raw))
+        if together >= MIN_SKILL:
             return
         for name in list(raw):
-            found = skill([name])
+            found = together if len(raw) == 1 else skill([name])
             if found >= MIN_SKILL:
                 continue
             step = _search_smoothed(functools.partial(loss, [name]))
