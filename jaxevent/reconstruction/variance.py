@@ -30,9 +30,9 @@ from jaxevent.reconstruction.features import FrameFeatures, ImagePoints
 # Members of a `Params`, in this order: r, e, s and d of the module's formula.
 ERROR_PARAMETERS = (
     Positive(0.005, "intensity", "noise of a frame's pixel, for the variance of images"),
-    Positive(0.3, "c", "error halfway between frames, per square root of events"),
-    Positive(0.1, "c", "error halfway between frames where no events are"),
-    Positive(0.35, "1", "error halfway between frames, as part of the change without events"),
+    Positive(0.31, "c", "error halfway between frames, per square root of events"),
+    Positive(0.11, "c", "error halfway between frames where no events are"),
+    Positive(0.36, "1", "error halfway between frames, as part of the change without events"),
 )
 NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight neighbours
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
@@ -94,14 +94,16 @@ class AugmentedFrameErrors(eqx.Module):
         def mean(values: Array) -> Array:
             return (values + jnp.roll(values, -1, axis=0)) / 2
 
-        still = ONE_SIDED_FACTOR * activity_variance(params, jnp.zeros_like(own), movement)
-        step = ONE_SIDED_FACTOR * activity_variance(params, jnp.ones_like(own), 0.0)
-        alone = noise + flicker + still
+        # Of neighbours those of the last gap count: half of it lies between frame and time.
+        near = jnp.where(between, around, jnp.roll(around, 1, axis=0)) * NEIGHBOUR_SHARE / 16
+        alone = noise + flicker + ONE_SIDED_FACTOR * activity_variance(params, near, movement)
+        event = (1 - NEIGHBOUR_SHARE) * jnp.ones_like(own)
+        step = ONE_SIDED_FACTOR * activity_variance(params, event, 0.0)
         bridge = gap_variance(params, activity, residual, movement) + mean(flicker)
         steady = jnp.where(between, mean(noise), alone)
         halfway = jnp.where(between, bridge - mean(noise) / 2, 0)
         per_event = jnp.where(between, 0, step)
-        # Before the first frame the events from there to the frame count.
+        # Before the first frame the events until then count.
         first = alone[0] + step[0] * (frames.before[0] + frames.before[1])
         begin = (first, jnp.zeros_like(first), -step[0])
         pieces = 1 if frames.head is None else 2  # of a frame: its exposure, and the gap after it
