@@ -198,6 +198,7 @@ class FrameImages:
         """Return the intensities of 256 evenly spaced grey values."""
         return evaluate_function(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
 
+    @functools.cached_property
     def tables(self) -> NDArray:
         """Return grey value, intensity and certainty of every whole number of an image."""
         assert self.recording.frames is not None
@@ -238,7 +239,7 @@ class FrameImages:
                 for values, out in zip(self.values(images), outs, strict=True):
                     out[:n] = values
             else:
-                for table, out in zip(self.tables(), outs, strict=True):
+                for table, out in zip(self.tables, outs, strict=True):
                     np.take(table, images, out=out[:n])
             for out in outs:
                 out[n:] = out[n - 1]
@@ -259,13 +260,8 @@ class FrameImages:
         """
         assert self.recording.frames is not None
         images = np.asarray(self.recording.frames[frame_range].images)[:, ::step, ::step]
-        made = self.values(images)[1] if images.dtype.kind == "f" else self._levels[images]
+        made = self.values(images)[1] if images.dtype.kind == "f" else self.tables[1][images]
         return made / self._gain[frame_range, None, None]
-
-    @functools.cached_property
-    def _levels(self) -> NDArray:
-        """Intensity of every whole number of an image."""
-        return self.tables()[1]
 
 
 def make_frame_features(

@@ -305,16 +305,21 @@ class WindowInputs(NamedTuple):
 
 
 @njit_noalloc_inlined
-def _sum_neighbours(cells, fields, sums, padded):
+def _sum_neighbours(cells, fields, sums, shape):
     """Sum two fields over the eight neighbours of a band's own pixels, into another."""
-    stride = len(sums)
-    out = cells[fields[0] : fields[0] + stride]
-    on, off = cells[fields[1] : fields[1] + stride], cells[fields[2] : fields[2] + stride]
-    for z in range(padded, stride - padded):
-        sums[z] = on[z - padded] + on[z] + on[z + padded]
-        sums[z] += off[z - padded] + off[z] + off[z + padded]
-    for z in range(padded + 1, stride - padded - 1):
-        out[z] = sums[z - 1] + sums[z] + sums[z + 1] - on[z] - off[z]
+    rows, padded = shape
+    (out_begin, on, off), n = fields, rows * padded
+    first, last = padded, 2 * padded
+    above_on, at_on, below_on = cells[on:], cells[on + first :], cells[on + last :]
+    above_off, at_off, below_off = cells[off:], cells[off + first :], cells[off + last :]
+    for z in range(n):
+        sums[z] = (
+            above_on[z] + at_on[z] + below_on[z] + above_off[z] + at_off[z] + below_off[z]
+        )
+    out, on_here, off_here = cells[out_begin + first + 1 :], at_on[1:], at_off[1:]
+    middle, right = sums[1:], sums[2:]
+    for z in range(n - 2):
+        out[z] = sums[z] + middle[z] + right[z] - on_here[z] - off_here[z]
 
 
 @njit_noalloc_inlined
@@ -339,9 +344,8 @@ def _take_steps(steps, begin, end, given, band, memory):
             )  # fmt: skip
             sum_exposure_segments(bands, band, frames, of, cells, sums)
         elif kind == STEP_AROUND:
-            _sum_neighbours(
-                cells, (at, of, left), memory.scratch[band, :stride], np.int64(bands.width + 2)
-            )
+            shape = np.int64(bands.edges[band + 1] - bands.edges[band]), np.int64(bands.width + 2)
+            _sum_neighbours(cells, (at, of, left), memory.scratch[band], shape)
         else:
             count_band_events(bands, band, (left, right), cells, at, of)
 
