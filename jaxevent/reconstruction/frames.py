@@ -312,7 +312,7 @@ def make_frame_features(
         rate = 1e6 * interval_rates(times)[: len(out)]
         out[: len(rate)] = rate
 
-    around = sum_neighbours(span.sum(0), images.recording.width) if filtering else None
+    around = sum_around(span.sum(0), images.recording.width) if filtering else None
     present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
         grey, intensity, certainty, images.response(), gain, span, around, before, head, tail,
@@ -321,12 +321,12 @@ def make_frame_features(
     )  # fmt: skip
 
 
-def sum_neighbours(values: NDArray, width: int) -> NDArray:
-    """Sum values (frames, pixels) over the eight neighbours of each pixel of a sensor."""
+def sum_around(values: NDArray, width: int) -> NDArray:
+    """Sum values (frames, pixels) over the 3x3 pixels around each pixel of a sensor."""
     image = np.pad(values.reshape(len(values), -1, width), ((0, 0), (1, 1), (1, 1)))
     rows = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
     around = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]
-    return around.reshape(values.shape) - values
+    return around.reshape(values.shape)
 
 
 def make_segments(
