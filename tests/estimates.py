@@ -1,12 +1,22 @@
 """A quick stand-in of the calibration, for tests of what is done with its values."""
 
+from typing import Any
+
 import numpy as np
 
-from jaxevent.calibration import Calibration, CalibrationValue
+from jaxevent.calibration import Calibration, CalibrationValue, storage
 from jaxevent.calibration.result import not_identifiable
 from jaxevent.recording import Recording
 
 NAMES = ("clock_offset", "c_on", "c_off")
+
+
+def make_up(monkeypatch: Any) -> None:
+    """Have calibrations made up, and none refined or remembered, for one test."""
+    for module in ("jaxevent.calibration", "jaxevent.calibration.storage"):
+        monkeypatch.setattr(f"{module}.calibrate", made_up)
+    monkeypatch.setattr("jaxevent.reconstruction.augment.refine", lambda *arguments: {})
+    monkeypatch.setattr(storage, "_memory", type(storage._memory)())
 
 
 def made_up(recording: Recording, I0: float = 1.0) -> Calibration:

@@ -104,12 +104,12 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
 
 
 def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict[str, Any]:
-    """The settings of --params; without a method they may be a calibration alone."""
+    """The settings of --params; without a method they need a calibration."""
     from jaxevent.parameters import CALIBRATION_TABLE, read_toml
 
     if params is None:
         return {}
-    if method is None and set(read_toml(params)) != {CALIBRATION_TABLE}:
+    if method is None and CALIBRATION_TABLE not in read_toml(params):
         raise InputError(f"{params}: parameters are of one method; name it with --method")
     return estimator.Params.load_table(params, method)
 

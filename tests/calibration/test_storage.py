@@ -6,7 +6,7 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-from estimates import NAMES, made_up
+from estimates import NAMES, made_up, make_up
 
 import jaxevent
 from jaxevent import akf, aks, high_pass, last_frame, mc
@@ -25,8 +25,7 @@ def recording():
 def folder(tmp_path, monkeypatch):
     """An empty cache, and nothing in memory."""
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(storage, "_memory", type(storage._memory)())
-    monkeypatch.setattr(storage, "calibrate", made_up)
+    make_up(monkeypatch)
     return tmp_path / "cache" / "calibrations"
 
 
@@ -123,7 +122,7 @@ def test_nothing_is_kept_where_nothing_can_be(recording, tmp_path, monkeypatch):
     first = made_up(recording)
     monkeypatch.setenv("JAXEVENT_CACHE", "0")
     assert_same(first, recall_calibration(recording))
-    assert not list(tmp_path.rglob("*.npz"))
+    assert not list(tmp_path.rglob("*.kept"))
     forget(monkeypatch)
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "file"))  # no folder can be made there
@@ -160,8 +159,9 @@ def test_explicit_values_win_one_by_one(recording):
     for params, expected in (
         (akf.Params.for_recording(recording), (clock, on, off)),
         (akf.Params.for_recording(recording, c_on=0.3), (clock, 0.3, off)),
-        (found.params(akf.Params, clock_offset=0.0), (0.0, on, off)),
         (akf.Params.for_recording(recording, preset="hdr"), (clock, 0.2, 0.2)),
+        (found.params(akf.Params), (clock, on, off)),
+        (found.params(akf.Params, clock_offset=0.0), (0.0, on, off)),
         (mc.Params.for_recording(recording), (clock, 0.2, 0.2)),
     ):
         values = [float(getattr(params, name)) for name in NAMES]
@@ -195,6 +195,11 @@ def test_a_file_of_a_calibration_serves_methods(recording, tmp_path):
     assert akf.Params.load(path).values() == found.params(akf.Params, c_on=0.3).values()
     path.write_text(text + "[akf]\nkappa = 3.0\n[aks]\nshare = 0.1\n")
     assert akf.Params.load(path, "akf").values() == found.params(akf.Params, kappa=3.0).values()
+    assert mc.Params.load(path, "mc").values() == found.params(mc.Params).values()
+    numbers = {"akf": {"clock_offset": 0.02, "c_on": 0.4}}
+    path.write_text(format_toml(found, 1.0, "a", numbers))
+    expected = found.params(akf.Params, **numbers["akf"])
+    assert akf.Params.load(path, "akf").values() == expected.values()
     path.write_text("I0 = 0.3\n" + text)
     with pytest.warns(InputWarning, match="hold for I0 = 1, not for 0.3.*calibrate --I0 0.3"):
         params = akf.Params.load(path)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import described, fails
-from estimates import NAMES, made_up
+from estimates import NAMES, made_up, make_up
 from PIL import Image
 
 import jaxevent
@@ -43,8 +43,7 @@ def found(recording):
 
 @pytest.fixture(autouse=True)
 def made_up_values(monkeypatch):
-    for module in ("jaxevent.calibration", "jaxevent.calibration.storage"):
-        monkeypatch.setattr(f"{module}.calibrate", made_up)
+    make_up(monkeypatch)
     monkeypatch.setenv("JAXEVENT_CACHE", "0")
 
 
@@ -69,7 +68,9 @@ def test_table_file_and_picture(path, found, tmp_path, capsys):
     assert f"written to {folder}: calibration.toml, calibration.png" in out
     with Image.open(folder / "calibration.png") as picture:
         assert picture.width > 1000
-    table = tomllib.loads((folder / "calibration.toml").read_text())["calibration"]
+    tables = tomllib.loads((folder / "calibration.toml").read_text())
+    assert list(tables) == ["calibration", "akf", "aks"] and "best for aks: clock" in out
+    table = tables["calibration"]
     assert [table[name] for name in NAMES] == [getattr(found, name).value for name in NAMES]
     for name, (low, high) in table["intervals"].items():
         assert low <= table[name] <= high
