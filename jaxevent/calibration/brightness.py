@@ -215,14 +215,14 @@ def read_positions(
     Args:
         events: Events of a stretch.
         path: Their interpolation.
-        middle_us: (frames,) sorted middles of exposures, us.
+        middle_us: (frames,) sorted middles of exposures, us since the path's origin.
         length_us: (frames,) their lengths, us, positive.
         longest: Longest mean time between the two events, s.
 
     Returns:
         The counts.
     """
-    begin = middle_us - path.origin - length_us / 2
+    begin = middle_us - length_us / 2
     shape = len(events.active), len(middle_us)
     good, gap = np.empty(shape, np.bool_), np.empty(shape, np.float32)
     out = Positions(good, gap, *(np.empty((*shape, 4), np.float32) for _ in range(3)))

@@ -15,6 +15,7 @@ from jaxevent.calibration.events_alone import (
 from jaxevent.calibration.model import (
     CURVATURE,
     DEGREES_OF_FREEDOM,
+    GAUSSIAN_SCALE,
     SHORTEST_US,
     Fit,
     Model,
@@ -35,17 +36,24 @@ from jaxevent.recording import Recording
 OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
 MIN_PEAK_RATIO = 2.0  # of the highest correlation to those far from it
+MIN_POLARITY_SHARE = 0.05  # of the rarer polarity
 EARLIER_STARTS_S = (0.0, 3e-3, 8e-3)  # counts of whole events are late
 MAX_FIRST_PIXELS = 10_000  # of the fits that choose among starts
 FIRST_VARIANCES = (1e-5, 0.05, 0.01)
 FIRST_EXPOSURE = 0.3  # of the time between frames
 GREY_NOISE = 1.5 / 255  # by which pixels are chosen
-GAUSSIAN_SCALE = 1.204  # standard deviation of Gaussian errors, per scale of Student's t
-# Relative errors of the model itself, found on simulated scenes: of c_on, c_off, clock (of the time
-# between frames), dead time (of the shortest gaps) and exposure.
-MODEL_ERROR = (0.012, 0.012, 0.003, 0.1, 0.1)
+# Errors of the model itself, found on simulated scenes. Paths between events are not parabolas, so
+# that errors grow with the time between these.
+THRESHOLD_ERROR = 0.025  # relative
+CLOCK_ERROR = 0.035  # of the time between events
+MIN_CLOCK_ERROR_S = 1e-4
+DEAD_TIME_ERROR_S = 1.5e-4
+EXPOSURE_ERROR = 0.1  # relative
+BLUR_OF_GAPS, BLUR_ERROR = 0.4, 0.35  # of the squared time between events, in squared exposure
+DARK_OFFSET_ERROR = 0.8  # of its logarithm
 LATENESS_S = (-0.015, 0.005)  # interval about the best offset for whole events
 COARSE_FACTOR = 1.6  # half width of the interval of thresholds by them
+NOISE_ERROR = 0.15  # of noises, relative
 N_PROFILE_STEPS = 4
 DARK_OFFSETS = np.geomspace(1e-3, 3, 15)
 MIN_DRIFT_SPAN_S = 20.0
@@ -127,8 +135,10 @@ def calibrate(recording: Recording, I0: float = 1.0) -> Calibration:
         what = "frames" if frames < 2 else "events"
         return _without_fit(sample, ratio, dead, f"too few {what}")
     clock = find_offset(sample, I0)
-    if math.isnan(clock.best):
-        return _without_fit(sample, ratio, dead, clock.why, clock)
+    on, off = sample.counts.sum((1, 2)).tolist()
+    if math.isnan(clock.best) or min(on, off) < MIN_POLARITY_SHARE * (on + off):
+        why = clock.why or "nearly all events are of one polarity"
+        return _without_fit(sample, ratio, dead, why, clock)
     grey = np.linspace(0, 1, 1025)
     table = np.asarray(recording.response.intensity(grey), np.float64)
     slope = np.stack([grey, np.maximum(np.gradient(table, grey), 1e-6)])
@@ -195,14 +205,14 @@ def _by_whole_events(
 def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibration:
     """Return the values of a fit with their intervals."""
     theta = fit.physics.theta
-    floor = np.array(MODEL_ERROR)
-    scale = np.array([theta[0], theta[1], model.interval_s, 1e-3, 1.0])
-    covariance = fit.covariance + np.diag((floor * scale) ** 2 * (np.arange(5) < 4))
+    clock_error = max(CLOCK_ERROR * _gap(fit, 2, 1), MIN_CLOCK_ERROR_S)
+    more = [*(THRESHOLD_ERROR * theta[:2]), clock_error, DEAD_TIME_ERROR_S, 0.0]
+    covariance = fit.covariance + np.diag(np.square(more))
     error = np.sqrt(np.diag(covariance))
     c_on, c_off = (_interval(float(theta[k]), float(error[k]), "ln I") for k in (0, 1))
     ratio = float(theta[0] / theta[1])
     by = np.array([1 / theta[0], -1 / theta[1]])
-    ratio_error = math.sqrt(float(by @ covariance[:2, :2] @ by))
+    ratio_error = math.hypot(math.sqrt(float(by @ fit.covariance[:2, :2] @ by)), THRESHOLD_ERROR)
     late = float(theta[2])
     reach = CONFIDENCE_Z * float(error[2])
     offset = CalibrationValue(late, late - reach, late + reach, "s")
@@ -232,15 +242,24 @@ def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibrati
     )
 
 
+def _gap(fit: Fit, column: int, power: int) -> float:
+    """Return the mean power of the time (s) between events where they tell of a parameter."""
+    weight = fit.weight * fit.terms.J[:, column] ** 2
+    return float(np.average(fit.changes.gap**power, weights=weight + 1e-300))
+
+
 def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     known = np.concatenate([s.exposure for s in sample.stretches])
     if (known > 0).all():
         length = float(np.median(known)) * 1e-6
         return CalibrationValue(length, length, length, "s", "as the recording says")
     square, error = float(fit.physics.theta[4]), math.sqrt(float(fit.covariance[4, 4]))
-    error = math.hypot(error, 2 * MODEL_ERROR[4] * square)
+    # Interpolation smooths paths between events, as a longer exposure would.
+    blur = _gap(fit, 4, 2)
+    square += BLUR_OF_GAPS * blur
+    error = math.hypot(error, BLUR_ERROR * blur, 2 * EXPOSURE_ERROR * square)
     low, high = (math.sqrt(max(square + sign * CONFIDENCE_Z * error, 0)) for sign in (-1, 1))
-    if not high < model.interval_s:
+    if not high < 1.5 * model.interval_s:
         return not_identifiable("s", "little of the scene moves fast enough")
     least = max(low, SHORTEST_US * 1e-6)
     if low == 0:
@@ -278,7 +297,7 @@ def _noises(fit: Fit) -> tuple[CalibrationValue, CalibrationValue]:
     sigma = GAUSSIAN_SCALE * np.sqrt(V)
     out = []
     for row, unit in ((0, "grey"), (2, "c")):
-        spread = math.hypot(float(error[row]), 0.1)
+        spread = math.hypot(float(error[row]), NOISE_ERROR)
         if spread > 0.5:
             out.append(not_identifiable(unit, "other errors are larger"))
         else:
@@ -331,9 +350,9 @@ def _dark_offset(model: Model, fit: Fit) -> CalibrationValue:
     bend = float((left - 2 * here + right).sum()) / step**2
     slope = (right - left)[:, None] / (2 * step)
     meat = max(float(cluster_sums(slope, fit.changes, by)[0, 0]) for by in ("tile", "interval"))
-    error = math.hypot(math.sqrt(meat) / bend, 0.1)
+    error = math.hypot(math.sqrt(meat) / bend, DARK_OFFSET_ERROR)
     value = float(DARK_OFFSETS[k] * math.exp(-slope.sum() / bend))
-    if error > 1.5:
+    if not 0 < error < 1.5:
         return not_identifiable("intensity", "pixels differ too little in brightness")
     return _interval(value, value * error, "intensity")
 

@@ -39,6 +39,7 @@ SHORTEST_US = 50.0  # exposure, below which it is a point in time
 MAX_RELATIVE_NOISE = 0.15  # of a frame's I + I0, beyond which logarithms of noise are biased
 MIN_CHANGES = 60
 MAX_CHANGES = 60_000
+GAUSSIAN_SCALE = 1.15  # standard deviation of Gaussian errors, per scale of Student's t
 N_STEPS = 12
 TRUST = np.array([np.inf, np.inf, 2e-3, 5e-4, np.inf])  # largest steps of the last three
 PRECISION = np.array([1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
@@ -67,6 +68,7 @@ class Changes(NamedTuple):
     by_square: NDArray[np.float64]  # (2, n) derivatives by the exposure's square, 1/s^2
     travel: NDArray[np.float64]  # (2, 2, n) ON and OFF counts within both exposures
     loose: NDArray[np.float64]  # (n,) 0 to 2, with the time between events around the frames
+    gap: NDArray[np.float64]  # (n,) that time's mean of both frames, s
     tile: NDArray[np.intp]  # (n,)
     interval: NDArray[np.intp]  # (n,) number of the pair of frames
     stretch: NDArray[np.intp]  # (n,)
@@ -171,7 +173,7 @@ class Model:
             read_positions(
                 events,
                 path,
-                stretch.frame_t + 1e6 * theta[2],
+                (stretch.frame_t - path.origin) + 1e6 * theta[2],
                 self._lengths(stretch, theta),
                 self.interval_s,
             )
@@ -208,6 +210,7 @@ class Model:
                     square[1] - square[0],
                     np.stack([v[:2] for v in travel]),
                     np.add(*loose),
+                    (at.gap[row, pair] + at.gap[row, pair + 1]).astype(np.float64) / 2,
                     self.sample.tile[pixel],
                     pair + interval,
                     np.full(len(pair), number),
@@ -261,7 +264,8 @@ class Model:
         Returns:
             The likelihood, without covariance, and the step (5,).
         """
-        terms = make_terms(changes, physics.theta, I0 or self.I0, self.grey_noise)
+        noise = GAUSSIAN_SCALE * np.sqrt(physics.V[0])
+        terms = make_terms(changes, physics.theta, I0 or self.I0, noise)
         V, weight = weigh(physics.V, terms)
         J = terms.J[:, moves]
         A = (J * weight[:, None]).T @ J

@@ -44,14 +44,17 @@ class HiddenFrames:
         self.given = part.with_frames(slice(0, None, 2))
         last = (len(part.frames) - 1) // 2 * 2
         self.hidden: Frames = part.frames[slice(1, last, 2)]
-        self.truth = self.hidden.intensity.astype(np.float64)
+        gain = part.gain[slice(1, last, 2), None, None]
+        linear = np.asarray(part.response.intensity(self.hidden.intensity), np.float64)
+        self.white, self.truth = 1 / gain, linear / gain
 
     def errors(self, method: Any, params: Any) -> NDArray[np.float64]:
-        """Return the errors of the predicted frames, intensities clipped to [0, 1]."""
+        """Return the errors of the predicted frames, intensities clipped to the frames' range."""
         late = round(float(params.clock_offset) * 1e6)
         images = method.estimate(self.given, params, progress=False)
         mean, _, _ = images(self.hidden.t + late, extrapolate=True)
-        return (np.nan_to_num(np.asarray(mean), nan=0.5).clip(0, 1) - self.truth).ravel()
+        image = np.nan_to_num(np.asarray(mean, np.float64), nan=0.5)
+        return (image.clip(0, self.white) - self.truth).ravel()
 
 
 def _busiest_band(recording: Recording, events: Any) -> tuple[int, int]:

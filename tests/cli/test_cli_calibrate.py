@@ -101,11 +101,11 @@ def test_bad_input(path, recording, tmp_path, capsys):
     assert "not identifiable" in next(line for line in out.splitlines() if "clock_offset" in line)
 
 
-def test_reconstruct_calibrates(path, found, tmp_path, capsys):
+def test_reconstruct_calibrates(path, recording, tmp_path, capsys):
     out = tmp_path / "out.h5"
     words = ("reconstruct", path, "--method", "akf", "--at", "frames", "--out", out, "--force")
     said, _ = run(capsys, *words)
-    clock, on, off = values_of(found.params(akf.Params))
+    clock, on, off = values_of(akf.Params.for_recording(recording))
     line = f"calibrated: clock {1e3 * clock:+.1f} ms, c_on {on:.3g}, c_off {off:.3g} (jaxevent "
     assert said.startswith(line + "calibrate shows more; --no-calibrate turns it off)\n")
     told = described(out)["params"]
@@ -118,7 +118,9 @@ def test_reconstruct_calibrates(path, found, tmp_path, capsys):
     mine = tmp_path / "mine.toml"
     mine.write_text("c_on = 0.3\n")
     said, _ = run(capsys, *words, "--params", mine)
-    assert said.startswith(f"calibrated: clock {1e3 * clock:+.1f} ms, c_off {off:.3g} (")
+    values = akf.Params.for_recording(recording, c_on=0.3)
+    clock, off = 1e3 * float(values.clock_offset), float(values.c_off)
+    assert said.startswith(f"calibrated: clock {clock:+.1f} ms, c_off {off:.3g} (")
     assert described(out)["params"]["c_on"] == pytest.approx(0.3)
     said, _ = run(capsys, *words, "--params", mine, "--no-calibrate")
     told = described(out)["params"]

@@ -1,0 +1,238 @@
+"""Calibration against simulated truth and closed forms, its invariances, and odd input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxevent
+from jaxevent.calibration.brightness import interpolate, read_positions, sort_by_pixel
+from jaxevent.calibration.sampling import Stretch, choose_pixels, correlate, take_sample
+from jaxevent.recording import Frames, Recording
+from jaxevent.simulate import MovingObjects, Sensor, simulate
+
+SENSOR = Sensor(
+    c_on=0.15, c_off=0.2, mismatch=0.02, dark_offset=0.02, refractory=5e-4, background_rate=0.1,
+    hot_fraction=2e-3, frame_rate=25, exposure=0.012, read_noise=1.0, clock_offset=-0.07,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """A scene with the clocks apart and exposures that the file does not tell."""
+    scene = MovingObjects((96, 72), duration=1.2, speed=60, background=0.8, seed=5)
+    return without_exposure(simulate(scene, SENSOR, seed=5))
+
+
+@pytest.fixture(scope="module")
+def found(recording):
+    return jaxevent.calibrate(recording, SENSOR.dark_offset)
+
+
+def without_exposure(recording):
+    frames = recording.frames
+    return dataclasses.replace(
+        recording, frames=Frames(frames.t, frames.images, 0 * frames.exposure)
+    )
+
+
+def moved(recording, us):
+    events, frames = recording.events, recording.frames
+    return dataclasses.replace(
+        recording,
+        events=dataclasses.replace(events, t=events.t + us),
+        frames=dataclasses.replace(frames, t=frames.t + us),
+    )
+
+
+def test_simulated_truth(found):
+    truth = {
+        "clock_offset": SENSOR.clock_offset,
+        "c_on": SENSOR.c_on,
+        "c_off": SENSOR.c_off,
+        "threshold_ratio": SENSOR.c_on / SENSOR.c_off,
+        "exposure": SENSOR.exposure,
+    }
+    for name, true in truth.items():
+        one = getattr(found, name)
+        wide = one.high - one.low
+        assert one.low - wide / 2 < true < one.high + wide / 2, name
+        assert wide < (2.5 if name == "exposure" else 0.25) * abs(true), name
+    noise = np.hypot(SENSOR.read_noise, 12**-0.5) / 255
+    assert found.frame_noise.value == pytest.approx(noise, rel=0.4)
+
+
+def test_hot_pixels_are_found(recording, found):
+    true = np.zeros((recording.height, recording.width), bool)
+    x, y = recording.extra["hot"].T
+    true[y, x] = True
+    assert (found.hot_pixels == true).all()
+
+
+def test_clocks_shift_together_or_apart(recording, found):
+    shifted = jaxevent.calibrate(moved(recording, 10**12), SENSOR.dark_offset)
+    assert repr(shifted) == repr(found)
+    frames = recording.frames
+    late = dataclasses.replace(frames, t=frames.t + 30_000)
+    other = jaxevent.calibrate(dataclasses.replace(recording, frames=late), SENSOR.dark_offset)
+    assert other.clock_offset.value == pytest.approx(found.clock_offset.value - 0.03, abs=2e-4)
+
+
+def test_depth_of_frames_and_gains_do_not_matter(recording, found):
+    frames = recording.frames
+    deep = dataclasses.replace(frames, images=frames.images.astype(np.uint16) * 257)
+    again = jaxevent.calibrate(dataclasses.replace(recording, frames=deep), SENSOR.dark_offset)
+    for name, one in found.values().items():
+        np.testing.assert_allclose(getattr(again, name)[:3], one[:3], rtol=1e-3, err_msg=name)
+
+
+def test_polarity_swapped(recording):
+    events = recording.events
+    swapped = dataclasses.replace(recording, events=dataclasses.replace(events, p=~events.p))
+    assert not jaxevent.calibrate(swapped, 0.02).c_on.is_identifiable
+    offsets = np.arange(-20, 21) * 5000
+    one, two = (correlate(take_sample(r), offsets, 0.02) for r in (recording, swapped))
+    np.testing.assert_allclose(one, -two, atol=1e-12)
+
+
+def test_correlation_is_pearsons(recording):
+    sample = take_sample(recording)
+    (stretch,) = sample.stretches
+    offset = -70_000
+    change = np.diff(np.log(stretch.intensity + np.float32(0.02)), axis=0)
+    used = stretch.clear[1:] & stretch.clear[:-1]
+    net = np.zeros(change.shape)
+    for k in range(len(change)):
+        part = slice(*np.searchsorted(stretch.t, stretch.frame_t[k : k + 2] + offset))
+        np.add.at(net[k], stretch.pixel[part], np.where(stretch.p[part], 1, -1))
+    inside = stretch.frame_t[:-1] + offset >= stretch.t[0]
+    r = np.corrcoef(change[inside][used[inside]], net[inside][used[inside]])[0, 1]
+    assert correlate(sample, np.array([offset]), 0.02)[0] == pytest.approx(r, abs=1e-5)
+
+
+@pytest.mark.parametrize("rho", [0.0, 2e-3])
+def test_counts_of_smooth_brightness_are_exact(rho):
+    """Of a parabola in time the mean over an exposure is known, whatever the dead time."""
+    c, rate, curve = 0.1, 20.0, 30.0
+
+    def level(t):
+        return rate * t + curve * t**2
+
+    # After an event at t the level counts from t + rho.
+    times, t = [], 0.0
+    while t < 0.3:
+        wanted = level(t + rho) + c
+        t = (-rate + np.sqrt(rate**2 + 4 * curve * wanted)) / (2 * curve)
+        times.append(t)
+    us = np.rint(1e9 * np.array(times)).astype(np.int64)  # ns in place of us, against rounding
+    none = np.zeros((2, 1), np.float32)
+    stretch = Stretch(
+        us, np.zeros(len(us), np.int32), np.ones(len(us), bool), (0, 10**9), np.arange(2),
+        np.zeros(2, np.int64), np.zeros(2, np.int64), none, none, np.ones((2, 1), bool),
+    )  # fmt: skip
+    events = sort_by_pixel(stretch, stretch.clear)
+    path = interpolate(events, 1e9 * rho)
+    middle, length = np.array([0.1e9, 0.2e9]), np.array([0.02e9, 0.03e9])
+    at = read_positions(events, path, middle - path.origin, length, np.inf)
+    assert at.good.all()
+    m, T = 1e-9 * middle, 1e-9 * length
+    true = (level(m) + curve * T**2 / 12) / c
+    assert at.mean[0, 1, 0] - at.mean[0, 0, 0] == pytest.approx(true[1] - true[0], rel=2e-3)
+    travel = (level(m + T / 2) - level(m - T / 2)) / c
+    np.testing.assert_allclose(at.travel[0, :, 0], travel, rtol=0.03)
+
+
+def test_pixels_are_whole_tiles():
+    places, tile = choose_pixels(1280, 720)
+    assert 80_000 < len(places) <= 100_000
+    assert (np.bincount(tile)[np.unique(tile)] == 256).all()
+    assert len(choose_pixels(240, 180)[0]) == 240 * 180
+
+
+def test_the_sample_of_a_long_recording_is_bounded(recording, monkeypatch):
+    monkeypatch.setattr("jaxevent.calibration.sampling.MAX_INTERVALS", 8)
+    monkeypatch.setattr("jaxevent.calibration.sampling.N_STRETCHES", 4)
+    sample = take_sample(recording)
+    assert len(sample.stretches) == 4 and not sample.is_whole
+    assert sum(len(s.rows) - 1 for s in sample.stretches) == 8
+    found = jaxevent.calibrate(recording, 0.02)
+    assert found.clock_offset.value == pytest.approx(SENSOR.clock_offset, abs=3e-3)
+
+
+def odd_recordings(recording):
+    events, frames = recording.events, recording.frames
+    none = dict(zip("txyp", np.empty((4, 0), int), strict=True))
+    n = len(events)
+
+    def with_events(**columns):
+        return dataclasses.replace(recording, events=dataclasses.replace(events, **columns))
+
+    def with_images(images):
+        return dataclasses.replace(
+            recording, frames=Frames(frames.t, images.astype(np.uint8), frames.exposure)
+        )
+
+    yield "no frames", dataclasses.replace(recording, frames=None)
+    yield "one frame", recording.with_frames(slice(0, 1))
+    yield "two frames", recording.with_frames(slice(0, 2))
+    yield "no events", with_events(**none)
+    yield "one event", dataclasses.replace(recording, events=events[:1])
+    yield "equal frames", with_images(np.broadcast_to(frames.images[:1], frames.images.shape))
+    yield "white", with_images(np.full(frames.images.shape, 255))
+    yield "black", with_images(np.zeros(frames.images.shape))
+    yield "all ON", with_events(p=np.ones(n, bool))
+    yield "one time", with_events(t=np.full(n, frames.t[3]))
+    yield "one pixel", with_events(x=np.zeros(n, int), y=np.zeros(n, int))
+    few = np.arange(40)
+    yield (
+        "two pixels",
+        Recording.from_arrays(
+            few * 1000, few % 2, 0 * few, few % 2, width=2, height=1,
+            frames=np.tile(np.uint8([[[90, 120]]]), (4, 1, 1)),
+            frame_times=np.arange(4) * 10_000,
+        ),
+    )  # fmt: skip
+
+
+def test_odd_recordings_determine_nothing(recording):
+    for name, odd in odd_recordings(recording):
+        found = jaxevent.calibrate(odd)
+        for field in ("clock_offset", "c_on", "dark_offset", "exposure", "clock_drift"):
+            one = getattr(found, field)
+            assert not one.is_identifiable or name == "two frames", (name, field)
+            assert one.is_identifiable or one.note.startswith("not identifiable: "), (name, field)
+        assert "hot pixels" in repr(found)
+
+
+def test_events_alone_tell_ratio_and_dead_time(recording):
+    found = jaxevent.calibrate(dataclasses.replace(recording, frames=None))
+    ratio = found.threshold_ratio
+    assert ratio.low < SENSOR.c_on / SENSOR.c_off < ratio.high
+    assert found.hot_pixels.sum() == len(recording.extra["hot"])
+    gaps = np.random.default_rng(0).exponential(900, (1000, 16)) + 1000
+    t = np.cumsum(gaps, 0).astype(np.int64).ravel()
+    order, (y, x) = np.argsort(t), np.divmod(np.tile(np.arange(16), 1000), 4)
+    made = Recording.from_arrays(t[order], x[order], y[order], 0 * y, width=4, height=4)
+    rho = jaxevent.calibrate(made).rho_ref
+    assert rho.value == pytest.approx(1e-3, rel=0.01) and rho.low < 1e-3 < rho.high
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*events contradict frames")
+def test_refined_parameters_predict_better(recording):
+    given = recording.with_frames(slice(0, None, 2))
+    hidden = recording.frames[slice(3, 23, 2)]
+
+    def error(method, params):
+        late = round(1e6 * float(params.clock_offset))
+        mean, _, _ = method.estimate(given, params, progress=False)(hidden.t + late)
+        true = recording.response.intensity(hidden.intensity)
+        return float(((mean - true) ** 2)[hidden.intensity > 0.02].mean())
+
+    method = jaxevent.aks
+    given = jaxevent.events.crop(given, 0, 16, 96, 40)
+    hidden = dataclasses.replace(hidden, images=hidden.images[:, 16:56])
+    refined = method.Params.for_recording(given)
+    physics = jaxevent.calibrate(given).params(method.Params)
+    assert error(method, refined) < 0.95 * error(method, physics)
+    assert error(method, refined) < 0.7 * error(method, method.Params())
