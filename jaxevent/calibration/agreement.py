@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.sampling import Sample, Stretch, log_changes
+from jaxevent.calibration.sampling import Sample, SampledSegment, log_changes
 
 I0 = 0.1  # inside the logarithm: between the filters' 1 and the dark offset of sensors
 MAX_PAIRS = 16  # pairs of frames that are compared
@@ -86,7 +86,7 @@ class _Sums(NamedTuple):
 
 
 def _lag_counts(
-    stretch: Stretch, row: int, lags: NDArray[np.int64]
+    stretch: SampledSegment, row: int, lags: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
     """Count the events between two frames at lags.
 
@@ -182,7 +182,7 @@ def measure_agreement(sample: Sample) -> Agreement | None:
     )  # fmt: skip
 
 
-def _pair(stretch: Stretch, row: int) -> Stretch:
+def _pair(stretch: SampledSegment, row: int) -> SampledSegment:
     """Return a stretch with two frames."""
     two = slice(row, row + 2)
     return stretch._replace(intensity=stretch.intensity[two], clear=stretch.clear[two])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.sampling import Stretch
+from jaxevent.calibration.sampling import SampledSegment
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
 MIN_EVENTS_PER_PIXEL = 4
@@ -62,7 +62,7 @@ class Positions(NamedTuple):
     travel: NDArray[np.float32]  # from its begin to its end
 
 
-def sort_by_pixel(stretch: Stretch, clear: NDArray[np.bool_]) -> PixelEvents:
+def sort_by_pixel(stretch: SampledSegment, clear: NDArray[np.bool_]) -> PixelEvents:
     """Sort the events of a stretch by pixel.
 
     Args:

@@ -30,7 +30,7 @@ from jaxevent.calibration.brightness import (
     read_positions,
     sort_by_pixel,
 )
-from jaxevent.calibration.sampling import Sample, Stretch
+from jaxevent.calibration.sampling import Sample, SampledSegment
 
 DEGREES_OF_FREEDOM = 4.0  # of Student's t
 # Curvature of the likelihood by the mean, as part of the mean of weights.
@@ -160,7 +160,7 @@ class Model:
         steps = [np.diff(s.frame_t) for s in self.sample.stretches]
         return float(np.median(np.concatenate(steps))) * 1e-6
 
-    def _lengths(self, stretch: Stretch, theta: NDArray) -> NDArray[np.float64]:
+    def _lengths(self, stretch: SampledSegment, theta: NDArray) -> NDArray[np.float64]:
         """Return the lengths of exposures, us."""
         unknown = 1e6 * np.sqrt(max(theta[4], 0))
         return np.maximum(np.where(stretch.exposure > 0, stretch.exposure, unknown), SHORTEST_US)
@@ -266,7 +266,7 @@ class Model:
         """
         noise = GAUSSIAN_SCALE * np.sqrt(physics.V[0])
         terms = make_terms(changes, physics.theta, I0 or self.I0, noise)
-        V, weight = weigh(physics.V, terms)
+        V, weight = reweight(physics.V, terms)
         J = terms.J[:, moves]
         A = (J * weight[:, None]).T @ J
         # A little damping keeps what the data do not determine where it is.
@@ -292,7 +292,7 @@ def losses_of(residual: NDArray, variance: NDArray) -> NDArray[np.float64]:
     return np.log(variance) / 2 + (nu + 1) / 2 * np.log1p(residual**2 / variance / nu)
 
 
-def weigh(V: NDArray[np.float64], terms: Terms) -> tuple[NDArray, NDArray]:
+def reweight(V: NDArray[np.float64], terms: Terms) -> tuple[NDArray, NDArray]:
     """Return better variances, and the weights of changes by them."""
     nu, X, square = DEGREES_OF_FREEDOM, terms.X, terms.residual**2
     for _ in range(5):

@@ -26,7 +26,7 @@ MARGIN_LEVELS = 2.5  # of 255, from either end, within which a pixel counts as c
 WHITE_SHARE = 0.97  # of the brightest grey value, from which a pixel counts as clipped
 
 
-class Stretch(NamedTuple):
+class SampledSegment(NamedTuple):
     """Consecutive frames and the events around them, of the sampled pixels."""
 
     t: NDArray[np.int64]  # (events,) us
@@ -40,7 +40,7 @@ class Stretch(NamedTuple):
     intensity: NDArray[np.float32]  # (frames, pixels)
     clear: NDArray[np.bool_]  # (frames, pixels), not clipped
 
-    def without(self, pixels: NDArray[np.bool_]) -> "Stretch":
+    def without(self, pixels: NDArray[np.bool_]) -> "SampledSegment":
         """Return the stretch without the events of some of the sampled pixels."""
         keep = ~pixels[self.pixel]
         clear = self.clear & ~pixels
@@ -50,7 +50,7 @@ class Stretch(NamedTuple):
 class Sample(NamedTuple):
     """Stretches of a recording, without its hot pixels."""
 
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[SampledSegment, ...]
     places: NDArray[np.intp]  # (pixels,) y width + x of the sampled pixels
     tile: NDArray[np.intp]  # (pixels,) number of the pixel's tile
     size: tuple[int, int]  # width, height
@@ -187,7 +187,7 @@ def take_sample(recording: Recording) -> Sample:
         exposure = frames.exposure[rows] if frames is not None else np.empty(0, np.int64)
         # Before the first and after the last event nothing is known to be missing.
         found.append(
-            Stretch(
+            SampledSegment(
                 events.t[keep], pixel[keep], events.p[keep], span, rows, stamps, exposure,
                 grey, intensity, np.zeros(grey.shape, bool),
             )
@@ -205,7 +205,7 @@ def take_sample(recording: Recording) -> Sample:
     )  # fmt: skip
 
 
-def count_between(stretch: Stretch, offset_us: int = 0) -> NDArray[np.int32]:
+def count_between(stretch: SampledSegment, offset_us: int = 0) -> NDArray[np.int32]:
     """Count the events between consecutive frames.
 
     Args:
@@ -225,7 +225,9 @@ def count_between(stretch: Stretch, offset_us: int = 0) -> NDArray[np.int32]:
     return out
 
 
-def log_changes(stretch: Stretch, I0: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def log_changes(
+    stretch: SampledSegment, I0: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the changes of ln(I + I0) from each frame to the next.
 
     Args:

@@ -7,7 +7,7 @@ import pytest
 
 import jaxevent
 from jaxevent.calibration.brightness import interpolate, read_positions, sort_by_pixel
-from jaxevent.calibration.sampling import Stretch, choose_pixels, correlate, take_sample
+from jaxevent.calibration.sampling import SampledSegment, choose_pixels, correlate, take_sample
 from jaxevent.recording import Frames, Recording
 from jaxevent.simulate import MovingObjects, Sensor, simulate
 
@@ -126,7 +126,7 @@ def test_counts_of_smooth_brightness_are_exact(rho):
         times.append(t)
     us = np.rint(1e9 * np.array(times)).astype(np.int64)  # ns in place of us, against rounding
     none = np.zeros((2, 1), np.float32)
-    stretch = Stretch(
+    stretch = SampledSegment(
         us, np.zeros(len(us), np.int32), np.ones(len(us), bool), (0, 10**9), np.arange(2),
         np.zeros(2, np.int64), np.zeros(2, np.int64), none, none, np.ones((2, 1), bool),
     )  # fmt: skip
