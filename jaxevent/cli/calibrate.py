@@ -84,8 +84,8 @@ def _numbers_of_methods(recording: Any) -> dict[str, dict[str, float]]:
 
     found: dict[str, dict[str, float]] = {}
     for name in names("reconstruction"):
-        method = find(name)
-        if method.Params.predictor() is method:
+        method: Any = find(name)
+        if method.fuses and method.Params.predictor() is not None:
             values = calibrated_values(recording, method.Params(), method.names_left_open({}))
             if values.found:
                 found[name] = values.found

@@ -53,7 +53,10 @@ class FrameParams(Parameters):
 
     @classmethod
     def predictor(cls) -> Any:
-        """Return the method whose predictions of hidden frames refine a calibration, or None."""
+        """Return the method whose predictions of hidden frames refine a calibration, or None.
+
+        Parameters of another class take over what it finds.
+        """
         return None
 
     @classmethod
@@ -79,8 +82,8 @@ def calibrated_values(
 ) -> CalibratedValues:
     """Return what a recording says of some numbers, thresholds at the `I0` of parameters.
 
-    Methods with a `predictor` take numbers by which they predict hidden frames of the recording
-    best, sought from the calibration on.
+    Parameters with a `predictor` take the numbers by which this method predicts hidden frames of
+    the recording best, sought from the calibration on.
 
     Args:
         recording: Events and frames.
@@ -97,6 +100,11 @@ def calibrated_values(
     method = params.predictor()
     if method is None or values.missing:
         return values
+    if method.Params is not type(params):
+        of_method = calibrated_values(recording, method.Params(), method.Params.calibrated).found
+        return CalibratedValues(
+            {name: of_method.get(name, values.found[name]) for name in names}, {}
+        )
     start = params.replace(**values.found)
     others = [start.replace(**{n: v for n, v in params.values().items() if n in THRESHOLDS})]
 

@@ -69,7 +69,7 @@ def test_table_file_and_picture(path, found, tmp_path, capsys):
     with Image.open(folder / "calibration.png") as picture:
         assert picture.width > 1000
     tables = tomllib.loads((folder / "calibration.toml").read_text())
-    assert list(tables) == ["calibration", "akf", "aks"] and "best for aks: clock" in out
+    assert list(tables) == ["calibration", "akf", "aks", "mc"] and "best for aks: clock" in out
     table = tables["calibration"]
     assert [table[name] for name in NAMES] == [getattr(found, name).value for name in NAMES]
     for name, (low, high) in table["intervals"].items():

@@ -120,8 +120,8 @@ class Params(smoother.Params):
     calibrated = ("clock_offset",)
 
     @classmethod
-    def predictor(cls) -> None:
-        return None
+    def predictor(cls) -> smoother.Smoother:
+        return smoother.aks  # the images at single instants are a smoother's
 
     presets = {
         "hdr": {
