@@ -218,11 +218,11 @@ class Model:
                 )
             )
             interval += len(stretch.frame_t)
-        columns: Any = zip(*parts, strict=True)
-        joined = Changes(*(np.concatenate(column, -1) for column in columns))
+        columns: list[Any] = [np.concatenate(one, -1) for one in zip(*parts, strict=True)]
+        joined = Changes(*columns)
         if len(joined.n[0]) > MAX_CHANGES:
             keep = np.sort(np.random.default_rng(0).permutation(len(joined.n[0]))[:MAX_CHANGES])
-            joined = Changes(*(values[..., keep] for values in joined))
+            joined = Changes(*[values[..., keep] for values in columns])
         return joined
 
     def fit(self, start: Physics, free: tuple[bool, ...], steps: int = N_STEPS) -> Fit | None:
