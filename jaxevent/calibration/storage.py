@@ -1,7 +1,8 @@
 """Calibrations kept in the user's cache folder, by the content of their recordings.
 
 A recording is known again by its sizes and by samples of its events and frames, so that long ones
-are not read whole. The key holds the source of this package too: another estimator finds nothing.
+are not read whole. The key holds the source of estimators and methods too, so that others find
+nothing.
 A file that is damaged or cannot be read is as none, and what cannot be written is not kept.
 """
 
@@ -132,8 +133,13 @@ def _spread(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
 
 @functools.cache
 def _hash_source() -> str:
-    """Hash the files of this package."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
+    """Hash the files of estimators and of methods that refine what these find."""
+    package = Path(__file__).parents[1]
+    files = [
+        file
+        for folder in ("calibration", "reconstruction")
+        for file in sorted((package / folder).rglob("*.py"))
+    ]
     return hashlib.blake2b(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -179,16 +185,23 @@ def decode(content: bytes) -> Calibration:
     return Calibration(**{**values, **found})
 
 
-def format_toml(calibration: Calibration, I0: float, source: str) -> str:
+def format_toml(
+    calibration: Calibration,
+    I0: float,
+    source: str,
+    methods: Mapping[str, Mapping[str, float]] | None = None,
+) -> str:
     """Format a calibration as a TOML file, which `Parameters.load` reads.
 
     Args:
         calibration: The calibration.
         I0: Offset inside the logarithm that its thresholds hold for.
         source: Name of the recording, for a remark.
+        methods: Numbers of single methods by name, which win over the calibration there.
 
     Returns:
-        The text: a table `[calibration]` of values, and one of their 95 % intervals.
+        The text: a table `[calibration]` of values, one of their 95 % intervals, and one for each
+            of the methods.
     """
     lines = [
         f"# {' '.join(source.split())} by jaxevent {jaxevent.__version__}",
@@ -206,6 +219,9 @@ def format_toml(calibration: Calibration, I0: float, source: str) -> str:
             intervals.append(f"{name} = [{one.low!r}, {one.high!r}]")
     places = np.argwhere(calibration.hot_pixels)[:, ::-1]
     lines.append(f"hot_pixels = {toml.text(places.tolist())}  # [x, y]")
+    for name, numbers in (methods or {}).items():
+        intervals += ["", f"[{toml.key(name)}]"]
+        intervals += [f"{key} = {value!r}" for key, value in numbers.items()]
     return "\n".join([*lines, "", *intervals]) + "\n"
 
 
