@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,7 @@ def _without_fit(
         "dark_offset": "intensity", "event_noise": "c", "frame_noise": "grey", "exposure": "s",
         "exposure_anchor": "exposure",
     }  # fmt: skip
-    none = {name: not_identifiable(unit, why) for name, unit in units.items()}
+    none: dict[str, Any] = {name: not_identifiable(unit, why) for name, unit in units.items()}
     empty = np.zeros(0)
     return Calibration(
         **none, threshold_ratio=ratio, rho_ref=dead, hot_pixels=sample.hot,

@@ -18,7 +18,7 @@ choice depends neither on the change nor on the number of events, and so does no
 import copy
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -218,10 +218,11 @@ class Model:
                 )
             )
             interval += len(stretch.frame_t)
-        joined = Changes(*(np.concatenate(column, -1) for column in zip(*parts, strict=True)))
+        columns: list[Any] = [np.concatenate(one, -1) for one in zip(*parts, strict=True)]
+        joined = Changes(*columns)
         if len(joined.n[0]) > MAX_CHANGES:
             keep = np.sort(np.random.default_rng(0).permutation(len(joined.n[0]))[:MAX_CHANGES])
-            joined = Changes(*(values[..., keep] for values in joined))
+            joined = Changes(*[values[..., keep] for values in columns])
         return joined
 
     def fit(self, start: Physics, free: tuple[bool, ...], steps: int = N_STEPS) -> Fit | None:
@@ -316,13 +317,10 @@ def sandwich(
     H = np.linalg.pinv((J * weight[:, None]).T @ J * CURVATURE)
     S = J * (weight * residual)[:, None]
     parts = [H @ cluster_sums(S, changes, by) @ H for by in ("tile", "interval", "both")]
-    covariance = parts[0] + parts[1] - parts[2]
-    # Few clusters can make the difference too small: no less than one of its parts.
-    scale = np.sqrt(
-        np.max([np.diag(part) for part in (covariance, *parts)], 0)
-        / np.maximum(np.diag(covariance), 1e-30)
-    )
-    return covariance * np.outer(scale, scale)
+    sums = [np.diag(part) for part in (parts[0] + parts[1] - parts[2], *parts)]
+    # Few clusters can make the difference too small, or negative: no less than one of its parts.
+    scale = np.sqrt(np.max(sums, 0) / np.maximum(sums[3], 1e-30))
+    return parts[2] * np.outer(scale, scale)
 
 
 def cluster_sums(score: NDArray, changes: Changes, by: str) -> NDArray[np.float64]:

@@ -44,6 +44,7 @@ class HiddenFrames:
         self.given = part.with_frames(slice(0, None, 2))
         last = (len(part.frames) - 1) // 2 * 2
         self.hidden: Frames = part.frames[slice(1, last, 2)]
+        self.interval_s = float(np.median(np.diff(part.frames.t))) * 1e-6
         gain = part.gain[slice(1, last, 2), None, None]
         linear = np.asarray(part.response.intensity(self.hidden.intensity), np.float64)
         self.white, self.truth = 1 / gain, linear / gain
@@ -121,7 +122,7 @@ def refine(
     parts = choose_parts(recording, float(params.clock_offset))
     if not parts or not names:
         return {}
-    interval = float(np.median(np.diff(parts[0].given.frames.t))) * 0.5e-6
+    interval = parts[0].interval_s
 
     def errors(at: Any) -> NDArray[np.float64]:
         return np.concatenate([part.errors(method, at) for part in parts])

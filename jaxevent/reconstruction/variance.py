@@ -38,7 +38,7 @@ NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight 
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
 
 
-def activity_variance(params: Any, activity: Array | float, movement: Array | float) -> Array:
+def activity_variance(params: Any, activity: Any, movement: Any) -> Array:
     """Return the variance halfway between frames by activity alone, D = 0.
 
     Args:
