@@ -38,7 +38,7 @@ NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight 
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
 
 
-def activity_variance(params: Any, activity: Array, movement: Array) -> Array:
+def activity_variance(params: Any, activity: Any, movement: Any) -> Array:
     """Return the variance halfway between frames by activity alone, D = 0.
 
     Args:
@@ -53,7 +53,7 @@ def activity_variance(params: Any, activity: Array, movement: Array) -> Array:
     return c2 * (params.error_still**2 * movement + params.error_event**2 * activity)
 
 
-def gap_variance(params: Any, activity: Array, residual: Array, movement: Array) -> Array:
+def gap_variance(params: Any, activity: Array, residual: Array, movement: Any) -> Array:
     """Return the variance halfway between two frames, beside their noise and flicker.
 
     Args:
