@@ -257,7 +257,7 @@ def movement(recording):
 
 def halfway(p, activity, residual, moving):
     """Variance halfway between two frames, but for their noise."""
-    c2 = (p["c_on"] ** 2 + p["c_off"] ** 2) / 2
+    c2 = (p["c_on"] ** 2 + p["c_off"] ** 2) / 4 + 0.1**2 / 2
     walk = c2 * (p["error_still"] ** 2 * moving + p["error_event"] ** 2 * activity)
     return walk + p["error_change"] ** 2 * residual**2 / (1 + activity)
 
