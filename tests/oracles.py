@@ -232,13 +232,74 @@ def reconstruct(method, recording, p, times, likelihood=False):
                 other for (i, j), other in pixels.items() if max(abs(i - x), abs(j - y)) == 1
             ]
             sources = [(1 - part * len(near_by), pixel), *((part, other) for other in near_by)]
-            seen, one = smooth(pixel, sources, [int(time) - start for time in times], p)
+            unseen = movement(recording)
+            seen, one = smooth(pixel, sources, [int(time) - start for time in times], p, unseen)
             images[:, :, y, x], total = seen.reshape(2, -1), total + float(one)
             continue
         trace = run(method, pixel, [near[i] for i in rows[x, y]], p)
         for j, time in enumerate(times):
             images[:, j, y, x] = read(method, pixel, trace, int(time) - start, p)
+            if method == "akf" and pixel.frames:
+                near_by = [
+                    other for (i, k), other in pixels.items() if max(abs(i - x), abs(k - y)) == 1
+                ]
+                unseen = movement(recording)
+                images[1, j, y, x] += lasting(pixel, near_by, int(time) - start, p, unseen)
     return (images, total) if likelihood else images
+
+
+def movement(recording):
+    """How much of a recording moves, by its events per pixel and second."""
+    seconds = (recording.stop - recording.start) * 1e-6
+    rate = len(recording.events) / (recording.width * recording.height * max(seconds, 1e-6))
+    return rate / (rate + 1)
+
+
+def halfway(p, activity, residual, moving):
+    """Variance halfway between two frames, but for their noise."""
+    c2 = (p["c_on"] ** 2 + p["c_off"] ** 2) / 4 + 0.1**2 / 2
+    walk = c2 * (p["error_still"] ** 2 * moving + p["error_event"] ** 2 * activity)
+    return walk + p["error_change"] ** 2 * residual**2 / (1 + activity)
+
+
+def lasting(pixel, near_by, time, p, moving):
+    """Variance that the filter leaves out, of frames that do not flicker."""
+
+    def count(one, begin, end):
+        times = zip(one.t, one.weight, strict=True)
+        return sum(w for t, w in times if begin <= t < end)
+
+    def around(k):
+        if not 0 <= k < pixel.frames - 1:
+            return 0.0
+        return sum(count(one, pixel.left[k], pixel.right[k + 1]) for one in near_by)
+
+    k, last = -1, pixel.frames - 1
+    for f in range(pixel.frames):
+        if time >= (pixel.seam(f - 1)[1] if f else pixel.left[0]):
+            k = f
+    f, g = max(k, 0), min(max(k, 0) + 1, last)
+    between = pixel.mid[g] > pixel.mid[f]
+    x = pixel.grey[f] + p["I0"]
+    y = pixel.grey[g] + p["I0"] if between else x
+    noise = (p["frame_noise"] / ((x + y) / 2)) ** 2
+    if k >= 0 and between:
+        own = count(pixel, pixel.mid[f], pixel.mid[g])
+        S = pixel.before(pixel.mid[g]) - pixel.before(pixel.mid[f])
+        Q = halfway(p, own / 2 + around(f) / 16, 2 * (y - x) / (x + y) - S, moving)
+        j = sum(m <= time for m in pixel.mid) - 1
+        inside = 0 <= j < last and pixel.mid[j + 1] > pixel.mid[j]
+        v = (time - pixel.mid[j]) / (pixel.mid[j + 1] - pixel.mid[j]) if inside else 0
+        w = 4 * v * (1 - v)
+        return noise * (1 - w / 2) + w * Q
+    if k >= 0:
+        own = count(pixel, pixel.left[k], time + 1)
+        near = around(k - 1)
+    else:
+        own = count(pixel, time + 1, pixel.right[0])
+        noise = (p["frame_noise"] / (pixel.grey[0] + p["I0"] if not between else (x + y) / 2)) ** 2
+        near = around(0) if between else 0.0
+    return noise + 4 * halfway(p, own / 2 + near / 32, 0, moving)
 
 
 def reference(method, pixel):
@@ -326,7 +387,7 @@ def half_seen(m, P, bound, sign, floor):
     return mass + math.log(x[1] - x[0]), mean, (weight * (x - mean) ** 2).sum()
 
 
-def smooth(pixel, sources, times, p):
+def smooth(pixel, sources, times, p, moving):
     """Image and variance at times (us from the start), and the log likelihood of the frames.
 
     `sources` are the pixels whose events move this one, each with its part.
@@ -387,4 +448,40 @@ def smooth(pixel, sources, times, p):
                 measured.append((k, (mean / variance - m / P) / J, 1 / J / counts))
         measured.append((k, z, r / clear))
     image = [given(pixel.frames + j) for j in range(len(times))]
-    return np.array([[math.exp(m) - I0, P] for m, P in image]).T, total
+    counted = so_far(lambda source, s: 1.0)
+    moved = so_far(lambda source, s: s * source.c(s))
+
+    def later(k):
+        """What the frames from k on measure of the level at frame k."""
+        rows = [row for row in measured if row[0] >= k]
+        at = [r for r, _, _ in rows]
+        H = np.minimum.outer(V[at] - V[k], V[at] - V[k]) + np.diag([r for _, _, r in rows])
+        weights = np.linalg.solve(H, np.ones(len(rows)))
+        z = np.array([z for _, z, _ in rows]) - moved[at] + moved[k]
+        return weights @ z / weights.sum()
+
+    def past(k):
+        kept = measured[:]
+        measured[:] = [row for row in measured if row[0] <= k]
+        m = given(k)[0]
+        measured[:] = kept
+        return m
+
+    out = []
+    for j, (m, P) in enumerate(image):
+        i, time = pixel.frames + j, times[j]
+        k = sum(mid <= time for mid in pixel.mid) - 1
+        x = math.exp(m)
+        noise, w = (p["frame_noise"] / x) ** 2, 0.0
+        if 0 <= k < pixel.frames - 1:
+            v = (time - pixel.mid[k]) / (pixel.mid[k + 1] - pixel.mid[k])
+            w, A, q = 4 * v * (1 - v), counted[k + 1] - counted[k], (V[k + 1] - V[k]) / 4
+            D = later(k + 1) - past(k) - (moved[k + 1] - moved[k])
+            total_error = noise * (1 - w / 2) + w * halfway(p, A, D, moving)
+        else:
+            end = max(k, 0)
+            A, q = abs(counted[i] - counted[end]), abs(V[i] - V[end])
+            total_error = noise + 4 * halfway(p, A, 0, moving)
+        frame = (p["sigma_frame"] / max(p["w_min"], 0.09) / x) ** 2 + p["sigma_floor"] ** 2
+        out.append([x - I0, total_error + max(P - q - frame, 0)])
+    return np.array(out).T, total

@@ -317,7 +317,7 @@ def make_frame_features(
     return FrameFeatures(
         grey, intensity, certainty, images.response(), gain, span, around, before, head, tail,
         segments, weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
-        *(np.asarray(value, dtype) for value in unseen), images.recording.width,
+        *(np.asarray(v, dtype) for v in unseen), images.recording.width,
     )  # fmt: skip
 
 

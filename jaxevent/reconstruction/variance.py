@@ -10,8 +10,9 @@ the part v of the gap. The variance is
 
 r is the noise of the frames, A the activity, events of the pixel and of its neighbours, D the
 change between the frames that events do not explain, M how much of the recording moves, F the
-flicker of its frames. Before the first frame and after the last one D is not known, and the
-error walks on: V = r + 4 c^2 (s^2 M + e^2 A) + F / (I + I0)^2.
+flicker of its frames, c^2 the mean of the squares of the thresholds and of a usual one. Before the
+first frame and after the last one D is not known, and the error walks on:
+V = r + 4 c^2 (s^2 M + e^2 A) + F / (I + I0)^2.
 
 The filter's gains follow its own P, which falls without bound. P is added: it is the noise of
 events that the filter has not forgotten yet.
@@ -34,6 +35,8 @@ ERROR_PARAMETERS = (
     Positive(0.11, "c", "error halfway between frames where no events are"),
     Positive(0.36, "1", "error halfway between frames, as part of the change without events"),
 )
+# Errors do not shrink in proportion to thresholds that are low, or that a calibration finds too low.
+USUAL_THRESHOLD = 0.1  # ln I
 NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight neighbours
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
 
@@ -50,10 +53,11 @@ def activity_variance(params: Any, activity: Any, movement: Any) -> Array:
         The variance, (ln I)^2.
     """
     c2 = (params.c_on**2 + params.c_off**2) / 2
+    c2 = (c2 + USUAL_THRESHOLD**2) / 2
     return c2 * (params.error_still**2 * movement + params.error_event**2 * activity)
 
 
-def gap_variance(params: Any, activity: Array, residual: Array, movement: Array) -> Array:
+def gap_variance(params: Any, activity: Array, residual: Array, movement: Any) -> Array:
     """Return the variance halfway between two frames, beside their noise and flicker.
 
     Args:
