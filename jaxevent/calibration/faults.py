@@ -26,11 +26,12 @@ MAX_POLARITY_SHARE, MIN_POLARITIES = 0.95, 1_000
 SIGMAS = 6.0  # of a correlation that is not chance, among some hundred that are tried
 MIN_ADVANTAGE = 2.0  # of a correlation over that of the recording as it is
 MIN_BUSY = 100  # pixels with several events between frames, which determine clock and exposure
-# Tiles with such pixels: where all of them agree, the significance is the root of their number.
-MIN_RELATED = (3 * SIGMAS) ** 2
+# Tiles with such pixels: where all of them agree, the significance is the root of their number,
+# and half of that is usual.
+MIN_RELATED = (2.5 * SIGMAS) ** 2
 MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half the interval
 MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
-MIN_BLUR_GAIN = 0.1  # of the variance that short exposures leave unexplained
+MAX_DILUTION = 1.25  # of the change per event; slow scenes without blur reach 1.1
 MAX_UNDONE_SHARE = 0.5  # of the events
 WHITE, MAX_WHITE_SHARE = 0.98, 0.05  # of the grey values' range; of the pixels
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
@@ -159,7 +160,7 @@ def _count_bursts(t: NDArray[np.int64]) -> int:
 def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
     """Check polarity, and events against frames."""
     on, off = sample.counts[:, ~sample.hot].sum(1).tolist()
-    if on + off >= MIN_POLARITIES and max(on, off) > MAX_POLARITY_SHARE * (on + off):
+    if one_sign := on + off >= MIN_POLARITIES and max(on, off) > MAX_POLARITY_SHARE * (on + off):
         yield Fault(
             "lost polarity", max(on, off) / (on + off), MAX_POLARITY_SHARE,
             f"{100 * on / (on + off):.3g} % of the events are ON, while what passes a pixel makes "
@@ -175,14 +176,14 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         )  # fmt: skip
         if mismatch.is_disjoint:
             return
-    agreement = measure_agreement(sample)
-    yield from _check_brightness(sample, agreement)
-    if agreement is not None:
-        if on + off and max(on, off) <= MAX_POLARITY_SHARE * (on + off):
-            relation = list(_check_relation(agreement))
-            yield from relation
-            if not relation:
-                yield from _check_clock(recording, agreement)
+    if (agreement := measure_agreement(sample)) is None:
+        return
+    relation = [] if one_sign else list(_check_relation(agreement))
+    yield from relation
+    known = not (one_sign or relation)
+    yield from _check_brightness(sample, agreement.offset if known else 0.0, known)
+    if known:
+        yield from _check_clock(agreement)
 
 
 def _mismatch(recording: Recording) -> tuple[float, float]:
@@ -233,21 +234,20 @@ def _check_relation(agreement: Agreement) -> Iterator[Fault]:
         )  # fmt: skip
 
 
-def _check_clock(recording: Recording, agreement: Agreement) -> Iterator[Fault]:
+def _check_clock(agreement: Agreement) -> Iterator[Fault]:
     """Check offset and exposure of frames that belong to the events."""
     if agreement.busy < MIN_BUSY:
         return
-    assert recording.frames is not None
     interval = agreement.interval
-    left = (1 - agreement.blurred**2) / (1 - agreement.unblurred**2 + 1e-9)
-    if left < 1 - MIN_BLUR_GAIN and agreement.exposure > MAX_EXPOSURE_INTERVALS * interval:
+    if agreement.exposure > MAX_EXPOSURE_INTERVALS * interval:
         yield Fault(
-            "blurred frames", agreement.exposure / interval, MAX_EXPOSURE_INTERVALS,
+            "blurred frames", agreement.dilution, MAX_DILUTION,
             f"changes of the frames follow the events over {agreement.exposure / 1e3:.0f} ms, "
             f"longer than their interval of {interval / 1e3:.0f} ms, as means of several do",
             "use the frames before they were averaged, or only every few of them",
         )  # fmt: skip
-        return
+        if agreement.dilution > MAX_DILUTION:
+            return
     offset, sigma = agreement.offset * 1e-6, agreement.offset_sigma * 1e-6
     if abs(offset) - 2 * sigma > MAX_OFFSET_INTERVALS * interval * 1e-6:
         yield Fault(
@@ -258,13 +258,12 @@ def _check_clock(recording: Recording, agreement: Agreement) -> Iterator[Fault]:
         )  # fmt: skip
 
 
-def _check_brightness(sample: Sample, agreement: Agreement | None) -> Iterator[Fault]:
-    """Check that frames change brightness only as events do, and often enough."""
-    offset = 0 if agreement is None or np.isnan(agreement.offset) else int(agreement.offset)
+def _check_brightness(sample: Sample, offset: float, known: bool) -> Iterator[Fault]:
+    """Check that frames change brightness only as events do, and, with known polarity, often."""
     steps, net, total = [], 0, 0
     for stretch in sample.stretches:
         changes, clear = log_changes(stretch, I0)
-        counts = count_between(stretch, offset)
+        counts = count_between(stretch, 0 if np.isnan(offset) else int(offset))
         for d, used, (on, off) in zip(changes, clear, counts, strict=True):
             quiet = used & (on + off == 0)
             net += int(np.abs(on - off).sum())
@@ -279,7 +278,7 @@ def _check_brightness(sample: Sample, agreement: Agreement | None) -> Iterator[F
         'give the brightness of each frame as extra["gain"], or record with constant exposure '
         "and gain",
     )  # fmt: skip
-    undone = 1 - net / total if total and agreement is not None else 0.0
+    undone = 1 - net / total if total and known else 0.0
     yield Fault(
         "sparse frames", undone, MAX_UNDONE_SHARE,
         f"of the change that events report, {100 * undone:.2g} % is undone before the next frame",
