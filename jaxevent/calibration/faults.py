@@ -180,7 +180,7 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         return
     relation = [] if one_sign else list(_check_relation(agreement))
     yield from relation
-    known = not (one_sign or relation)
+    known = not (one_sign or relation) and agreement.significance[0].max() > SIGMAS
     yield from _check_brightness(sample, agreement.offset if known else 0.0, known)
     if known:
         yield from _check_clock(agreement)
