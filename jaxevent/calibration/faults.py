@@ -180,9 +180,10 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         return
     relation = [] if one_sign else list(_check_relation(agreement))
     yield from relation
-    known = not (one_sign or relation) and agreement.significance[0].max() > SIGMAS
-    yield from _check_brightness(sample, agreement.offset if known else 0.0, known)
-    if known:
+    has_polarity = not (one_sign or relation)
+    is_related = has_polarity and agreement.significance[0].max() > SIGMAS
+    yield from _check_brightness(sample, agreement.offset if is_related else 0.0, has_polarity)
+    if is_related:
         yield from _check_clock(agreement)
 
 
@@ -258,8 +259,8 @@ def _check_clock(agreement: Agreement) -> Iterator[Fault]:
         )  # fmt: skip
 
 
-def _check_brightness(sample: Sample, offset: float, known: bool) -> Iterator[Fault]:
-    """Check that frames change brightness only as events do, and, with known polarity, often."""
+def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iterator[Fault]:
+    """Check that frames change brightness as events do, and, where these have polarity, often."""
     steps, net, total = [], 0, 0
     for stretch in sample.stretches:
         changes, clear = log_changes(stretch, I0)
@@ -278,7 +279,7 @@ def _check_brightness(sample: Sample, offset: float, known: bool) -> Iterator[Fa
         'give the brightness of each frame as extra["gain"], or record with constant exposure '
         "and gain",
     )  # fmt: skip
-    undone = 1 - net / total if total and known else 0.0
+    undone = 1 - net / total if total and has_polarity else 0.0
     yield Fault(
         "sparse frames", undone, MAX_UNDONE_SHARE,
         f"of the change that events report, {100 * undone:.2g} % is undone before the next frame",
