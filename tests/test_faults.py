@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 import jaxevent
-from jaxevent.calibration.agreement import TRANSFORMS
+from jaxevent.calibration.correspondence import TRANSFORMS
 from jaxevent.calibration.hot import find_hot_pixels
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show.describe import describe

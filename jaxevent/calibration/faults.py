@@ -10,7 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.agreement import I0, TRANSFORMS, Agreement, measure_agreement
+from jaxevent.calibration.correspondence import (
+    I0,
+    TRANSFORMS,
+    Correspondence,
+    measure_correspondence,
+)
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording
@@ -176,15 +181,15 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         )  # fmt: skip
         if mismatch.is_disjoint:
             return
-    if (agreement := measure_agreement(sample)) is None:
+    if (correspondence := measure_correspondence(sample)) is None:
         return
-    relation = [] if one_sign else list(_check_relation(agreement))
+    relation = [] if one_sign else list(_check_relation(correspondence))
     yield from relation
     has_polarity = not (one_sign or relation)
-    is_related = has_polarity and agreement.significance[0].max() > SIGMAS
-    yield from _check_brightness(sample, agreement.offset if is_related else 0.0, has_polarity)
+    is_related = has_polarity and correspondence.significance[0].max() > SIGMAS
+    yield from _check_brightness(sample, correspondence.offset if is_related else 0.0, has_polarity)
     if is_related:
-        yield from _check_clock(agreement)
+        yield from _check_clock(correspondence)
 
 
 def _mismatch(recording: Recording) -> tuple[float, float]:
@@ -201,9 +206,9 @@ def _mismatch(recording: Recording) -> tuple[float, float]:
     return lengths[1] / max(lengths[0], 1), 1 / MIN_SPAN_RATIO
 
 
-def _check_relation(agreement: Agreement) -> Iterator[Fault]:
+def _check_relation(correspondence: Correspondence) -> Iterator[Fault]:
     """Check whether events belong to the frames, as they are or turned over."""
-    r, z = agreement.correlation, agreement.significance
+    r, z = correspondence.correlation, correspondence.significance
     here = max(float(r[0].max()), 0.0)
     real = np.where(np.abs(z) > SIGMAS, r, 0)
     kind, lag = np.unravel_index(np.argmax(np.abs(real)), real.shape)
@@ -218,38 +223,38 @@ def _check_relation(agreement: Agreement) -> Iterator[Fault]:
             f"{changed} by {abs(found):.2f}",
             f"make the recording of events with {changed}",
         )  # fmt: skip
-    elif not found and agreement.activity > SIGMAS:
+    elif not found and correspondence.activity > SIGMAS:
         yield Fault(
-            "lost polarity", agreement.activity, SIGMAS,
+            "lost polarity", correspondence.activity, SIGMAS,
             f"events come where and when frames change, but their polarity says nothing about the "
             f"sign: the correlation is {float(np.abs(r[0]).max()):.2f} at most",
             "read the file again with the column or bit of its polarity; use methods without "
             "polarity, or frames alone",
         )  # fmt: skip
-    elif not found and agreement.tiles > MIN_RELATED:
+    elif not found and correspondence.tiles > MIN_RELATED:
         yield Fault(
-            "unrelated events", float(agreement.tiles), MIN_RELATED,
+            "unrelated events", float(correspondence.tiles), MIN_RELATED,
             f"events and changes of the frames do not correlate within "
-            f"{agreement.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
+            f"{correspondence.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
             "check that frames and events are of one recording, clock and camera",
         )  # fmt: skip
 
 
-def _check_clock(agreement: Agreement) -> Iterator[Fault]:
+def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
     """Check offset and exposure of frames that belong to the events."""
-    if agreement.busy < MIN_BUSY:
+    if correspondence.busy < MIN_BUSY:
         return
-    interval = agreement.interval
-    if agreement.exposure > MAX_EXPOSURE_INTERVALS * interval:
+    interval = correspondence.interval
+    if correspondence.exposure > MAX_EXPOSURE_INTERVALS * interval:
         yield Fault(
-            "blurred frames", agreement.dilution, MAX_DILUTION,
-            f"changes of the frames follow the events over {agreement.exposure / 1e3:.0f} ms, "
+            "blurred frames", correspondence.dilution, MAX_DILUTION,
+            f"changes of the frames follow the events over {correspondence.exposure / 1e3:.0f} ms, "
             f"longer than their interval of {interval / 1e3:.0f} ms, as means of several do",
             "use the frames before they were averaged, or only every few of them",
         )  # fmt: skip
-        if agreement.dilution > MAX_DILUTION:
+        if correspondence.dilution > MAX_DILUTION:
             return
-    offset, sigma = agreement.offset * 1e-6, agreement.offset_sigma * 1e-6
+    offset, sigma = correspondence.offset * 1e-6, correspondence.offset_sigma * 1e-6
     if abs(offset) - 2 * sigma > MAX_OFFSET_INTERVALS * interval * 1e-6:
         yield Fault(
             "clock offset", abs(offset), MAX_OFFSET_INTERVALS * interval * 1e-6,

@@ -1,4 +1,4 @@
-"""Agreement of events and frames: products of counts with changes, over lags and transforms.
+"""Correspondence of events and frames: products of counts with changes, over lags and transforms.
 
 Between two frames a pixel counts S = ON - OFF events, and its log intensity changes by d. Their
 correlation is high where events and frames belong together, and tells what is wrong elsewhere.
@@ -40,7 +40,7 @@ TRANSFORMS: Mapping[str, Callable[[NDArray], NDArray]] = MappingProxyType(
 )
 
 
-class Agreement(NamedTuple):
+class Correspondence(NamedTuple):
     """Correlations of events with frames over lags, and their significance.
 
     The significance of a sum of products is the sum over tiles of 16 x 16 pixels and pairs of
@@ -86,7 +86,7 @@ class _Sums(NamedTuple):
 
 def _lag_counts(
     stretch: Stretch, row: int, lags: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.floating]]:
     """Count the events between two frames at lags.
 
     Returns:
@@ -108,14 +108,14 @@ def _lag_counts(
     return active, counted[0], counted[1]
 
 
-def measure_agreement(sample: Sample) -> Agreement | None:
+def measure_correspondence(sample: Sample) -> Correspondence | None:
     """Measure how events and frames agree.
 
     Args:
         sample: Sample of a recording.
 
     Returns:
-        The agreement; None where no clear pixels of two frames are within the events' time.
+        The correspondence; None where no clear pixels of two frames are within the events' time.
     """
     pairs = [(s, row) for s in sample.stretches for row in range(len(s.frame_t) - 1) if len(s.t)]
     if not pairs:
@@ -175,7 +175,7 @@ def measure_agreement(sample: Sample) -> Agreement | None:
     parts = [[s for k, s in enumerate(sums) if k % N_PARTS != part] for part in range(N_PARTS)]
     offsets = np.array([_find_offset(part, step) for part in parts[: len(sums)] if part])
     error = np.sqrt((len(offsets) - 1) * np.var(offsets)) if len(offsets) > 1 else np.nan
-    return Agreement(
+    return Correspondence(
         lags, interval, correlation, significance, activity, busy, tiles,
         _find_offset(sums, step), float(error), *_find_exposure(sums, step, interval),
     )  # fmt: skip
@@ -225,7 +225,7 @@ def _find_offset(sums: list[_Sums], step: int) -> float:
 
 
 def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float]:
-    """Find exposure (us) and dilution, see `Agreement`."""
+    """Find exposure (us) and dilution, see `Correspondence`."""
     fits = [
         (*_fit_window(sums, slice(middle - half, middle + half + 1)), 2.0 * half * step)
         for half in range(N_STEPS - 1)
