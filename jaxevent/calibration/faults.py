@@ -10,7 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.agreement import I0, TRANSFORMS, Agreement, measure_agreement
+from jaxevent.calibration.correspondence import (
+    I0,
+    TRANSFORMS,
+    Correspondence,
+    measure_correspondence,
+)
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording
@@ -26,11 +31,12 @@ MAX_POLARITY_SHARE, MIN_POLARITIES = 0.95, 1_000
 SIGMAS = 6.0  # of a correlation that is not chance, among some hundred that are tried
 MIN_ADVANTAGE = 2.0  # of a correlation over that of the recording as it is
 MIN_BUSY = 100  # pixels with several events between frames, which determine clock and exposure
-# Tiles with such pixels: where all of them agree, the significance is the root of their number.
-MIN_RELATED = (3 * SIGMAS) ** 2
+# Tiles with such pixels: where all of them agree, the significance is the root of their number,
+# and half of that is usual.
+MIN_RELATED = (2.5 * SIGMAS) ** 2
 MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half the interval
 MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
-MIN_BLUR_GAIN = 0.1  # of the variance that short exposures leave unexplained
+MAX_DILUTION = 1.25  # of the change per event; slow scenes without blur reach 1.1
 MAX_UNDONE_SHARE = 0.5  # of the events
 WHITE, MAX_WHITE_SHARE = 0.98, 0.05  # of the grey values' range; of the pixels
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
@@ -159,7 +165,7 @@ def _count_bursts(t: NDArray[np.int64]) -> int:
 def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
     """Check polarity, and events against frames."""
     on, off = sample.counts[:, ~sample.hot].sum(1).tolist()
-    if on + off >= MIN_POLARITIES and max(on, off) > MAX_POLARITY_SHARE * (on + off):
+    if one_sign := on + off >= MIN_POLARITIES and max(on, off) > MAX_POLARITY_SHARE * (on + off):
         yield Fault(
             "lost polarity", max(on, off) / (on + off), MAX_POLARITY_SHARE,
             f"{100 * on / (on + off):.3g} % of the events are ON, while what passes a pixel makes "
@@ -175,14 +181,15 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         )  # fmt: skip
         if mismatch.is_disjoint:
             return
-    agreement = measure_agreement(sample)
-    yield from _check_brightness(sample, agreement)
-    if agreement is not None:
-        if on + off and max(on, off) <= MAX_POLARITY_SHARE * (on + off):
-            relation = list(_check_relation(agreement))
-            yield from relation
-            if not relation:
-                yield from _check_clock(recording, agreement)
+    if (correspondence := measure_correspondence(sample)) is None:
+        return
+    relation = [] if one_sign else list(_check_relation(correspondence))
+    yield from relation
+    has_polarity = not (one_sign or relation)
+    is_related = has_polarity and correspondence.significance[0].max() > SIGMAS
+    yield from _check_brightness(sample, correspondence.offset if is_related else 0.0, has_polarity)
+    if is_related:
+        yield from _check_clock(correspondence)
 
 
 def _mismatch(recording: Recording) -> tuple[float, float]:
@@ -199,9 +206,9 @@ def _mismatch(recording: Recording) -> tuple[float, float]:
     return lengths[1] / max(lengths[0], 1), 1 / MIN_SPAN_RATIO
 
 
-def _check_relation(agreement: Agreement) -> Iterator[Fault]:
+def _check_relation(correspondence: Correspondence) -> Iterator[Fault]:
     """Check whether events belong to the frames, as they are or turned over."""
-    r, z = agreement.correlation, agreement.significance
+    r, z = correspondence.correlation, correspondence.significance
     here = max(float(r[0].max()), 0.0)
     real = np.where(np.abs(z) > SIGMAS, r, 0)
     kind, lag = np.unravel_index(np.argmax(np.abs(real)), real.shape)
@@ -216,39 +223,38 @@ def _check_relation(agreement: Agreement) -> Iterator[Fault]:
             f"{changed} by {abs(found):.2f}",
             f"make the recording of events with {changed}",
         )  # fmt: skip
-    elif not found and agreement.activity > SIGMAS:
+    elif not found and correspondence.activity > SIGMAS:
         yield Fault(
-            "lost polarity", agreement.activity, SIGMAS,
+            "lost polarity", correspondence.activity, SIGMAS,
             f"events come where and when frames change, but their polarity says nothing about the "
             f"sign: the correlation is {float(np.abs(r[0]).max()):.2f} at most",
             "read the file again with the column or bit of its polarity; use methods without "
             "polarity, or frames alone",
         )  # fmt: skip
-    elif not found and agreement.tiles > MIN_RELATED:
+    elif not found and correspondence.tiles > MIN_RELATED:
         yield Fault(
-            "unrelated events", float(agreement.tiles), MIN_RELATED,
+            "unrelated events", float(correspondence.tiles), MIN_RELATED,
             f"events and changes of the frames do not correlate within "
-            f"{agreement.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
+            f"{correspondence.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
             "check that frames and events are of one recording, clock and camera",
         )  # fmt: skip
 
 
-def _check_clock(recording: Recording, agreement: Agreement) -> Iterator[Fault]:
+def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
     """Check offset and exposure of frames that belong to the events."""
-    if agreement.busy < MIN_BUSY:
+    if correspondence.busy < MIN_BUSY:
         return
-    assert recording.frames is not None
-    interval = agreement.interval
-    left = (1 - agreement.blurred**2) / (1 - agreement.unblurred**2 + 1e-9)
-    if left < 1 - MIN_BLUR_GAIN and agreement.exposure > MAX_EXPOSURE_INTERVALS * interval:
+    interval = correspondence.interval
+    if correspondence.exposure > MAX_EXPOSURE_INTERVALS * interval:
         yield Fault(
-            "blurred frames", agreement.exposure / interval, MAX_EXPOSURE_INTERVALS,
-            f"changes of the frames follow the events over {agreement.exposure / 1e3:.0f} ms, "
+            "blurred frames", correspondence.dilution, MAX_DILUTION,
+            f"changes of the frames follow the events over {correspondence.exposure / 1e3:.0f} ms, "
             f"longer than their interval of {interval / 1e3:.0f} ms, as means of several do",
             "use the frames before they were averaged, or only every few of them",
         )  # fmt: skip
-        return
-    offset, sigma = agreement.offset * 1e-6, agreement.offset_sigma * 1e-6
+        if correspondence.dilution > MAX_DILUTION:
+            return
+    offset, sigma = correspondence.offset * 1e-6, correspondence.offset_sigma * 1e-6
     if abs(offset) - 2 * sigma > MAX_OFFSET_INTERVALS * interval * 1e-6:
         yield Fault(
             "clock offset", abs(offset), MAX_OFFSET_INTERVALS * interval * 1e-6,
@@ -258,13 +264,12 @@ def _check_clock(recording: Recording, agreement: Agreement) -> Iterator[Fault]:
         )  # fmt: skip
 
 
-def _check_brightness(sample: Sample, agreement: Agreement | None) -> Iterator[Fault]:
-    """Check that frames change brightness only as events do, and often enough."""
-    offset = 0 if agreement is None or np.isnan(agreement.offset) else int(agreement.offset)
+def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iterator[Fault]:
+    """Check that frames change brightness as events do, and, where these have polarity, often."""
     steps, net, total = [], 0, 0
     for stretch in sample.stretches:
         changes, clear = log_changes(stretch, I0)
-        counts = count_between(stretch, offset)
+        counts = count_between(stretch, 0 if np.isnan(offset) else int(offset))
         for d, used, (on, off) in zip(changes, clear, counts, strict=True):
             quiet = used & (on + off == 0)
             net += int(np.abs(on - off).sum())
@@ -279,7 +284,7 @@ def _check_brightness(sample: Sample, agreement: Agreement | None) -> Iterator[F
         'give the brightness of each frame as extra["gain"], or record with constant exposure '
         "and gain",
     )  # fmt: skip
-    undone = 1 - net / total if total and agreement is not None else 0.0
+    undone = 1 - net / total if total and has_polarity else 0.0
     yield Fault(
         "sparse frames", undone, MAX_UNDONE_SHARE,
         f"of the change that events report, {100 * undone:.2g} % is undone before the next frame",

@@ -38,10 +38,10 @@ def _frames_of(recording: Recording) -> Frames:
 def _with_images(recording: Recording, change: Callable[[NDArray], NDArray]) -> Recording:
     """Change the grey values (frames, height, width) in [0, 1], which are rounded and clipped."""
     frames = _frames_of(recording)
-    kind = np.dtype(frames.images.dtype)
+    kind = frames.images.dtype
     grey = np.clip(change(frames.intensity), 0, 1)
     if kind.kind == "u":
-        grey = np.rint(grey * np.iinfo(kind).max)
+        grey = np.rint(grey * (2 ** (8 * kind.itemsize) - 1))
     return dataclasses.replace(
         recording, frames=dataclasses.replace(frames, images=grey.astype(kind))
     )

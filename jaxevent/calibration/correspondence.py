@@ -1,4 +1,4 @@
-"""Agreement of events and frames: products of counts with changes, over lags and transforms.
+"""Correspondence of events and frames: products of counts with changes, over lags and transforms.
 
 Between two frames a pixel counts S = ON - OFF events, and its log intensity changes by d. Their
 correlation is high where events and frames belong together, and tells what is wrong elsewhere.
@@ -40,7 +40,7 @@ TRANSFORMS: Mapping[str, Callable[[NDArray], NDArray]] = MappingProxyType(
 )
 
 
-class Agreement(NamedTuple):
+class Correspondence(NamedTuple):
     """Correlations of events with frames over lags, and their significance.
 
     The significance of a sum of products is the sum over tiles of 16 x 16 pixels and pairs of
@@ -59,7 +59,7 @@ class Agreement(NamedTuple):
     | tiles | number of the tiles, and pairs of frames, with such pixels |
     | offset, offset_sigma | lag of the highest correlation, and its standard error, us |
     | exposure | length of the exposure of the highest correlation, us |
-    | unblurred, blurred | highest correlation at exposures up to an interval, and at any |
+    | dilution | change per event at that exposure, over that at the best one up to an interval |
     """
 
     lags: NDArray[np.int64]
@@ -72,8 +72,7 @@ class Agreement(NamedTuple):
     offset: float
     offset_sigma: float
     exposure: float
-    unblurred: float
-    blurred: float
+    dilution: float
 
 
 class _Sums(NamedTuple):
@@ -87,7 +86,7 @@ class _Sums(NamedTuple):
 
 def _lag_counts(
     stretch: SampledSegment, row: int, lags: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.floating]]:
     """Count the events between two frames at lags.
 
     Returns:
@@ -109,14 +108,14 @@ def _lag_counts(
     return active, counted[0], counted[1]
 
 
-def measure_agreement(sample: Sample) -> Agreement | None:
+def measure_correspondence(sample: Sample) -> Correspondence | None:
     """Measure how events and frames agree.
 
     Args:
         sample: Sample of a recording.
 
     Returns:
-        The agreement; None where no clear pixels of two frames are within the events' time.
+        The correspondence; None where no clear pixels of two frames are within the events' time.
     """
     pairs = [(s, row) for s in sample.stretches for row in range(len(s.frame_t) - 1) if len(s.t)]
     if not pairs:
@@ -176,7 +175,7 @@ def measure_agreement(sample: Sample) -> Agreement | None:
     parts = [[s for k, s in enumerate(sums) if k % N_PARTS != part] for part in range(N_PARTS)]
     offsets = np.array([_find_offset(part, step) for part in parts[: len(sums)] if part])
     error = np.sqrt((len(offsets) - 1) * np.var(offsets)) if len(offsets) > 1 else np.nan
-    return Agreement(
+    return Correspondence(
         lags, interval, correlation, significance, activity, busy, tiles,
         _find_offset(sums, step), float(error), *_find_exposure(sums, step, interval),
     )  # fmt: skip
@@ -198,49 +197,42 @@ def _contrast(curve: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
     return out
 
 
-def _correlate_window(sums: list[_Sums], window: slice) -> float:
-    """Correlate d with S averaged over a window of lags; NaN with fewer than half of the pairs."""
+def _fit_window(sums: list[_Sums], window: slice) -> tuple[float, float]:
+    """Fit d to S averaged over a window of lags, of which half of the pairs know all events.
+
+    Returns:
+        The correlation, minus infinity where it is not known, and the change per event.
+    """
     known = [s for s in sums if s.inside[window].all()]
-    norm = sum(s.S2[window, window].sum() for s in known) * sum(s.d2 for s in known)
-    if 2 * len(known) < len(sums) or norm <= 0:
-        return np.nan
-    return float(sum(s.Sd[window].sum() for s in known) / np.sqrt(norm))
+    S2 = sum(s.S2[window, window].sum() for s in known)
+    d2 = sum(s.d2 for s in known)
+    if 2 * len(known) < len(sums) or S2 * d2 <= 0:
+        return -np.inf, np.nan
+    Sd = sum(s.Sd[window].sum() for s in known)
+    return float(Sd / np.sqrt(S2 * d2)), float(Sd / S2 * (window.stop - window.start))
 
 
 def _find_offset(sums: list[_Sums], step: int) -> float:
     """Find the lag of the highest correlation (us), by a parabola through three."""
-    curve = np.array([_correlate_window(sums, slice(k, k + 1)) for k in range(2 * N_STEPS + 1)])
+    curve = np.array([_fit_window(sums, slice(k, k + 1))[0] for k in range(2 * N_STEPS + 1)])
     if not np.isfinite(curve).any():
         return np.nan
-    top = int(np.nanargmax(curve))
-    left, middle, right = (
-        curve[max(top - 1, 0) : top + 2] if 0 < top < 2 * N_STEPS else [np.nan] * 3
-    )
+    top = int(curve.argmax())
+    left, middle, right = np.pad(curve, 1, constant_values=-np.inf)[top : top + 3]
     bend = left - 2 * middle + right
-    return (top - N_STEPS + (0.5 * (left - right) / bend if bend < 0 else 0)) * step
+    inner = np.isfinite(bend) and bend < 0
+    return float((top - N_STEPS + (0.5 * (left - right) / bend if inner else 0)) * step)
 
 
-def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float, float]:
-    """Find the exposure of the highest correlation, see `Agreement`."""
-    lags = 2 * N_STEPS + 1
-    halves = np.arange(N_STEPS - 1)
-    best = np.array(
-        [
-            max(
-                (
-                    _correlate_window(sums, slice(middle - half, middle + half + 1))
-                    for middle in range(half, lags - half)
-                ),
-                key=lambda r: -np.inf if np.isnan(r) else r,
-            )
-            for half in halves.tolist()
-        ]
-    )
-    if not np.isfinite(best).any():
-        return np.nan, np.nan, np.nan
-    lengths = 2.0 * halves * step
-    return (
-        float(lengths[np.nanargmax(best)]),
-        float(np.nanmax(best[lengths <= interval])),
-        float(np.nanmax(best)),
-    )
+def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float]:
+    """Find exposure (us) and dilution, see `Correspondence`."""
+    fits = [
+        (*_fit_window(sums, slice(middle - half, middle + half + 1)), 2.0 * half * step)
+        for half in range(N_STEPS - 1)
+        for middle in range(half, 2 * N_STEPS + 1 - half)
+    ]
+    best = max(fits)
+    short = max(fit for fit in fits if fit[2] <= interval)
+    if not np.isfinite(best[0] + short[0]):
+        return np.nan, np.nan
+    return best[2], best[1] / short[1]
