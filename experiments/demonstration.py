@@ -36,7 +36,7 @@ DRAWN = {"noises": {"fit": range(3), "test": range(100, 103)},
          "r_t": {"fit": range(16), "test": range(100, 108)}}  # fmt: skip
 TRUTHS = {"noises": {name: AKF[name] for name in ("sigma_proc", "sigma_iso")}, "r_t": VOTES}
 RANGES = {"sigma_proc": (0.01, 3.0), "sigma_iso": (0.01, 3.0), "r_t": (1.0, 1e5)}  # of the grid
-DOT = {"rate": 19.39, "centre": (314.29, 202.35), "radius": 107.66}  # Hz, px, px
+DOT_RATE_HZ, DOT_CENTRE_PX, DOT_RADIUS_PX = 19.39, (314.29, 202.35), 107.66
 
 
 def draw(folder: Path, part: str) -> None:
@@ -94,7 +94,8 @@ def simulated(folder: Path, part: str) -> tuple[list[dict[str, Any]], Any]:
     task: Task = plan.tasks[0]
     batches = {}
     for split in ("fit", "test"):
-        given = [(name, jaxevent.load(path)) for name, path in plan.recordings[split]]
+        paths: Any = plan.recordings[split]
+        given = [(name, jaxevent.load(path)) for name, path in paths]
         named = [(n, dataclasses.replace(one, name=n)) for n, one in given]
         sources: Any = {"fit": named, "validation": [], "test": []}
         batches[split] = task.goal.problem(sources, None, None)(task.params)[0]
@@ -198,15 +199,15 @@ def dot_motion(recording: Any) -> KnownMotion:
     """Return the image velocity of the spinning dot, whose phase and sense events tell."""
     events = recording.events
     x, y = (
-        np.asarray(v, float) - c for v, c in zip((events.x, events.y), DOT["centre"], strict=True)
+        np.asarray(v, float) - c for v, c in zip((events.x, events.y), DOT_CENTRE_PX, strict=True)
     )
-    turn = 2 * np.pi * DOT["rate"] * 1e-6
+    turn = 2 * np.pi * DOT_RATE_HZ * 1e-6
     angle, t = np.arctan2(y, x), np.asarray(events.t, float)
     means = {sense: np.exp(1j * (angle - sense * turn * t)).mean() for sense in (-1, 1)}
     sense = max(means, key=lambda one: abs(means[one]))
     times = np.arange(recording.start, recording.stop + 101, 100)
     now = np.angle(means[sense]) + sense * turn * times
-    speed = sense * turn * 1e6 * DOT["radius"]
+    speed = sense * turn * 1e6 * DOT_RADIUS_PX
     return KnownMotion(Planar, times, speed * np.stack([-np.sin(now), np.cos(now)], 1))
 
 

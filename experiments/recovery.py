@@ -163,6 +163,7 @@ def akf_recovery(seed: int) -> Recovered:
     start = jaxevent.akf.Params(
         c_on=0.2, c_off=0.2, sigma_proc=0.1, sigma_iso=0.2, sigma_ref=0.1, rho=RHO, I0=I0, P0=P0,
         kappa=1e-9, calibrate=False, deblur=False,
+        frame_noise=0.0, error_event=0.0, error_still=0.0, error_change=0.0,
     )  # fmt: skip
     drawn = cut_windows(from_akf(seed), "reference")
     problem = Problem(Objective(jaxevent.akf, "nll", False), drawn)

@@ -20,6 +20,7 @@ import optax
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from jaxevent import devices
@@ -36,8 +37,8 @@ P = TypeVar("P", bound=Parameters)
 # for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
 MAX_FORWARD_PARAMETERS = 2
 
-# A line on which a loss is probed, in unit steps: changes over 0.1, 0.2 and 0.4 of one.
-PROBE_STEPS = (-0.7, -0.3, -0.1, 0.0, 0.1, 0.3, 0.7)
+# A line on which a loss is probed, in unit steps: changes over 0.1 and 0.3 of one.
+PROBE_STEPS = (-0.4, -0.1, 0.0, 0.1, 0.4)
 MIN_SKILL = 0.5  # of the gradient, below which a loss is rough
 NEGLIGIBLE_CHANGE = 1e-5  # of a loss, relative: single precision rounds sums by about 1e-6
 ROUGH_SEARCH_REACH, N_ROUGH_CANDIDATES = 6.4, 17  # unit steps to both sides: a factor of 600
@@ -374,9 +375,7 @@ def optimise(
         return FitResult(fitted, loss, run.history, run.rough)
 
 
-def gradient_skill(
-    steps: Sequence[float], losses: Sequence[float], slopes: Sequence[float]
-) -> float:
+def gradient_skill(steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike) -> float:
     """Measure how well the slope of a loss predicts its changes along a line.
 
     From one point to the next the slope predicts the change h (g + g') / 2, exactly for a parabola.
@@ -391,13 +390,22 @@ def gradient_skill(
     Returns:
         The skill, at most 1.
     """
+    error, _ = _prediction_errors(steps, losses, slopes)
+    change = np.diff(np.asarray(losses)[np.isfinite(slopes)])
+    total = float(change @ change)
+    return 1.0 - float(error @ error) / total if total > 0 else 1.0
+
+
+def _prediction_errors(
+    steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the errors of predicted changes, 0 where negligible, and the predictions."""
     table = np.array([steps, losses, slopes], float)
     at, loss, slope = table[:, np.isfinite(table).all(0)]
-    change = np.diff(loss)
-    error = change - np.diff(at) * (slope[1:] + slope[:-1]) / 2
-    least = (NEGLIGIBLE_CHANGE * np.abs(loss).max(initial=0)) ** 2 * len(change)
-    total = float(change @ change)
-    return 1.0 - float(error @ error) / total if total > least else 1.0
+    predicted = np.diff(at) * (slope[1:] + slope[:-1]) / 2
+    error = np.diff(loss) - predicted
+    least = NEGLIGIBLE_CHANGE * np.abs(loss).max(initial=0)
+    return np.where(np.abs(error) > least, error, 0.0), predicted
 
 
 def unit_step(number: Number, value: float, start: float) -> float:
@@ -674,7 +682,8 @@ class _Loop:
     def _search_rough_numbers(self, replay: Iterator[float]) -> None:
         """Probe the loss around the given start, and search the numbers in which it is rough.
 
-        A line along all numbers is probed first, and a line along each only if that one is rough.
+        A line along all numbers comes first. Suspect are those that change the loss by less than
+        the errors of all predictions together; these are probed one by one.
         """
         position = self.run.position
         params = self.params.with_raw(position.searched)
@@ -699,29 +708,35 @@ class _Loop:
                 self._note(value)
             return value
 
-        def slope(names: Sequence[str], step: float) -> float:
+        def slopes(names: Sequence[str], step: float) -> list[float]:
             at = moved(names, step)
-            value = next(replay, None)
-            if value is None:
-                function = functools.partial(loss_and_grad, self.function, self.forward, params, at)
-                gradient = _mean(function, batches)[1]
-                value = sum(units[name] * float(gradient[name].sum()) for name in names)
-                self._note(value)
-            return value
+            known = [value for _, value in zip(names, replay, strict=False)]
+            if known:
+                return known
+            function = functools.partial(loss_and_grad, self.function, self.forward, params, at)
+            gradient = _mean(function, batches)[1]
+            found = [units[name] * float(gradient[name].sum()) for name in names]
+            self._note(*found)
+            return found
 
-        def skill(names: Sequence[str]) -> float:
-            losses = [loss(names, step) for step in PROBE_STEPS]
-            inside = [k for k, value in enumerate(losses) if math.isfinite(value)]
-            steps = [PROBE_STEPS[k] for k in inside]
-            return gradient_skill(
-                steps, [losses[k] for k in inside], [slope(names, step) for step in steps]
-            )
+        def probe(names: Sequence[str]) -> tuple[list[float], list[float], NDArray[np.float64]]:
+            losses = {step: loss(names, step) for step in PROBE_STEPS}
+            steps = [step for step, value in losses.items() if math.isfinite(value)]
+            table = np.array([slopes(names, step) for step in steps])
+            return steps, [losses[step] for step in steps], table
 
-        together = skill(list(raw))
-        if together >= MIN_SKILL:
-            return
-        for name in list(raw):
-            found = together if len(raw) == 1 else skill([name])
+        names = list(raw)
+        steps, losses, table = probe(names)
+        error, _ = _prediction_errors(steps, losses, table.sum(1))
+        for k, name in enumerate(names):
+            _, predicted = _prediction_errors(steps, losses, table[:, k])
+            if error @ error <= (1 - MIN_SKILL) * (predicted @ predicted):
+                continue
+            if len(names) > 1:
+                steps, alone, slope = probe([name])
+                found = gradient_skill(steps, alone, slope[:, 0])
+            else:
+                found = gradient_skill(steps, losses, table[:, 0])
             if found >= MIN_SKILL:
                 continue
             step = _search_smoothed(functools.partial(loss, [name]))
@@ -731,9 +746,9 @@ class _Loop:
         shifted = {n: leaf + (raw[n] - leaf[:1]) for n, leaf in position.raw.items()}
         self.run.position = dataclasses.replace(position, raw=shifted, best=shifted)
 
-    def _note(self, value: float) -> None:
-        """Keep a value that a resumed search replays."""
-        self.run.tried.append(value)
+    def _note(self, *values: float) -> None:
+        """Keep values that a resumed search replays."""
+        self.run.tried += values
         self.save(self.run, False)
 
     def _with_value(self, params: Any, name: str, value: float) -> Any:
