@@ -9,6 +9,7 @@ target (`trajectories`). Along these paths the images are fused (`fusion`).
 import collections
 import dataclasses
 import math
+import os
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -25,6 +26,7 @@ from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
+from jaxevent.reconstruction.compensated.consistency import EventNoise
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
     AdjacentFrames,
@@ -80,6 +82,7 @@ from jaxevent.reconstruction.compensated.trajectories import (
     NodeTrajectories,
     advect_nodes,
     change_clock,
+    choose_trajectories,
     estimate_trajectories,
     gauss_newton_step,
     node_shape,
@@ -107,6 +110,8 @@ from jaxevent.recording import Recording, Times, microseconds
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
+MIN_TRUST = float(os.environ.get("MT", ".8"))
+MIN_CLOCK_TRUST = 0.5
 N_CACHED_ANCHORS = 2
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
 MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
@@ -194,6 +199,7 @@ class TrajectoryEstimate(NamedTuple):
     # (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
     path_index: NDArray[np.int32] | None = None
     smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
+    noise: NDArray[np.float32] | None = None
 
     @property
     def paths(self) -> NDArray[np.float32]:
@@ -293,39 +299,95 @@ class TrajectoryEstimator:
         )
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
-        self._anchors: collections.OrderedDict[int, tuple[TargetInstants, NDArray[np.float32]]]
+        self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
+        self._anchors: collections.OrderedDict[tuple[int, bool], tuple[TargetInstants, NDArray[np.float32]]]
         self._anchors = collections.OrderedDict()
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         """Return L, V and clear at instants, and the smooth part that is subtracted from L."""
         L, V, clear = self.images(instants.t)
+        V = self.inflate(instants, V, clear)
         if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
             return L, V, clear, None
         smooth = gaussian_blur(L)
         return L - smooth, V, clear, smooth
 
+    def noise_factors(self, instants):
+        """Return the factors (K, h, w) on the variances of images between frames."""
+        interval = int(np.searchsorted(self.schedule.frames, instants.t[instants.target], "right")) - 1
+        one = np.ones(self.images.image_shape, np.float32)
+        if instants.t[instants.target] in self.schedule.frames: return np.stack([one]*len(instants))
+        return np.stack([self.event_noise(interval)[0]]*len(instants))
+
+    def inflate(self, instants, V, clear):
+        frames = self.schedule.frames
+        V = V.copy()
+        for k, t in enumerate(instants.t.tolist()):
+            if t in frames: continue
+            i = int(np.searchsorted(frames, t, "right")) - 1
+            g, add, _ = self.event_noise(i)
+            if 0 <= i < len(frames) - 1:
+                w = (t - frames[i]) / (frames[i + 1] - frames[i])
+            else:
+                i = min(max(i, 0), len(frames) - 2)
+                w = .5
+            new = V[k] * g + add * np.float32(w * (1 - w))
+            V[k] = np.where(clear[k] > 0, V[k], new)
+        return V
+
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
+    def _schedule(self, t: int, timed: bool) -> TargetInstants:
+        """Choose the instants of a target; where events are not to be trusted on the clock of time."""
+        instants = self.schedule(t)
+        return instants.with_clock(TIME_CLOCK) if timed else instants
+
+    def _trust(self, t: int) -> float:
+        return self.event_noise(int(np.searchsorted(self.schedule.frames, t, "right")) - 1)[2]
+
     def _anchor(self, t: int) -> tuple[TargetInstants, NDArray[np.float32]]:
         """Return the anchor next to a time (us), and its motion at half resolution."""
         first, last = self.schedule.span
+        frames = self.schedule.frames
         interval = ANCHOR_STEPS * self.schedule.step
         at = min(max(first + round((t - first) / interval) * interval, first), last)
-        if at in self._anchors:
-            self._anchors.move_to_end(at)
+        trust = min(self._trust(t), self._trust(at))
+        right = int(np.searchsorted(frames, t, "right"))
+        alone = trust < MIN_TRUST and 0 < right < len(frames)
+        if alone:
+            at = int(frames[right - 1] + frames[right]) // 2
+        key = at, trust < MIN_CLOCK_TRUST
+        if key in self._anchors:
+            self._anchors.move_to_end(key)
         else:
-            instants = self.schedule(at)
+            instants = self._schedule(at, trust < MIN_CLOCK_TRUST)
             L, V, clear, _ = self._images(instants)
             pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
             plan = plan_stages(instants.s, instants.first_horizon)
             motion = estimate_trajectories(pyramid, instants.s, plan, self._cost)
-            self._anchors[at] = instants, motion.at_level(1, L.shape[1:]).p
+            p = motion.at_level(1, L.shape[1:]).p
+            if alone:
+                p = self._prefer_frames(instants, L, V, pyramid, p)
+            self._anchors[key] = instants, p
             if len(self._anchors) > N_CACHED_ANCHORS:
                 self._anchors.popitem(last=False)
-        return self._anchors[at]
+        return self._anchors[key]
+
+    def _prefer_frames(self, instants, L, V, pyramid, p):
+        """Return the motion that frames alone show, where images agree better along it."""
+        framed = np.isin(instants.t, self.schedule.frames)
+        if framed.sum() < 2:
+            return p
+        s = instants.s[framed]
+        alone = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
+        near = float(np.abs(instants.s[[instants.before, instants.after]]).max())
+        motion = estimate_trajectories(alone, s, plan_stages(s, near), self._cost)
+        other = motion.at_level(1, L.shape[1:]).p
+        images = PackedImages.of(pyramid[1], instants.s)
+        return choose_trajectories(images, (p, other), self._cost)
 
     def _initial_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32]:
         """Return the motion that a target starts from, at half resolution."""
@@ -361,7 +423,7 @@ class TrajectoryEstimator:
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
-        instants = self.schedule(t)
+        instants = self._schedule(t, self._trust(t) < MIN_CLOCK_TRUST)
         p = self._initial_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
         size = L.shape[1:]
@@ -374,13 +436,14 @@ class TrajectoryEstimator:
         p = NodeTrajectories(p, 1).at_level(0, size).p
         # The target's own image is the smoother's. The image fused so far is a better one to refine
         # with.
-        fused = fuse_target(self.params, TrajectoryEstimate(instants, L, V, clear, p))
+        noise = self.noise_factors(instants)[instants.target]
+        fused = fuse_target(self.params, TrajectoryEstimate(instants, L, V, clear, p, noise=noise))
         better, target = L.copy(), instants.target
         better[target] = fused.L
         variance[target] = FUSED_VARIANCE_FACTOR * np.asarray(fused.P) + self._cost.floor
         images = PackedImages.of(pack_images(better, variance), instants.s)
         p, path_index = refine_paths(images, p, self._cost)
-        return TrajectoryEstimate(instants, L, V, clear, p, path_index, smooth)
+        return TrajectoryEstimate(instants, L, V, clear, p, path_index, smooth, noise)
 
 
 @jax.jit
@@ -405,7 +468,7 @@ def compare_images(
     warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
     layout = make_layout(instants, clear, len(instants))
     mean = robust_mean(params, L, warped, layout)
-    return mean, reference_images(L, V, warped, layout, squared_reach(paths))
+    return mean, reference_images(L, V, warped, layout, squared_reach(paths), target.noise)
 
 
 def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:

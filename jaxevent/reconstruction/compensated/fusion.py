@@ -65,6 +65,7 @@ class ReferenceImages(NamedTuple):
     # Distance of the target from the nearest frame, in intervals from that to `other`, where frames
     # are on one side alone; else 1.
     intervals_away: Numeric
+    noise: Numeric = 1.0
 
 
 def reference_images(
@@ -73,6 +74,7 @@ def reference_images(
     warped: WarpedImages,
     layout: InstantLayout,
     squared_reach: Numeric | float = np.inf,
+    noise=None,
 ) -> ReferenceImages:
     """Collect the images that the robust mean is compared with.
 
@@ -106,6 +108,7 @@ def reference_images(
         rest=layout.rest,
         squared_reach=squared_reach,
         intervals_away=jnp.where((a == b) & (a != c), abs(layout.s[a]) / interval, 1),
+        noise=1.0 if noise is None else noise,
     )
 
 
@@ -138,6 +141,7 @@ class FusionFeatures(ShortRepr):
     rest: Float[Array, ""]
     stationary: Float[Array, "..."]  # 1 where points stay in their places, else 0
     intervals_away: Float[Array, ""]  # as in `ReferenceImages`
+    noise: Float[Array, "..."]
 
 
 def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures:
@@ -150,7 +154,9 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
     Returns:
         Candidates and features.
     """
-    M, near, smoothed = mean.M, mean.near_mean, images.target
+    M = mean.M
+    noise = jnp.asarray(images.noise, M.dtype)
+    near, smoothed = (M + (image - M) / noise for image in (mean.near_mean, images.target))
     blend = (1 - images.after_weight) * images.before + images.after_weight * images.after
 
     def squared_difference(one: Array, other: Array) -> Array:
@@ -183,7 +189,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
     clipped = jnp.where(beyond > 0, CLIPPED_VARIANCE_BEYOND, CLIPPED_VARIANCE)
     squared_reach = jnp.asarray(images.squared_reach, jnp.float32)
     return FusionFeatures(
-        candidates=jnp.stack([M, smoothed, blend]),
+        candidates=jnp.stack([M, images.target, blend]),
         in_place=1 / (1 + (images.blend_variance / clipped) ** 2),
         features=jnp.stack([*X, jnp.ones_like(M)]),
         shares=mean.shares,
@@ -193,6 +199,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
         rest=jnp.asarray(images.rest, jnp.float32),
         stationary=1 / (1 + (squared_reach / MAX_STATIONARY_PX**2) ** 2),
         intervals_away=jnp.asarray(images.intervals_away),
+        noise=jnp.asarray(images.noise, jnp.float32),
     )
 
 
@@ -218,11 +225,13 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     )
     # At rest events are noise, which the smoother in place adds up.
     logits = logits.at[0].add(jnp.log(jnp.maximum(1 - given.rest, MIN_SQUARED_DIFFERENCE)))
+    import os
+    logits = logits.at[0].add(-float(os.environ.get('BETA', 2)) * jnp.log(given.noise))
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(logits[:1]), logits]), axis=0)
     quiet = MIN_SQUARED_DIFFERENCE / jnp.exp(X[FEATURE_NAMES.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
     # with those around the target.
-    q = _shift_weight(q, given.stationary * given.in_place * quiet, 1)
+    q = _shift_weight(q, given.stationary * given.in_place * quiet / given.noise, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
     alone = gaussian_blur(quiet, NOISE_EVENT_SIGMA_PX)
     q = _shift_weight(q, given.rest * jnp.maximum(quiet, alone), 2)

@@ -40,6 +40,7 @@ from jaxevent.reconstruction.compensated.normal_equations import (
 from jaxevent.reconstruction.compensated.robust_mean import (
     blur_along_x,
     blur_along_y,
+    blur_image,
     gaussian_taps,
 )
 from jaxevent.reconstruction.compensated.warp import (
@@ -74,6 +75,7 @@ class PathSearch(NamedTuple):
     sigma: float  # of the Gaussian over which costs are gathered, in units of the spacing
 
 
+CHOICE_SIGMA = 2.0
 # Set on objects of seeds that are not scored, and on the first half of slider_depth.
 PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
 
@@ -231,6 +233,20 @@ def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) 
     """
     points, M, _ = sample_trajectories(images, p, cost)
     return float(((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).mean())
+
+
+def choose_trajectories(images, several, cost):
+    """Choose for every node the trajectories along which images agree best around it."""
+    costs = []
+    for p in several:
+        points, M, _ = sample_trajectories(images, p, cost)
+        squares = ((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).sum(1)
+        h, w = squares.shape
+        padded = np.pad(squares, [(0, h % 2), (0, w % 2)], mode="edge")
+        nodes = padded.reshape(-(-h // 2), 2, -(-w // 2), 2).mean((1, 3))
+        costs.append(blur_image(nodes.astype(np.float32), CHOICE_SIGMA))
+    best = np.argmin(costs, 0)
+    return np.take_along_axis(np.stack(several), best[None, ..., None], 0)[0]
 
 
 def change_clock(
