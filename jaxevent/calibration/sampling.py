@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.hot import find_hot_pixels
 from jaxevent.codegen import njit_noalloc
-from jaxevent.events import is_hot
 from jaxevent.recording import Recording
 
 MAX_EVENTS = 3_000_000
@@ -153,7 +153,7 @@ def take_sample(recording: Recording) -> Sample:
             chosen = chosen * N_STRETCHES
     most = MAX_EVENTS // len(chosen)
     counts = np.zeros((2, width * height), np.int64)
-    found, events_read = [], 0
+    by_part, found, events_read = [], [], 0
     for number, rows in enumerate(chosen):
         if len(rows) > 1:
             rows, span, first, last = _read_stretch(recording, (0, 0), most, rows)
@@ -167,6 +167,14 @@ def take_sample(recording: Recording) -> Sample:
         place = events.y.astype(np.int64) * width + events.x
         for row, of in enumerate((events.p, ~events.p)):
             counts[row] += np.bincount(place[of], minlength=width * height)
+        cuts = np.empty(0, np.intp)
+        if len(chosen) == 1 and len(events):
+            times = np.linspace(events.t[0], events.t[-1] + 1, N_STRETCHES + 1)
+            cuts = np.searchsorted(events.t, times[1:-1])
+        by_part += [
+            np.bincount(part, minlength=width * height).astype(np.int32)
+            for part in np.split(place, cuts)
+        ]
         pixel = index[place]
         keep = pixel >= 0
         grey = np.empty((len(rows), len(places)), np.float32)
@@ -186,7 +194,7 @@ def take_sample(recording: Recording) -> Sample:
         )  # fmt: skip
     white = max((float(s.grey.max(initial=0)) for s in found), default=0.0) * WHITE_SHARE
     dark, bright = MARGIN_LEVELS / 255, min(white, 1 - MARGIN_LEVELS / 255)
-    hot = is_hot(counts.sum(0).reshape(height, width))
+    hot = find_hot_pixels(np.stack(by_part).reshape(-1, height, width))
     is_out = hot.ravel()[places]
     stretches = tuple(
         s._replace(clear=(s.grey > dark) & (s.grey < bright)).without(is_out) for s in found

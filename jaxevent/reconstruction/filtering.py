@@ -69,6 +69,8 @@ class Observation(eqx.Module):
     # A bound and the rate (1/s) that pulls to it states below (positive) or above it (negative).
     bound: Float[Numeric, "*points"] | None = None
     push: Float[Numeric, "*points"] | None = None
+    # Of errors of the level that last, to be added to the state's in images; (ln I)^2.
+    variance: Float[Numeric, "*points"] | None = None
 
 
 class Event(eqx.Module):
@@ -195,7 +197,7 @@ class Filter(KernelEstimator[P]):
             Intensity, and variance of log intensity.
         """
         L, P = self.readout(params, self.predict(params, state, since, frame))
-        return jnp.exp(L) - params.I0, P
+        return jnp.exp(L) - params.I0, P if frame.variance is None else P + frame.variance
 
     def step_and_readout(
         self,

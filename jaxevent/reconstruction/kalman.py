@@ -20,8 +20,9 @@ from jaxevent.reconstruction.augment import (
     event_change,
     frame_information,
 )
-from jaxevent.reconstruction.features import FrameFeatures, Points
+from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Points
 from jaxevent.reconstruction.filtering import Event, Filter, FrameModel, Observation, PixelState
+from jaxevent.reconstruction.variance import ERROR_PARAMETERS, AugmentedFrameErrors
 
 
 class Params(AugmentParams):
@@ -45,6 +46,7 @@ class Params(AugmentParams):
     below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
     one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
     clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
+    frame_noise, error_event, error_still, error_change = ERROR_PARAMETERS
 
     presets = {
         "paper": {"ratio_width": 0.0},
@@ -116,6 +118,7 @@ class AugmentedFrameModel(FrameModel):
     begin: Float[Array, "frames pixels"]
     bound: Float[Array, "frames pixels"] | None
     push: Float[Array, "frames pixels"] | None
+    errors: AugmentedFrameErrors
 
     def __init__(self, params: Params, frames: FrameFeatures):
         self.level = AugmentedFrame(params, frames, noise_bias(params, frames))
@@ -133,6 +136,7 @@ class AugmentedFrameModel(FrameModel):
         edge = clipping_bound(params, frames)
         self.clipped = abs(side)
         self.begin = edge + jnp.where(side > 0, params.above, -params.below)
+        self.errors = AugmentedFrameErrors(params, frames)
         self.bound = self.push = None
         if params.one_sided:
             # Both frames of a gap are needed: where one is not clipped, events show when it began.
@@ -146,10 +150,13 @@ class AugmentedFrameModel(FrameModel):
             rate = self.present * self.density(points)
         else:
             rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
-        if self.bound is None or self.push is None:
-            return Observation(self.level(points), rate)
-        push = self.present * points.gather_frame(self.push)
-        return Observation(self.level(points), rate, points.gather_frame(self.bound), push)
+        bound = push = variance = None
+        if self.bound is not None and self.push is not None:
+            bound = points.gather_frame(self.bound)
+            push = self.present * points.gather_frame(self.push)
+        if isinstance(points, ImagePoints):
+            variance = self.present * self.errors(points)
+        return Observation(self.level(points), rate, bound, push, variance)
 
     def initial_level(self, points: Points) -> Array:
         level = self.level(points)

@@ -458,8 +458,10 @@ class SmootherPasses:
         self.clock, self.layout = recording.windows.clock, recording.layout
         stride = self.layout.stride
         self.kind = KernelKind(self.clock.exposed, self.dtype, stride, directions)
-        fixed = recording.fixed_inputs(clock_offset)
-        self._fixed = {name: fixed[name] for name in ("clock_offset", "response")}
+        fixed = recording.fixed_inputs(clock_offset, method.has_unseen_errors)
+        self._fixed = {
+            name: fixed[name] for name in ("clock_offset", "response", "flicker", "movement")
+        }
         self._program: SmootherProgram | None = None
         self.spare: queue.SimpleQueue[NDArray] = queue.SimpleQueue()  # memory for bands
         self.use_params(params)
