@@ -9,7 +9,6 @@ target (`trajectories`). Along these paths the images are fused (`fusion`).
 import collections
 import dataclasses
 import math
-import os
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -26,7 +25,11 @@ from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
-from jaxevent.reconstruction.compensated.consistency import EventNoise
+from jaxevent.reconstruction.compensated.event_noise import (
+    EventNoise,
+    IntervalNoise,
+    inflate_variances,
+)
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
     AdjacentFrames,
@@ -110,8 +113,9 @@ from jaxevent.recording import Recording, Times, microseconds
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
-MIN_TRUST = float(os.environ.get("MT", ".8"))
-MIN_CLOCK_TRUST = 0.5
+# In the events of an interval, from which its motion is sought along them and on their clock. Of
+# 0.5, 0.8 and 0.9 chosen on simulated scenes, with and without faults.
+MIN_TRUST = 0.8
 N_CACHED_ANCHORS = 2
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
 MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
@@ -123,6 +127,9 @@ class PreparedTarget(NamedTuple):
 
     rows: Int[Numeric, "*times k"]  # its instants among all
     layout: InstantLayout
+    # Rows of `PreparedTargets.noise` of its instants, and `event_noise.InstantPlaces.shape`.
+    noise_rows: Int[Numeric, "*times k"]
+    noise_shape: Float[Numeric, "*times k"]
     p: Float[Numeric, "*times rows columns 4"]  # trajectories of nodes, px
     path_index: Int[Numeric, "*times h w"]  # the pixel whose path each one takes
     exposures: AdjacentExposures
@@ -135,13 +142,14 @@ class PreparedTargets(ShortRepr):
 
     instants: ReadOut  # all instants of all targets, sorted
     targets: PreparedTarget  # stacked
+    noise: IntervalNoise  # of the intervals between frames at hand; constant, as motion is
     # Of exposures; None: images are not fitted to them.
     samples: int | None = eqx.field(static=True, default=None)
 
     def take(self, rows: NDArray) -> "PreparedTargets":
         """Choose some of the images, in the order of `rows`."""
         chosen = jax.tree.map(lambda leaf: leaf[rows], self.targets)
-        return PreparedTargets(self.instants, chosen, self.samples)
+        return PreparedTargets(self.instants, chosen, self.noise, self.samples)
 
     def over(self, devices: Sequence[Any]) -> "PreparedTargets":
         """Return the targets as they are: pixels read each other and are not shared out."""
@@ -188,6 +196,9 @@ def make_instant_schedule(
     return InstantSchedule(frames, (first, last), speed, motion_clock)
 
 
+Anchor = tuple[TargetInstants, NDArray[np.float32]]
+
+
 class TrajectoryEstimate(NamedTuple):
     """A target, the images at its instants, and the motion of its points."""
 
@@ -199,7 +210,7 @@ class TrajectoryEstimate(NamedTuple):
     # (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
     path_index: NDArray[np.int32] | None = None
     smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
-    noise: NDArray[np.float32] | None = None
+    noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `ReferenceImages`
 
     @property
     def paths(self) -> NDArray[np.float32]:
@@ -300,94 +311,79 @@ class TrajectoryEstimator:
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
         self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
-        self._anchors: collections.OrderedDict[tuple[int, bool], tuple[TargetInstants, NDArray[np.float32]]]
-        self._anchors = collections.OrderedDict()
+        # By their times, and whether events there are doubted.
+        self._anchors: collections.OrderedDict[tuple[int, bool], Anchor] = collections.OrderedDict()
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         """Return L, V and clear at instants, and the smooth part that is subtracted from L."""
         L, V, clear = self.images(instants.t)
-        V = self.inflate(instants, V, clear)
+        V = self.event_noise.inflate(instants.t, V)
         if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
             return L, V, clear, None
         smooth = gaussian_blur(L)
         return L - smooth, V, clear, smooth
 
-    def noise_factors(self, instants):
-        """Return the factors (K, h, w) on the variances of images between frames."""
-        interval = int(np.searchsorted(self.schedule.frames, instants.t[instants.target], "right")) - 1
-        one = np.ones(self.images.image_shape, np.float32)
-        if instants.t[instants.target] in self.schedule.frames: return np.stack([one]*len(instants))
-        return np.stack([self.event_noise(interval)[0]]*len(instants))
-
-    def inflate(self, instants, V, clear):
-        frames = self.schedule.frames
-        V = V.copy()
-        for k, t in enumerate(instants.t.tolist()):
-            if t in frames: continue
-            i = int(np.searchsorted(frames, t, "right")) - 1
-            g, add, _ = self.event_noise(i)
-            if 0 <= i < len(frames) - 1:
-                w = (t - frames[i]) / (frames[i + 1] - frames[i])
-            else:
-                i = min(max(i, 0), len(frames) - 2)
-                w = .5
-            new = V[k] * g + add * np.float32(w * (1 - w))
-            V[k] = np.where(clear[k] > 0, V[k], new)
-        return V
+    def _noise(self, t: int) -> NDArray[np.float32] | float:
+        """Return the factor (h, w) on the variance of the events' images at a target (us)."""
+        interval, shape = self.event_noise.locate(np.array([t]))
+        return self.event_noise(int(interval[0])).factor if shape[0] > 0 else 1.0
 
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
-    def _schedule(self, t: int, timed: bool) -> TargetInstants:
-        """Choose the instants of a target; where events are not to be trusted on the clock of time."""
+    def _schedule(self, t: int, doubted: bool) -> TargetInstants:
+        """Choose a target's instants; where events are doubted, by time and not on their clock."""
         instants = self.schedule(t)
-        return instants.with_clock(TIME_CLOCK) if timed else instants
+        return instants.with_clock(TIME_CLOCK) if doubted else instants
 
-    def _trust(self, t: int) -> float:
-        return self.event_noise(int(np.searchsorted(self.schedule.frames, t, "right")) - 1)[2]
+    def _anchor(self, t: int) -> Anchor:
+        """Return the anchor next to a time (us), and its motion at half resolution.
 
-    def _anchor(self, t: int) -> tuple[TargetInstants, NDArray[np.float32]]:
-        """Return the anchor next to a time (us), and its motion at half resolution."""
+        Where the events are doubted that is halfway between the frames around the time.
+        """
         first, last = self.schedule.span
-        frames = self.schedule.frames
         interval = ANCHOR_STEPS * self.schedule.step
         at = min(max(first + round((t - first) / interval) * interval, first), last)
-        trust = min(self._trust(t), self._trust(at))
-        right = int(np.searchsorted(frames, t, "right"))
-        alone = trust < MIN_TRUST and 0 < right < len(frames)
-        if alone:
-            at = int(frames[right - 1] + frames[right]) // 2
-        key = at, trust < MIN_CLOCK_TRUST
-        if key in self._anchors:
-            self._anchors.move_to_end(key)
+        doubted = min(self.event_noise.trust(t), self.event_noise.trust(at)) < MIN_TRUST
+        frames = self.schedule.frames
+        after = int(np.searchsorted(frames, t, "right"))
+        if doubted and 0 < after < len(frames):
+            at = int(frames[after - 1] + frames[after]) // 2
+        if (at, doubted) in self._anchors:
+            self._anchors.move_to_end((at, doubted))
         else:
-            instants = self._schedule(at, trust < MIN_CLOCK_TRUST)
-            L, V, clear, _ = self._images(instants)
-            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-            plan = plan_stages(instants.s, instants.first_horizon)
-            motion = estimate_trajectories(pyramid, instants.s, plan, self._cost)
-            p = motion.at_level(1, L.shape[1:]).p
-            if alone:
-                p = self._prefer_frames(instants, L, V, pyramid, p)
-            self._anchors[key] = instants, p
+            self._anchors[at, doubted] = self._make_anchor(at, doubted)
             if len(self._anchors) > N_CACHED_ANCHORS:
                 self._anchors.popitem(last=False)
-        return self._anchors[key]
+        return self._anchors[at, doubted]
 
-    def _prefer_frames(self, instants, L, V, pyramid, p):
-        """Return the motion that frames alone show, where images agree better along it."""
+    def _make_anchor(self, at: int, doubted: bool) -> Anchor:
+        """Seek the motion of the target at a time (us) from nothing."""
+        instants = self._schedule(at, doubted)
+        L, V, clear, _ = self._images(instants)
+        pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+        p = self._seek(pyramid, instants.s, instants.first_horizon, L.shape[1:])
         framed = np.isin(instants.t, self.schedule.frames)
-        if framed.sum() < 2:
-            return p
+        if not doubted or framed.sum() < 2:
+            return instants, p
         s = instants.s[framed]
-        alone = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
-        near = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        motion = estimate_trajectories(alone, s, plan_stages(s, near), self._cost)
-        other = motion.at_level(1, L.shape[1:]).p
+        frames_alone = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
+        nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
+        other = self._seek(frames_alone, s, nearest, L.shape[1:])
         images = PackedImages.of(pyramid[1], instants.s)
-        return choose_trajectories(images, (p, other), self._cost)
+        return instants, choose_trajectories(images, (p, other), self._cost)
+
+    def _seek(
+        self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float, size: tuple[int, ...]
+    ) -> NDArray[np.float32]:
+        """Seek trajectories of nodes at half resolution, first within a horizon."""
+        return (
+            estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
+            .at_level(1, size)
+            .p
+        )
 
     def _initial_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32]:
         """Return the motion that a target starts from, at half resolution."""
@@ -423,20 +419,19 @@ class TrajectoryEstimator:
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
-        instants = self._schedule(t, self._trust(t) < MIN_CLOCK_TRUST)
+        instants = self._schedule(t, self.event_noise.trust(t) < MIN_TRUST)
         p = self._initial_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
-        size = L.shape[1:]
+        size, noise = L.shape[1:], self._noise(t)
         if self.start is not None and not self.start.refine:
             p = NodeTrajectories(p, 1).at_level(0, size).p
-            return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth)
+            return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         variance = self._cautious(V, clear)
         pyramid = ImagePyramid(L, variance, PYRAMID_VARIANCE_FACTOR)
         instants, p = self._improve(pyramid[1], instants, p)
         p = NodeTrajectories(p, 1).at_level(0, size).p
         # The target's own image is the smoother's. The image fused so far is a better one to refine
         # with.
-        noise = self.noise_factors(instants)[instants.target]
         fused = fuse_target(self.params, TrajectoryEstimate(instants, L, V, clear, p, noise=noise))
         better, target = L.copy(), instants.target
         better[target] = fused.L
@@ -468,7 +463,7 @@ def compare_images(
     warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
     layout = make_layout(instants, clear, len(instants))
     mean = robust_mean(params, L, warped, layout)
-    return mean, reference_images(L, V, warped, layout, squared_reach(paths), target.noise)
+    return mean, reference_images(L, V, warped, layout, squared_reach(paths), noise=target.noise)
 
 
 def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
@@ -658,6 +653,7 @@ class CompensatedVideo(ImageSequence[Params]):
         s = target.instants.to_relative_times(at).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
+        V = self.trajectories.event_noise.inflate(at, V)
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
             L, M = L - gaussian_blur(L), M - gaussian_blur(M)
@@ -760,22 +756,36 @@ class MotionCompensation(ImageEstimator[Params]):
             features, instants = features.scale_counts(factors), instants.scale_counts(factors)
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
+        noise = trajectories.event_noise
+        intervals = np.unique(noise.locate(every).interval)
         targets = []
         for t in wanted.tolist():
             target = trajectories(t)
             one, rows = target.instants, np.zeros(count, np.int32)
             rows[: len(one)] = np.searchsorted(every, one.t)
+            places, shape = noise.locate(every[rows])
+            noise_rows = np.searchsorted(intervals, places).astype(np.int32)
             path_index = own if target.path_index is None else target.path_index
-            layout, exposures = (
-                make_layout(one, target.clear, count),
-                trajectories.exposures(t, one),
-            )
-            steady, prior = np.float32(target.smooth is None), trajectories.brightness.prior(t)
             targets.append(
-                PreparedTarget(rows, layout, target.p, path_index, exposures, steady, prior)
+                PreparedTarget(
+                    rows,
+                    make_layout(one, target.clear, count),
+                    noise_rows,
+                    shape,
+                    target.p,
+                    path_index,
+                    trajectories.exposures(t, one),
+                    np.float32(target.smooth is None),
+                    trajectories.brightness.prior(t),
+                )
             )
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *targets)
-        out = PreparedTargets(instants, stacked, trajectories.exposures.samples)
+
+        def stack(*leaves: Any) -> NDArray:
+            return np.stack(leaves)
+
+        found = jax.tree.map(stack, *(noise(k) for k in intervals.tolist()))
+        stacked = jax.tree.map(stack, *targets)
+        out = PreparedTargets(instants, stacked, found, trajectories.exposures.samples)
         return features, jax.device_put(out)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
@@ -808,14 +818,18 @@ class MotionCompensation(ImageEstimator[Params]):
 
         @jax.checkpoint
         def one(target: PreparedTarget) -> tuple[Array, Array]:
-            rows, layout, p, path_index, exposures, steady, brightness = target
+            rows, layout, noise_rows, shape, p, path_index, exposures, steady, brightness = target
             smooth = (1 - steady) * gaussian_blur(L[rows])
-            images = (L[rows] - smooth, V[rows], clear[rows])
+            noise = jax.tree.map(lambda values: values[noise_rows], out.noise)
+            variances = inflate_variances(V[rows], noise, shape)
+            images = (L[rows] - smooth, variances, clear[rows])
+            at_frame = shape[layout.target] == 0
+            factor = jnp.where(at_frame, 1, noise.factor[layout.target])
             if self.through_motion:
                 p = self._with_derivative(params, images, layout, p)
             paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
             warped = warp_images_jax(*images, layout.s, paths)
-            fused = fuse(params, *images[:2], warped, layout, squared_reach(paths))
+            fused = fuse(params, *images[:2], warped, layout, squared_reach(paths), noise=factor)
             if out.samples is not None:
                 at = exposures.frame
                 adjacent = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])

@@ -65,7 +65,8 @@ class ReferenceImages(NamedTuple):
     # Distance of the target from the nearest frame, in intervals from that to `other`, where frames
     # are on one side alone; else 1.
     intervals_away: Numeric
-    noise: Numeric = 1.0
+    # Factor on the variance of the events' images, (h, w) or (); `event_noise.IntervalNoise`.
+    noise: Numeric | float = 1.0
 
 
 def reference_images(
@@ -74,7 +75,8 @@ def reference_images(
     warped: WarpedImages,
     layout: InstantLayout,
     squared_reach: Numeric | float = np.inf,
-    noise=None,
+    *,
+    noise: Numeric | float = 1.0,
 ) -> ReferenceImages:
     """Collect the images that the robust mean is compared with.
 
@@ -84,6 +86,7 @@ def reference_images(
         warped: The images along trajectories.
         layout: Their instants.
         squared_reach: (h, w) or (), squared distance that points go at most, px^2.
+        noise: (h, w) or (), factor on the variance of the events' images.
 
     Returns:
         The images.
@@ -108,7 +111,7 @@ def reference_images(
         rest=layout.rest,
         squared_reach=squared_reach,
         intervals_away=jnp.where((a == b) & (a != c), abs(layout.s[a]) / interval, 1),
-        noise=1.0 if noise is None else noise,
+        noise=noise,
     )
 
 
@@ -141,7 +144,7 @@ class FusionFeatures(ShortRepr):
     rest: Float[Array, ""]
     stationary: Float[Array, "..."]  # 1 where points stay in their places, else 0
     intervals_away: Float[Array, ""]  # as in `ReferenceImages`
-    noise: Float[Array, "..."]
+    noise: Float[Array, "..."]  # as in `ReferenceImages`
 
 
 def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures:
@@ -156,6 +159,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
     """
     M = mean.M
     noise = jnp.asarray(images.noise, M.dtype)
+    # Differences from images of noisy events say little of the candidates.
     near, smoothed = (M + (image - M) / noise for image in (mean.near_mean, images.target))
     blend = (1 - images.after_weight) * images.before + images.after_weight * images.after
 
@@ -199,7 +203,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
         rest=jnp.asarray(images.rest, jnp.float32),
         stationary=1 / (1 + (squared_reach / MAX_STATIONARY_PX**2) ** 2),
         intervals_away=jnp.asarray(images.intervals_away),
-        noise=jnp.asarray(images.noise, jnp.float32),
+        noise=noise,
     )
 
 
@@ -225,8 +229,7 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     )
     # At rest events are noise, which the smoother in place adds up.
     logits = logits.at[0].add(jnp.log(jnp.maximum(1 - given.rest, MIN_SQUARED_DIFFERENCE)))
-    import os
-    logits = logits.at[0].add(-float(os.environ.get('BETA', 2)) * jnp.log(given.noise))
+    logits = logits.at[0].add(-2 * jnp.log(given.noise))
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(logits[:1]), logits]), axis=0)
     quiet = MIN_SQUARED_DIFFERENCE / jnp.exp(X[FEATURE_NAMES.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
@@ -281,6 +284,8 @@ def fuse(
     warped: WarpedImages,
     layout: InstantLayout,
     squared_reach: Numeric | float = np.inf,
+    *,
+    noise: Numeric | float = 1.0,
 ) -> FusedImage:
     """Fuse a target's images in one; pure and differentiable.
 
@@ -291,6 +296,7 @@ def fuse(
         warped: The images along trajectories.
         layout: Their instants.
         squared_reach: (h, w) or (), squared distance that points go at most, px^2.
+        noise: (h, w) or (), factor on the variance of the events' images.
 
     Returns:
         The image.
@@ -298,7 +304,7 @@ def fuse(
     L, V = jnp.asarray(L), jnp.asarray(V)
     warped, layout = jax.tree.map(jnp.asarray, (warped, layout))
     mean = robust_mean_jax(params, L, warped, layout)
-    images = reference_images(L, V, warped, layout, squared_reach)
+    images = reference_images(L, V, warped, layout, squared_reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, images))
 
 
