@@ -118,6 +118,11 @@ class Params(smoother.Params):
     )
     # Thresholds are learned (`learn`) along trajectories, from more than events between frames.
     calibrated = ("clock_offset",)
+
+    @classmethod
+    def predictor(cls) -> None:
+        return None
+
     presets = {
         "hdr": {
             **smoother.Params.presets["hdr"],
