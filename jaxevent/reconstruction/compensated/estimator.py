@@ -333,11 +333,6 @@ class TrajectoryEstimator:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
-    def _schedule(self, t: int, doubted: bool) -> TargetInstants:
-        """Choose a target's instants; where events are doubted, by time and not on their clock."""
-        instants = self.schedule(t)
-        return instants.with_clock(TIME_CLOCK) if doubted else instants
-
     def _anchor(self, t: int) -> Anchor:
         """Return the anchor next to a time (us), and its motion at half resolution.
 
@@ -361,19 +356,43 @@ class TrajectoryEstimator:
 
     def _make_anchor(self, at: int, doubted: bool) -> Anchor:
         """Seek the motion of the target at a time (us) from nothing."""
-        instants = self._schedule(at, doubted)
+        instants = self.schedule(at)
         L, V, clear, _ = self._images(instants)
+        framed, size = np.isin(instants.t, self.schedule.frames), L.shape[1:]
+        other = None
+        if doubted and framed.sum() > 1:
+            frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
+            instants, other = self._seek_in_frames(instants, framed, frames, size)
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-        p = self._seek(pyramid, instants.s, instants.first_horizon, L.shape[1:])
-        framed = np.isin(instants.t, self.schedule.frames)
-        if not doubted or framed.sum() < 2:
-            return instants, p
-        s = instants.s[framed]
-        frames_alone = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
-        nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        other = self._seek(frames_alone, s, nearest, L.shape[1:])
-        images = PackedImages.of(pyramid[1], instants.s)
-        return instants, choose_trajectories(images, (p, other), self._cost)
+        p = self._seek(pyramid, instants.s, instants.first_horizon, size)
+        if other is not None:
+            images = PackedImages.of(pyramid[1], instants.s)
+            p = choose_trajectories(images, (p, other), self._cost)
+        return instants, p
+
+    def _seek_in_frames(
+        self,
+        instants: TargetInstants,
+        framed: NDArray[np.bool_],
+        pyramid: ImagePyramid,
+        size: tuple[int, ...],
+    ) -> Anchor:
+        """Seek motion in frames alone, on the clock on which they agree better."""
+
+        def sought(clock: TargetInstants) -> tuple[float, NDArray[np.float32]]:
+            s = clock.s[framed]
+            nearest = float(np.abs(clock.s[[clock.before, clock.after]]).max())
+            p = self._seek(pyramid, s, nearest, size)
+            return robust_cost(PackedImages.of(pyramid[1], s), p, self._cost), p
+
+        timed = instants.with_clock(TIME_CLOCK)
+        cost, p = sought(timed)
+        if instants.clock.event_share:
+            other_cost, other = sought(instants)
+            trust = self.event_noise.trust(int(instants.t[instants.target]))
+            if other_cost < MAX_CLOCK_COST_RATIO * trust * cost:
+                return instants, other
+        return timed, p
 
     def _seek(
         self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float, size: tuple[int, ...]
@@ -419,7 +438,9 @@ class TrajectoryEstimator:
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
-        instants = self._schedule(t, self.event_noise.trust(t) < MIN_TRUST)
+        instants = self.schedule(t)
+        if instants.clock.event_share:
+            instants = instants.with_clock(self._anchor(t)[0].clock)
         p = self._initial_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
         size, noise = L.shape[1:], self._noise(t)
