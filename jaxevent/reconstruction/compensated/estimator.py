@@ -25,6 +25,11 @@ from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
+from jaxevent.reconstruction.compensated.event_noise import (
+    EventNoise,
+    IntervalNoise,
+    inflate_variances,
+)
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
     AdjacentFrames,
@@ -80,6 +85,7 @@ from jaxevent.reconstruction.compensated.trajectories import (
     NodeTrajectories,
     advect_nodes,
     change_clock,
+    choose_trajectories,
     estimate_trajectories,
     gauss_newton_step,
     node_shape,
@@ -107,6 +113,9 @@ from jaxevent.recording import Recording, Times, microseconds
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
+# In the events of an interval, from which its motion is sought along them and on their clock. Of
+# 0.5, 0.8 and 0.9 chosen on simulated scenes, with and without faults.
+MIN_TRUST = 0.8
 N_CACHED_ANCHORS = 2
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
 MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
@@ -118,6 +127,9 @@ class PreparedTarget(NamedTuple):
 
     rows: Int[Numeric, "*times k"]  # its instants among all
     layout: InstantLayout
+    # Rows of `PreparedTargets.noise` of its instants, and `event_noise.InstantPlaces.shape`.
+    noise_rows: Int[Numeric, "*times k"]
+    noise_shape: Float[Numeric, "*times k"]
     p: Float[Numeric, "*times rows columns 4"]  # trajectories of nodes, px
     path_index: Int[Numeric, "*times h w"]  # the pixel whose path each one takes
     exposures: AdjacentExposures
@@ -130,13 +142,14 @@ class PreparedTargets(ShortRepr):
 
     instants: ReadOut  # all instants of all targets, sorted
     targets: PreparedTarget  # stacked
+    noise: IntervalNoise  # of the intervals between frames at hand; constant, as motion is
     # Of exposures; None: images are not fitted to them.
     samples: int | None = eqx.field(static=True, default=None)
 
     def take(self, rows: NDArray) -> "PreparedTargets":
         """Choose some of the images, in the order of `rows`."""
         chosen = jax.tree.map(lambda leaf: leaf[rows], self.targets)
-        return PreparedTargets(self.instants, chosen, self.samples)
+        return PreparedTargets(self.instants, chosen, self.noise, self.samples)
 
     def over(self, devices: Sequence[Any]) -> "PreparedTargets":
         """Return the targets as they are: pixels read each other and are not shared out."""
@@ -183,6 +196,9 @@ def make_instant_schedule(
     return InstantSchedule(frames, (first, last), speed, motion_clock)
 
 
+Anchor = tuple[TargetInstants, NDArray[np.float32]]
+
+
 class TrajectoryEstimate(NamedTuple):
     """A target, the images at its instants, and the motion of its points."""
 
@@ -194,6 +210,7 @@ class TrajectoryEstimate(NamedTuple):
     # (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
     path_index: NDArray[np.int32] | None = None
     smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
+    noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `ReferenceImages`
 
     @property
     def paths(self) -> NDArray[np.float32]:
@@ -293,39 +310,99 @@ class TrajectoryEstimator:
         )
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
-        self._anchors: collections.OrderedDict[int, tuple[TargetInstants, NDArray[np.float32]]]
-        self._anchors = collections.OrderedDict()
+        self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
+        # By their times, and whether events there are doubted.
+        self._anchors: collections.OrderedDict[tuple[int, bool], Anchor] = collections.OrderedDict()
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         """Return L, V and clear at instants, and the smooth part that is subtracted from L."""
         L, V, clear = self.images(instants.t)
+        V = self.event_noise.inflate(instants.t, V)
         if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
             return L, V, clear, None
         smooth = gaussian_blur(L)
         return L - smooth, V, clear, smooth
 
+    def _noise(self, t: int) -> NDArray[np.float32] | float:
+        """Return the factor (h, w) on the variance of the events' images at a target (us)."""
+        interval, shape = self.event_noise.locate(np.array([t]))
+        return self.event_noise(int(interval[0])).factor if shape[0] > 0 else 1.0
+
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
-    def _anchor(self, t: int) -> tuple[TargetInstants, NDArray[np.float32]]:
-        """Return the anchor next to a time (us), and its motion at half resolution."""
+    def _anchor(self, t: int) -> Anchor:
+        """Return the anchor next to a time (us), and its motion at half resolution.
+
+        Where the events are doubted that is halfway between the frames around the time.
+        """
         first, last = self.schedule.span
         interval = ANCHOR_STEPS * self.schedule.step
         at = min(max(first + round((t - first) / interval) * interval, first), last)
-        if at in self._anchors:
-            self._anchors.move_to_end(at)
+        doubted = min(self.event_noise.trust(t), self.event_noise.trust(at)) < MIN_TRUST
+        frames = self.schedule.frames
+        after = int(np.searchsorted(frames, t, "right"))
+        if doubted and 0 < after < len(frames):
+            at = int(frames[after - 1] + frames[after]) // 2
+        if (at, doubted) in self._anchors:
+            self._anchors.move_to_end((at, doubted))
         else:
-            instants = self.schedule(at)
-            L, V, clear, _ = self._images(instants)
-            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-            plan = plan_stages(instants.s, instants.first_horizon)
-            motion = estimate_trajectories(pyramid, instants.s, plan, self._cost)
-            self._anchors[at] = instants, motion.at_level(1, L.shape[1:]).p
+            self._anchors[at, doubted] = self._make_anchor(at, doubted)
             if len(self._anchors) > N_CACHED_ANCHORS:
                 self._anchors.popitem(last=False)
-        return self._anchors[at]
+        return self._anchors[at, doubted]
+
+    def _make_anchor(self, at: int, doubted: bool) -> Anchor:
+        """Seek the motion of the target at a time (us) from nothing."""
+        instants = self.schedule(at)
+        L, V, clear, _ = self._images(instants)
+        framed, size = np.isin(instants.t, self.schedule.frames), L.shape[1:]
+        other = None
+        if doubted and framed.sum() > 1:
+            frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
+            instants, other = self._seek_in_frames(instants, framed, frames, size)
+        pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+        p = self._seek(pyramid, instants.s, instants.first_horizon, size)
+        if other is not None:
+            images = PackedImages.of(pyramid[1], instants.s)
+            p = choose_trajectories(images, (p, other), self._cost)
+        return instants, p
+
+    def _seek_in_frames(
+        self,
+        instants: TargetInstants,
+        framed: NDArray[np.bool_],
+        pyramid: ImagePyramid,
+        size: tuple[int, ...],
+    ) -> Anchor:
+        """Seek motion in frames alone, on the clock on which they agree better."""
+
+        def sought(clock: TargetInstants) -> tuple[float, NDArray[np.float32]]:
+            s = clock.s[framed]
+            nearest = float(np.abs(clock.s[[clock.before, clock.after]]).max())
+            p = self._seek(pyramid, s, nearest, size)
+            return robust_cost(PackedImages.of(pyramid[1], s), p, self._cost), p
+
+        timed = instants.with_clock(TIME_CLOCK)
+        cost, p = sought(timed)
+        if instants.clock.event_share:
+            other_cost, other = sought(instants)
+            trust = self.event_noise.trust(int(instants.t[instants.target]))
+            if other_cost < MAX_CLOCK_COST_RATIO * trust * cost:
+                return instants, other
+        return timed, p
+
+    def _seek(
+        self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float, size: tuple[int, ...]
+    ) -> NDArray[np.float32]:
+        """Seek trajectories of nodes at half resolution, first within a horizon."""
+        return (
+            estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
+            .at_level(1, size)
+            .p
+        )
 
     def _initial_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32]:
         """Return the motion that a target starts from, at half resolution."""
@@ -362,25 +439,27 @@ class TrajectoryEstimator:
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
         instants = self.schedule(t)
+        if instants.clock.event_share:
+            instants = instants.with_clock(self._anchor(t)[0].clock)
         p = self._initial_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
-        size = L.shape[1:]
+        size, noise = L.shape[1:], self._noise(t)
         if self.start is not None and not self.start.refine:
             p = NodeTrajectories(p, 1).at_level(0, size).p
-            return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth)
+            return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         variance = self._cautious(V, clear)
         pyramid = ImagePyramid(L, variance, PYRAMID_VARIANCE_FACTOR)
         instants, p = self._improve(pyramid[1], instants, p)
         p = NodeTrajectories(p, 1).at_level(0, size).p
         # The target's own image is the smoother's. The image fused so far is a better one to refine
         # with.
-        fused = fuse_target(self.params, TrajectoryEstimate(instants, L, V, clear, p))
+        fused = fuse_target(self.params, TrajectoryEstimate(instants, L, V, clear, p, noise=noise))
         better, target = L.copy(), instants.target
         better[target] = fused.L
         variance[target] = FUSED_VARIANCE_FACTOR * np.asarray(fused.P) + self._cost.floor
         images = PackedImages.of(pack_images(better, variance), instants.s)
         p, path_index = refine_paths(images, p, self._cost)
-        return TrajectoryEstimate(instants, L, V, clear, p, path_index, smooth)
+        return TrajectoryEstimate(instants, L, V, clear, p, path_index, smooth, noise)
 
 
 @jax.jit
@@ -405,7 +484,7 @@ def compare_images(
     warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
     layout = make_layout(instants, clear, len(instants))
     mean = robust_mean(params, L, warped, layout)
-    return mean, reference_images(L, V, warped, layout, squared_reach(paths))
+    return mean, reference_images(L, V, warped, layout, squared_reach(paths), noise=target.noise)
 
 
 def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
@@ -595,6 +674,7 @@ class CompensatedVideo(ImageSequence[Params]):
         s = target.instants.to_relative_times(at).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
+        V = self.trajectories.event_noise.inflate(at, V)
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
             L, M = L - gaussian_blur(L), M - gaussian_blur(M)
@@ -697,22 +777,36 @@ class MotionCompensation(ImageEstimator[Params]):
             features, instants = features.scale_counts(factors), instants.scale_counts(factors)
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
+        noise = trajectories.event_noise
+        intervals = np.unique(noise.locate(every).interval)
         targets = []
         for t in wanted.tolist():
             target = trajectories(t)
             one, rows = target.instants, np.zeros(count, np.int32)
             rows[: len(one)] = np.searchsorted(every, one.t)
+            places, shape = noise.locate(every[rows])
+            noise_rows = np.searchsorted(intervals, places).astype(np.int32)
             path_index = own if target.path_index is None else target.path_index
-            layout, exposures = (
-                make_layout(one, target.clear, count),
-                trajectories.exposures(t, one),
-            )
-            steady, prior = np.float32(target.smooth is None), trajectories.brightness.prior(t)
             targets.append(
-                PreparedTarget(rows, layout, target.p, path_index, exposures, steady, prior)
+                PreparedTarget(
+                    rows,
+                    make_layout(one, target.clear, count),
+                    noise_rows,
+                    shape,
+                    target.p,
+                    path_index,
+                    trajectories.exposures(t, one),
+                    np.float32(target.smooth is None),
+                    trajectories.brightness.prior(t),
+                )
             )
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *targets)
-        out = PreparedTargets(instants, stacked, trajectories.exposures.samples)
+
+        def stack(*leaves: Any) -> NDArray:
+            return np.stack(leaves)
+
+        found = jax.tree.map(stack, *(noise(k) for k in intervals.tolist()))
+        stacked = jax.tree.map(stack, *targets)
+        out = PreparedTargets(instants, stacked, found, trajectories.exposures.samples)
         return features, jax.device_put(out)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
@@ -745,14 +839,18 @@ class MotionCompensation(ImageEstimator[Params]):
 
         @jax.checkpoint
         def one(target: PreparedTarget) -> tuple[Array, Array]:
-            rows, layout, p, path_index, exposures, steady, brightness = target
+            rows, layout, noise_rows, shape, p, path_index, exposures, steady, brightness = target
             smooth = (1 - steady) * gaussian_blur(L[rows])
-            images = (L[rows] - smooth, V[rows], clear[rows])
+            noise = jax.tree.map(lambda values: values[noise_rows], out.noise)
+            variances = inflate_variances(V[rows], noise, shape)
+            images = (L[rows] - smooth, variances, clear[rows])
+            at_frame = shape[layout.target] == 0
+            factor = jnp.where(at_frame, 1, noise.factor[layout.target])
             if self.through_motion:
                 p = self._with_derivative(params, images, layout, p)
             paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
             warped = warp_images_jax(*images, layout.s, paths)
-            fused = fuse(params, *images[:2], warped, layout, squared_reach(paths))
+            fused = fuse(params, *images[:2], warped, layout, squared_reach(paths), noise=factor)
             if out.samples is not None:
                 at = exposures.frame
                 adjacent = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])

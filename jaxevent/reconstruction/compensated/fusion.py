@@ -65,6 +65,8 @@ class ReferenceImages(NamedTuple):
     # Distance of the target from the nearest frame, in intervals from that to `other`, where frames
     # are on one side alone; else 1.
     intervals_away: Numeric
+    # Factor on the variance of the events' images, (h, w) or (); `event_noise.IntervalNoise`.
+    noise: Numeric | float = 1.0
 
 
 def reference_images(
@@ -73,6 +75,8 @@ def reference_images(
     warped: WarpedImages,
     layout: InstantLayout,
     squared_reach: Numeric | float = np.inf,
+    *,
+    noise: Numeric | float = 1.0,
 ) -> ReferenceImages:
     """Collect the images that the robust mean is compared with.
 
@@ -82,6 +86,7 @@ def reference_images(
         warped: The images along trajectories.
         layout: Their instants.
         squared_reach: (h, w) or (), squared distance that points go at most, px^2.
+        noise: (h, w) or (), factor on the variance of the events' images.
 
     Returns:
         The images.
@@ -106,6 +111,7 @@ def reference_images(
         rest=layout.rest,
         squared_reach=squared_reach,
         intervals_away=jnp.where((a == b) & (a != c), abs(layout.s[a]) / interval, 1),
+        noise=noise,
     )
 
 
@@ -138,6 +144,7 @@ class FusionFeatures(ShortRepr):
     rest: Float[Array, ""]
     stationary: Float[Array, "..."]  # 1 where points stay in their places, else 0
     intervals_away: Float[Array, ""]  # as in `ReferenceImages`
+    noise: Float[Array, "..."]  # as in `ReferenceImages`
 
 
 def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures:
@@ -150,7 +157,10 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
     Returns:
         Candidates and features.
     """
-    M, near, smoothed = mean.M, mean.near_mean, images.target
+    M = mean.M
+    noise = jnp.asarray(images.noise, M.dtype)
+    # Differences from images of noisy events say little of the candidates.
+    near, smoothed = (M + (image - M) / noise for image in (mean.near_mean, images.target))
     blend = (1 - images.after_weight) * images.before + images.after_weight * images.after
 
     def squared_difference(one: Array, other: Array) -> Array:
@@ -183,7 +193,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
     clipped = jnp.where(beyond > 0, CLIPPED_VARIANCE_BEYOND, CLIPPED_VARIANCE)
     squared_reach = jnp.asarray(images.squared_reach, jnp.float32)
     return FusionFeatures(
-        candidates=jnp.stack([M, smoothed, blend]),
+        candidates=jnp.stack([M, images.target, blend]),
         in_place=1 / (1 + (images.blend_variance / clipped) ** 2),
         features=jnp.stack([*X, jnp.ones_like(M)]),
         shares=mean.shares,
@@ -193,6 +203,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
         rest=jnp.asarray(images.rest, jnp.float32),
         stationary=1 / (1 + (squared_reach / MAX_STATIONARY_PX**2) ** 2),
         intervals_away=jnp.asarray(images.intervals_away),
+        noise=noise,
     )
 
 
@@ -218,11 +229,12 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     )
     # At rest events are noise, which the smoother in place adds up.
     logits = logits.at[0].add(jnp.log(jnp.maximum(1 - given.rest, MIN_SQUARED_DIFFERENCE)))
+    logits = logits.at[0].add(-2 * jnp.log(given.noise))
     q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(logits[:1]), logits]), axis=0)
     quiet = MIN_SQUARED_DIFFERENCE / jnp.exp(X[FEATURE_NAMES.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
     # with those around the target.
-    q = _shift_weight(q, given.stationary * given.in_place * quiet, 1)
+    q = _shift_weight(q, given.stationary * given.in_place * quiet / given.noise, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
     alone = gaussian_blur(quiet, NOISE_EVENT_SIGMA_PX)
     q = _shift_weight(q, given.rest * jnp.maximum(quiet, alone), 2)
@@ -272,6 +284,8 @@ def fuse(
     warped: WarpedImages,
     layout: InstantLayout,
     squared_reach: Numeric | float = np.inf,
+    *,
+    noise: Numeric | float = 1.0,
 ) -> FusedImage:
     """Fuse a target's images in one; pure and differentiable.
 
@@ -282,6 +296,7 @@ def fuse(
         warped: The images along trajectories.
         layout: Their instants.
         squared_reach: (h, w) or (), squared distance that points go at most, px^2.
+        noise: (h, w) or (), factor on the variance of the events' images.
 
     Returns:
         The image.
@@ -289,7 +304,7 @@ def fuse(
     L, V = jnp.asarray(L), jnp.asarray(V)
     warped, layout = jax.tree.map(jnp.asarray, (warped, layout))
     mean = robust_mean_jax(params, L, warped, layout)
-    images = reference_images(L, V, warped, layout, squared_reach)
+    images = reference_images(L, V, warped, layout, squared_reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, images))
 
 

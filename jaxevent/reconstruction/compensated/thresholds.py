@@ -104,7 +104,7 @@ def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int
     return [(t, t + lag) for t in begins.tolist()]
 
 
-def _count_events(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np.floating]:
+def count_events(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np.floating]:
     """Count ON and OFF events (2, pixels), weighted for a dead time `rho` (us)."""
     source = recording.events
     # With enough events before the begin to know the gaps of nearly all pixels.
@@ -138,7 +138,7 @@ def learn_thresholds(
         return None
     times = _change_times(recording, span_us)
     rho = 1e6 * float(params.rho_ref)  # us
-    counts = np.stack([_count_events(recording, *pair, rho) for pair in times], 1)
+    counts = np.stack([count_events(recording, *pair, rho) for pair in times], 1)
     if counts.sum((0, 1)).mean() < MIN_EVENTS_PER_PIXEL:
         return None
     known = {t: images(t) for t in sorted({t for pair in times for t in pair})}

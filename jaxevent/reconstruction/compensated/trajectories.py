@@ -20,6 +20,7 @@ Steps go on from such paths: near borders more of them are right then, so more p
 one to take.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,7 @@ from jaxevent.reconstruction.compensated.normal_equations import (
 from jaxevent.reconstruction.compensated.robust_mean import (
     blur_along_x,
     blur_along_y,
+    blur_image,
     gaussian_taps,
 )
 from jaxevent.reconstruction.compensated.warp import (
@@ -74,6 +76,7 @@ class PathSearch(NamedTuple):
     sigma: float  # of the Gaussian over which costs are gathered, in units of the spacing
 
 
+CHOICE_SIGMA = 2.0  # of the Gaussian over which costs of trajectories are compared, in nodes
 # Set on objects of seeds that are not scored, and on the first half of slider_depth.
 PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
 
@@ -231,6 +234,32 @@ def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) 
     """
     points, M, _ = sample_trajectories(images, p, cost)
     return float(((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).mean())
+
+
+def choose_trajectories(
+    images: PackedImages, several: Sequence[NDArray[np.float32]], cost: CostParams
+) -> NDArray[np.float32]:
+    """Choose for every node the trajectories along which images agree best around it.
+
+    Args:
+        images: Packed images.
+        several: Trajectories of nodes, each (rows, columns, 4), px.
+        cost: Parameters of the cost, float32.
+
+    Returns:
+        (rows, columns, 4) the trajectories chosen, px.
+    """
+    costs = []
+    for p in several:
+        points, M, _ = sample_trajectories(images, p, cost)
+        squares = ((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).sum(1)
+        rows, columns = p.shape[:2]
+        unpaired = [(0, 2 * rows - len(squares)), (0, 2 * columns - squares.shape[1])]
+        padded = np.pad(squares, unpaired, mode="edge")
+        nodes = padded.reshape(rows, 2, columns, 2).mean((1, 3))
+        costs.append(blur_image(nodes, CHOICE_SIGMA))
+    best = np.argmin(costs, 0)
+    return np.take_along_axis(np.stack(several), best[None, ..., None], 0)[0]
 
 
 def change_clock(
