@@ -1,11 +1,13 @@
 """The frames of a window: when they were taken, their values, and the events between them."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.clipping import find_clipping
 from jaxevent.codegen import njit
 from jaxevent.codegen.graph import evaluate_function
 from jaxevent.reconstruction.features import (
@@ -197,6 +199,12 @@ class FrameImages:
         """Return the intensities of 256 evenly spaced grey values."""
         return evaluate_function(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
 
+    @functools.cached_property
+    def white(self) -> NDArray | None:
+        """See `FrameFeatures.white`."""
+        found = find_clipping(self.recording).white
+        return None if found.level is None else np.array([found.level, found.excess], self.dtype)
+
     def tables(self) -> NDArray:
         """Return grey value, intensity and certainty of every whole number of an image."""
         assert self.recording.frames is not None
@@ -293,7 +301,7 @@ def make_frame_features(
 
     present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
-        grey, intensity, certainty, images.response(), gain, span, before, head, tail, segments,
+        grey, intensity, certainty, images.response(), gain, images.white, span, before, head, tail, segments,
         weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
         images.recording.width,
     )  # fmt: skip

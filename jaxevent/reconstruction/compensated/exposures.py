@@ -22,7 +22,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, run_over_rows
-from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped_weight
+from jaxevent.reconstruction.augment import (
+    clipped_side,
+    clipping_bound,
+    expected_excess,
+    unclipped_weight,
+)
 from jaxevent.reconstruction.compensated.fusion import FusedImage
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
@@ -39,7 +44,7 @@ from jaxevent.reconstruction.compensated.warp import (
     sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import EventTiming, FrameClock
+from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
 from jaxevent.recording import Recording
 
@@ -67,6 +72,7 @@ class AdjacentFrames(NamedTuple):
     intensity: Float[Numeric, "n pixels"]
     response: Float[Numeric, " 256"]
     gain: Float[Numeric, " n"]
+    white: Float[Numeric, " 2"] | None
 
 
 class _FrameEvidence(NamedTuple):
@@ -83,6 +89,7 @@ class _ClippedSide(NamedTuple):
 
     side: Float[Array, "n h w"]  # +1, -1: B lies above, below `bound`; 0: nothing known
     bound: Float[Array, "n h w"]
+    excess: Float[Array, "n #h #w"] | None
 
 
 def choose_sample_count(motion_px: float) -> int:
@@ -113,7 +120,9 @@ class FrameExposures:
         self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
         moved = SPEED_MARGIN * speed * 2e-6 * float(self._half.max(initial=0))
         samples = choose_sample_count(moved) if params.deblur else 1
-        wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
+        images = FrameImages(recording, np.dtype(np.float32))
+        clips = float(params.margin) > 0 or images.white is not None
+        wanted = samples > 1 or (clips and params.one_sided)
         self.samples = samples if params.integrate and wanted else None
 
     def __call__(self, t: int, instants: TargetInstants) -> AdjacentExposures:
@@ -266,7 +275,9 @@ def _frame_evidence(
 
     # A clipped pixel acts as the Gaussian that gives the moments of the truncated one.
     side = read(clipped_side(params, frames)) * inside * params.one_sided
-    row = _ClippedSide(side, read(clipping_bound(params, frames)))
+    excess = expected_excess(params, frames)
+    excess = None if excess is None else excess[:, :, None]
+    row = _ClippedSide(side, read(clipping_bound(params, frames)), excess)
     state = Gaussian(B, jnp.broadcast_to(fused.P, B.shape))
     message, _ = one_sided_message(state, row, params.sigma_floor**2)
     return _FrameEvidence(

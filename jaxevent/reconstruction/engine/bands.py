@@ -294,11 +294,13 @@ class PartitionedRecording:
 
     def fixed_inputs(self, clock_offset: Any) -> dict[str, NDArray]:
         """Return what kernels know beside parameters, for the clock that windows were made for."""
-        return {
+        known = {
             "clock_offset": np.asarray(clock_offset, self.dtype),
             "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
             "response": self._response,
         }
+        white = self.images.white
+        return known if white is None else known | {"white": white}
 
     def partition(
         self, state: StreamState, begin_row: int, end_row: int
