@@ -89,9 +89,7 @@ def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     return ClippedEnd(first - 0.5 if found else None, share, ratio)
 
 
-def _expected_excess(
-    recording: Recording, grey: NDArray, level: float, share: float
-) -> float:
+def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:
     """Return how far beyond white clipped pixels lie on average, ln I.
 
     If the density of ln I falls exponentially, with mean m, from the band below white on, then the

@@ -23,7 +23,6 @@ from jaxevent.parameters import Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.recording import Recording
 
-
 MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
 
 T = TypeVar("T", bound="FrameParams")

@@ -301,8 +301,8 @@ def make_frame_features(
 
     present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
-        grey, intensity, certainty, images.response(), gain, images.white, span, before, head, tail, segments,
-        weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
+        grey, intensity, certainty, images.response(), gain, images.white, span, before, head, tail,
+        segments, weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
         images.recording.width,
     )  # fmt: skip
 

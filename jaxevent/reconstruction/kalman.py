@@ -47,7 +47,7 @@ class Params(AugmentParams):
     above = Number(0.0, "ln I", "initial distance of saturated pixels above the clipping bound")
     below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
     one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
-    clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
+    clip_rate = Positive(1000.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
 
     presets = {
         "paper": {"ratio_width": 0.0},
