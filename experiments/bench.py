@@ -3,7 +3,7 @@
     python experiments/bench.py [PART ...] [--gate | --bless] [--json FILE]
 
 Parts: images (the complete path from a file to images, losses, gradients), xla (the scan, where
-there is no kernel), smoother, tracker (bench_blob.py), voting and motion
+there is no kernel), calibration, smoother, tracker (bench_blob.py), voting and motion
 (bench_motion.py), memory (streaming.py). Without any, all but motion, which takes minutes.
 CPU seconds of this process are compared, so other programs on the machine change little: `--gate`
 compares the ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance;
@@ -34,6 +34,7 @@ GATED = {
     "filter by XLA / numba program": ("higher", 0.4),
     "features and packing / numba program": ("higher", 0.4),
     "compilations for a second recording": ("lower", 0.0),
+    "calibration / reading and filtering of 30 M events": ("lower", 0.4),
     "smoother / numba program": ("higher", 0.3),
     "smoother, one image / numba program": ("higher", 0.3),
     "smoother, preset hdr / the same compiled by XLA": ("higher", 0.4),
@@ -53,6 +54,7 @@ GATED = {
 PARTS = {
     "images": "bench_images.images_bench",
     "xla": "bench_images.xla_bench",
+    "calibration": "bench_images.calibration_bench",
     "smoother": "bench_images.smoother_bench",
     "tracker": "bench_blob.tracker_bench",
     "voting": "bench_motion.voting_bench",

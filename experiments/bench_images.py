@@ -1,6 +1,6 @@
 """Speed of images, as part of `bench.py`: filters, smoother, files, losses and gradients.
 
-    python experiments/bench.py images xla smoother gpu start
+    python experiments/bench.py images xla calibration smoother gpu start
 
 A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
 read, filtered and shown. Beside it run, on one core: the whole filter as a plain numba program
@@ -27,6 +27,7 @@ from common import cpu_seconds, least_cpu, markdown_table
 
 import jaxevent
 from jaxevent.blob import moment
+from jaxevent.calibration.storage import hash_content
 from jaxevent.egomotion import voting
 from jaxevent.io import load, save
 from jaxevent.io.hdf5_files import search_heaps
@@ -38,6 +39,7 @@ from jaxevent.reconstruction.filtering import (
 )
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.runs.demo import RECORDING_FILE
 from jaxevent.simulate import LinearMotion, Target, motion_scene, simulate_blobs
 
 WIDTH, HEIGHT = 346, 260
@@ -213,10 +215,10 @@ def read(path: Path, in_memory: bool) -> Recording:
 
 
 def images(given: Recording | Path, compiler: Any, rate: int, method: Any = jaxevent.akf) -> None:
-    """Run the complete path of a recording in memory, or in a file."""
+    """Run the complete path of a recording in memory, or in a file, with default parameters."""
     given = read(given, in_memory=False) if isinstance(given, Path) else given
     times = np.arange(given.start, given.stop, 1_000_000 // rate)
-    for _ in method.estimate(given, compiler=compiler).batches(times):
+    for _ in method.estimate(given, method.Params(), compiler=compiler).batches(times):
         pass
 
 
@@ -352,7 +354,7 @@ def compilations() -> int:
     def run(seed: int, events: int) -> None:
         recording = stream(events, 1.0 + seed, seed)
         times = np.arange(50_000, 10**6, 50_000)
-        jaxevent.akf.estimate(recording, compiler="xla")(times)
+        jaxevent.akf.estimate(recording, jaxevent.akf.Params(), compiler="xla")(times)
 
     run(0, 300_000)
     jax.monitoring.register_event_duration_secs_listener(listen)
@@ -469,6 +471,54 @@ def program_images(recording: Recording, times: np.ndarray) -> np.ndarray:
     e = recording.events[:]
     return smoother_program(e.t, e.x, e.y, e.p, image, certain[grey], frames.t, times,
                    tuple(float(n) for n in numbers))  # fmt: skip
+
+
+def repeat(recording: Recording, times: int) -> Recording:
+    """Repeat a recording end to end, one frame interval apart."""
+    e, frames = recording.events, recording.frames
+    assert isinstance(e, Events) and frames is not None
+    late = np.arange(times) * (recording.stop - recording.start + int(frames.t[1] - frames.t[0]))
+    return Recording(
+        "repeated",
+        recording.width,
+        recording.height,
+        Events(
+            (e.t + late[:, None]).ravel(), np.tile(e.x, times), np.tile(e.y, times),
+            np.tile(e.p, times),
+        ),
+        Frames(
+            (frames.t + late[:, None]).ravel(), np.tile(np.asarray(frames.images), (times, 1, 1)),
+            np.tile(frames.exposure, times),
+        ),
+    )  # fmt: skip
+
+
+def calibration_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure calibration of a long recording: 30 M events, the packaged one end to end."""
+    recording = repeat(load(str(RECORDING_FILE)), 90)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "long.h5"
+        save(recording, path)
+        tasks: dict[str, Callable[[], object]] = {
+            "hash": lambda: hash_content(read(path, in_memory=False), 1.0),
+            "calibration": lambda: jaxevent.calibrate(read(path, in_memory=False)),
+            "filtering": lambda: images(path, "numba", 1),
+            "complete": lambda: images(path, "numba", 100),
+        }
+        least, n = least_cpu(tasks), len(recording.events) / 1e6
+    speed = {
+        "30 M events, reading and filtering": n / least["filtering"],
+        "30 M events, complete path": n / least["complete"],
+        "30 M events, complete path with calibration": n
+        / (least["complete"] + least["calibration"]),
+    }
+    ratio = {
+        "CPU seconds of a calibration": least["calibration"],
+        "CPU seconds to find a kept one": least["hash"],
+        "calibration / reading and filtering of 30 M events": least["calibration"]
+        / least["filtering"],
+    }
+    return speed, ratio
 
 
 def images_by(

@@ -66,7 +66,7 @@ class Images:
 
     def compare_with_whole(self) -> str:
         image = self.live(self.live.stop).mean
-        whole = jaxevent.akf.estimate(self.recording)(self.live.stop).mean
+        whole = jaxevent.akf.estimate(self.recording, jaxevent.akf.Params())(self.live.stop).mean
         return f"the last image is within {np.abs(image - whole).max():.1e} of the whole's"
 
 

@@ -262,6 +262,48 @@ def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> R
     return NOISE, fit_with_intervals(loss, start, list(names), batches, settings)
 
 
+VOTES = {"r_t": 50.0}
+VOTES_SETTINGS = {
+    "likelihood": "literal", "radius": 5, "per_pixel": 1, "tau_max": 0.15, "every": 1, "batch": 4,
+    "longest": 0.02, "candidates": 25, "d_max": 1e3, "noise": 0.6, "alpha_literal": 4.0,
+}  # fmt: skip
+
+
+def from_literal_votes(seed: int, seconds: float = 2.0) -> tuple[Recording, KnownMotion]:
+    """Draw pairs of events from the literal likelihood: distance and lateness are exponential.
+
+    The motion is along an axis, of about 50 px/s, and only its speed wanders. Each pair has a
+    neighbourhood of its own, so that no other event is a candidate.
+    """
+    rng, cell, reach = np.random.default_rng([seed, 9]), 16, VOTES_SETTINGS["radius"]
+    way = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[seed % 4]
+    steps, count = round(seconds * 1e3), round(seconds * 500)
+    alpha, spread = VOTES_SETTINGS["alpha_literal"], VOTES_SETTINGS["noise"] * np.sqrt(1e-3)
+    logs = np.cumsum(spread * rng.normal(size=steps + 1))
+    speed = 50 * np.exp(logs - logs[0])
+    t = np.sort(rng.uniform(0, seconds, count))
+    expected = 1 / speed[(1e3 * t).astype(int)]
+    age = np.zeros(count)
+    while (early := age <= 1e-4).any():
+        late = rng.laplace(0, 1 / (alpha * VOTES["r_t"]), count)
+        age = np.where(early, expected + late, age)
+    axis = np.arange(-reach, reach + 1)
+    d = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    chance = np.exp(-alpha * np.linalg.norm(d - way, axis=1))
+    d = d[rng.choice(len(d), count, p=chance / chance.sum())]
+    columns, rows = 20, 15
+    place = rng.permutation(columns * rows)[np.arange(count) % (columns * rows)]
+    at = np.stack([place % columns, place // columns], 1) * cell + cell // 2
+    times, xy = np.concatenate([t - age, t]), np.concatenate([at, at + d])
+    sign = np.tile(rng.random(count) < 0.5, 2)
+    order = np.argsort(times, kind="stable")
+    order = order[times[order] >= 0]
+    x, y = xy[order].T.astype(np.uint16)
+    events = Events(np.rint(1e6 * times[order]).astype(np.int64), x, y, sign[order])
+    truth = KnownMotion(Planar, 1000 * np.arange(steps + 1), speed[:, None] * way)
+    return Recording("votes", columns * cell, rows * cell, events), truth
+
+
 def sensor_recovery(seed: int) -> Recovered:
     """Recover a simulated sensor: a slow pan, 2 s, all noise of a DAVIS.
 

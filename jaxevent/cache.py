@@ -8,7 +8,7 @@ leaves all as it is and keeps nothing, and JAXEVENT_CACHE=FOLDER names another f
 Machine code that is loaded runs with the user's rights. So the folder is the user's alone: it is
 made with mode 0700, and not used where another user owns it or may write to it. Files of kernels,
 which hold pickles (`jaxevent.codegen.cache`), are read under a key that no other user can read
-(`secret_key`).
+(`secret_key`). Calibrations of recordings are numbers without code, and have a folder beside it.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ import platform
 import sys
 import tempfile
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 MIN_COMPILE_SECONDS = 0.3  # s; shorter compilations are not worth a file
@@ -63,15 +64,25 @@ def folder_for_compiled() -> Path | None:
 
     A folder that other users own or may write to is not used, with a warning.
     """
+    return _find_folder("compiled", _processor)
+
+
+def folder_for_calibrations() -> Path | None:
+    """Return the user's own folder of calibrations, or None where there can be none."""
+    return _find_folder("recordings", lambda: "calibrations")
+
+
+def _find_folder(kind: str, name: Callable[[], str]) -> Path | None:
+    """Return the folder of a name in the one that the user named, or in the user's of a kind."""
     wanted = os.environ.get("JAXEVENT_CACHE", "")
     if wanted == "0":
         return None
-    base = (Path(wanted) if wanted else _user_folder()).absolute()
-    folder = _own_folder(base)
+    base = (Path(wanted) if wanted else _user_folder(kind)).absolute()
+    folder = _own_folder(base, name())
     if folder is not None and not folder.is_dir():  # somebody removed it meanwhile
         _own_folder.cache_clear()
         secret_key.cache_clear()
-        folder = _own_folder(base)
+        folder = _own_folder(base, name())
     return folder
 
 
@@ -151,8 +162,8 @@ _HAS_USERS = hasattr(os, "geteuid")  # elsewhere the folders of a profile are th
 
 
 @functools.cache
-def _own_folder(base: Path) -> Path | None:
-    folder = base / _processor()
+def _own_folder(base: Path, name: str) -> Path | None:
+    folder = base / name
     try:
         for one in [*reversed(base.parents), base, folder]:
             if not one.is_dir():
@@ -161,10 +172,10 @@ def _own_folder(base: Path) -> Path | None:
             reason = _foreign_access(one.stat())
             if reason:
                 warnings.warn(
-                    f"{one}: compiled programs are neither kept nor looked for there, as {reason}; "
-                    "remove the folder, or name one of your own by JAXEVENT_CACHE=FOLDER, or "
-                    "keep none by JAXEVENT_CACHE=0",
-                    stacklevel=3,
+                    f"{one}: compiled programs and calibrations are neither kept nor looked for "
+                    f"there, as {reason}; remove the folder, or name one of your own by "
+                    "JAXEVENT_CACHE=FOLDER, or keep none by JAXEVENT_CACHE=0",
+                    stacklevel=4,
                 )
                 return None
     except OSError:  # no home, as in some containers: everything works without
@@ -181,12 +192,13 @@ def _foreign_access(status: os.stat_result) -> str:
     return "other users may write to it" if status.st_mode & 0o022 else ""
 
 
-def _user_folder() -> Path:
+def _user_folder(kind: str) -> Path:
     from platformdirs import user_cache_path
 
-    return user_cache_path("jaxevent", appauthor=False) / "compiled"
+    return user_cache_path("jaxevent", appauthor=False) / kind
 
 
+@functools.cache
 def _processor() -> str:
     """A name of the instructions that this processor has."""
     about = platform.machine()

@@ -19,6 +19,11 @@ The curvature is not used where it is not positive, where the interval would be 
 fit stopped away from the minimum. There the loss itself is followed in both directions, with the
 other numbers held, until its rise is as large as at the ends of an interval by curvature: t / 2
 standard errors of the rise's mean over parts. An end that is not found is open.
+
+Neither holds where the loss is rough at the scale of the interval, so that derivatives tell nothing
+of its changes. There the loss of every part is smoothed: a parabola is fitted to it on a line as
+long as the interval or longer. The formula above, with its derivatives, gives an interval around
+its minimum.
 """
 
 import dataclasses
@@ -35,21 +40,27 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import RenamedAttribute, renamed_names
-from jaxevent.parameters import MAX_VALUE, Number, Parameters, Positive, UnitInterval
+from jaxevent.parameters import MAX_VALUE, Number, Parameters, Positive
 from jaxevent.tuning import (
     MAX_FORWARD_PARAMETERS,
+    MIN_SKILL,
     Batches,
     Interval,
     Loss,
     PreparedBatches,
     evaluate_loss,
+    gradient_skill,
     loss_and_grad,
     map_batches,
+    unit_step,
 )
 
 CONFIDENCE_LEVEL = 0.95
 DIFFERENCE_LOG_STEP = 0.02  # of differences, in logarithms, or in shares of a number that has none
 MAX_TRUSTED_LOG_WIDTH = 2.0  # half widths in logarithms beyond which the curvature is not trusted
+MAX_RISE_RATIO = 4.0  # of a loss at an interval's ends and its rise by the curvature
+SMOOTHED_REACHES, N_SMOOTHED = (0.35, 0.7, 1.4, 2.8), 9  # unit steps, and points on such a line
+MIN_CURVATURE_ERRORS = 4.0  # of a smoothed loss, standard errors
 FIRST_SEARCH_STEP, MAX_DOUBLINGS, N_HALVINGS = 0.1, 6, 5  # of the steps of the search for an end
 RUNAWAY_LOG_DISTANCE = math.log(10.0)  # distance from the start of a number that ran away
 BOUND_LOG_TOLERANCE = 0.25  # of a bound, in the same measure
@@ -59,6 +70,7 @@ REACHED_SEARCH_END = "ran to the end of its search, {:g}"
 RAN_AWAY = "ran away: the loss does not bound it"
 UNDETERMINED = "these data do not determine it"
 NOT_CONVERGED = "had not converged"
+ROUGH = "the loss is rough at the scale of its interval"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -295,32 +307,31 @@ def _physical(number: Number, raw: float) -> float:
     return float(number.physical(jnp.asarray(raw)))
 
 
-def _unit_step(number: Number, value: float, start: float) -> float:
-    """Return a unit step: 1 for numbers stored as logarithms, else the size of the number."""
-    if isinstance(number, Positive | UnitInterval):
-        return 1.0
-    return max(abs(value), abs(start)) or 1.0
-
-
 def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterInterval]:
     """Find the intervals of all numbers that were fitted by gradient."""
     numbers = [sample.found.numbers[name] for name, _ in sample.places]
     begun = np.array([float(np.asarray(start.raw[name])[i]) for name, i in sample.places])
-    scales = np.array(list(map(_unit_step, numbers, sample.at, begun)))
-    widths, newton = _widths(sample, scales) if len(numbers) else (scales, scales)
+    scales = np.array(list(map(unit_step, numbers, sample.at, begun)))
+    widths, newton, curvatures = _widths(sample, scales) if len(numbers) else (scales,) * 3
     findings = []
     for k, ((name, index), number) in enumerate(zip(sample.places, numbers, strict=True)):
         settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_LOG_STEP)
+        objective = functools.partial(_losses_at_step, sample, k, scales[k])
         trusted = widths[k] < MAX_TRUSTED_LOG_WIDTH and settled
         if trusted:
             ends = [-widths[k], widths[k]]
+            rough = _rises_otherwise(sample, objective, widths[k], curvatures[k])
         else:
-            objective = functools.partial(_losses_at_step, sample, k, scales[k])
             ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
+            rough = _has_no_skill(sample, k, scales[k], ends)
+        if rough:
+            ends = _smoothed_ends(sample, objective) or ends
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
             remark = NOT_CONVERGED
+        if not remark and rough:
+            remark = ROUGH
         label = name if not index else f"{name}[{index[0] + 1}]"
         began, value = (_physical(number, raw) for raw in (begun[k], sample.at[k]))
         low, high = (None if raw is None else _physical(number, raw) for raw in (low, high))
@@ -328,10 +339,70 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
     return findings
 
 
-def _widths(
-    sample: _Sample, scales: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute half widths by curvature and Newton steps, both in unit steps.
+def _rises_otherwise(
+    sample: _Sample,
+    objective: Callable[[float], NDArray[np.float64] | None],
+    width: float,
+    curvature: float,
+) -> bool:
+    """Return true if the loss at the ends of an interval is not what the curvature predicts."""
+    found = [objective(sign * width) for sign in (-1.0, 1.0)]
+    rises = [sample.shares @ (values - sample.values) for values in found if values is not None]
+    if len(rises) < 2 or not np.isfinite(rises).all():
+        return False
+    ratio = float(np.mean(rises)) / (curvature * width**2 / 2)
+    return not 1 / MAX_RISE_RATIO < ratio < MAX_RISE_RATIO
+
+
+def _has_no_skill(sample: _Sample, k: int, scale: float, ends: Sequence[float | None]) -> bool:
+    """Return true if the slope does not predict the changes of the loss inside an interval."""
+    if not all(end is not None and math.isfinite(end) for end in ends):
+        return False
+    low, high = (0.99 * float(end) for end in ends if end is not None)
+    steps, losses, slopes = [low, low / 2, 0.0, high / 2, high], [], []
+    for step in steps:
+        values = _losses_at_step(sample, k, scale, step)
+        at = sample.at.copy()
+        at[k] += step * scale
+        losses.append(math.nan if values is None else sample.shares @ values)
+        slopes.append(scale * sample.mean_slope(at)[k])
+    return gradient_skill(steps, losses, slopes) < MIN_SKILL
+
+
+def _smoothed_ends(
+    sample: _Sample, objective: Callable[[float], NDArray[np.float64] | None]
+) -> list[float | None] | None:
+    """Find the ends of the interval of a smoothed loss; None if it has no minimum near.
+
+    The line is the shortest that holds the interval and tells the curvature to a quarter.
+    """
+    if sample.count < 3:
+        return None
+
+    def standard_error(each: NDArray[np.float64]) -> float:
+        apart = (each - sample.shares @ each) * sample.shares
+        return math.sqrt(apart @ apart * sample.count / (sample.count - 1))
+
+    for reach in SMOOTHED_REACHES:
+        steps = np.linspace(-reach, reach, N_SMOOTHED)
+        found = [objective(float(step)) for step in steps]
+        table = np.array([value for value in found if value is not None])
+        if len(table) < N_SMOOTHED or not np.isfinite(table).all():
+            return None
+        half_curvature, slope, _ = np.polyfit(steps, table, 2)
+        H = 2 * sample.shares @ half_curvature
+        if not H > MIN_CURVATURE_ERRORS * standard_error(2 * half_curvature):
+            continue
+        lowest = -(sample.shares @ slope) / H
+        each = slope + 2 * half_curvature * lowest
+        width = sample.quantile * standard_error(each) / H
+        if abs(lowest) + width <= reach:
+            return [lowest - width, lowest + width]
+    return None
+
+
+def _widths(sample: _Sample, scales: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Compute half widths by curvature, Newton steps and curvatures, in unit steps.
 
     Infinite if undetermined.
     """
@@ -351,7 +422,7 @@ def _widths(
             break
         kept.pop(int(np.argmax(np.abs(ways[:, 0]))))
     if not kept:
-        return widths, newton
+        return widths, newton, np.diag(H)
     slope = sample.mean_slope(sample.at)[kept] * scales[kept]
     inverse = np.linalg.inv(H[np.ix_(kept, kept)])
     newton[kept] = -inverse @ slope
@@ -362,9 +433,9 @@ def _widths(
     elif sample.by_measurements:
         covariance = inverse / sample.measurements
     else:
-        return widths, newton
+        return widths, newton, np.diag(H)
     widths[kept] = sample.quantile * np.sqrt(np.diag(covariance))
-    return widths, newton
+    return widths, newton, np.diag(H)
 
 
 def _losses_at_step(

@@ -221,6 +221,17 @@ class Estimator(abc.ABC, Generic[P]):
     def __deepcopy__(self, known: Any) -> "Estimator[P]":
         return self
 
+    def names_left_open(self, explicit: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the names of parameters that a calibration of the recording sets by default.
+
+        Args:
+            explicit: Values that the user gave, by name, and perhaps "preset".
+
+        Returns:
+            Names that neither these nor their preset set.
+        """
+        return self.Params.names_left_open(explicit)
+
     def check(self, recording: Recording) -> None:
         """Raise `InputError` if the recording lacks what the estimator needs.
 
@@ -286,7 +297,8 @@ class Estimator(abc.ABC, Generic[P]):
 
         Args:
             recording: Events, and frames if the estimator uses them.
-            params: Parameters; by default `Params()`.
+            params: Parameters; by default `Params()`, with what the recording shows of numbers in
+                `names_left_open`.
             **options: Options of the estimator, see `options`.
 
         Returns:

@@ -2,7 +2,9 @@
 
 import difflib
 import inspect
+import math
 import tomllib
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
@@ -17,12 +19,14 @@ from jaxtyping import Array
 from jaxevent.deprecated import renamed_names
 from jaxevent.dispatch import check_platform_available
 from jaxevent.display import with_article
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
 
 MAX_VALUE = 1e15  # a value must be smaller, so that its square is in the range of float32
+CALIBRATION_TABLE = "calibration"  # name of the table that jaxevent calibrate writes
+THRESHOLDS = frozenset({"c_on", "c_off"})  # numbers of a calibration that hold for one `I0`
 NO_GRADIENT_REASON = "acts when data are prepared or by comparisons, and has no gradient to follow"
 
 
@@ -268,6 +272,7 @@ class Parameters(_Module):
     numbers: ClassVar[Mapping[str, Number]] = {}
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    calibrated: ClassVar[tuple[str, ...]] = ()  # names that calibrations of recordings determine
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
@@ -317,6 +322,19 @@ class Parameters(_Module):
     def settings(cls) -> dict[str, Setting]:
         """Return all members by name."""
         return {**cls.numbers, **cls.choices}
+
+    @classmethod
+    def names_left_open(cls, explicit: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the names in `calibrated` that neither explicit values nor their preset set.
+
+        Args:
+            explicit: Values by name, and perhaps "preset".
+
+        Returns:
+            The names, which a calibration of the recording may set.
+        """
+        stated = {*explicit, *cls.presets.get(explicit.get("preset") or "", {})}
+        return tuple(name for name in cls.calibrated if name not in stated)
 
     @property
     def is_gradient(self) -> bool:
@@ -460,10 +478,7 @@ class Parameters(_Module):
         method: str | None = None,
         rest: Mapping[str, Any] | None = None,
     ) -> T:
-        """Read parameters from a TOML file.
-
-        The file holds `name = value` settings, or one table of them for each of several methods, as
-        `jaxevent fit` writes.
+        """Read parameters from a TOML file; see `load_table`.
 
         Args:
             path: The file.
@@ -477,8 +492,29 @@ class Parameters(_Module):
             InputError: The file cannot be read or holds another setting; the message names file and
                 key.
         """
+        return cls.of(cls.load_table(path, method), rest)
+
+    @classmethod
+    def load_table(cls, path: str | Path, method: str | None = None) -> dict[str, Any]:
+        """Read `name = value` settings from a TOML file.
+
+        The file holds settings, or one table of them for each of several methods, as `jaxevent fit`
+        writes. A table `[calibration]`, as `jaxevent calibrate` writes, gives the numbers that the
+        others leave open; its thresholds hold for its own `I0`, and are left out for another.
+
+        Args:
+            path: The file.
+            method: Name of the table to take from a file of several methods.
+
+        Returns:
+            Values by name, and perhaps "preset".
+
+        Raises:
+            InputError: As `load`.
+        """
         table = read_toml(path)
         try:
+            calibration = table.pop(CALIBRATION_TABLE, None)
             if table and all(isinstance(part, dict) for part in table.values()):
                 if method is None or method not in table:
                     raise InputError(
@@ -486,9 +522,43 @@ class Parameters(_Module):
                         "those methods or give another file"
                     )
                 table = table[method]
-            return cls.of(table, rest)
+            params = cls.of(table)
+            if calibration is not None:
+                table = {**cls._take_calibration(calibration, table, params), **table}
+                cls.of(table)
+            return table
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+
+    @classmethod
+    def _take_calibration(
+        cls, calibration: Any, table: Mapping[str, Any], params: "Parameters"
+    ) -> dict[str, Any]:
+        """Return what a table `[calibration]` says of the names that another table leaves open."""
+        if not isinstance(calibration, dict):
+            raise InputError(
+                f"calibration is {str(calibration)[:40]!r}; give the table that jaxevent calibrate "
+                "writes"
+            )
+        if not cls.calibrated:
+            raise InputError(
+                "holds the calibration of a recording, and this method has no clock or thresholds; "
+                "leave it out"
+            )
+        found = {n: calibration[n] for n in cls.names_left_open(table) if n in calibration}
+        if not found.keys() & THRESHOLDS:
+            return found
+        I0, own = calibration.get("I0", 1.0), params.values()["I0"]
+        cls.numbers["I0"].check(I0)
+        if math.isclose(I0, own, rel_tol=1e-4):
+            return found
+        warnings.warn(
+            f"thresholds of the calibration hold for I0 = {I0:g}, not for {own:.4g}, and are left "
+            f"out; make others by jaxevent calibrate --I0 {own:.4g}",
+            InputWarning,
+            stacklevel=4,
+        )
+        return {name: value for name, value in found.items() if name not in THRESHOLDS}
 
 
 # By NumPy, and by JAX.

@@ -9,8 +9,8 @@ estimator. All local devices are used, and several processes fit together: `jaxe
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ from tqdm import tqdm
 from jaxevent import devices
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, suggest_name
+from jaxevent.parameters import Number, Parameters, Positive, UnitInterval, suggest_name
 from jaxevent.progress import bar
 
 P = TypeVar("P", bound=Parameters)
@@ -35,6 +35,12 @@ P = TypeVar("P", bound=Parameters)
 # for 1 number, 181 ms for 2; in reverse 213 ms for any. Forwards over reverse, both in turn: 0.60
 # for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
 MAX_FORWARD_PARAMETERS = 2
+
+# A line on which a loss is probed, in unit steps: changes over 0.1, 0.2 and 0.4 of one.
+PROBE_STEPS = (-0.7, -0.3, -0.1, 0.0, 0.1, 0.3, 0.7)
+MIN_SKILL = 0.5  # of the gradient, below which a loss is rough
+NEGLIGIBLE_CHANGE = 1e-5  # of a loss, relative: single precision rounds sums by about 1e-6
+ROUGH_SEARCH_REACH, N_ROUGH_CANDIDATES = 6.4, 17  # unit steps to both sides: a factor of 600
 
 Loss = Callable[[Any, Any], Array]
 Batches = tuple[Sequence[Any], Sequence[Any]]
@@ -150,7 +156,8 @@ class Settings:
     starting points are followed at once: the given one, and others drawn around it with a standard
     deviation of `spread` in the unconstrained numbers. `batch` batches make a step, drawn without
     replacement; None takes all. `forward` chooses the mode of differentiation; None takes the
-    faster.
+    faster. With `probe` the loss is probed before the first step: numbers whose gradient does not
+    predict how the loss changes (`gradient_skill`) are searched before they are followed.
     """
 
     iterations: int = 300
@@ -163,6 +170,19 @@ class Settings:
     batch: int | None = None
     seed: int = 0
     forward: bool | None = None
+    probe: bool = True
+
+
+class RoughNumber(NamedTuple):
+    """A number in which the loss is rough.
+
+    Attributes:
+        skill: The gradient's skill at the start, see `gradient_skill`.
+        searched: Where the search before the descent ended, in the number's unit.
+    """
+
+    skill: float
+    searched: float
 
 
 class Position(eqx.Module):
@@ -186,7 +206,8 @@ class Run:
     Stage 2 r is the search of round r, 2 r + 1 its descent; one last search follows. `tried` are
     the losses of this search's candidates in order: the search is a function of them, so it is
     taken up again by replaying it. `history` has start, round, iteration, fit loss and validation
-    loss (None where it was not looked at).
+    loss (None where it was not looked at). `rough` has a `RoughNumber` for each number in which
+    the loss is rough.
     """
 
     position: Position
@@ -194,18 +215,24 @@ class Run:
     iteration: int = 0
     tried: list[float] = dataclasses.field(default_factory=list)
     history: list[list[Any]] = dataclasses.field(default_factory=list)
+    rough: dict[str, RoughNumber] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
 class FitResult(Generic[P]):
-    """The parameters found, their validation loss (without validation.
+    """The parameters found, and how the fit came to them.
 
-    Fit loss), and the history.
+    Attributes:
+        params: The parameters.
+        loss: Their validation loss; without validation their fit loss.
+        history: Losses over iterations, see `Run`.
+        rough: Numbers in which the loss is rough, and which were searched first.
     """
 
     params: P
     loss: float
     history: list[list[Any]]
+    rough: Mapping[str, RoughNumber] = dataclasses.field(default_factory=dict)
 
     @property
     def diverged(self) -> bool:
@@ -343,7 +370,50 @@ def optimise(
             run.stage, run.iteration, run.tried = run.stage + 1, 0, []
             loop.save(run, True)
         fitted = loop.leader()
-        return FitResult(fitted, loop.loss(fitted, loop.watched(fitted)), run.history)
+        loss = loop.loss(fitted, loop.watched(fitted))
+        return FitResult(fitted, loss, run.history, run.rough)
+
+
+def gradient_skill(
+    steps: Sequence[float], losses: Sequence[float], slopes: Sequence[float]
+) -> float:
+    """Measure how well the slope of a loss predicts its changes along a line.
+
+    From one point to the next the slope predicts the change h (g + g') / 2, exactly for a parabola.
+    With d the changes and e the errors of these predictions, the skill is 1 - sum e^2 / sum d^2.
+    A prediction of no change has the skill 0. Changes too small to matter count as predicted.
+
+    Args:
+        steps: (n,) points on the line, in ascending order.
+        losses: (n,) losses there.
+        slopes: (n,) derivatives by the step; points without a finite one are left out.
+
+    Returns:
+        The skill, at most 1.
+    """
+    table = np.array([steps, losses, slopes], float)
+    at, loss, slope = table[:, np.isfinite(table).all(0)]
+    change = np.diff(loss)
+    error = change - np.diff(at) * (slope[1:] + slope[:-1]) / 2
+    least = (NEGLIGIBLE_CHANGE * np.abs(loss).max(initial=0)) ** 2 * len(change)
+    total = float(change @ change)
+    return 1.0 - float(error @ error) / total if total > least else 1.0
+
+
+def unit_step(number: Number, value: float, start: float) -> float:
+    """Return a unit step: 1 for numbers stored as logarithms, else the size of the number.
+
+    Args:
+        number: The number.
+        value: Its value.
+        start: Its value at the start of a fit, whose size counts where it is larger.
+
+    Returns:
+        The step of the unconstrained number.
+    """
+    if isinstance(number, Positive | UnitInterval):
+        return 1.0
+    return max(abs(value), abs(start)) or 1.0
 
 
 # A step whose gradient is not finite is left out, however many there are.
@@ -586,9 +656,8 @@ class _Loop:
                 candidate = self._with_value(leader, name, value)
                 loss = self.loss(candidate, self.prepare(candidate)[0])
                 loss = loss if math.isfinite(loss) else math.inf
-                self.run.tried.append(loss)
                 self.bar.set_postfix({name: f"{value:.4g}", "loss": f"{loss:.4g}"})
-                self.save(self.run, False)
+                self._note(loss)
             return loss
 
         for name, interval in self.intervals.items():
@@ -599,6 +668,73 @@ class _Loop:
             leader = self._with_value(leader, name, found)
         searched = {name: leader.raw[name] for name in self.intervals}
         self.run.position = dataclasses.replace(self.run.position, searched=searched)
+        if self.run.stage == 0 and self.settings.probe and self.run.position.raw:
+            self._search_rough_numbers(replay)
+
+    def _search_rough_numbers(self, replay: Iterator[float]) -> None:
+        """Probe the loss around the given start, and search the numbers in which it is rough.
+
+        A line along all numbers is probed first, and a line along each only if that one is rough.
+        """
+        position = self.run.position
+        params = self.params.with_raw(position.searched)
+        fit = self.prepare(params)[0]
+        batches = [fit[k] for k in self._drawn(len(fit))]
+        raw = {name: leaf[:1] for name, leaf in position.raw.items()}
+        units = {}
+        for name, leaf in raw.items():
+            size = float(jnp.abs(leaf).max())
+            units[name] = unit_step(params.numbers[name], size, size)
+
+        def moved(names: Sequence[str], step: float) -> dict[str, Array]:
+            return {n: leaf + step * units[n] if n in names else leaf for n, leaf in raw.items()}
+
+        def loss(names: Sequence[str], step: float) -> float:
+            at = moved(names, step)
+            value = next(replay, None)
+            if value is None:
+                function = functools.partial(_values, self.function, params, at)
+                value = float(_mean(function, batches)[0])
+                value = value if math.isfinite(value) else math.inf
+                self._note(value)
+            return value
+
+        def slope(names: Sequence[str], step: float) -> float:
+            at = moved(names, step)
+            value = next(replay, None)
+            if value is None:
+                function = functools.partial(loss_and_grad, self.function, self.forward, params, at)
+                gradient = _mean(function, batches)[1]
+                value = sum(units[name] * float(gradient[name].sum()) for name in names)
+                self._note(value)
+            return value
+
+        def skill(names: Sequence[str]) -> float:
+            losses = [loss(names, step) for step in PROBE_STEPS]
+            inside = [k for k, value in enumerate(losses) if math.isfinite(value)]
+            steps = [PROBE_STEPS[k] for k in inside]
+            return gradient_skill(
+                steps, [losses[k] for k in inside], [slope(names, step) for step in steps]
+            )
+
+        together = skill(list(raw))
+        if together >= MIN_SKILL:
+            return
+        for name in list(raw):
+            found = together if len(raw) == 1 else skill([name])
+            if found >= MIN_SKILL:
+                continue
+            step = _search_smoothed(functools.partial(loss, [name]))
+            raw[name] = moved([name], step)[name]
+            value = float(params.numbers[name].physical(raw[name].mean()))
+            self.run.rough[name] = RoughNumber(found, value)
+        shifted = {n: leaf + (raw[n] - leaf[:1]) for n, leaf in position.raw.items()}
+        self.run.position = dataclasses.replace(position, raw=shifted, best=shifted)
+
+    def _note(self, value: float) -> None:
+        """Keep a value that a resumed search replays."""
+        self.run.tried.append(value)
+        self.save(self.run, False)
 
     def _with_value(self, params: Any, name: str, value: float) -> Any:
         raw = params.numbers[name].unconstrained(jnp.asarray(value, params.raw[name].dtype))
@@ -654,6 +790,33 @@ class _Loop:
         for start in range(self.settings.starts):
             pair = [None if v is None else float(v[start]) for v in (losses, seen)]
             self.run.history.append([start, turn, i, *pair])
+
+
+def _search_smoothed(objective: Callable[[float], float]) -> float:
+    """Search a rough loss along a line, from 0 to `ROUGH_SEARCH_REACH` on both sides.
+
+    A point is judged by its loss and that of its neighbours, 1/4, 1/2, 1/4, so that no single dip
+    decides. Then the grid is made twice as fine around the best point, twice.
+    """
+    grid = np.linspace(-ROUGH_SEARCH_REACH, ROUGH_SEARCH_REACH, N_ROUGH_CANDIDATES)
+    best, width = 0.0, grid[1] - grid[0]
+    tried: dict[float, float] = {}
+
+    def look(step: float) -> float:
+        step = float(step)
+        if step not in tried:
+            tried[step] = objective(step)
+        return tried[step]
+
+    for _ in range(3):
+        losses = np.array([look(step) for step in grid])
+        finite = losses[np.isfinite(losses)]
+        losses = np.minimum(losses, finite.max(initial=-np.inf))
+        smooth = np.convolve(np.pad(losses, 1, "edge"), [0.25, 0.5, 0.25], "valid")
+        best = float(grid[int(np.argmin(smooth))])
+        width /= 2
+        grid = best + width * np.arange(-2, 3)
+    return best
 
 
 def _search_minimum(

@@ -7,6 +7,16 @@ findings = jaxevent.check_consistency(recording)
 
 from jaxevent.calibration.estimation import calibrate
 from jaxevent.calibration.faults import Fault, check_consistency
-from jaxevent.calibration.result import Calibration, CalibrationValue
+from jaxevent.calibration.result import CalibratedValues, Calibration, CalibrationValue
+from jaxevent.calibration.storage import format_toml, recall_calibration
 
-__all__ = ["CalibrationValue", "Calibration", "Fault", "calibrate", "check_consistency"]
+__all__ = [
+    "CalibratedValues",
+    "Calibration",
+    "CalibrationValue",
+    "Fault",
+    "calibrate",
+    "check_consistency",
+    "format_toml",
+    "recall_calibration",
+]

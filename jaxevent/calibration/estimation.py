@@ -1,12 +1,100 @@
-"""Estimation of clock offset and thresholds from the events between frames."""
+"""Estimation of clock, thresholds and noises from the events between frames."""
+
+import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from jaxevent.calibration.result import Calibration, CalibrationValue
+from jaxevent.calibration.events_alone import (
+    CONFIDENCE_Z,
+    estimate_dead_time,
+    estimate_ratio,
+)
+from jaxevent.calibration.model import (
+    CURVATURE,
+    DEGREES_OF_FREEDOM,
+    SHORTEST_US,
+    Fit,
+    Model,
+    Physics,
+    cluster_sums,
+)
+from jaxevent.calibration.result import Calibration, CalibrationValue, not_identifiable
+from jaxevent.calibration.sampling import SEARCH_US, Sample, correlate, take_sample
 from jaxevent.recording import Recording
 
-MAX_INTERVALS = 24
-OFFSETS_US = np.arange(-40, 41, 4) * 1000
+OFFSET_STEP_US = 4000
+MIN_CORRELATION = 0.1
+MIN_PEAK_RATIO = 2.0  # of the highest correlation to those far from it
+EARLIER_STARTS_S = (0.0, 3e-3, 8e-3)  # counts of whole events are late
+FIRST_VARIANCES = (1e-5, 0.05, 0.01)
+FIRST_EXPOSURE = 0.3  # of the time between frames
+GREY_NOISE = 1.5 / 255  # by which pixels are chosen
+GAUSSIAN_SCALE = 1.204  # standard deviation of Gaussian errors, per scale of Student's t
+# Relative errors of the model itself, found on simulated scenes: of c_on, c_off, clock (of the time
+# between frames), dead time (of the shortest gaps) and exposure.
+MODEL_ERROR = (0.012, 0.012, 0.003, 0.1, 0.1)
+N_PROFILE_STEPS = 4
+DARK_OFFSETS = np.geomspace(1e-3, 3, 15)
+MIN_DRIFT_SPAN_S = 20.0
+MIN_FACTOR_SIGMA = 0.03
+MIN_CHANGES_PER_PIXEL = 4.0
+
+
+class Clock(NamedTuple):
+    """Offsets that were tried, with their correlations, and the best of them."""
+
+    offsets: NDArray[np.float64]  # s
+    correlations: NDArray[np.float64]
+    best: float  # s; NaN: none
+    why: str
+
+
+def find_offset(sample: Sample, I0: float) -> Clock:
+    """Find the offset of the clocks at which events and frames agree best.
+
+    Args:
+        sample: The sample.
+        I0: Offset inside the logarithm.
+
+    Returns:
+        The offset, to about a step.
+    """
+    count = SEARCH_US // OFFSET_STEP_US
+    tried = np.arange(-count, count + 1) * OFFSET_STEP_US
+    found = correlate(sample, tried, I0)
+    known = np.isfinite(found)
+    if not known.any():
+        return Clock(tried * 1e-6, found, math.nan, "no events between frames")
+    top = int(np.nanargmax(found))
+    interval = np.median(np.concatenate([np.diff(s.frame_t) for s in sample.stretches]))
+    far = found[known & (np.abs(tried - tried[top]) > 2 * max(interval, OFFSET_STEP_US))]
+    others = float(np.quantile(np.abs(far), 0.9)) if len(far) else 0.0
+    why = ""
+    if found[top] < max(MIN_CORRELATION, MIN_PEAK_RATIO * others):
+        why = f"events and frames agree at no offset (correlation {found[top]:.2f})"
+    return Clock(tried * 1e-6, found, math.nan if why else float(tried[top]) * 1e-6, why)
+
+
+def _interval(value: float, error: float, unit: str, note: str = "") -> CalibrationValue:
+    """Return a positive value with the interval of its logarithm."""
+    wide = math.exp(min(CONFIDENCE_Z * error / value, 50.0))
+    return CalibrationValue(value, value / wide, value * wide, unit, note)
+
+
+def _first_fit(model: Model, clock: Clock, is_unknown: bool) -> Fit | None:
+    """Fit from several offsets, and return the best fit."""
+    best = None
+    for early in EARLIER_STARTS_S:
+        theta = [0.2, 0.2, clock.best - early, 0.0, (FIRST_EXPOSURE * model.interval_s) ** 2]
+        start = Physics(np.array(theta), np.array(FIRST_VARIANCES))
+        fit = model.fit(start, (True, True, True, False, False), 5)
+        if fit is not None and (best is None or fit.losses.mean() < best.losses.mean()):
+            best = fit
+    if best is None:
+        return None
+    return model.fit(best.physics, (True, True, True, True, is_unknown)) or best
 
 
 def calibrate(recording: Recording, I0: float = 1.0) -> Calibration:
@@ -17,66 +105,221 @@ def calibrate(recording: Recording, I0: float = 1.0) -> Calibration:
         I0: Offset inside the logarithm, L = ln(I + I0), for which thresholds hold.
 
     Returns:
-        The values found.
+        The values found, each with its 95 % interval or the reason why there is none.
     """
-    pixels = recording.width * recording.height
-    hot = np.zeros((recording.height, recording.width), bool)
-    frames, source = recording.frames, recording.events
-    nothing = CalibrationValue(np.nan, np.nan, np.nan, "s", "not identifiable: too few frames")
-    empty = Calibration(nothing, nothing, nothing, nothing, hot, np.zeros(0), np.zeros(0))
-    if frames is None or len(frames) < 2 or not len(source):
-        return empty
-    rows = np.unique(
-        np.linspace(0, len(frames) - 2, min(len(frames) - 1, MAX_INTERVALS)).astype(int)
-    )
-    grey = {k: frames[k : k + 1].intensity[0].ravel().astype(float) for k in {*rows, *(rows + 1)}}
-    top = 0.97 * max(float(g.max()) for g in grey.values())
+    sample = take_sample(recording)
+    ratio, dead = estimate_ratio(sample), estimate_dead_time(sample)
+    frames = 0 if recording.frames is None else len(recording.frames)
+    if frames < 2 or not len(recording.events):
+        what = "frames" if frames < 2 else "events"
+        return _without_fit(sample, ratio, dead, f"too few {what}")
+    clock = find_offset(sample, I0)
+    if math.isnan(clock.best):
+        return _without_fit(sample, ratio, dead, clock.why, clock)
+    grey = np.linspace(0, 1, 1025)
+    table = np.asarray(recording.response.intensity(grey), np.float64)
+    slope = np.stack([grey, np.maximum(np.gradient(table, grey), 1e-6)])
+    model = Model(sample, I0, GREY_NOISE, slope)
+    is_unknown = any((s.exposure == 0).any() for s in sample.stretches)
+    fit = _first_fit(model, clock, is_unknown)
+    if fit is None:
+        why = "too few pixels change brightness while frames are taken"
+        return _without_fit(sample, ratio, dead, why, clock)
+    return _with_fit(sample, fit, model, clock)
 
-    def counts(offset: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        on, off, change = [], [], []
-        for k in rows:
-            first, last = (source.index(int(frames.t[k + i]) + offset) for i in (0, 1))
-            if last - first < 50:
-                continue
-            events = source[first:last]
-            place = events.y.astype(np.int64) * recording.width + events.x
-            a = np.bincount(place[events.p], minlength=pixels)
-            b = np.bincount(place[~events.p], minlength=pixels)
-            d = np.log(grey[k + 1] + I0) - np.log(grey[k] + I0)
-            inside = np.all([(g > 0.03) & (g < top) for g in (grey[k], grey[k + 1])], 0)
-            used = inside & (a + b > 0) & (a + b < 40)
-            on.append(a[used])
-            off.append(b[used])
-            change.append(d[used])
-        if not on:
-            return (np.zeros(0),) * 3
-        return np.concatenate(on), np.concatenate(off), np.concatenate(change)
 
-    correlations = []
-    for offset in OFFSETS_US.tolist():
-        a, b, d = counts(offset)
-        correlations.append(np.corrcoef(a - b, d)[0, 1] if len(d) > 100 else 0.0)
-    found = np.array(correlations)
-    top_row = int(np.clip(np.argmax(found), 1, len(found) - 2))
-    left, best, right = found[top_row - 1 : top_row + 2]
-    bend = left - 2 * best + right
-    offset = OFFSETS_US[top_row] + (0.5 * (left - right) / bend * 4000 if bend < 0 else 0)
-    a, b, d = counts(int(offset))
-    up, down = (a > b) & (d > 0), (b > a) & (d < 0)
-    if min(up.sum(), down.sum()) < 100 or found.max() < 0.2:
-        return empty
-    c_on = d[up].sum() / (a - b)[up].sum()
-    c_off = -d[down].sum() / (b - a)[down].sum()
-
-    def value(v: float, unit: str) -> CalibrationValue:
-        return CalibrationValue(float(v), np.nan, np.nan, unit)
-
+def _without_fit(
+    sample: Sample,
+    ratio: CalibrationValue,
+    dead: CalibrationValue,
+    why: str,
+    clock: Clock | None = None,
+) -> Calibration:
+    """Return what is known without a fit to frames."""
+    units = {
+        "clock_offset": "s", "clock_drift": "s/s", "c_on": "ln I", "c_off": "ln I",
+        "dark_offset": "intensity", "sigma_event": "c", "frame_noise": "grey", "exposure": "s",
+        "exposure_anchor": "exposure",
+    }  # fmt: skip
+    none = {name: not_identifiable(unit, why) for name, unit in units.items()}
+    empty = np.zeros(0)
     return Calibration(
-        value(offset * 1e-6, "s"),
-        value(c_on, "ln I"),
-        value(c_off, "ln I"),
-        value(c_on / c_off, "1"),
-        hot,
-        OFFSETS_US * 1e-6,
-        found,
+        **none, threshold_ratio=ratio, rho_ref=dead, hot_pixels=sample.hot,
+        offsets=empty if clock is None else clock.offsets,
+        correlations=empty if clock is None else clock.correlations,
+    )  # fmt: skip
+
+
+def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibration:
+    """Return the values of a fit with their intervals."""
+    theta = fit.physics.theta
+    floor = np.array(MODEL_ERROR)
+    scale = np.array([theta[0], theta[1], model.interval_s, 1e-3, 1.0])
+    covariance = fit.covariance + np.diag((floor * scale) ** 2 * (np.arange(5) < 4))
+    error = np.sqrt(np.diag(covariance))
+    c_on, c_off = (_interval(float(theta[k]), float(error[k]), "ln I") for k in (0, 1))
+    ratio = float(theta[0] / theta[1])
+    by = np.array([1 / theta[0], -1 / theta[1]])
+    ratio_error = math.sqrt(float(by @ covariance[:2, :2] @ by))
+    late = float(theta[2])
+    reach = CONFIDENCE_Z * float(error[2])
+    offset = CalibrationValue(late, late - reach, late + reach, "s")
+    rho, reach = float(theta[3]), CONFIDENCE_Z * float(error[3])
+    if rho - reach > 0:
+        dead = CalibrationValue(rho, rho - reach, rho + reach, "s")
+    else:
+        dead = not_identifiable("s", f"at most {rho + reach:.2g} s")
+    exposure = _exposure(sample, fit, model)
+    noise, event_noise = _noises(fit)
+    return Calibration(
+        clock_offset=offset,
+        clock_drift=_drift(sample, fit),
+        c_on=c_on,
+        c_off=c_off,
+        threshold_ratio=_interval(ratio, ratio * ratio_error, "1"),
+        dark_offset=_dark_offset(model, fit),
+        sigma_event=event_noise,
+        frame_noise=noise,
+        exposure=exposure,
+        exposure_anchor=_anchor(offset, exposure),
+        rho_ref=dead,
+        hot_pixels=sample.hot,
+        offsets=clock.offsets,
+        correlations=clock.correlations,
+        threshold_factors=_factors(sample, fit),
     )
+
+
+def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
+    known = np.concatenate([s.exposure for s in sample.stretches])
+    if (known > 0).all():
+        length = float(np.median(known)) * 1e-6
+        return CalibrationValue(length, length, length, "s", "as the recording says")
+    square, error = float(fit.physics.theta[4]), math.sqrt(float(fit.covariance[4, 4]))
+    error = math.hypot(error, 2 * MODEL_ERROR[4] * square)
+    low, high = (math.sqrt(max(square + sign * CONFIDENCE_Z * error, 0)) for sign in (-1, 1))
+    if not high < model.interval_s:
+        return not_identifiable("s", "little of the scene moves fast enough")
+    least = max(low, SHORTEST_US * 1e-6)
+    if low == 0:
+        return CalibrationValue(
+            math.sqrt(square), 0.0, high, "s", "frames are hardly blurred by motion"
+        )
+    return CalibrationValue(math.sqrt(max(square, least**2)), low, high, "s")
+
+
+def _anchor(offset: CalibrationValue, exposure: CalibrationValue) -> CalibrationValue:
+    """Say where in the exposure the stamps lie, if the clocks are the same."""
+    if not exposure.is_identifiable or exposure.low <= 0:
+        return not_identifiable("exposure", "exposures are not known")
+    # Stamps at the begin of exposures are half of one before their middle.
+    low, high = (0.5 - end / exposure.value for end in (offset.high, offset.low))
+    place = 0.5 - offset.value / exposure.value
+    fits = [name for at, name in ((0, "begin"), (0.5, "middle"), (1, "end")) if low <= at <= high]
+    if len(fits) != 1:
+        why = f"stamps may be at {' or '.join(fits)}" if fits else "the clocks differ"
+        return not_identifiable("exposure", why)
+    return CalibrationValue(place, low, high, "exposure", f"stamps are at the {fits[0]}")
+
+
+def _noises(fit: Fit) -> tuple[CalibrationValue, CalibrationValue]:
+    """Return the noise of frames and of events."""
+    nu, V, changes = DEGREES_OF_FREEDOM, fit.physics.V, fit.changes
+    v = V @ fit.terms.X
+    # Derivatives of the likelihood by the logarithms of variances.
+    part = (V[:, None] * fit.terms.X / v).T
+    score = 0.5 * part * (fit.weight * fit.terms.residual**2 - 1)[:, None]
+    H = 0.5 * nu / (nu + 3) * part.T @ part
+    inverse = np.linalg.pinv(H)
+    meat = np.max([cluster_sums(score, changes, by) for by in ("tile", "interval")], 0)
+    error = np.sqrt(np.diag(inverse @ meat @ inverse)) / 2
+    sigma = GAUSSIAN_SCALE * np.sqrt(V)
+    out = []
+    for row, unit in ((0, "grey"), (2, "c")):
+        spread = math.hypot(float(error[row]), 0.1)
+        if spread > 0.5:
+            out.append(not_identifiable(unit, "other errors are larger"))
+        else:
+            out.append(_interval(float(sigma[row]), float(sigma[row]) * spread, unit))
+    return out[0], out[1]
+
+
+def _drift(sample: Sample, fit: Fit) -> CalibrationValue:
+    """Return the growth of the clock offset from stretch to stretch."""
+    changes, J = fit.changes, fit.terms.J[:, 2]
+    middle = np.array([s.frame_t.mean() for s in sample.stretches]) * 1e-6
+    rows = np.unique(changes.stretch)
+    if len(rows) < 3 or np.ptp(middle[rows]) < MIN_DRIFT_SPAN_S:
+        return not_identifiable("s/s", f"the recording is shorter than {MIN_DRIFT_SPAN_S:g} s")
+    offset, information = np.zeros(len(rows)), np.zeros(len(rows))
+    for k, row in enumerate(rows):
+        own = changes.stretch == row
+        score = (fit.weight * fit.terms.residual * J)[own]
+        H = (fit.weight * J**2)[own].sum() * CURVATURE
+        _, index = np.unique(changes.interval[own], return_inverse=True)
+        offset[k] = score.sum() / H
+        information[k] = H**2 / max((np.bincount(index, score) ** 2).sum(), 1e-12)
+    information = 1 / (1 / information + 1e-8)
+    t = middle[rows] - np.average(middle[rows], weights=information)
+    slope = (information * t * offset).sum() / (information * t * t).sum()
+    spread = (information * (offset - slope * t) ** 2).sum() / max(len(rows) - 2, 1)
+    reach = 2.5 * math.sqrt(max(spread, 1.0) / (information * t * t).sum())
+    return CalibrationValue(float(slope), float(slope - reach), float(slope + reach), "s/s")
+
+
+def _dark_offset(model: Model, fit: Fit) -> CalibrationValue:
+    """Return the offset in the logarithm under which frames are likeliest."""
+    fits, physics = [], fit.physics
+    thresholds = np.arange(2)
+    for I0 in DARK_OFFSETS[::-1].tolist():
+        for _ in range(N_PROFILE_STEPS):
+            found, move = model.step(physics, fit.changes, thresholds, I0)
+            theta = physics.theta + move
+            theta[:2] = np.maximum(theta[:2], physics.theta[:2] / 2)
+            physics = Physics(theta, found.physics.V)
+        # Densities of grey values rather than of their logarithms, which depend on I0.
+        fits.insert(0, found.losses + found.terms.log_slope)
+    loss = np.array([one.mean() for one in fits])
+    k = int(np.argmin(loss))
+    if k in (0, len(loss) - 1):
+        end = f"{'at most' if k == 0 else 'at least'} {DARK_OFFSETS[k]:.2g}"
+        return not_identifiable("intensity", f"dark pixels tell no more than {end}")
+    step = math.log(DARK_OFFSETS[1] / DARK_OFFSETS[0])
+    left, here, right = fits[k - 1 : k + 2]
+    bend = float((left - 2 * here + right).sum()) / step**2
+    slope = (right - left)[:, None] / (2 * step)
+    meat = max(float(cluster_sums(slope, fit.changes, by)[0, 0]) for by in ("tile", "interval"))
+    error = math.hypot(math.sqrt(meat) / bend, 0.1)
+    value = float(DARK_OFFSETS[k] * math.exp(-slope.sum() / bend))
+    if error > 1.5:
+        return not_identifiable("intensity", "pixels differ too little in brightness")
+    return _interval(value, value * error, "intensity")
+
+
+def _factors(sample: Sample, fit: Fit) -> NDArray[np.float32] | None:
+    """Return factors on the thresholds of pixels, if halves of the data agree on them."""
+    changes, theta = fit.changes, fit.physics.theta
+    pixels = len(sample.places)
+    if len(changes.loose) < MIN_CHANGES_PER_PIXEL * pixels:
+        return None
+    x = np.stack([theta[0] * changes.n[0], -theta[1] * changes.n[1]])
+
+    def regress(rows: NDArray, prior: float) -> tuple[NDArray, NDArray]:
+        pixel, w = changes.pixel[rows], fit.weight[rows]
+        a, b, e = x[0, rows], x[1, rows], fit.terms.residual[rows]
+        sums = [np.bincount(pixel, w * v, pixels) for v in (a * a, a * b, b * b, a * e, b * e)]
+        A, C = sums[0] + prior**-2, sums[2] + prior**-2
+        det = A * C - sums[1] ** 2
+        d = np.stack([C * sums[3] - sums[1] * sums[4], A * sums[4] - sums[1] * sums[3]]) / det
+        return d, 1 - np.stack([C, A]) / det / prior**2
+
+    every = np.arange(len(changes.loose))
+    halves = [regress(every[changes.interval % 2 == k], 0.1) for k in (0, 1)]
+    (d1, part1), (d2, part2) = halves
+    variance = (d1 * d2).sum() / max((part1 * part2).sum(), 1e-9)
+    if not variance > MIN_FACTOR_SIGMA**2:
+        return None
+    d, _ = regress(every, math.sqrt(variance))
+    factors = np.ones((2, sample.size[0] * sample.size[1]), np.float32)
+    factors[:, sample.places] = 1 + d
+    return factors.reshape(2, sample.size[1], sample.size[0])

@@ -1,8 +1,39 @@
-"""Checks of a recording: faults of its events, its frames and their clocks."""
+"""Checks of a recording: faults of its events, its frames and their clocks.
 
+Limits come from chance, from geometry or from simulated scenes; docs/faults.md gives each with its
+reason. All checks use one sample of the recording, so that they cost seconds however long it is.
+"""
+
+from collections.abc import Iterator
 from typing import NamedTuple
 
-from jaxevent.recording import Recording
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration.agreement import I0, TRANSFORMS, Agreement, measure_agreement
+from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
+from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
+from jaxevent.recording import Events, Recording
+
+MAX_HOT_SHARE = 0.01  # of the pixels
+MIN_GAP_US, MIN_GAP_STEPS = 1_000, 5  # steps of the stamps, which may be of ms
+MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
+MAX_MISSED_EVENTS = 100  # expected in a gap: by chance none come with e^-100, in clusters e^-10
+MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
+BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
+MAX_BURST_SHARE = 0.05  # of the events
+MAX_POLARITY_SHARE, MIN_POLARITIES = 0.95, 1_000
+SIGMAS = 6.0  # of a correlation that is not chance, among some hundred that are tried
+MIN_ADVANTAGE = 2.0  # of a correlation over that of the recording as it is
+MIN_BUSY = 100  # pixels with several events between frames, which determine clock and exposure
+# Tiles with such pixels: where all of them agree, the significance is the root of their number.
+MIN_RELATED = (3 * SIGMAS) ** 2
+MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half the interval
+MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
+MIN_BLUR_GAIN = 0.1  # of the variance that short exposures leave unexplained
+MAX_UNDONE_SHARE = 0.5  # of the events
+WHITE, MAX_WHITE_SHARE = 0.98, 0.05  # of the grey values' range; of the pixels
+MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 
 class Fault(NamedTuple):
@@ -12,7 +43,7 @@ class Fault(NamedTuple):
     |---|---|
     | name | name of the check |
     | statistic | the number that was measured |
-    | limit | the number from which it is a fault |
+    | limit | the number above which it is a fault |
     | text | one sentence that says what was found |
     | remedy | one sentence that says what to do |
     """
@@ -23,7 +54,246 @@ class Fault(NamedTuple):
     text: str
     remedy: str
 
+    def __str__(self) -> str:
+        return (
+            f"{self.name}: {self.text} (statistic {self.statistic:.3g}, limit {self.limit:.3g}); "
+            f"{self.remedy}"
+        )
+
 
 def check_consistency(recording: Recording) -> tuple[Fault, ...]:
-    """Check a recording for faults of events, frames and clocks."""
-    return ()
+    """Check a recording for faults of events, frames and clocks.
+
+    Hot pixels go out first; the other checks see the rest. What needs frames is left out without
+    them, and what needs both clocks where they do not meet.
+
+    Args:
+        recording: The recording, in memory or in a file.
+
+    Returns:
+        The faults, empty where nothing is wrong.
+    """
+    sample = take_sample(recording)
+    return tuple(
+        fault
+        for found in (
+            _check_hot_pixels(sample),
+            _check_times(recording, sample),
+            _check_both(recording, sample),
+            _check_white(sample),
+        )
+        for fault in found
+        if fault.statistic > fault.limit
+    )
+
+
+def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
+    """Check the share of hot pixels."""
+    share = float(sample.hot.mean())
+    yield Fault(
+        "hot pixels", share, MAX_HOT_SHARE,
+        f"{100 * share:.2g} % of the pixels fire in all parts of the recording, unlike those "
+        "around them",
+        "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
+        "calibrate(recording).hot_pixels",
+    )  # fmt: skip
+
+
+def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:
+    """Return times of events without hot pixels: of all in memory, else of the stretches."""
+    events = recording.events
+    if not isinstance(events, Events):
+        return [stretch.t for stretch in sample.stretches]
+    return [events.t[~sample.hot[events.y, events.x]] if sample.hot.any() else events.t]
+
+
+def _check_times(recording: Recording, sample: Sample) -> Iterator[Fault]:
+    """Check the times of events for gaps and bursts."""
+    gaps, total, in_bursts = [], 0, 0
+    for t in _times(recording, sample):
+        total += len(t)
+        steps = np.diff(t)
+        least = MIN_GAP_STEPS * np.median(steps[steps > 0]) if steps.any() else 0
+        rows = np.flatnonzero(steps >= max(MIN_GAP_US, least))
+        begin, end = t[rows], t[rows + 1]
+        # The lesser rate of the two sides, each over the length of the gap.
+        before = rows + 1 - np.searchsorted(t, 2 * begin - end)
+        after = np.searchsorted(t, 2 * end - begin, side="right") - rows - 1
+        missed = np.minimum(before, after)
+        gaps += zip(missed.tolist(), begin.tolist(), end.tolist(), strict=True)
+        in_bursts += _count_bursts(t)
+    gaps = [gap for gap in gaps if gap[0] > MAX_MISSED_EVENTS]
+    long = [gap for gap in gaps if gap[2] - gap[1] >= MAX_PAUSE_US]
+    lost = sum(gap[0] for gap in gaps)
+    if long or lost > MAX_MISSED_SHARE * (total + lost):
+        most, begin, end = max(long or gaps)
+        yield Fault(
+            "missing events", float(most), MAX_MISSED_EVENTS,
+            f"about {100 * lost / (total + lost):.2g} % of the events are missing in {len(gaps)} "
+            f"gaps, as about {most:,} from {begin / 1e6:.6f} to {end / 1e6:.6f} s",
+            "record again with a larger buffer or a lower event rate; images between frames around "
+            "the gaps rest on the frames",
+        )  # fmt: skip
+    share = in_bursts / max(total, 1)
+    yield Fault(
+        "event bursts", share, MAX_BURST_SHARE,
+        f"{100 * share:.2g} % of the events come in milliseconds with over {BURST_RATIO} times as "
+        "many as around them",
+        "look for flashes of light, and for stamps that a buffer gave many events together",
+    )  # fmt: skip
+
+
+def _count_bursts(t: NDArray[np.int64]) -> int:
+    """Count the events in bins of 1 ms that hold far more than the 10 on either side."""
+    if not len(t):
+        return 0
+    bins, counts = np.unique((t - t[0]) // BURST_US, return_counts=True)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    before = ends[:-1] - ends[np.searchsorted(bins, bins - BURST_BINS)]
+    after = ends[np.searchsorted(bins, bins + BURST_BINS, side="right")] - ends[1:]
+    around = np.maximum(before, after) / BURST_BINS + 1
+    inner = (bins >= BURST_BINS) & (bins <= bins[-1] - BURST_BINS)
+    return int(counts[inner & (counts > BURST_RATIO * around)].sum())
+
+
+def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
+    """Check polarity, and events against frames."""
+    on, off = sample.counts[:, ~sample.hot].sum(1).tolist()
+    if on + off >= MIN_POLARITIES and max(on, off) > MAX_POLARITY_SHARE * (on + off):
+        yield Fault(
+            "lost polarity", max(on, off) / (on + off), MAX_POLARITY_SHARE,
+            f"{100 * on / (on + off):.3g} % of the events are ON, while what passes a pixel makes "
+            "events of both polarities",
+            "read the file again with the column or bit of its polarity; use methods without "
+            "polarity, or frames alone",
+        )  # fmt: skip
+    if (mismatch := compare_clocks(recording)) is not None:
+        outside, limit = _mismatch(recording)
+        yield Fault(
+            "disjoint clocks", outside, limit, mismatch.text,
+            "check the unit and the clock of both, or estimate the offset: jaxevent register",
+        )  # fmt: skip
+        if mismatch.is_disjoint:
+            return
+    agreement = measure_agreement(sample)
+    yield from _check_brightness(sample, agreement)
+    if agreement is not None:
+        if on + off and max(on, off) <= MAX_POLARITY_SHARE * (on + off):
+            relation = list(_check_relation(agreement))
+            yield from relation
+            if not relation:
+                yield from _check_clock(recording, agreement)
+
+
+def _mismatch(recording: Recording) -> tuple[float, float]:
+    """Return the statistic of a mismatch of clocks and its limit."""
+    frames, events = recording.frames, recording.events
+    assert frames is not None
+    spans = [(int(frames.t[0]), int(frames.t[-1]))]
+    spans.append((int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])))
+    lengths = sorted(end - begin for begin, end in spans)
+    common = min(end for _, end in spans) - max(begin for begin, _ in spans)
+    outside = 1 - max(common, 0) / max(lengths[0], 1)
+    if outside > 1 - MIN_OVERLAP_SHARE:
+        return outside, 1 - MIN_OVERLAP_SHARE
+    return lengths[1] / max(lengths[0], 1), 1 / MIN_SPAN_RATIO
+
+
+def _check_relation(agreement: Agreement) -> Iterator[Fault]:
+    """Check whether events belong to the frames, as they are or turned over."""
+    r, z = agreement.correlation, agreement.significance
+    here = max(float(r[0].max()), 0.0)
+    real = np.where(np.abs(z) > SIGMAS, r, 0)
+    kind, lag = np.unravel_index(np.argmax(np.abs(real)), real.shape)
+    found, significance = float(real[kind, lag]), float(abs(z[kind, lag]))
+    name = list(TRANSFORMS)[kind]
+    if found and (kind or found < 0) and abs(found) > MIN_ADVANTAGE * here:
+        inverse = "polarity inverted" if found < 0 else ""
+        changed = " and ".join(part for part in (name, inverse) if part)
+        yield Fault(
+            "flipped or swapped axes" if kind else "inverted polarity", significance, SIGMAS,
+            f"events correlate with the changes of the frames by {here:.2f} at most, with "
+            f"{changed} by {abs(found):.2f}",
+            f"make the recording of events with {changed}",
+        )  # fmt: skip
+    elif not found and agreement.activity > SIGMAS:
+        yield Fault(
+            "lost polarity", agreement.activity, SIGMAS,
+            f"events come where and when frames change, but their polarity says nothing about the "
+            f"sign: the correlation is {float(np.abs(r[0]).max()):.2f} at most",
+            "read the file again with the column or bit of its polarity; use methods without "
+            "polarity, or frames alone",
+        )  # fmt: skip
+    elif not found and agreement.tiles > MIN_RELATED:
+        yield Fault(
+            "unrelated events", float(agreement.tiles), MIN_RELATED,
+            f"events and changes of the frames do not correlate within "
+            f"{agreement.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
+            "check that frames and events are of one recording, clock and camera",
+        )  # fmt: skip
+
+
+def _check_clock(recording: Recording, agreement: Agreement) -> Iterator[Fault]:
+    """Check offset and exposure of frames that belong to the events."""
+    if agreement.busy < MIN_BUSY:
+        return
+    assert recording.frames is not None
+    interval = agreement.interval
+    left = (1 - agreement.blurred**2) / (1 - agreement.unblurred**2 + 1e-9)
+    if left < 1 - MIN_BLUR_GAIN and agreement.exposure > MAX_EXPOSURE_INTERVALS * interval:
+        yield Fault(
+            "blurred frames", agreement.exposure / interval, MAX_EXPOSURE_INTERVALS,
+            f"changes of the frames follow the events over {agreement.exposure / 1e3:.0f} ms, "
+            f"longer than their interval of {interval / 1e3:.0f} ms, as means of several do",
+            "use the frames before they were averaged, or only every few of them",
+        )  # fmt: skip
+        return
+    offset, sigma = agreement.offset * 1e-6, agreement.offset_sigma * 1e-6
+    if abs(offset) - 2 * sigma > MAX_OFFSET_INTERVALS * interval * 1e-6:
+        yield Fault(
+            "clock offset", abs(offset), MAX_OFFSET_INTERVALS * interval * 1e-6,
+            f"frames fit the events best {abs(offset) * 1e3:.1f} ms "
+            f"{'later' if offset > 0 else 'earlier'} than their stamps",
+            f"set clock_offset = {offset:.4f}, or let calibrate(recording) find it",
+        )  # fmt: skip
+
+
+def _check_brightness(sample: Sample, agreement: Agreement | None) -> Iterator[Fault]:
+    """Check that frames change brightness only as events do, and often enough."""
+    offset = 0 if agreement is None or np.isnan(agreement.offset) else int(agreement.offset)
+    steps, net, total = [], 0, 0
+    for stretch in sample.stretches:
+        changes, clear = log_changes(stretch, I0)
+        counts = count_between(stretch, offset)
+        for d, used, (on, off) in zip(changes, clear, counts, strict=True):
+            quiet = used & (on + off == 0)
+            net += int(np.abs(on - off).sum())
+            total += int((on + off).sum())
+            if quiet.any():
+                steps.append(float(np.median(d[quiet])))
+    flicker = float(np.median(np.abs(steps))) if steps else 0.0
+    yield Fault(
+        "flickering frames", flicker, MAX_FLICKER,
+        f"from frame to frame pixels without an event change by {100 * flicker:.2g} % in the "
+        "median",
+        'give the brightness of each frame as extra["gain"], or record with constant exposure '
+        "and gain",
+    )  # fmt: skip
+    undone = 1 - net / total if total and agreement is not None else 0.0
+    yield Fault(
+        "sparse frames", undone, MAX_UNDONE_SHARE,
+        f"of the change that events report, {100 * undone:.2g} % is undone before the next frame",
+        "record more frames per second; events must bridge the time between them, for which their "
+        "thresholds must be known well",
+    )  # fmt: skip
+
+
+def _check_white(sample: Sample) -> Iterator[Fault]:
+    """Check the share of pixels whose frames are white."""
+    white = sum(int((stretch.grey >= WHITE).sum()) for stretch in sample.stretches)
+    share = white / max(sum(stretch.grey.size for stretch in sample.stretches), 1)
+    yield Fault(
+        "clipped frames", share, MAX_WHITE_SHARE,
+        f"{100 * share:.2g} % of the frames' pixels are white, where only events tell what happens",
+        'shorten the exposure; use preset="hdr", which takes white for a lower bound',
+    )  # fmt: skip

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,42 +34,125 @@ class CalibrationValue(NamedTuple):
         return math.isfinite(self.value)
 
 
+class CalibratedValues(NamedTuple):
+    """Values that parameters take from a calibration.
+
+    | field | meaning |
+    |---|---|
+    | found | values by name |
+    | missing | notes of those that the data do not determine, by name |
+    """
+
+    found: dict[str, float]
+    missing: dict[str, str]
+
+    def __str__(self) -> str:
+        return ", ".join(format_calibrated(name, value) for name, value in self.found.items())
+
+
+def format_calibrated(name: str, value: float) -> str:
+    """Format a value of a calibration for a line, as "clock +7.8 ms".
+
+    Args:
+        name: Name of the parameter.
+        value: Its value.
+
+    Returns:
+        Words.
+    """
+    return f"clock {1e3 * value:+.1f} ms" if name == "clock_offset" else f"{name} {value:.3g}"
+
+
+def not_identifiable(unit: str, why: str) -> CalibrationValue:
+    """Return a value that the data do not determine.
+
+    Args:
+        unit: Its unit.
+        why: The reason.
+
+    Returns:
+        The value, NaN.
+    """
+    return CalibrationValue(math.nan, math.nan, math.nan, unit, f"not identifiable: {why}")
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Calibration:
     """Values that `calibrate` found in a recording.
 
     Attributes:
         clock_offset: Time added to the frames' stamps, s.
-        c_on: Contrast threshold of ON events at `I0`, ln I.
-        c_off: Contrast threshold of OFF events at `I0`, ln I.
+        clock_drift: Growth of the clock offset with time, s / s.
+        c_on: Contrast threshold of ON events in ln(I + I0), I0 as given to `calibrate`.
+        c_off: Contrast threshold of OFF events.
         threshold_ratio: Ratio of the ON threshold to the OFF threshold.
+        dark_offset: Offset inside the logarithm at which thresholds are the same at all
+            intensities.
+        sigma_event: Noise of an event's step and spread of thresholds, in thresholds.
+        frame_noise: Standard deviation of a frame's grey value, 1 is white.
+        exposure: Length of the exposures, s.
+        exposure_anchor: Place of the stamps in the exposures: 0 begin, 0.5 middle, 1 end.
+        rho_ref: Dead time of a pixel after an event, s.
         hot_pixels: (height, width), true for pixels that fire without cause.
         offsets: (n,) clock offsets that were tried, s.
         correlations: (n,) correlation of the events' counts with the frames' changes at `offsets`.
+        threshold_factors: (2, height, width) ratios of a pixel's ON and OFF thresholds to the
+            common ones, 1 where unknown; None where the data do not determine them.
     """
 
     clock_offset: CalibrationValue
+    clock_drift: CalibrationValue
     c_on: CalibrationValue
     c_off: CalibrationValue
     threshold_ratio: CalibrationValue
+    dark_offset: CalibrationValue
+    sigma_event: CalibrationValue
+    frame_noise: CalibrationValue
+    exposure: CalibrationValue
+    exposure_anchor: CalibrationValue
+    rho_ref: CalibrationValue
     hot_pixels: NDArray[np.bool_]
     offsets: NDArray[np.float64]
     correlations: NDArray[np.float64]
+    threshold_factors: NDArray[np.float32] | None = None
+
+    def __repr__(self) -> str:
+        known = [
+            f"{name}={one.value:.4g} ({one.low:.3g} to {one.high:.3g}){' ' * (one.unit != '1')}"
+            f"{one.unit if one.unit != '1' else ''}"
+            for name, one in self.values().items()
+            if one.is_identifiable
+        ]
+        return f"<Calibration: {', '.join([*known, f'{int(self.hot_pixels.sum())} hot pixels'])}>"
+
+    def values(self) -> dict[str, CalibrationValue]:
+        """Return all values with intervals, by name."""
+        return {name: v for name, v in vars(self).items() if isinstance(v, CalibrationValue)}
+
+    def select(self, names: Iterable[str]) -> CalibratedValues:
+        """Return the values of some names, and those that the data do not determine.
+
+        Args:
+            names: Names of fields, as of `Parameters.calibrated`.
+
+        Returns:
+            The values.
+        """
+        chosen = {name: getattr(self, name) for name in names}
+        return CalibratedValues(
+            {name: one.value for name, one in chosen.items() if one.is_identifiable},
+            {name: one.note for name, one in chosen.items() if not one.is_identifiable},
+        )
 
     def params(self, kind: type[Parameters], **explicit: Any) -> Any:
         """Return parameters of a method with the values that were found.
 
         Args:
             kind: Class of the parameters, as `jaxevent.akf.Params`.
-            **explicit: Values that win over those found.
+            **explicit: Values that win over those found; those of a preset do, too.
 
         Returns:
             The parameters.
         """
-        known = kind.settings()
-        found = {
-            name: getattr(self, name).value
-            for name in ("clock_offset", "c_on", "c_off")
-            if name in known and getattr(self, name).is_identifiable
-        }
-        return kind(**{**found, **explicit})
+        found: dict[str, Any] = {**self.select(kind.names_left_open(explicit)).found}
+        return kind(**found, **explicit)

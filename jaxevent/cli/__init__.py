@@ -1,4 +1,4 @@
-"""The command line: demo, info, convert, filter, register, reconstruct, track, motion and so on.
+"""The command line: demo, info, calibrate, convert, reconstruct, track, motion and so on.
 
 What cannot be used is said in one line on stderr, exit status 2. The libraries are imported by the
 command that needs them, so that help appears at once.
@@ -19,6 +19,7 @@ from typing import Any
 
 import jaxevent
 from jaxevent.cli import (
+    calibrate,
     camera,
     convert,
     demo,
@@ -38,8 +39,8 @@ from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
 COMMANDS = (
-    demo, info, convert, filter, register, camera, reconstruct, track, motion, evaluate, fit,
-    simulate, view,
+    demo, info, calibrate, convert, filter, register, camera, reconstruct, track, motion, evaluate,
+    fit, simulate, view,
 )  # fmt: skip
 
 

@@ -78,6 +78,26 @@ def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:
     )
 
 
+def add_no_calibrate(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--no-calibrate",
+        dest="calibrate",
+        action="store_false",
+        help="leave clock and thresholds that are not given at the defaults, instead of taking "
+        "them from the recording",
+    )
+
+
+def describe_calibration(values: Any) -> str:
+    """Describe the `CalibratedValues` that a command takes from a recording, in one line."""
+    notes: dict[str, list[str]] = {}
+    for name, note in values.missing.items():
+        notes.setdefault(note, []).append("clock" if name == "clock_offset" else name)
+    parts = [f"calibrated: {values}" if values.found else "not calibrated"]
+    parts += [f"{', '.join(names)} by default ({note})" for note, names in notes.items()]
+    return f"{'; '.join(parts)} (jaxevent calibrate shows more; --no-calibrate turns it off)"
+
+
 def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
     """Open a recording with the options of `add_reading`; events and images stay in its file."""
     from jaxevent.io import load

@@ -37,6 +37,7 @@ def add(commands: Any) -> None:
         "matlab_ssim (MATLAB's), authors_ssim and masked_mse (of the AKF's authors), or "
         "your own: package.module:function",
     )
+    arguments.add_no_calibrate(one)
     where = one.add_mutually_exclusive_group()
     where.add_argument(
         "--workers", metavar="N", type=int, help="compute in N processes instead of one"
@@ -59,11 +60,27 @@ def add(commands: Any) -> None:
     )
 
 
+def _calibrated_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Lines about what the recordings determined, one for methods that it is the same for."""
+    from jaxevent.calibration.result import format_calibrated
+
+    methods: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if "calibrated" in row:
+            values = [format_calibrated(name, row["params"][name]) for name in row["calibrated"]]
+            methods.setdefault((row["recording"], ", ".join(values)), []).append(row["method"])
+    return [
+        f"{recording}: calibrated for {', '.join(names)}: {values}"
+        for (recording, values), names in methods.items()
+    ]
+
+
 def run(
     *,
     config: Path,
     out: Path | None,
     metrics: list[str],
+    calibrate: bool,
     workers: int | None,
     cluster: str | None,
     scheduler_file: Path | None,
@@ -84,8 +101,11 @@ def run(
         retries=retries,
         replace=force,
         metrics=metrics,
+        calibrate=None if calibrate else False,
     )
     print(markdown_table(rows), end="")
+    for line in _calibrated_lines(rows):
+        print(line)
     if out is not None:
         files = "report.html, results.json, results.md, results.parquet, config.toml"
         if not (out / "results.parquet").exists():

@@ -39,6 +39,7 @@ def add(commands: Any) -> None:
         help="recording to fit to, instead of those in the file: a path, a pattern, or "
         "NAME:FOLDER for a whole data set; may be repeated",
     )
+    arguments.add_no_calibrate(one)
     one.add_argument("--resume", action="store_true", help="continue from the checkpoint in DIR")
     one.add_argument(
         "--coordinator", metavar="HOST:PORT", help="a free port of the machine of process 0"
@@ -59,6 +60,7 @@ def run(
     config: Path,
     out: Path,
     recordings: list[str] | None,
+    calibrate: bool,
     resume: bool,
     coordinator: str | None,
     processes: int | None,
@@ -79,7 +81,8 @@ def run(
 
     from jaxevent.runs.fit import RESULT_FILES, fit
 
-    rows = fit(config, out, recordings, resume, show_progress(), replace=force)
+    use = None if calibrate else False
+    rows = fit(config, out, recordings, resume, show_progress(), replace=force, calibrate=use)
     if not devices.is_process_zero():
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")

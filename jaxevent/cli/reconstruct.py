@@ -2,12 +2,13 @@
 
 import dataclasses
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 
 
 def add(commands: Any) -> None:
@@ -59,8 +60,11 @@ def add(commands: Any) -> None:
         "--params",
         metavar="FILE",
         type=Path,
-        help="TOML file of name = value lines, e.g. c_on = 0.1, or params.toml of a fit",
+        help="TOML file of name = value lines, e.g. c_on = 0.1, params.toml of a fit, or "
+        "calibration.toml of jaxevent calibrate; what it does not set of clock and thresholds is "
+        "calibrated",
     )
+    arguments.add_no_calibrate(one)
     one.add_argument(
         "--tone",
         choices=["linear", "log", "percentile", "clahe", "changes"],
@@ -99,6 +103,46 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
     return method
 
 
+def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict[str, Any]:
+    """The settings of --params; without a method they may be a calibration alone."""
+    from jaxevent.parameters import CALIBRATION_TABLE, read_toml
+
+    if params is None:
+        return {}
+    if method is None and set(read_toml(params)) != {CALIBRATION_TABLE}:
+        raise InputError(f"{params}: parameters are of one method; name it with --method")
+    return estimator.Params.load_table(params, method)
+
+
+def _default_times(
+    recording: Any, estimator: Any, values: Any, rate: float | int | None, start: float | int | None
+) -> Any:
+    """The times of images where no file gives them, us."""
+    from jaxevent.events.clocks import check_clocks, compare_clocks
+    from jaxevent.runs.protocols import frame_times
+    from jaxevent.show.export import evenly_spaced_times
+
+    if rate is None and recording.frames is not None:
+        if not estimator.needs_frames:
+            check_clocks(recording, values.clock_offset)
+        return frame_times(recording.frames, values)
+    spanned = recording
+    if getattr(estimator, "fuses", True) or estimator.needs_frames:
+        check_clocks(recording, values.clock_offset)
+    elif compare_clocks(recording, values.clock_offset) is not None:
+        spanned = dataclasses.replace(recording, frames=None)
+    return evenly_spaced_times(spanned, 100.0 if rate is None else rate, start)
+
+
+def _warn_of_faults(recording: Any) -> None:
+    """Warn of each fault of events, frames and clocks, with its statistic and the remedy."""
+    from jaxevent.calibration import check_consistency
+
+    for fault in check_consistency(recording):
+        if fault.name != "disjoint clocks":  # which `check_clocks` judges at the offset used
+            warnings.warn(f"{recording.name}: {fault}", InputWarning, stacklevel=2)
+
+
 def run(
     *,
     path: Path,
@@ -109,24 +153,23 @@ def run(
     start: float | int | None,
     stop: float | int | None,
     params: Path | None,
+    calibrate: bool,
     reading: dict[str, Any],
     tone: str | None,
     colour: bool,
     out: Path,
 ) -> None:
-    from jaxevent.events.clocks import check_clocks, compare_clocks
+    from jaxevent.events.clocks import check_clocks
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
-    from jaxevent.runs.protocols import frame_times
-    from jaxevent.show.export import evenly_spaced_times, within, write_hdf5, writer
+    from jaxevent.reconstruction.augment import calibrated_values
+    from jaxevent.show.export import within, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
-    if method is None and params is not None:
-        raise InputError(f"{params}: parameters are of one method; name it with --method")
     estimator = find(method or "mc", "reconstruction")
-    values = estimator.Params() if params is None else estimator.Params.load(params, method)
+    table = _read_table(params, estimator, method)
     recording = arguments.open_recording(path, reading)
     asked = None if times is None else read_times(times, (recording.start, recording.stop))
     name = recording.name
@@ -134,24 +177,32 @@ def run(
     if at == "frames" and recording.frames is None:
         missing = recording.describe_left_out("frames")
         raise InputError(f"{path}: holds no frames{missing}; give --rate instead of --at frames")
-    if asked is None and rate is None and recording.frames is not None:
-        if not estimator.needs_frames:
-            check_clocks(recording, values.clock_offset)
-        asked = frame_times(recording.frames, values)
-    elif asked is None:
-        spanned = recording
-        if getattr(estimator, "fuses", True) or estimator.needs_frames:
-            check_clocks(recording, values.clock_offset)
-        elif compare_clocks(recording, values.clock_offset) is not None:
-            spanned = dataclasses.replace(recording, frames=None)
-        asked = evenly_spaced_times(spanned, 100.0 if rate is None else rate, start)
-    asked = within(asked, start, stop, str(path))
+
+    def choose_times(values: Any) -> Any:
+        wanted = (
+            _default_times(recording, estimator, values, rate, start) if times is None else asked
+        )
+        return within(wanted, start, stop, str(path))
+
+    values = estimator.Params.of(table)
+    chosen = choose_times(values)
     if method is None:
-        pixels = len(asked) * recording.width * recording.height
+        pixels = len(chosen) * recording.width * recording.height
         missing = recording.describe_left_out("frames")
         usual = _usual(recording.frames is not None, pixels, missing)
         estimator = find(usual, "reconstruction")
-        values = estimator.Params()
+        table = _read_table(params, estimator, usual)
+        values = estimator.Params.of(table)
+    names = estimator.names_left_open(table) if calibrate else ()
+    if recording.frames is not None:
+        if names:
+            check_clocks(recording, values.clock_offset)
+        _warn_of_faults(recording)
+    found = calibrated_values(recording, values, names)
+    if found.found or found.missing:
+        print(arguments.describe_calibration(found))
+    values = values.replace(**found.found)
+    chosen = choose_times(values)
     clock = time.perf_counter()
     video = estimator.estimate(recording, values, progress=show_progress())
     colours = None
@@ -160,9 +211,9 @@ def run(
 
         colours = colour_video(video, recording)
     tone = tone or ("changes" if recording.frames is None else "linear")
-    how = write(video, asked, out, tone, name, colours)
+    how = write(video, chosen, out, tone, name, colours)
     seconds = time.perf_counter() - clock
     print(
-        f"{out}: {len(asked):,} images{how}, {seconds:.2f} s, "
+        f"{out}: {len(chosen):,} images{how}, {seconds:.2f} s, "
         f"{len(recording.events) / seconds:,.0f} events/s"
     )

@@ -7,6 +7,7 @@ among the frames, `features.Points`) it looks the tables up.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
@@ -16,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.calibration import calibrate
+from jaxevent.calibration import CalibratedValues, recall_calibration
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
-from jaxevent.parameters import Choice, Number, Parameters, Positive
+from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.recording import Recording
 
@@ -49,19 +50,43 @@ class FrameParams(Parameters):
         most=1e6,
     )
 
+    calibrated = ("clock_offset", "c_on", "c_off")
+
     @classmethod
     def for_recording(cls: type[T], recording: Recording, **explicit: Any) -> T:
-        """Return parameters with the thresholds and the clock offset that a recording shows.
+        """Return parameters with the clock and the thresholds that a recording shows.
+
+        They are kept in the user's cache folder for recordings of the same content.
 
         Args:
             recording: Events and frames, which `jaxevent.calibrate` calibrates.
-            **explicit: Values that win over those found.
+            **explicit: Values that win over those found, one by one; those of a preset do, too.
 
         Returns:
-            The parameters.
+            The parameters; defaults where the recording does not determine a number.
         """
-        I0 = float(cls(**explicit).I0)
-        return calibrate(recording, I0).params(cls, **explicit)
+        params = cls(**explicit)
+        values = calibrated_values(recording, params, cls.names_left_open(explicit))
+        return params.replace(**values.found)
+
+
+def calibrated_values(
+    recording: Recording, params: FrameParams, names: Sequence[str]
+) -> CalibratedValues:
+    """Return what a recording says of some numbers, thresholds at the `I0` of parameters.
+
+    Args:
+        recording: Events and frames.
+        params: Parameters.
+        names: Names of the numbers; none, or fewer than two frames, calibrate nothing.
+
+    Returns:
+        The values.
+    """
+    if not names or recording.frames is None or len(recording.frames) < 2:
+        return CalibratedValues({}, {})
+    I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
+    return recall_calibration(recording, I0).select(names)
 
 
 class CertaintyParams(FrameParams):

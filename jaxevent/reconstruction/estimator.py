@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -12,6 +12,7 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.events.clocks import check_clocks
+from jaxevent.reconstruction.augment import calibrated_values
 from jaxevent.reconstruction.engine.images import make_kernel_images, make_kernel_video
 from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.frames import EventTiming, time_span
@@ -100,6 +101,28 @@ class ImageEstimator(Estimator[P]):
         """
         check_times(times, *time_span(recording, params.clock_offset), recording.name)
 
+    def names_left_open(self, explicit: Mapping[str, Any]) -> tuple[str, ...]:
+        return super().names_left_open(explicit) if self.fuses else ()
+
+    def usual_params(self, recording: Recording) -> P:
+        """Return the parameters with which `estimate` makes images where none are given.
+
+        Methods that combine events and frames take clock and thresholds from the recording.
+
+        Args:
+            recording: Events and frames.
+
+        Returns:
+            The parameters.
+
+        Raises:
+            InputError: The recording lacks what the method needs.
+        """
+        self.check(recording)
+        params = self.Params()
+        found = calibrated_values(recording, params, self.names_left_open({})).found
+        return params.replace(**found)
+
     def check(self, recording: Recording) -> None:
         """Raise `InputError` for a recording without data, or without what the method needs."""
         super().check(recording)
@@ -126,7 +149,7 @@ class ImageEstimator(Estimator[P]):
 
         Args:
             recording: Events and frames.
-            params: Parameters; the defaults if None.
+            params: Parameters; those of `usual_params` if None.
             **options: Options of the method.
 
         Returns:
@@ -265,7 +288,7 @@ class PixelEstimator(ImageEstimator[P]):
 
         Args:
             recording: Events and frames.
-            params: Parameters; the defaults if None.
+            params: Parameters; those of `usual_params` if None.
             **options: Options of `Video`.
 
         Returns:
@@ -275,7 +298,8 @@ class PixelEstimator(ImageEstimator[P]):
             InputError: The recording lacks what the method needs.
         """
         self.check_options(**options)
-        return Video(self, recording, self.Params() if params is None else params, **options)
+        params = self.usual_params(recording) if params is None else params
+        return Video(self, recording, params, **options)
 
     def live(
         self, size: tuple[int, int], params: P | None = None, *, frames: bool, **options: Any
@@ -328,7 +352,7 @@ class KernelEstimator(PixelEstimator[P]):
 
         Args:
             recording: Events and frames.
-            params: Parameters; the defaults if None.
+            params: Parameters; those of `usual_params` if None.
             compiler: "numba" or "xla", to demand one of the two.
             **options: Options of `Video`; those of `aks` include `factors`.
 
@@ -340,7 +364,7 @@ class KernelEstimator(PixelEstimator[P]):
                 demanded.
         """
         self.check_options(**options)
-        params = self.Params() if params is None else params
+        params = self.usual_params(recording) if params is None else params
         fused = make_kernel_video(self.kernel_video, self, recording, params, compiler, options)
         return Video(self, recording, params, **options) if fused is None else fused
 

@@ -201,6 +201,7 @@ class FrameFeatures(ShortRepr):
     gain: Float[Numeric, " frames"]  # the frames' exposure relative to the common one
     white: Float[Numeric, " 2"] | None  # as in `augment.GreyFrames`
     span: Float[Numeric, "2 frames pixels"]  # ON, OFF
+    around: Float[Numeric, "frames pixels"] | None  # `span` of the 8 neighbours; None: not counted
     before: Float[Numeric, "2 pixels"]
     head: Float[Numeric, "2 frames pixels"] | None  # None where no exposure is known
     tail: Float[Numeric, "2 frames pixels"] | None
@@ -210,6 +211,8 @@ class FrameFeatures(ShortRepr):
     present: Float[Numeric, ""]  # 1, or 0 if the recording has no frames
     rows: Int[Numeric, " 3"]  # number of frames; rows of the last one before, of the next's first
     clock_offset: Float[Numeric, ""]  # s, for which the positions were prepared
+    flicker: Float[Numeric, ""]  # variance of the intensity that all pixels of a frame share
+    movement: Float[Numeric, ""]  # how much of the recording moves, 0 to 1
     width: int = eqx.field(static=True)  # of the sensor, whose pixels are in rows
 
 
@@ -269,7 +272,8 @@ class Features(EventCounts):
         f, s = self.frames, self.frames.segments
         tiles = [] if self.tiles is None else [self.tiles.points.on, self.tiles.points.off]
         exposed = [] if s is None else [f.head, f.tail, s.on, s.off]
-        return [f.span, f.before, *exposed, *tiles]
+        around = [] if f.around is None else [f.around]
+        return [f.span, f.before, *around, *exposed, *tiles]
 
     def scale_counts(self, factors: Float[Numeric, "2 pixels"]) -> "Features":
         """Multiply the ON and OFF events of every pixel by its factors; without tiles."""

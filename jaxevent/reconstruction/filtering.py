@@ -70,6 +70,8 @@ class Observation(eqx.Module):
     bound: Float[Numeric, "*points"] | None = None
     push: Float[Numeric, "*points"] | None = None
     excess: Float[Numeric, "*points"] | None = None  # of states beyond the bound, expected; ln I
+    # Of errors of the level that last, to be added to the state's in images; (ln I)^2.
+    variance: Float[Numeric, "*points"] | None = None
 
 
 class Event(eqx.Module):
@@ -196,7 +198,7 @@ class Filter(KernelEstimator[P]):
             Intensity, and variance of log intensity.
         """
         L, P = self.readout(params, self.predict(params, state, since, frame))
-        return jnp.exp(L) - params.I0, P
+        return jnp.exp(L) - params.I0, P if frame.variance is None else P + frame.variance
 
     def step_and_readout(
         self,

@@ -254,6 +254,26 @@ class FrameImages:
             intensity[n:] = intensity[n - 1]
         return grey, intensity, certainty, gain
 
+    def sample(self, frame_range: slice, step: int) -> NDArray:
+        """Read the intensities of every `step`-th row and column of a range of frames.
+
+        Args:
+            frame_range: Range of the recording's frames.
+            step: Step, px.
+
+        Returns:
+            (frames, rows, columns).
+        """
+        assert self.recording.frames is not None
+        images = np.asarray(self.recording.frames[frame_range].images)[:, ::step, ::step]
+        made = self.values(images)[1] if images.dtype.kind == "f" else self._levels[images]
+        return made / self._gain[frame_range, None, None]
+
+    @functools.cached_property
+    def _levels(self) -> NDArray:
+        """Intensity of every whole number of an image."""
+        return self.tables()[1]
+
 
 def make_frame_features(
     images: FrameImages,
@@ -263,6 +283,8 @@ def make_frame_features(
     counts: EdgeCounts,
     *,
     segments: ExposureSegments | None,
+    unseen: tuple[float, float],
+    filtering: bool,
     capacity: int,
 ) -> FrameFeatures:
     """Prepare a range of frames.
@@ -274,6 +296,8 @@ def make_frame_features(
         rows: The numbers `FrameFeatures.rows`.
         counts: Events before the edges of the exposures.
         segments: Segments within the exposures, where these are known.
+        unseen: Flicker of the frames, and movement; see `unseen.UnseenChange`.
+        filtering: Count the events around each pixel, for filters.
         capacity: Frames for which memory is allocated.
 
     Returns:
@@ -299,12 +323,21 @@ def make_frame_features(
         rate = 1e6 * interval_rates(times)[: len(out)]
         out[: len(rate)] = rate
 
+    around = sum_neighbours(span.sum(0), images.recording.width) if filtering else None
     present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
-        grey, intensity, certainty, images.response(), gain, images.white, span, before, head, tail,
-        segments, weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
-        images.recording.width,
+        grey, intensity, certainty, images.response(), gain, images.white, span, around, before,
+        head, tail, segments, weight_rate, blend_rate, present, rows,
+        np.asarray(clock.offset, dtype), *np.asarray(unseen, dtype), images.recording.width,
     )  # fmt: skip
+
+
+def sum_neighbours(values: NDArray, width: int) -> NDArray:
+    """Sum values (frames, pixels) over the eight neighbours of each pixel of a sensor."""
+    image = np.pad(values.reshape(len(values), -1, width), ((0, 0), (1, 1), (1, 1)))
+    rows = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
+    around = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]
+    return around.reshape(values.shape) - values
 
 
 def make_segments(

@@ -23,8 +23,9 @@ from jaxevent.reconstruction.augment import (
     frame_information,
     measured_share,
 )
-from jaxevent.reconstruction.features import FrameFeatures, Points
+from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Points
 from jaxevent.reconstruction.filtering import Event, Filter, FrameModel, Observation, PixelState
+from jaxevent.reconstruction.variance import ERROR_PARAMETERS, AugmentedFrameErrors
 
 
 class Params(AugmentParams):
@@ -48,6 +49,7 @@ class Params(AugmentParams):
     below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
     one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
     clip_rate = Positive(1000.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
+    frame_noise, error_event, error_still, error_change = ERROR_PARAMETERS
 
     presets = {
         "paper": {"ratio_width": 0.0},
@@ -121,6 +123,7 @@ class AugmentedFrameModel(FrameModel):
     bound: Float[Array, "frames pixels"] | None
     push: Float[Array, "frames pixels"] | None
     excess: Float[Array, "frames pixels"] | None
+    errors: AugmentedFrameErrors
 
     def __init__(self, params: Params, frames: FrameFeatures):
         self.level = AugmentedFrame(params, frames, noise_bias(params, frames))
@@ -146,6 +149,7 @@ class AugmentedFrameModel(FrameModel):
         if expected is not None:
             above = jnp.where(params.margin > 0, above, expected)
         self.begin = edge + jnp.where(side > 0, above, -params.below)
+        self.errors = AugmentedFrameErrors(params, frames)
         self.bound = self.push = self.excess = None
         if expected is not None:
             self.excess = jnp.broadcast_to(expected, edge.shape)
@@ -163,11 +167,15 @@ class AugmentedFrameModel(FrameModel):
             rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
             if self.share is not None:
                 rate = rate * self.share(points)
-        if self.bound is None or self.push is None:
-            return Observation(self.level(points), rate)
-        push = self.present * points.gather_frame(self.push)
-        excess = None if self.excess is None else points.gather_frame(self.excess)
-        return Observation(self.level(points), rate, points.gather_frame(self.bound), push, excess)
+        bound = push = excess = variance = None
+        if self.bound is not None and self.push is not None:
+            bound = points.gather_frame(self.bound)
+            push = self.present * points.gather_frame(self.push)
+        if self.excess is not None:
+            excess = points.gather_frame(self.excess)
+        if isinstance(points, ImagePoints):
+            variance = self.present * self.errors(points)
+        return Observation(self.level(points), rate, bound, push, excess, variance)
 
     def initial_level(self, points: Points) -> Array:
         level = self.level(points)

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.special import log_ndtr
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import renamed_methods, renamed_names
@@ -54,6 +54,13 @@ from jaxevent.reconstruction.features import (
     ImagePoints,
     Numeric,
     ReadOut,
+)
+from jaxevent.reconstruction.variance import (
+    ERROR_PARAMETERS,
+    ONE_SIDED_FACTOR,
+    activity_variance,
+    bridge_weight,
+    gap_variance,
 )
 
 
@@ -88,6 +95,15 @@ class Params(CertaintyParams):
         most=1e6,
     )
     one_sided = Choice((True, False), "use clipped frames as evidence that L lies beyond the clip")
+
+
+SHOWN_CERTAINTY = 0.09  # least certainty w of a frame that shows a pixel
+
+
+class SmootherParams(Params):
+    """Parameters of the smoother and of its variance."""
+
+    frame_noise, error_event, error_still, error_change = ERROR_PARAMETERS
 
 
 class Gaussian(eqx.Module):
@@ -323,6 +339,41 @@ def redistribute_events(params: Params, own: Array, around: Array, given: Array)
     return own + params.share * (around / 8 - given * own)
 
 
+class GapEvidence(eqx.Module):
+    """What is known of the gap between two frames that contains a time."""
+
+    activity: Float[Numeric, "*pixels"]  # events, part of them from neighbours
+    residual: Float[Numeric, "*pixels"]  # change that events do not explain, ln I
+    added: Float[Numeric, "*pixels"]  # variance of the random walk over the gap, (ln I)^2
+    part: Float[Numeric, "*#pixels"]  # of the gap that is over, 0 to 1
+    is_between: Bool[Numeric, "*#pixels"]  # whether a frame follows, and one is before
+
+
+def between_frames(
+    params: Params, past: Gaussian, later: Message, counts: tuple[Array, Array], seconds: Any
+) -> GapEvidence:
+    """Make the evidence of a gap.
+
+    Args:
+        params: Parameters.
+        past: State after the frame before.
+        later: Message of later frames, at the next one; without precision if there is none.
+        counts: ON and OFF events of the gap.
+        seconds: Since the frame before, and until the next one.
+
+    Returns:
+        The evidence.
+    """
+    on, off = counts
+    elapsed, left = seconds
+    S, q = predict_change(params, on, off, elapsed + left)
+    known = later.J > 0
+    residual = later.h / jnp.where(known, later.J, 1) - past.m - S
+    length = elapsed + left
+    part = elapsed / jnp.where(length > 0, length, 1)
+    return GapEvidence(on + off, jnp.where(known, residual, 0), q, part, left > 0)
+
+
 def added_variance(params: Params, on: Array, off: Array, seconds: Array) -> Array:
     """Return the variance that events and time add.
 
@@ -436,6 +487,7 @@ def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> Fr
         **({"white": None} | fixed),
         gain=gain[0],
         span=none,
+        around=None,
         before=none[:, 0],
         head=None,
         tail=None,
@@ -582,6 +634,7 @@ class Smoother(KernelEstimator[Params]):
     """The asynchronous Kalman smoother."""
 
     has_likelihood: ClassVar[bool] = True
+    has_unseen_errors: ClassVar[bool] = True  # whether the variance is that of `image_variance`
     kernel_video: ClassVar[Any] = SmootherVideo
     kernel_images: ClassVar[Any] = SmootherImages
     options: frozenset[str] = dataclasses.field(
@@ -626,6 +679,36 @@ class Smoother(KernelEstimator[Params]):
         """
         image = jnp.exp(state.m) - params.I0
         return Estimate(image, state.P, jnp.isfinite(image))
+
+    def image_variance(
+        self, params: Any, state: Gaussian, gap: GapEvidence, flicker: Array, movement: Array
+    ) -> Array:
+        """Return the variance of images, by the formula of `variance`.
+
+        The smoother's own P rests on noises that are made to weigh frames and events, not on what
+        errors are. It says only what clipped frames do not show: the part that no two frames which
+        show the pixel would leave.
+
+        Args:
+            params: Parameters.
+            state: Smoothed state at the time.
+            gap: What is known of the gap around.
+            flicker: Variance of the intensity that all pixels of a frame share.
+            movement: How much of the recording moves, 0 to 1.
+
+        Returns:
+            The variance, (ln I)^2.
+        """
+        I_plus = jnp.exp(state.m)
+        noise, common = (params.frame_noise / I_plus) ** 2, flicker / I_plus**2
+        w = bridge_weight(gap.part)
+        bridge = gap_variance(params, gap.activity, gap.residual, movement) + common
+        walk = ONE_SIDED_FACTOR * activity_variance(params, gap.activity, movement)
+        shown = noise * (1 - w / 2) + w * bridge
+        V = jnp.where(gap.is_between, shown, noise + common + walk)
+        frame = params.sigma_frame / jnp.maximum(params.w_min, SHOWN_CERTAINTY) / I_plus
+        q = jnp.where(gap.is_between, gap.added / 4, gap.added)
+        return V + jnp.maximum(state.P - q - frame**2 - params.sigma_floor**2, 0)
 
     def init_state(self, params: Params, features: Features) -> Gaussian:
         pixels = features.last.shape
@@ -682,7 +765,20 @@ class Smoother(KernelEstimator[Params]):
         # Times are whole microseconds, the middle of an exposure may lie up to one before.
         here = ~behind & (jnp.asarray(points.elapsed)[:, None] < 1e-6)
         info = jax.tree.map(lambda v: v[f], trajectory.info)
-        return self.readout(params, combine_messages(m, precision, later), info, here)
+        state = combine_messages(m, precision, later)
+        images = self.readout(params, state, info, here)
+        if not self.has_unseen_errors:
+            return images
+        past, following = jax.tree.map(
+            lambda v: jnp.where(behind, 0, v[f]), (trajectory.past, trajectory.future)
+        )
+        between = ~behind & (seconds > 0)
+        total = jnp.where(between, since + until, jnp.where(behind, until, since))
+        passed = jnp.where(behind, seconds, elapsed), jnp.where(between, seconds, 0)
+        gap = between_frames(params, past, following, (total[0], total[1]), passed)
+        frames = trajectory.frames
+        V = self.image_variance(params, state, gap, frames.flicker, frames.movement)
+        return Estimate(images.mean, V, images.valid)
 
     def pixel_state_spec(self, number: Array) -> dict[str, Any]:
         """Return the pytrees that `pixel_functions` refer to, every leaf the given number."""
@@ -716,6 +812,12 @@ class Smoother(KernelEstimator[Params]):
             return redistribute_events(params, on, around_on, given), redistribute_events(
                 params, off, around_off, given
             )
+
+        def with_variance(known, image, state, gap):
+            params, fixed = known
+            unseen = fixed["flicker"], fixed["movement"]
+            V = self.image_variance(params, state, gap, *unseen)
+            return Estimate(image.mean, V, image.valid)
 
         def frame(known, clipped, *, exists, gain, total, inside, state, **image):
             params, fixed = known
@@ -754,14 +856,26 @@ class Smoother(KernelEstimator[Params]):
             left = predict_change(known[0], moved_on - on, moved_off - off, rest)
             S, q = predict_change(known[0], on, off, elapsed - lag(known))
             state = combine_messages(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
-            return {"image": self.readout(known[0], state, info, here)}
+            image = self.readout(known[0], state, info, here)
+            if self.has_unseen_errors:
+                total = jnp.where(seconds > 0, moved_on, on), jnp.where(seconds > 0, moved_off, off)
+                span = elapsed - lag(known), rest
+                gap = between_frames(known[0], past, message, total, span)
+                image = with_variance(known, image, state, gap)
+            return {"image": image}
 
         def before(known, later, info, seconds, **counts):
             left = predict_change(known[0], *counted(known[0], **counts), seconds + lag(known))
             first = later + state_to_message(init(known[0]))
             zero = jnp.zeros_like(later.h)
             state = combine_messages(zero, zero, first.propagate_back(*left))
-            return {"image": self.readout(known[0], state, info, zero > 0)}
+            image = self.readout(known[0], state, info, zero > 0)
+            if self.has_unseen_errors:
+                total = counted(known[0], **counts)
+                none = Gaussian(zero, zero), Message(zero, zero)
+                gap = between_frames(known[0], *none, total, (seconds + lag(known), zero))
+                image = with_variance(known, image, state, gap)
+            return {"image": image}
 
         def start(known):
             return {"state": init(known[0])}
@@ -796,7 +910,7 @@ class Smoother(KernelEstimator[Params]):
 
 aks = Smoother(
     "aks",
-    Params,
+    SmootherParams,
     needs_frames=True,
     about="The asynchronous Kalman smoother. Per pixel it estimates the log intensity from all "
     "frames and events, earlier and later ones, with its variance; an event's change is shared "

@@ -7,6 +7,7 @@ recording is prepared whole (`prepare`, for fits), or in windows with carried st
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -47,6 +48,7 @@ from jaxevent.reconstruction.stream import (
     update_last_times,
 )
 from jaxevent.reconstruction.tiles import SlotMap, TileLayout, TileMemory, make_tiles
+from jaxevent.reconstruction.unseen import UnseenChange, measure_unseen_change
 from jaxevent.recording import Events, Recording, Times, microseconds
 
 MAX_WINDOW_EVENTS = 1 << 20
@@ -267,6 +269,11 @@ class WindowedRecording:
         self._images = FrameImages(recording, self.dtype)
         self._memory = TileMemory(reuse, self.dtype)
 
+    @functools.cached_property
+    def unseen(self) -> UnseenChange:
+        """Changes that events do not show."""
+        return measure_unseen_change(self._images, self.clock)
+
     def __iter__(self) -> Iterator[tuple[EventWindow, Features]]:
         before, start = self.initial(), None
         while True:
@@ -449,8 +456,9 @@ class WindowedRecording:
             segments = make_segments(clock, used, stream, weight, counts, self.dtype)
         rows = self._frame_rows(stop, used, before)
         frames = make_frame_features(
-            self._images, clock, used, rows, counts, segments=segments, capacity=self.frames
-        )
+            self._images, clock, used, rows, counts, segments=segments, unseen=self.unseen,
+            filtering=self.filtering, capacity=self.frames,
+        )  # fmt: skip
         after, own = before.copy(), self._stream(events.own)
         after.frames = max(used.stop, 1)
         if layout is None:

@@ -8,15 +8,14 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from jaxevent import datasets
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator
 from jaxevent.parameters import Parameters, read_toml, suggest_name
 from jaxevent.recording import Recording
-
-P = TypeVar("P", bound=Parameters)
 
 Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
 
@@ -148,6 +147,10 @@ def is_metrics(value: Any) -> bool:
 
 
 METRICS_CHECK = (is_metrics, 'a list of names, as ["lpips"], or of "package.module:function"')
+CALIBRATE_CHECK: Check = (
+    lambda value: isinstance(value, bool),
+    "true, to take clock and thresholds that are not given from the recording, or false",
+)
 STREAM_CHECK = (is_text, 'the name of a camera, as "left"')
 SIZE_CHECK: Check = (
     lambda value: isinstance(value, list) and len(value) == 2 and all(map(is_natural, value)),
@@ -266,30 +269,38 @@ def files_named_in(config: Path) -> list[Path]:
     return found
 
 
-def read_params(kind: type[P], name: str, given: Any, folder: Path) -> P:
-    """Params of a method as a configuration gives them: a table, a TOML file's path, or both.
+def read_params(method: Estimator, name: str, given: Any, folder: Path) -> dict[str, Any]:
+    """Read the parameters that a configuration gives a method, checked.
 
-    Paths are relative to `folder`. Raises `InputError` for anything else and naming a bad setting.
+    They are a table, the path of a TOML file, both, or an object of the method's `Params`, which
+    gives all. Raises `InputError` for anything else and naming a bad setting.
+
+    Args:
+        method: The method.
+        name: Its name, of the table in a file of several methods.
+        given: What the configuration gives.
+        folder: The folder that paths are relative to.
+
+    Returns:
+        The values that are given, by name, and perhaps "preset".
     """
-
-    def load_file(path: str) -> P:
-        return kind.load(folder / os.path.expandvars(path), name)
-
-    if isinstance(given, str):
-        return load_file(given)
+    kind = method.Params
     if isinstance(given, Parameters):
         if type(given) is not kind:
             raise InputError(
                 f"params are {type(given).__module__}.{type(given).__name__}, not those of the "
                 f"method {name!r}; give {kind.__module__}.{kind.__name__}"
             )
-        return given
+        return given.values()
+    if isinstance(given, str):
+        given = {"file": given}
     if not isinstance(given, dict):
         raise InputError(f"params is {given!r}; give a table or the path of a TOML file")
     values = dict(given)
     file = values.pop("file", None)
-    if file is None:
-        return kind.of(values)
-    if not isinstance(file, str):
-        raise InputError(f"file is {file!r}; give the path of a TOML file")
-    return kind.of({**load_file(file).values(), **values})
+    if file is not None:
+        if not isinstance(file, str):
+            raise InputError(f"file is {file!r}; give the path of a TOML file")
+        values = {**kind.load_table(folder / os.path.expandvars(file), name), **values}
+    kind.of(values)
+    return values

@@ -18,10 +18,6 @@ from jaxevent.show.images import Kind, comparison_figure, video_writer
 from jaxevent.show.tables import markdown_table
 
 RECORDING_FILE = resources.files("jaxevent") / "data/slider_depth_crop.h5"
-# The thresholds of the demo's sensor, and the lag of its frames' clock, set by hand.
-HAND_TUNED_PARAMS = {"c_on": 0.083, "c_off": 0.059, "clock_offset": 0.0075}
-
-
 RESULT_FILES = ("comparison.png", "video.mp4", "results.md", "results.json")
 
 
@@ -35,16 +31,11 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     check_folder(out, RESULT_FILES, replace=replace)
     with resources.as_file(RECORDING_FILE) as path:
         recording = load(path)
-    by_hand = {name: find(name).Params.of(HAND_TUNED_PARAMS) for name in ("akf", "augmented")}
     runs: list[tuple[str, Any, Any]] = [
+        *((name, find(name), None) for name in names("reconstruction")),
         *(
-            (name, method, method.Params())
-            for name in names("reconstruction")
-            for method in [find(name)]
-        ),
-        *(
-            (f"{name}, thresholds and clock set by hand", find(name), by_hand[name])
-            for name in by_hand
+            (f"{name}, not calibrated", find(name), find(name).Params())
+            for name in ("akf", "augmented")
         ),
     ]
     with open_results(out) as write:
@@ -57,16 +48,19 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
                 continue
             rows.append({**row, "method": label})
         print(markdown_table(rows))
-        print("Every second frame was hidden and reconstructed; seconds include compiling.")
+        print(
+            "Every second frame was hidden and reconstructed; clock and thresholds are from the "
+            "others\nand the events, unless not calibrated. Seconds include compiling."
+        )
         write_rows(rows, write)
         written = ["results.md", "results.json"]
         try:
-            _figure(recording, by_hand, out / "comparison.png")
+            _figure(recording, out / "comparison.png")
             written.append("comparison.png")
         except MissingExtra as error:
             skipped.append(f"comparison.png is left out: {error}")
         try:
-            slower = _video(recording, by_hand["akf"], out / "video.mp4", progress)
+            slower = _video(recording, out / "video.mp4", progress)
             written.append(f"video.mp4 ({slower:.0f} times slower than real time)")
         except MissingExtra as error:
             skipped.append(f"video.mp4 is left out: {error}")
@@ -74,7 +68,7 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     print(f"Written to {out}: {', '.join(written)}")
 
 
-def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
+def _figure(recording: Recording, path: Path) -> None:
     """Draw the reconstructions of one hidden frame, and error and uncertainty of `mc`."""
     given, hidden = held_out(recording)
     middle = hidden[len(hidden) // 2 :][:1]
@@ -87,14 +81,14 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
     ]
     error = doubt = truth
     for name, label in (
-        ("akf", "AKF, set by hand"),
+        ("akf", "AKF"),
         ("aks", "smoother"),
         ("flow", "flow between frames"),
         ("mc", "mc, motion-compensated"),
     ):
-        method = find(name)
-        values = params.get(name) or method.Params()
+        method: Any = find(name)
         try:
+            values = method.usual_params(given)
             image, variance, _ = method.estimate(given, values)(frame_times(middle, values))
         except MissingExtra:
             continue
@@ -106,10 +100,10 @@ def _figure(recording: Recording, params: dict[str, Any], path: Path) -> None:
     comparison_figure(path, panels, f"{recording.name} at {middle.t[0] / 1e6:.3f} s")
 
 
-def _video(recording: Recording, params: Any, path: Path, progress: bool | None) -> float:
+def _video(recording: Recording, path: Path, progress: bool | None) -> float:
     """Write 200 images per second of the recording, shown at 30; return the slow-down."""
     rate, fps, longest = 200.0, 30.0, 180
-    video = find("akf").estimate(recording, params, progress=progress)
+    video = find("akf").estimate(recording, progress=progress)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
         for _, image in display_images(

@@ -12,6 +12,8 @@
                                                     # the others are hidden; omitted: 2
     moving = true                                   # with "held-out": the error where something
                                                     # moves, too
+    calibrate = false                               # clock and thresholds that are not given stay
+                                                    # at the defaults; see below
 
     [[method]]
     name = "akf"                                    # a key of jaxevent.METHODS, or of your own:
@@ -22,6 +24,12 @@
     label = "akf, by hand"                          # in the table; omitted: the name
     grid = { c_on = [0.05, 0.1], kappa = [1, 2] }   # each combination, added to params and label
     normalise = "affine"                            # fit each image's brightness to the truth
+    calibrate = false                               # as above, of this method
+
+Clock and thresholds that a method of images does not get here, name by name, are calibrated
+(`jaxevent.calibration`) from the frames and events that the protocol gives, where the method
+combines both. A preset's count as given, and parameters given as an object in Python count as a
+whole. A row's `params` are those that were used, and its `calibrated` names those that were found.
 
 Each family of estimators has protocols of its own, with settings of their own beside it: images
 are asked for by "held-out" and "reference", described below, the others are described in
@@ -107,7 +115,7 @@ from jaxevent.show.tables import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
-RESULTS_VERSION = 4
+RESULTS_VERSION = 5
 RESULT_FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
 
 _opened = RecordingCache()
@@ -120,6 +128,7 @@ def evaluate(
     progress: bool | None = None,
     *,
     metrics: Any = (),
+    calibrate: bool | None = None,
     workers: int | None = None,
     cluster: Any = None,
     scheduler_file: PathLike | None = None,
@@ -169,6 +178,8 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
             (method, params), or a mapping with the keys of a [[method]].
         metrics: Further metrics, besides those of the file: names, functions
             `metric(estimate, truth)` of one's own, pairs (name, function), or a mapping from names.
+        calibrate: Whether clock and thresholds that are not given are taken from the recording, as
+            the file's `calibrate`; None: as the file says, or true.
         protocol: What methods are given and compared with; omitted, the first of the methods'
             family: "held-out", "tracks" or "motion".
         out: A folder for results.json ({"rows": [...]}), results.md (the table), report.html (one
@@ -206,7 +217,7 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
 RESOURCE_ARGUMENTS = ("workers", "cluster", "scheduler_file", "retries", "replace")
 CALL_FORMS = Forms(
     'jaxevent.evaluate(recording, ["akf"])',
-    ("config", "out", "progress", "metrics", *RESOURCE_ARGUMENTS),
+    ("config", "out", "progress", "metrics", "calibrate", *RESOURCE_ARGUMENTS),
     ("recordings", "methods", "protocol"),
 )
 
@@ -217,11 +228,14 @@ def _evaluate_file(
     progress: bool | None = None,
     *,
     metrics: Any = (),
+    calibrate: bool | None = None,
     **where: Any,
 ) -> Evaluation:
     path, further = Path(config), metrics_of(metrics)
-    plan = read_plan(path, further)
+    plan = read_plan(path, further, calibrate)
     text = path.read_bytes()
+    if calibrate is not None:
+        text = f"# With calibrate = {toml.text(calibrate)}.\n".encode() + text
     if further:
         names = ", ".join(to_toml_table(further))
         text = f"# With the further metrics {names}.\n".encode() + text
@@ -445,7 +459,8 @@ def _compute(
                 told = values_of(values)
         row = kind.score(recording, source, values, options, progress)
         sample = row.pop("sample", None)
-    row = {"recording": recording.name, "method": source.name, **row, "params": told}
+    row = {"recording": recording.name, "method": source.name, **row}
+    row.setdefault("params", told)
     return {"row": row, "picture": None if sample is None else picture(sample)}
 
 
@@ -501,12 +516,15 @@ class Entry:
         return {} if self.params is None else values_of(self.params)
 
 
-def read_plan(config: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
+def read_plan(
+    config: Path, metrics: Sequence[str | Metric] = (), calibrate: bool | None = None
+) -> Plan:
     """Read and check a configuration.
 
     Args:
         config: The TOML file.
         metrics: Metrics in addition to those of the file.
+        calibrate: In place of the file's `calibrate`; None leaves it.
 
     Returns:
         The plan of an evaluation.
@@ -515,6 +533,8 @@ def read_plan(config: Path, metrics: Sequence[str | Metric] = ()) -> Plan:
         InputError: A setting cannot be used; the message names file and setting.
     """
     table = read_toml(config)
+    if calibrate is not None:
+        table["calibrate"] = calibrate
     try:
         return plan_of(table, config.parent, metrics)
     except InputError as error:
@@ -553,6 +573,7 @@ def plan_of(table: Mapping[str, Any], folder: Path, metrics: Sequence[str | Metr
     size = table.get("size")
     recordings = find_recordings(table.get("recordings"), folder)
     methods = _methods(table.get("method"), folder, protocol, family, options)
+    options.pop("calibrate", None)  # each method has the names that it means
     size = None if size is None else (size[0], size[1])
     return Plan(recordings, methods, name, protocol, options, size, table.get("stream"))
 
@@ -602,6 +623,7 @@ def _entries(
         raise InputError('name and label must be text; give name = "akf"')
     own = {key: rest.pop(key) for key in protocol.own if key in rest}
     check(own, protocol.own)
+    calibrate = own.pop("calibrate", options.get("calibrate", True))
     ending = protocol.label({**options, **own})
     if isinstance(name, str) and name in protocol.sources:
         source = protocol.sources[name].of(rest, folder.absolute())
@@ -621,7 +643,9 @@ def _entries(
         yield Entry(label + ending, sent, method, None, own)
         return
     protocol.check_method(method, options)
-    params = read_params(method.Params, method.name, rest.get("params", {}), folder)
+    given = rest.get("params", {})
+    explicit = read_params(method, method.name, given, folder)
+    params = given if isinstance(given, Parameters) else method.Params.of(explicit)
     grid = rest.get("grid", {})
     if not isinstance(grid, dict) or not all(isinstance(v, list) and v for v in grid.values()):
         raise InputError(f"grid is {grid!r}; give a table of lists, as {{ c_on = [0.05, 0.1] }}")
@@ -631,4 +655,7 @@ def _entries(
         values = dict(zip(grid, combination, strict=True))
         suffix = "".join(f", {format_setting(key, value)}" for key, value in values.items())
         chosen = method.Params.of({**params.values(), **values}) if values else params
+        if "calibrate" in protocol.own:
+            names = method.names_left_open({**explicit, **values}) if calibrate else ()
+            own = {**own, "calibrate": names}
         yield Entry(f"{label}{suffix}{ending}", sent, method, chosen, own)

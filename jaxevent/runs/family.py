@@ -142,6 +142,19 @@ class Goal(abc.ABC):
         """Return the files that are read besides the recording."""
         return []
 
+    def calibrate(self, sources: Sources, params: Any, names: Sequence[str]) -> Any:
+        """Return the start of a fit, with what the recordings to fit say of some numbers.
+
+        Args:
+            sources: Recordings by split.
+            params: Parameters.
+            names: Names of the numbers.
+
+        Returns:
+            The parameters.
+        """
+        return params
+
     @abc.abstractmethod
     def problem(
         self, sources: Sources, split: Shares, window: float | int | None

@@ -19,6 +19,7 @@ describes it:
     error = "linear"                    # or "log", "nll"; see `objectives.Objective`
     dark_offset = 0.003                 # of the error "log"
     weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
+    calibrate = false                   # start from the defaults, see below
     warm_up = 0.2                       # s that are prepared around a window
     gap = 2                             # of the protocol "held-out": every gap-th frame is given
 
@@ -31,10 +32,13 @@ describes it:
     prior = { c_on = [0.1, 0.5] }       # what is believed, standard deviation of its logarithm
     prior_weight = 1.0                  # twice what one standard deviation adds to the loss
 
-A method may have its own loss, error, learning_rate, iterations, starts and prior_weight.
-Parameters that are fixed when a recording is prepared have no gradient to follow; each candidate of
-a search is prepared anew. Values omitted are those above, except where comments say otherwise, and
-no prior.
+Clock and thresholds that `params` does not give start from the median of what the recordings to
+fit show, of the frames given (`jaxevent.calibration`), unless `calibrate` is false.
+
+A method may have its own calibrate, loss, error, learning_rate, iterations, starts and
+prior_weight. Parameters that are fixed when a recording is prepared have no gradient to follow;
+each candidate of a search is prepared anew. Values omitted are those above, except where comments
+say otherwise, and no prior.
 
 The settings from `loss` on are those of reconstruction; `jaxevent.runs.blob` and
 `jaxevent.runs.egomotion` tell those of the other families. All local devices are used, and several
@@ -106,6 +110,7 @@ def fit(
     resume: bool = False,
     progress: bool | None = None,
     replace: bool = True,
+    calibrate: bool | None = None,
 ) -> Fits: ...
 
 
@@ -162,6 +167,8 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
             starts; where it had ended, its rows are returned.
         progress: Whether bars are shown; None: where somebody looks on.
         replace: Whether files in `out` may be replaced that are not of the fit that goes on.
+        calibrate: Whether clock and thresholds that are not given start from what the recordings
+            show; None: as the file says, or true.
         **settings: The other settings of a configuration, as `iterations=100` or `window=0.5`.
             `positions` and `truth` also take a DataFrame, or a mapping from recordings' names to
             them.
@@ -183,7 +190,7 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
 
 CALL_FORMS = Forms(
     'jaxevent.fit(recording, akf, fit=["c_on"])',
-    ("config", "out", "recordings", "resume", "progress", "replace"),
+    ("config", "out", "recordings", "resume", "progress", "replace", "calibrate"),
     ("method", "fit", "search", "params"),
 )
 
@@ -195,10 +202,11 @@ def _fit_file(
     resume: bool = False,
     progress: bool | None = None,
     replace: bool = True,
+    calibrate: bool | None = None,
 ) -> Fits:
     if out is None:
         raise InputError(f"{config}: out is missing; give the folder of the results")
-    plan = devices.on_all_processes(lambda: read_plan(Path(config), recordings))
+    plan = devices.on_all_processes(lambda: read_plan(Path(config), recordings, calibrate))
     return _fit(plan, Path(out), resume, progress, replace)
 
 
@@ -260,6 +268,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             if rows is not None:
                 return _finished(rows, out, plan)
         sources = devices.on_all_processes(lambda: _sources(plan, progress))
+        plan = devices.on_all_processes(lambda: calibrated_plan(plan, sources))
         key = ""
         if out is not None or jax.process_count() > 1:
             key = devices.on_all_processes(plan.digest)
@@ -288,6 +297,23 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
         write("params.toml", _tables(plan.tasks, done).encode())
         (out / CHECKPOINT_FILE).unlink()
     return fits
+
+
+def calibrated_plan(plan: Plan, sources: Sources) -> Plan:
+    """Return a plan whose fits start from what the recordings to fit show.
+
+    Args:
+        plan: The plan.
+        sources: Its recordings by split.
+
+    Returns:
+        The plan with other parameters to start from.
+    """
+    tasks = [
+        dataclasses.replace(task, params=task.goal.calibrate(sources, task.params, task.left_open))
+        for task in plan.tasks
+    ]
+    return dataclasses.replace(plan, tasks=tasks)
 
 
 def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:

@@ -17,6 +17,7 @@ from jaxevent.recording import Recording
 from jaxevent.runs import contents
 from jaxevent.runs.calls import to_toml_table
 from jaxevent.runs.config import (
+    CALIBRATE_CHECK,
     NAME_CHECK,
     NATURAL_CHECK,
     NOT_NEGATIVE_CHECK,
@@ -52,6 +53,7 @@ class Task:
     goal: Goal
     loss: Loss  # the goal's, with what is believed of numbers
     settings: Settings
+    left_open: tuple[str, ...] = ()  # names of parameters that start from the recordings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,6 +121,7 @@ _SETTINGS: dict[str, Check] = {
     "rounds": NATURAL_CHECK,
     "batch": NATURAL_CHECK,
     "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+    "probe": (lambda value: isinstance(value, bool), "true or false"),
 }
 _COMMON: dict[str, Check] = {
     **_SETTINGS,
@@ -137,6 +140,7 @@ _COMMON: dict[str, Check] = {
     ),
     "size": SIZE_CHECK,
     "stream": STREAM_CHECK,
+    "calibrate": CALIBRATE_CHECK,
     "window": POSITIVE_CHECK,
     "method": (
         lambda value: isinstance(value, list) and all(isinstance(n, dict) for n in value),
@@ -145,6 +149,7 @@ _COMMON: dict[str, Check] = {
 }
 _METHOD: dict[str, Check] = {
     **{name: _SETTINGS[name] for name in ("learning_rate", "iterations", "starts")},
+    "calibrate": CALIBRATE_CHECK,
     "prior_weight": POSITIVE_CHECK,
     "prior": (
         lambda value: (
@@ -176,17 +181,31 @@ _METHOD: dict[str, Check] = {
 }
 
 
-def read_plan(config: Path, recordings: Sequence[Any] | None = None) -> Plan:
-    """Read and check a configuration; raises `InputError` naming the file and the setting.
+def read_plan(
+    config: Path, recordings: Sequence[Any] | None = None, calibrate: bool | None = None
+) -> Plan:
+    """Read and check a configuration.
 
-    `recordings` take the place of those that it names, written like them but relative to the
-    working directory.
+    Args:
+        config: The TOML file.
+        recordings: In place of those that it names, written like them but relative to the working
+            directory.
+        calibrate: In place of the file's `calibrate`; None leaves it.
+
+    Returns:
+        The plan of a fit.
+
+    Raises:
+        InputError: A setting cannot be used; the message names file and setting.
     """
     table: dict[str, Any] = read_toml(config)
     text = config.read_bytes()
     try:
         if recordings:
             table = {**table, "recordings": [absolute_path(one) for one in recordings]}
+        if calibrate is not None:
+            table = {**table, "calibrate": calibrate}
+        if recordings or calibrate is not None:
             text = toml.dump(to_toml_table(table)).encode()
         return plan_of(table, config.parent, config, text)
     except InputError as error:
@@ -268,8 +287,11 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
     name = name if isinstance(name, str) else method.name
     family = family_of(method)
     check(entry, {**_METHOD, **{k: family.fit_settings[k] for k in family.own}})
-    params = read_params(method.Params, name, entry.get("params", {}), folder)
+    given = entry.get("params", {})
+    explicit = read_params(method, name, given, folder)
+    params = given if isinstance(given, Parameters) else method.Params.of(explicit)
     both = {**table, **entry}
+    left_open = method.names_left_open(explicit) if both.get("calibrate", True) else ()
     goal = family.goal(method, params, both)
     names, search = tuple(entry.get("fit", ())), entry.get("search", {})
     if not names and not search:
@@ -284,9 +306,9 @@ def _task(entry: Mapping[str, Any], table: Mapping[str, Any], folder: Path) -> T
         if one not in names and one not in search:
             raise InputError(f"the prior names {one}, which is not fitted; omit it")
     loss = with_prior(goal.loss, params, prior, both.get("prior_weight", 1.0))
-    given = {name: both[name] for name in _SETTINGS if name in both}
-    settings = Settings(**given, forward=goal.forward)
+    chosen = {name: both[name] for name in _SETTINGS if name in both}
+    settings = Settings(**chosen, forward=goal.forward)
     intervals = {name: (low, high, count) for name, (low, high, count) in search.items()}
     begin(params, names, settings, intervals)  # checks the names
     label = entry.get("label", name)
-    return Task(label, method, params, names, intervals, goal, loss, settings)
+    return Task(label, method, params, names, intervals, goal, loss, settings, left_open)

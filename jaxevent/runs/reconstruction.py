@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from jaxevent.devices import REMOTE_BATCH
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters
-from jaxevent.reconstruction.augment import FrameParams
+from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, make_pixel_mesh, shard_over_pixels
 from jaxevent.reconstruction.frames import EventTiming
@@ -356,6 +356,14 @@ class ImageGoal(Goal):
     @property
     def measure(self) -> str:
         return "log_mse" if self.loss.error == "log" and self.protocol == "reference" else "mse"
+
+    def calibrate(self, sources: Sources, params: FrameParams, names: Sequence[str]) -> FrameParams:
+        found: dict[str, list[float]] = {}
+        for _, recording in sources["fit"] if names else ():
+            given, _ = divide(recording, self.protocol, self.gap)
+            for name, value in calibrated_values(given, params, names).found.items():
+                found.setdefault(name, []).append(value)
+        return params.replace(**{name: float(np.median(one)) for name, one in found.items()})
 
     def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
         cut = functools.partial(

@@ -27,7 +27,7 @@ from jaxevent.io.output import finite
 from jaxevent.runs.fit_config import Plan, Task
 from jaxevent.show.tables import format_aligned_table
 from jaxevent.splits import SPLIT_NAMES
-from jaxevent.tuning import Batches, FitResult, Run, begin
+from jaxevent.tuning import Batches, FitResult, RoughNumber, Run, begin
 
 Write = Callable[[str, bytes], None]
 
@@ -74,7 +74,8 @@ class Fits(Rows):
     Attributes:
         params_by_method: The fitted `Params` of each method, by label.
         found: A dict for each number that was fitted: `method`, `parameter`, `unit`, `start`,
-            `found`, the ends `low` and `high` of its interval, `interval` in words, `remark`.
+            `found`, the ends `low` and `high` of its interval, `interval` in words, `remark`, and
+            where the loss is rough `gradient_skill`, see `jaxevent.tuning.gradient_skill`.
         gains: A dict for each method: its error `before` and `after`, by `measure`.
     """
 
@@ -209,10 +210,17 @@ def find_intervals(
         task.settings.forward,
     )  # fmt: skip
     of = f"{told.parts} {task.goal.part_name}s" if told.parts else INDEPENDENT_MEASUREMENTS
-    return [_row(task, finding, of) for finding in told.intervals]
+    return [_row(task, finding, of, one.rough) for finding in told.intervals]
 
 
-def _row(task: Task, one: ParameterInterval, of: str) -> dict[str, Any]:
+def _row(
+    task: Task, one: ParameterInterval, of: str, rough: Mapping[str, RoughNumber]
+) -> dict[str, Any]:
+    remark = one.remark
+    searched = rough.get(one.name.partition("[")[0])
+    if searched is not None:
+        first = f"rough loss: searched first, to {searched.searched:.4g}"
+        remark = "; ".join(filter(None, (first, remark)))
     ends = {k: None if v is None else finite(v) for k, v in (("low", one.low), ("high", one.high))}
     return {
         "method": task.label,
@@ -223,7 +231,8 @@ def _row(task: Task, one: ParameterInterval, of: str) -> dict[str, Any]:
         **ends,
         "interval": one.interval,
         "of": "" if one.interval == "-" else of,
-        "remark": one.remark,
+        "remark": remark,
+        "gradient_skill": None if searched is None else searched.skill,
     }
 
 
@@ -262,6 +271,13 @@ def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping
             sources[row["of"]].append(row["method"])
     for of, methods in sources.items():
         lines.append(f"\nIntervals of {', '.join(methods)}: from {of}.\n")
+    rough = [row for row in found if row["gradient_skill"] is not None]
+    for row in rough:
+        lines.append(
+            f"\nThe loss of {row['method']} is rough in {row['parameter']}: where the fit starts, "
+            f"the gradient predicts its changes with a skill of {row['gradient_skill']:.2g} (1: "
+            "exactly, 0: no better than no change). It was searched before the first step.\n"
+        )
     for one in gained:
         if one["before"] is None or one["after"] is None:
             continue
@@ -278,8 +294,10 @@ def save_checkpoint(path: Path, digest: str, done: Sequence[FitResult], run: Run
     """Write a checkpoint: a line of JSON, then the arrays as equinox stores them."""
     header = {
         "digest": digest,
-        "done": [[one.loss, one.history] for one in done],
-        "run": None if run is None else [run.stage, run.iteration, run.tried, run.history],
+        "done": [[one.loss, one.history, one.rough] for one in done],
+        "run": None
+        if run is None
+        else [run.stage, run.iteration, run.tried, run.history, run.rough],
     }
     arrays = [one.params.raw for one in done], None if run is None else run.position
     with complete(path) as partial, partial.open("wb") as file:
@@ -311,6 +329,8 @@ def restore_checkpoint(
             if isinstance(error, InputError):
                 raise
             raise InputError(f"{path}: is not a checkpoint; remove it to start anew") from error
+    for one in [*ended, *filter(None, [under_way])]:
+        one[-1] = {name: RoughNumber(*values) for name, values in one[-1].items()}
     done = [
         FitResult(task.params.with_raw(raw), *rest)
         for task, raw, rest in zip(tasks, raws, ended, strict=True)

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -29,10 +29,16 @@ from jaxevent.metrics import (
     regions,
     ssim,
 )
-from jaxevent.reconstruction.augment import FrameParams
+from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
-from jaxevent.runs.config import METRICS_CHECK, check_choice, external_name, is_texts
+from jaxevent.runs.config import (
+    CALIBRATE_CHECK,
+    METRICS_CHECK,
+    check_choice,
+    external_name,
+    is_texts,
+)
 from jaxevent.runs.external import ExternalImages, Normalise, check_normalise, fit_brightness
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
@@ -343,9 +349,11 @@ def score(
     "matlab_ssim" is MATLAB's `ssim`.
 
     With "held-out" every `gap`-th frame is given and all others are hidden; a gap other than 2 is
-    in the row. With `moving` rows have also `moving`: the `share` of pixels where something moves,
-    and the `mse` over these. There the given frames before and after differ by more than 0.05 of
-    white. Nothing is known to move after the last frame given.
+    in the row. Without `params` clock and thresholds are calibrated from the frames and events
+    given, where the method combines them; `calibrated` in the row names those found. With `moving`
+    rows have also `moving`: the `share` of pixels where something moves, and the `mse` over these.
+    There the given frames before and after differ by more than 0.05 of white. Nothing is known to
+    move after the last frame given.
 
     Where the method estimates a variance, `z2` is the mean of (error of ln(I + I0))^2 / variance,
     over all pixels, 1 for honest variances, and `z2_median` the mean over images of its median,
@@ -377,6 +385,8 @@ class ScoringOptions:
     normalise: str = "none"
     gap: int = DEFAULT_GAP_FRAMES
     moving: bool = False
+    # Names of parameters that are calibrated; None: where no parameters are given, those left open.
+    calibrate: tuple[str, ...] | None = None
     measures: Measures = dataclasses.field(init=False)
 
     def __post_init__(self):
@@ -392,8 +402,12 @@ class ImageProtocol(Protocol):
     settings = {
         "metrics": METRICS_CHECK,
         "optional_metrics": (is_texts, 'a list of names, as ["lpips"]'),
+        "calibrate": CALIBRATE_CHECK,
     }
-    own = {"normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'")}
+    own = {
+        "normalise": (lambda value: value in get_args(Normalise), "'none' or 'affine'"),
+        "calibrate": CALIBRATE_CHECK,
+    }
     sources = {ExternalImages.name: ExternalImages, PublishedResults.name: PublishedResults}
 
     def __init__(self, name: str):
@@ -437,6 +451,7 @@ class ImageProtocol(Protocol):
                 options.get("normalise", "none"),
                 options.get("gap", DEFAULT_GAP_FRAMES),
                 options.get("moving", False),
+                tuple(options.get("calibrate", ())),
             ),
             progress,
             external_name(Path(recording.name)),
@@ -473,6 +488,7 @@ def score_and_sample(
     clock = time.perf_counter()
     seconds, estimated = 0.0, False  # whether the method estimates a variance
     values: dict[str, Any]
+    calibrated: list[str] = []
     if isinstance(method, ExternalImages):
         estimates = _external(given, hidden, method, name or recording.name)
         values, I0 = method.values(), 0.0
@@ -480,7 +496,7 @@ def score_and_sample(
         estimates = _of_function(given, hidden, method)
         values, I0 = {}, 0.0
     else:
-        chosen: FrameParams = params or method.Params()
+        chosen, calibrated = _calibrate(given, method, params, asked.calibrate)
         estimates = _estimates(given, hidden, method, chosen, progress)
         values, I0 = values_of(chosen), float(chosen.I0)
     scores: list[Scores] = []
@@ -522,10 +538,25 @@ def score_and_sample(
         **({} if normalise == "none" else {"normalise": normalise}),
         **({} if asked.gap == DEFAULT_GAP_FRAMES else {"gap": asked.gap}),
         **own_names(measures.own),
+        **({"calibrated": calibrated} if calibrated else {}),
         "params": values,
         "per_frame": per_frame,
     }
     return row, sample
+
+
+def _calibrate(
+    given: Recording,
+    method: ImageEstimator,
+    params: FrameParams | None,
+    names: Sequence[str] | None,
+) -> tuple[FrameParams, list[str]]:
+    """Return the parameters of a method on a recording, and the names that it determined."""
+    if names is None:
+        names = method.names_left_open({}) if params is None else ()
+    params = params or method.Params()
+    found = calibrated_values(given, params, names).found
+    return params.replace(**found), list(found)
 
 
 def moving_pixels(given_recording: Recording, frame_row: int, gap_frames: int) -> NDArray[np.bool_]:

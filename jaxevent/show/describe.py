@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration import check_consistency
 from jaxevent.events import is_hot
-from jaxevent.events.clocks import compare_clocks
 from jaxevent.progress import bar
 from jaxevent.recording import EventSource, ImageSource, Recording, Triggers
 
@@ -30,7 +30,7 @@ _TRUTH_NAMES = (
 
 
 def describe(recording: Recording, progress: bool | None = None) -> list[tuple[str, str]]:
-    """Describe a recording; events are read in blocks.
+    """Describe a recording, with the faults that `check_consistency` finds; events in blocks.
 
     Hot pixels are those of `jaxevent.events.find_hot_pixels`. A gap is 0.1 s and more without
     an event, or an interval between frames or samples over 1.5 medians.
@@ -77,7 +77,8 @@ def describe(recording: Recording, progress: bool | None = None) -> list[tuple[s
         if name != "frames" and getattr(recording, name, None) is None
     ]
     lines += [("note", text) for text in recording.notes]
-    return lines
+    faults = [("fault", str(fault)) for fault in check_consistency(recording)]
+    return lines + (faults or [("faults", "none found")])
 
 
 def _value(values: Any) -> str:
@@ -117,7 +118,7 @@ def _about_triggers(triggers: Triggers) -> str:
 
 
 def _about_clocks(recording: Recording) -> list[str]:
-    """Describe intervals of frames and samples that are too long, and clocks without overlap."""
+    """Describe intervals that are too long, and samples not at the time of the events."""
     texts = []
     events = recording.events
     parts = [("frames", recording.frames), ("poses", recording.poses), ("IMU", recording.imu)]
@@ -132,10 +133,7 @@ def _about_clocks(recording: Recording) -> list[str]:
                 f"{name}: {len(long)} intervals over 1.5 medians, the longest "
                 f"{steps[row] / 1000:.3f} ms after {part.t[row] / 1e6:.6f} s"
             )
-        if name == "frames":
-            if (mismatch := compare_clocks(recording)) is not None:
-                texts.append(f"{mismatch.text}; check the unit and the clock of both")
-        elif len(events):
+        if name != "frames" and len(events):
             first, last = int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])
             if part.t[-1] < first or part.t[0] > last:
                 texts.append(

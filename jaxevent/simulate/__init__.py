@@ -19,9 +19,14 @@ A camera that moves in a rigid world:
 
     recording, truth = jaxevent.simulate.motion_scene("texture", motion="varying")
     truth.twist(recording.events.t)  # T and Omega of the camera at every event
+
+Recordings with faults, made of any others:
+
+    faulty = jaxevent.simulate.faults.randomise_polarity(recording, seed=1)
 """
 
 from jaxevent.deprecated import renamed_names
+from jaxevent.simulate import faults
 from jaxevent.simulate.blobs import (
     BLOB_SCENES,
     ApproachMotion,
@@ -86,6 +91,7 @@ __all__ = [
     "BlobTruth",
     "BoxWorld",
     "blob_scene",
+    "faults",
     "simulate_frame_events",
     "from_video",
     "make_texture",

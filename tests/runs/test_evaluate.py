@@ -549,13 +549,16 @@ def test_parameters_of_other_kinds_are_listed():
 
 @pytest.mark.slow
 def test_real_recording(data, float32, monkeypatch):
-    """The table of slider_depth, and that thresholds and clock by hand make the AKF better."""
+    """The table of slider_depth, and that thresholds and clock make the AKF better."""
     monkeypatch.setenv("JAXEVENT_DATA", str(data.parent))
     configs = Path(__file__).parents[2] / "configs"
-    rows = evaluate(configs / "slider_depth.toml")  # without OpenCV `flow` has none
+    config = configs / "slider_depth.toml"
+    rows = evaluate(config, calibrate=False)  # without OpenCV `flow` has none
     errors = {row["method"]: 100 * row["mse"] for row in rows if "mse" in row}
     expected = {"akf": 0.196, "augmented": 0.189, "cf": 0.274, "cf-augmented": 0.222}
     for method, error in {**expected, "blend": 0.291}.items():
         assert errors[method] == pytest.approx(error, rel=0.1), method
     assert errors["akf, by hand"] <= 0.15
     assert errors["mc"] <= 0.02
+    (row,) = evaluate(data / "slider_depth.zip", ["akf"])
+    assert row["calibrated"] == ["clock_offset", "c_on", "c_off"] and 100 * row["mse"] <= 0.155

@@ -487,6 +487,7 @@ def test_references_weigh_their_regions():
 
 EDI = """
 recordings = ["moving.h5"]
+calibrate = false
 iterations = 30
 learning_rate = 0.2
 [[method]]

@@ -46,6 +46,7 @@ CANDIDATE_CELL_PX = (
 )
 MAX_AGE_BASELINES = 1.2  # largest age of candidates, in baselines of the fast quarter of the image
 MAX_CANDIDATE_AGE_S = 1.0
+TIME_PENALTY_RATIO = 25.0  # r_t per median image speed
 MIN_SEARCH_SPEED_RATIO = 2.5  # median image speeds, least largest speed of a search
 MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
@@ -420,6 +421,7 @@ def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
 
     The oldest candidates are so old that the fast quarter of the image has moved by the baseline.
     They stay as they are if they are at least half as old: old ones blur a motion that changes.
+    Of the literal likelihood, the penalty of a wrong time: a speed, it grows with the image's.
 
     Args:
         params: The parameters.
@@ -428,10 +430,10 @@ def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     Returns:
         Values by parameter.
     """
-    if params.likelihood == "literal":
-        return {}
     chosen, oldest = {}, MAX_AGE_BASELINES * float(params.baseline) / speed.fast
-    if oldest > 2 * float(params.tau_max):
+    if params.likelihood == "literal":
+        chosen["r_t"] = TIME_PENALTY_RATIO * speed.median
+    elif oldest > 2 * float(params.tau_max):
         chosen["tau_max"] = min(oldest, MAX_CANDIDATE_AGE_S)
     if MIN_SEARCH_SPEED_RATIO * speed.median > float(params.speed_max):
         chosen["speed_max"] = MIN_SEARCH_SPEED_RATIO * speed.median

@@ -798,7 +798,7 @@ class MotionCompensation(ImageEstimator[Params]):
 
         Args:
             recording: The recording.
-            params: Parameters; None: the defaults.
+            params: Parameters; None: those of `usual_params`.
             **options: Options of `CompensatedVideo`.
 
         Returns:
@@ -809,7 +809,7 @@ class MotionCompensation(ImageEstimator[Params]):
         """
         self.refuse_unknown({name: v for name, v in options.items() if name != "progress"})
         self.check_options(**options)
-        chosen = self.Params() if params is None else params
+        chosen = self.usual_params(recording) if params is None else params
         return CompensatedVideo(self, recording, chosen, **options)
 
 

@@ -18,7 +18,7 @@ leaving out each of the frames around and predicting it from its neighbours.
 import collections
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,6 +65,8 @@ class InstantSmoother(Smoother):
     exposure the frame itself is more accurate: L of its pixel with the variance
     (sigma_pixel / (I + I0))^2 + 1e-4, deblurred as far as events determine it.
     """
+
+    has_unseen_errors: ClassVar[bool] = False  # the fusion has a variance of its own
 
     def frame_info(
         self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any

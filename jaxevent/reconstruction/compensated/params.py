@@ -116,6 +116,8 @@ class Params(smoother.Params):
     vague = Positive(
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )
+    # Thresholds are learned (`learn`) along trajectories, from more than events between frames.
+    calibrated = ("clock_offset",)
     presets = {
         "hdr": {
             **smoother.Params.presets["hdr"],

@@ -17,6 +17,7 @@ from jaxevent.codegen.graph import TranslationError
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.frames import EventTiming, FrameImages
 from jaxevent.reconstruction.stream import EventStream, StreamState, event_weights
+from jaxevent.reconstruction.unseen import UnseenChange
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import ColumnSource, EventColumns, Recording
 
@@ -292,9 +293,20 @@ class PartitionedRecording:
         """The recording's start (us), from which kernels count."""
         return self.windows.clock.origin
 
-    def fixed_inputs(self, clock_offset: Any) -> dict[str, NDArray]:
-        """Return what kernels know beside parameters, for the clock that windows were made for."""
+    def fixed_inputs(self, clock_offset: Any, has_variance: bool) -> dict[str, NDArray]:
+        """Return what kernels know beside parameters.
+
+        Args:
+            clock_offset: Offset of the frames' clock that windows were made for, s.
+            has_variance: Whether the method's variance rests on changes that events do not show.
+
+        Returns:
+            Arrays by the names of fields of `FrameFeatures`.
+        """
+        unseen = self.windows.unseen if has_variance else UnseenChange(0.0, 0.0)
         known = {
+            "flicker": np.asarray(unseen.flicker, self.dtype),
+            "movement": np.asarray(unseen.movement, self.dtype),
             "clock_offset": np.asarray(clock_offset, self.dtype),
             "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
             "response": self._response,

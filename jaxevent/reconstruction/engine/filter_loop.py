@@ -167,6 +167,7 @@ STEP_LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
 STEP_FILL = 2  # a field, with half of a number
 STEP_SUM = 3  # into a column of `WindowInputs.totals`, the segments of a frame's exposure
 STEP_COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
+STEP_AROUND = 5  # into a field, the sum of two others over the eight neighbours
 
 NO_PREVIOUS_FRAME = -9
 
@@ -247,6 +248,9 @@ class _FrameEntry:
                 k = base + row - number
                 left, right = self.left[k], self.right[k + 1]
             yield from self._count(places.span[:, row], left, right)
+            if places.around[row] >= 0:
+                fields = places.around[row], *places.span[:, row]
+                yield STEP_AROUND, *(int(field) * places.stride for field in fields)
         # The piece counts from its exposure's left edge, before the first from the window's start.
         begin = self.left[frame - number] if frame >= 0 else now
         yield from self._count(np.array([places.on, places.off]), begin, now)
@@ -301,6 +305,19 @@ class WindowInputs(NamedTuple):
 
 
 @njit_noalloc_inlined
+def _sum_neighbours(cells, fields, sums, padded):
+    """Sum two fields over the eight neighbours of a band's own pixels, into another."""
+    stride = len(sums)
+    out = cells[fields[0] : fields[0] + stride]
+    on, off = cells[fields[1] : fields[1] + stride], cells[fields[2] : fields[2] + stride]
+    for z in range(padded, stride - padded):
+        sums[z] = on[z - padded] + on[z] + on[z + padded]
+        sums[z] += off[z - padded] + off[z] + off[z + padded]
+    for z in range(padded + 1, stride - padded - 1):
+        out[z] = sums[z - 1] + sums[z] + sums[z + 1] - on[z] - off[z]
+
+
+@njit_noalloc_inlined
 def _take_steps(steps, begin, end, given, band, memory):
     """Take the steps from begin to end, of a band."""
     bands, frames, cells = given.bands, given.frames, memory.cells[band]
@@ -321,6 +338,10 @@ def _take_steps(steps, begin, end, given, band, memory):
                 memory.bound[band],
             )  # fmt: skip
             sum_exposure_segments(bands, band, frames, of, cells, sums)
+        elif kind == STEP_AROUND:
+            _sum_neighbours(
+                cells, (at, of, left), memory.scratch[band, :stride], np.int64(bands.width + 2)
+            )
         else:
             count_band_events(bands, band, (left, right), cells, at, of)
 
@@ -428,7 +449,7 @@ class FilterPasses:
         self.kind = KernelKind(
             recording.windows.clock.exposed, recording.dtype, recording.layout.stride, directions
         )
-        self._fixed = recording.fixed_inputs(clock_offset)
+        self._fixed = recording.fixed_inputs(clock_offset, method.has_covariance)
         self.kernel: CompiledProgram | None = None
         self.use_params(params)
 

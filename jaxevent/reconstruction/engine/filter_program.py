@@ -53,6 +53,7 @@ NO_IMAGE_WIDTH = 104_729  # one pixel is no image: a function that makes one of 
 # Inputs of the traced functions. Counts are [ON and OFF, rows].
 IMAGE_FIELDS = ("grey", "intensity", "certainty")
 COUNT_FIELDS = ("span", "head", "tail")
+GAP_FIELDS = ("span", "around")  # counted from each frame to the next
 UNIFORM_INPUTS = ("gain", "weight_rate", "blend_rate")  # equal for all pixels
 SEGMENT_INPUTS = ("segment_cell", "share", "edge", "segment_on", "segment_off")
 POINT_INPUTS = ("weight", "blend", "on", "off", "piece", "frame")
@@ -65,6 +66,9 @@ class FilterMethod(Protocol):
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def has_covariance(self) -> bool: ...
 
     def frame_model(self, params: Any, frames: Any) -> Any: ...
 
@@ -144,7 +148,7 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         "before": array(2, 1),
         "rows": array(3, kind=np.int32),
     }
-    given |= {"span": array(2, N_PIECE_FRAMES, 1)}
+    given |= {"span": array(2, N_PIECE_FRAMES, 1), "around": array(N_PIECE_FRAMES, 1)}
     if exposed:
         given |= {"head": array(2, N_PIECE_FRAMES, 1), "tail": array(2, N_PIECE_FRAMES, 1)}
         given |= dict.fromkeys(SEGMENT_INPUTS[1:], array(1))
@@ -358,18 +362,18 @@ def _input(
     if name in ("piece", "frame"):
         return ConstantArray(np.asarray(getattr(variant, name)), at_point=True)
     level = Level.POINT
-    if name in (*IMAGE_FIELDS, *COUNT_FIELDS, "before"):
+    if name in (*IMAGE_FIELDS, *COUNT_FIELDS, *GAP_FIELDS, "before"):
         level = Level.TABLE
     elif name in UNIFORM_INPUTS:
         level = Level.PIECE
     out, kind = np.empty(leaf.shape, object), KIND_BY_DTYPE[leaf.dtype.kind]
     # What happens after the last frame is not known.
-    counted = last if name == "span" else last + 1
+    counted = last if name in GAP_FIELDS else last + 1
     for number, place in enumerate(np.ndindex(*leaf.shape)):
         row = number % N_PIECE_FRAMES
         if name in IMAGE_FIELDS:
             number = min(row, last)
-        if name in COUNT_FIELDS and row >= counted:
+        if name in (*COUNT_FIELDS, *GAP_FIELDS) and row >= counted:
             out[place] = graph.constant(0.0)
         elif name == "gain" and row > last:
             out[place] = graph.constant(1.0)
@@ -436,6 +440,7 @@ class FieldPlaces(NamedTuple):
     span: NDArray[np.int64]  # [2, rows]
     head: NDArray[np.int64]
     tail: NDArray[np.int64]
+    around: NDArray[np.int64]  # [rows]
     # To where a field moves when a frame follows, and from: [fields, 2].
     shifted: NDArray[np.int64]
 
@@ -490,6 +495,7 @@ class PixelFields:
             n_rows = N_PIECE_FRAMES - 1 if name == "span" else N_PIECE_FRAMES
             rows = [p * N_PIECE_FRAMES + row for p in range(2) for row in range(n_rows)]
             names += [f"{name}.{row}" for row in rows if name in used]
+        names += [f"around.{row}" for row in range(N_PIECE_FRAMES - 1) if "around" in used]
         sums = len(program.excess)
         names += [f"total.{k}.{row}" for k in range(sums) for row in range(N_PIECE_FRAMES)]
         cells |= {name: len(cells) + k for k, name in enumerate(names)}
@@ -552,11 +558,12 @@ class PixelFields:
         total = np.full((self.sums, N_PIECE_FRAMES), -1)
         for k in range(self.sums):
             total[k] = rows(f"total.{k}")
-        every = np.concatenate([image, total, span, head, tail])
+        around = rows("around")
+        every = np.concatenate([image, total, span, head, tail, around[None]])
         order = np.stack([every[:, :-1].T, every[:, 1:].T], -1).reshape(-1, 2)
         return FieldPlaces(
             self.stride, self.factors, self.table_scratch, self.cells["on.0"], self.cells["off.0"],
-            of("before.0", "before.1"), image, total, span, head, tail,
+            of("before.0", "before.1"), image, total, span, head, tail, around,
             order[(order >= 0).all(1)],
         )  # fmt: skip
 

@@ -491,7 +491,7 @@ class FilterImages(ImageKernel):
 
     def check(self, params: Any, directions: DerivativeDirections) -> None:
         kind = self.passes_with_derivatives(params).kind._replace(directions=directions)
-        fixed = self.recording.fixed_inputs(self.clock_offset)
+        fixed = self.recording.fixed_inputs(self.clock_offset, self.method.has_covariance)
         check_filter_kernel(self.method, params, fixed, kind)
 
     def make(

@@ -8,7 +8,7 @@ stored for every frame (`ROW_FIELDS`, and what images need beside them).
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -80,6 +80,8 @@ UNIFORM_INPUTS = {
 @runtime_checkable
 class SmoothingMethod(ImageMethod, Protocol):
     """A method that a kernel is made of; see `smoother.Smoother`."""
+
+    has_unseen_errors: ClassVar[bool]
 
     def pixel_state_spec(self, number: Any) -> dict[str, Any]: ...
 

@@ -1,0 +1,246 @@
+"""Agreement of events and frames: products of counts with changes, over lags and transforms.
+
+Between two frames a pixel counts S = ON - OFF events, and its log intensity changes by d. Their
+correlation is high where events and frames belong together, and tells what is wrong elsewhere.
+"""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration.sampling import Sample, Stretch, log_changes
+
+I0 = 0.1  # inside the logarithm: between the filters' 1 and the dark offset of sensors
+MAX_PAIRS = 16  # pairs of frames that are compared
+N_STEPS = 20  # lags on either side
+STEPS_PER_INTERVAL = 8  # so that lags reach 2.5 intervals
+STEP_RANGE_US = (2_000, 20_000)
+MIN_PIXELS = 50  # clear in both frames
+# Events between two frames, from which rounding to whole thresholds is small beside the change.
+# With fewer, neighbouring intervals say more than the right one, and any lag or exposure fits.
+MIN_EVENTS = 4
+N_PARTS = 8  # of the pairs, each left out in turn for the error of the offset
+FAR_STEPS = 12  # lag at which events belong to other frames
+
+# What brings events to the frames' pixels, and the same of the frames' changes, taken back.
+TRANSFORMS: Mapping[str, Callable[[NDArray], NDArray]] = MappingProxyType(
+    {
+        "": lambda image: image,
+        "rows flipped": lambda image: image[::-1],
+        "columns flipped": lambda image: image[:, ::-1],
+        "rows and columns flipped": lambda image: image[::-1, ::-1],
+        "axes swapped": lambda image: image.T,
+        "axes swapped, then rows flipped": lambda image: image[::-1].T,
+        "axes swapped, then columns flipped": lambda image: image[:, ::-1].T,
+        "axes swapped, then rows and columns flipped": lambda image: image[::-1, ::-1].T,
+    }
+)
+
+
+class Agreement(NamedTuple):
+    """Correlations of events with frames over lags, and their significance.
+
+    The significance of a sum of products is the sum over tiles of 16 x 16 pixels and pairs of
+    frames, divided by the root of the sum of squares. It is normal with deviation 1 where the
+    signs of the tiles are independent and of equal odds. Offset and exposure come from pixels
+    with at least 4 events between two frames; they are NaN where there are none.
+
+    | field | meaning |
+    |---|---|
+    | lags | (m,) times added to the frames' stamps, us |
+    | interval | median interval between the frames, us |
+    | correlation | (transforms, m) of S with d, as `TRANSFORMS` orders them |
+    | significance | (transforms, m) of that |
+    | activity | significance of events at the same time and place as changes of either sign |
+    | busy | number of the pixels, and pairs of frames, with at least 4 events |
+    | tiles | number of the tiles, and pairs of frames, with such pixels |
+    | offset, offset_sigma | lag of the highest correlation, and its standard error, us |
+    | exposure | length of the exposure of the highest correlation, us |
+    | unblurred, blurred | highest correlation at exposures up to an interval, and at any |
+    """
+
+    lags: NDArray[np.int64]
+    interval: int
+    correlation: NDArray[np.float64]
+    significance: NDArray[np.float64]
+    activity: float
+    busy: int
+    tiles: int
+    offset: float
+    offset_sigma: float
+    exposure: float
+    unblurred: float
+    blurred: float
+
+
+class _Sums(NamedTuple):
+    """Sums of a pair of frames over its busy pixels."""
+
+    S2: NDArray[np.float64]  # (m, m) of S at two lags
+    Sd: NDArray[np.float64]  # (m,)
+    d2: float
+    inside: NDArray[np.bool_]  # (m,) lags of which all events are known
+
+
+def _lag_counts(
+    stretch: Stretch, row: int, lags: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """Count the events between two frames at lags.
+
+    Returns:
+        (active,) pixels with events, and net and total counts (m, active).
+    """
+    edges = np.concatenate([stretch.frame_t[row] + lags, stretch.frame_t[row + 1] + lags])
+    order = np.argsort(edges, kind="stable")
+    first, last = np.searchsorted(stretch.t, [edges.min(), edges.max()])
+    part = slice(first, last)
+    bins = np.searchsorted(edges[order], stretch.t[part], side="right") - 1
+    active, place = np.unique(stretch.pixel[part], return_inverse=True)
+    counted = []
+    for weights in (np.where(stretch.p[part], 1.0, -1.0), None):
+        shape = len(edges), len(active)
+        sums = np.bincount(bins * shape[1] + place, weights, shape[0] * shape[1]).reshape(shape)
+        before = np.empty(shape, np.float32)
+        before[order] = np.cumsum(sums, 0) - sums  # events before each edge
+        counted.append(before[len(lags) :] - before[: len(lags)])
+    return active, counted[0], counted[1]
+
+
+def measure_agreement(sample: Sample) -> Agreement | None:
+    """Measure how events and frames agree.
+
+    Args:
+        sample: Sample of a recording.
+
+    Returns:
+        The agreement; None where no clear pixels of two frames are within the events' time.
+    """
+    pairs = [(s, row) for s in sample.stretches for row in range(len(s.frame_t) - 1) if len(s.t)]
+    if not pairs:
+        return None
+    interval = int(np.median([s.frame_t[row + 1] - s.frame_t[row] for s, row in pairs]))
+    step = int(np.clip(interval // STEPS_PER_INTERVAL, *STEP_RANGE_US))
+    lags = np.arange(-N_STEPS, N_STEPS + 1) * step
+    width, height = sample.size
+    kinds = list(TRANSFORMS.values())[: len(TRANSFORMS) if width == height else 4]
+    m, n = len(lags), len(kinds)
+    total, squares, contrast = np.zeros((n, m)), np.zeros((n, m)), np.zeros((2, m))
+    S2, d2, used = np.zeros((n, m)), np.zeros((n, m)), np.zeros(m)
+    sums, busy, tiles = [], 0, 0
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).round().astype(int))
+    for stretch, row in (pairs[i] for i in chosen):
+        changes, clears = log_changes(_pair(stretch, row), I0)
+        d, clear = changes[0], clears[0]
+        begin = max(stretch.span[0], int(stretch.t[0]))
+        end = min(stretch.span[1], int(stretch.t[-1])) + 1
+        inside = (stretch.frame_t[row] + lags >= begin) & (stretch.frame_t[row + 1] + lags <= end)
+        if clear.sum() < MIN_PIXELS or not inside.any():
+            continue
+        # The median change is the frames' own brightness, which is judged apart.
+        d = np.where(clear, d - np.median(d[clear]), 0)
+        size = np.where(clear, np.abs(d) - np.abs(d)[clear].mean(), 0)
+        full = np.zeros((2, height * width), np.float32)
+        full[:, sample.places] = d, clear
+        moved, seen = (
+            np.stack([kind(image.reshape(height, width)).ravel() for kind in kinds])
+            for image in full
+        )
+        moved, seen = moved[:, sample.places], seen[:, sample.places]
+        active, S, N = _lag_counts(stretch, row, lags)
+        S, N = S * inside[:, None], N * inside[:, None]
+        tile = sample.tile[active]
+        order = np.argsort(tile, kind="stable")
+        for at in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
+            products = moved[:, active[at]] @ S[:, at].T
+            total += products
+            squares += products**2
+            above = _contrast(size[active[at]] @ N[:, at].T, inside)
+            contrast += above, above**2
+        S2 += seen[:, active] @ (S**2).T
+        d2 += (moved**2).sum(1)[:, None] * inside
+        used += inside
+        often = clear[active] & (N.max(0) >= MIN_EVENTS)
+        kept, change = S[:, often].astype(np.float64), d[active[often]].astype(np.float64)
+        sums.append(_Sums(kept @ kept.T, kept @ change, float(change @ change), inside))
+        busy += int(often.sum())
+        tiles += len(np.unique(tile[often]))
+    if not sums:
+        return None
+    enough = used >= max(used.max() / 2, 1)
+    correlation = np.where(enough, total / np.sqrt(S2 * d2 + 1e-12), 0)
+    significance = np.where(enough, total / np.sqrt(squares + 1e-12), 0)
+    activity = float((contrast[0] / np.sqrt(contrast[1] + 1e-12)).max())
+    parts = [[s for k, s in enumerate(sums) if k % N_PARTS != part] for part in range(N_PARTS)]
+    offsets = np.array([_find_offset(part, step) for part in parts[: len(sums)] if part])
+    error = np.sqrt((len(offsets) - 1) * np.var(offsets)) if len(offsets) > 1 else np.nan
+    return Agreement(
+        lags, interval, correlation, significance, activity, busy, tiles,
+        _find_offset(sums, step), float(error), *_find_exposure(sums, step, interval),
+    )  # fmt: skip
+
+
+def _pair(stretch: Stretch, row: int) -> Stretch:
+    """Return a stretch with two frames."""
+    two = slice(row, row + 2)
+    return stretch._replace(intensity=stretch.intensity[two], clear=stretch.clear[two])
+
+
+def _contrast(curve: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return a curve over lags above the mean of those at which events belong to other frames."""
+    out = np.zeros(len(curve))
+    near = np.arange(FAR_STEPS, len(curve) - FAR_STEPS)
+    known = inside[near] & inside[near - FAR_STEPS] & inside[near + FAR_STEPS]
+    beside = (curve[near - FAR_STEPS] + curve[near + FAR_STEPS]) / 2
+    out[near] = np.where(known, curve[near] - beside, 0)
+    return out
+
+
+def _correlate_window(sums: list[_Sums], window: slice) -> float:
+    """Correlate d with S averaged over a window of lags; NaN with fewer than half of the pairs."""
+    known = [s for s in sums if s.inside[window].all()]
+    norm = sum(s.S2[window, window].sum() for s in known) * sum(s.d2 for s in known)
+    if 2 * len(known) < len(sums) or norm <= 0:
+        return np.nan
+    return float(sum(s.Sd[window].sum() for s in known) / np.sqrt(norm))
+
+
+def _find_offset(sums: list[_Sums], step: int) -> float:
+    """Find the lag of the highest correlation (us), by a parabola through three."""
+    curve = np.array([_correlate_window(sums, slice(k, k + 1)) for k in range(2 * N_STEPS + 1)])
+    if not np.isfinite(curve).any():
+        return np.nan
+    top = int(np.nanargmax(curve))
+    left, middle, right = (
+        curve[max(top - 1, 0) : top + 2] if 0 < top < 2 * N_STEPS else [np.nan] * 3
+    )
+    bend = left - 2 * middle + right
+    return (top - N_STEPS + (0.5 * (left - right) / bend if bend < 0 else 0)) * step
+
+
+def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float, float]:
+    """Find the exposure of the highest correlation, see `Agreement`."""
+    lags = 2 * N_STEPS + 1
+    halves = np.arange(N_STEPS - 1)
+    best = np.array(
+        [
+            max(
+                (
+                    _correlate_window(sums, slice(middle - half, middle + half + 1))
+                    for middle in range(half, lags - half)
+                ),
+                key=lambda r: -np.inf if np.isnan(r) else r,
+            )
+            for half in halves.tolist()
+        ]
+    )
+    if not np.isfinite(best).any():
+        return np.nan, np.nan, np.nan
+    lengths = 2.0 * halves * step
+    return (
+        float(lengths[np.nanargmax(best)]),
+        float(np.nanmax(best[lengths <= interval])),
+        float(np.nanmax(best)),
+    )

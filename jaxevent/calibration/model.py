@@ -1,0 +1,331 @@
+"""The likelihood of frames given events, by which clock, thresholds and noises are estimated.
+
+From a frame to the next the log intensity of a pixel changes by
+
+    d = c_on n_on(delta, T, rho) - c_off n_off(delta, T, rho) + e,
+
+where counts n are interpolated between events (`brightness`), each averaged over the exposure T at
+the clock offset delta, with the dead time rho. So counts are known to a fraction of an event, and
+errors stand on d alone, but for noise of events. Their variance is a sum of that of both frames,
+sigma^2 (dI/dg)^2 / (I + I0)^2, of the interpolation, a part of c^2 that grows with the time between
+the events around a frame, and of the events, a part of c^2 each. Errors are Student's t.
+
+Only those pixels and pairs of frames count at which the events around both frames are near in time
+and of equal polarity: there the intensity is on its way, and interpolation is right on average. The
+choice depends neither on the change nor on the number of events, and so does not bias thresholds.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration.brightness import (
+    Interpolation,
+    Positions,
+    interpolate,
+    read_positions,
+    sort_by_pixel,
+)
+from jaxevent.calibration.sampling import Sample, Stretch
+
+DEGREES_OF_FREEDOM = 4.0  # of Student's t
+# Curvature of the likelihood by the mean, as part of the mean of weights.
+CURVATURE = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + 3)
+SHORTEST_US = 50.0  # exposure, below which it is a point in time
+MAX_RELATIVE_NOISE = 0.15  # of a frame's I + I0, beyond which logarithms of noise are biased
+MIN_CHANGES = 150
+MAX_CHANGES = 60_000
+N_STEPS = 12
+TRUST = np.array([np.inf, np.inf, 2e-3, 5e-4, np.inf])  # largest steps of the last three
+PRECISION = np.array([1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
+
+
+@dataclasses.dataclass(frozen=True)
+class Physics:
+    """Parameters of the model.
+
+    Attributes:
+        theta: c_on, c_off, clock offset (s), dead time (s), square of the exposure (s^2).
+        V: Variances: of a frame's grey value, of interpolation and of an event, in c^2.
+    """
+
+    theta: NDArray[np.float64]
+    V: NDArray[np.float64]
+
+
+class Changes(NamedTuple):
+    """Pixels at two consecutive frames, and what events say of the change."""
+
+    intensity: NDArray[np.float32]  # (2, n) of both frames
+    slope: NDArray[np.float64]  # (2, n) of intensity by the grey value
+    n: NDArray[np.float64]  # (4, n) differences of mean counts
+    by_clock: NDArray[np.float64]  # (2, n) derivatives, 1/s
+    by_square: NDArray[np.float64]  # (2, n) derivatives by the exposure's square, 1/s^2
+    travel: NDArray[np.float64]  # (2, 2, n) ON and OFF counts within both exposures
+    loose: NDArray[np.float64]  # (n,) 0 to 2, with the time between events around the frames
+    tile: NDArray[np.intp]  # (n,)
+    interval: NDArray[np.intp]  # (n,) number of the pair of frames
+    stretch: NDArray[np.intp]  # (n,)
+    pixel: NDArray[np.intp]  # (n,)
+
+
+class Terms(NamedTuple):
+    """Terms of the likelihood at some parameters."""
+
+    residual: NDArray[np.float64]  # (n,) ln I
+    J: NDArray[np.float64]  # (n, 5) derivatives of the predicted change by theta
+    X: NDArray[np.float64]  # (3, n) factors of the three variances
+    log_slope: NDArray[np.float64]  # (n,) mean ln(I + I0) of both frames
+
+
+class Fit(NamedTuple):
+    """Parameters that were fitted."""
+
+    physics: Physics
+    covariance: NDArray[np.float64]  # (5, 5), 0 where held
+    losses: NDArray[np.float64]  # (n,) negative log likelihood of each change
+    changes: Changes
+    terms: Terms
+    weight: NDArray[np.float64]  # (n,)
+
+
+def make_terms(changes: Changes, theta: NDArray[np.float64], I0: float, noise: float) -> Terms:
+    """Return the terms of the likelihood.
+
+    Args:
+        changes: The changes.
+        theta: Parameters, as of `Physics`.
+        I0: Offset inside the logarithm.
+        noise: Standard deviation of grey values, for the mean of the logarithm.
+
+    Returns:
+        The terms.
+    """
+    c = np.array([theta[0], -theta[1]])
+    n = changes.n
+    by_clock = c @ changes.by_clock
+    by_rho = c @ n[2:] - by_clock / 2
+    J = np.stack([n[0], -n[1], by_clock, by_rho, c @ changes.by_square], 1)
+    level = np.maximum(changes.intensity, 0).astype(np.float64) + I0
+    relative = changes.slope / level
+    # E ln(I + n) = ln I - var n / (2 I^2) for noise n.
+    logs = np.log(level) + (noise * relative) ** 2 / 2
+    # Of a straight path ln mean exp is the mean plus half of the variance.
+    bend = (c @ changes.travel) ** 2 / 24
+    residual = logs[1] - logs[0] - (bend[1] - bend[0]) - J[:, :2] @ theta[:2]
+    of_events = theta[0] ** 2 * abs(n[0]) + theta[1] ** 2 * abs(n[1])
+    X = np.stack([(relative**2).sum(0), theta[0] * theta[1] * changes.loose, of_events])
+    return Terms(residual, J, X, np.log(level).mean(0))
+
+
+class Model:
+    """The likelihood of a sample.
+
+    Args:
+        sample: The sample.
+        I0: Offset inside the logarithm.
+        grey_noise: Standard deviation of grey values, for the choice of pixels.
+        slope: (2, entries) grey values, and dI/dg there.
+    """
+
+    def __init__(self, sample: Sample, I0: float, grey_noise: float, slope: NDArray[np.float64]):
+        self.sample, self.I0, self.grey_noise, self.slope = sample, I0, grey_noise, slope
+        self._rho: float | None = None
+        self._paths: list[Interpolation] = []
+        self._events = []
+        for stretch in sample.stretches:
+            level = np.maximum(stretch.intensity, 0) + I0
+            noise = grey_noise * np.interp(stretch.grey, *slope)
+            clear = stretch.clear & (noise < MAX_RELATIVE_NOISE * level)
+            self._events.append(sort_by_pixel(stretch, clear))
+
+    @functools.cached_property
+    def interval_s(self) -> float:
+        """Median time between frames, s."""
+        steps = [np.diff(s.frame_t) for s in self.sample.stretches]
+        return float(np.median(np.concatenate(steps))) * 1e-6
+
+    def _lengths(self, stretch: Stretch, theta: NDArray) -> NDArray[np.float64]:
+        """Return the lengths of exposures, us."""
+        unknown = 1e6 * np.sqrt(max(theta[4], 0))
+        return np.maximum(np.where(stretch.exposure > 0, stretch.exposure, unknown), SHORTEST_US)
+
+    def _positions(self, theta: NDArray[np.float64]) -> list[Positions]:
+        if self._rho != theta[3]:
+            self._paths = [interpolate(events, 1e6 * theta[3]) for events in self._events]
+            self._rho = theta[3]
+        return [
+            read_positions(
+                events,
+                path,
+                stretch.frame_t + 1e6 * theta[2],
+                self._lengths(stretch, theta),
+                self.interval_s,
+            )
+            for stretch, events, path in zip(
+                self.sample.stretches, self._events, self._paths, strict=True
+            )
+        ]
+
+    def changes(self, theta: NDArray[np.float64]) -> Changes:
+        """Return the changes that count at some parameters."""
+        parts, interval = [], 0
+        for number, (stretch, events, at) in enumerate(
+            zip(self.sample.stretches, self._events, self._positions(theta), strict=True)
+        ):
+            row, pair = np.nonzero(at.good[:, 1:] & at.good[:, :-1])
+            length = 1e-6 * self._lengths(stretch, theta)
+            pixel, ends = events.active[row], (pair, pair + 1)
+            mean, edges, travel = (
+                [values[row, f].astype(np.float64).T for f in ends]
+                for values in (at.mean, at.edges, at.travel)
+            )
+            slope = [v[:2] / length[f] for v, f in zip(travel, ends, strict=True)]
+            square = [
+                (e - m)[:2] / (2 * length[f] ** 2)
+                for e, m, f in zip(edges, mean, ends, strict=True)
+            ]
+            loose = [1 / (1 + self.interval_s / 4 / at.gap[row, f]) for f in ends]
+            parts.append(
+                Changes(
+                    np.stack([stretch.intensity[f, pixel] for f in ends]),
+                    np.stack([np.interp(stretch.grey[f, pixel], *self.slope) for f in ends]),
+                    mean[1] - mean[0],
+                    slope[1] - slope[0],
+                    square[1] - square[0],
+                    np.stack([v[:2] for v in travel]),
+                    np.add(*loose),
+                    self.sample.tile[pixel],
+                    pair + interval,
+                    np.full(len(pair), number),
+                    pixel,
+                )
+            )
+            interval += len(stretch.frame_t)
+        joined = Changes(*(np.concatenate(column, -1) for column in zip(*parts, strict=True)))
+        if len(joined.n[0]) > MAX_CHANGES:
+            keep = np.sort(np.random.default_rng(0).permutation(len(joined.n[0]))[:MAX_CHANGES])
+            joined = Changes(*(values[..., keep] for values in joined))
+        return joined
+
+    def fit(self, start: Physics, free: tuple[bool, ...], steps: int = N_STEPS) -> Fit | None:
+        """Maximise the likelihood by Gauss-Newton steps.
+
+        Args:
+            start: First parameters.
+            free: Which of the five of `theta` move.
+            steps: Largest number of steps.
+
+        Returns:
+            The fit; None where fewer than `MIN_CHANGES` changes count.
+        """
+        physics, moves = start, np.flatnonzero(free)
+        for step in range(steps + 1):
+            changes = self.changes(physics.theta)
+            if len(changes.loose) < MIN_CHANGES:
+                return None
+            fit, move = self.step(physics, changes, moves)
+            if step == steps or (step > 2 and np.all(np.abs(move) < PRECISION)):
+                break
+            theta = self._bounded(physics.theta, np.clip(move, -TRUST, TRUST))
+            physics = Physics(theta, fit.physics.V)
+        covariance = np.zeros((5, 5))
+        part = sandwich(fit.terms.J[:, moves], fit.weight, fit.terms.residual, changes)
+        covariance[np.ix_(moves, moves)] = part
+        return fit._replace(covariance=covariance)
+
+    def step(
+        self, physics: Physics, changes: Changes, moves: NDArray[np.intp], I0: float | None = None
+    ) -> tuple[Fit, NDArray[np.float64]]:
+        """Return the likelihood of changes with its best variances, and a Gauss-Newton step.
+
+        Args:
+            physics: Parameters.
+            changes: The changes.
+            moves: Which of `theta` move.
+            I0: Offset inside the logarithm; None: the model's.
+
+        Returns:
+            The likelihood, without covariance, and the step (5,).
+        """
+        terms = make_terms(changes, physics.theta, I0 or self.I0, self.grey_noise)
+        V, weight = weigh(physics.V, terms)
+        J = terms.J[:, moves]
+        A = (J * weight[:, None]).T @ J
+        # A little damping keeps what the data do not determine where it is.
+        H = A + np.diag(1e-6 * np.diag(A) + 1e-12)
+        move = np.zeros(5)
+        move[moves] = np.linalg.solve(H, J.T @ (weight * terms.residual))
+        losses = losses_of(terms.residual, V @ terms.X)
+        new = Physics(physics.theta, V)
+        return Fit(new, np.zeros((5, 5)), losses, changes, terms, weight), move
+
+    def _bounded(self, theta: NDArray, move: NDArray) -> NDArray[np.float64]:
+        """Return parameters after a move, within their bounds."""
+        new = theta + move
+        new[:2] = np.clip(new[:2], theta[:2] / 2, theta[:2] * 2)
+        new[3] = np.clip(new[3], 0, self.interval_s / 4)
+        new[4] = np.clip(new[4], (1e-6 * SHORTEST_US) ** 2, self.interval_s**2)
+        return new
+
+
+def losses_of(residual: NDArray, variance: NDArray) -> NDArray[np.float64]:
+    """Return the negative log likelihood of each change, but for a constant."""
+    nu = DEGREES_OF_FREEDOM
+    return np.log(variance) / 2 + (nu + 1) / 2 * np.log1p(residual**2 / variance / nu)
+
+
+def weigh(V: NDArray[np.float64], terms: Terms) -> tuple[NDArray, NDArray]:
+    """Return better variances, and the weights of changes by them."""
+    nu, X, square = DEGREES_OF_FREEDOM, terms.X, terms.residual**2
+    for _ in range(5):
+        v = V @ X
+        share = (nu + 1) / (nu + square / v) * square / v**2
+        # The factors that make the gradient 0; they keep variances positive.
+        V = V * np.sqrt((X @ share) / (X @ (1 / v)))
+        V = np.clip(V, [1e-7, 1e-5, 1e-7], [0.1, 1.0, 4.0])
+    v = V @ X
+    return V, (nu + 1) / (nu + square / v) / v
+
+
+def sandwich(
+    J: NDArray, weight: NDArray, residual: NDArray, changes: Changes
+) -> NDArray[np.float64]:
+    """Return the covariance that allows for errors in common of a tile or of a pair of frames.
+
+    H^-1 (K_tile + K_interval - K_both) H^-1, K the sums of squared gradients of clusters (Cameron,
+    Gelbach & Miller 2011).
+    """
+    H = np.linalg.pinv((J * weight[:, None]).T @ J * CURVATURE)
+    S = J * (weight * residual)[:, None]
+    parts = [H @ cluster_sums(S, changes, by) @ H for by in ("tile", "interval", "both")]
+    covariance = parts[0] + parts[1] - parts[2]
+    # Few clusters can make the difference too small: no less than one of its parts.
+    scale = np.sqrt(
+        np.max([np.diag(part) for part in (covariance, *parts)], 0)
+        / np.maximum(np.diag(covariance), 1e-30)
+    )
+    return covariance * np.outer(scale, scale)
+
+
+def cluster_sums(score: NDArray, changes: Changes, by: str) -> NDArray[np.float64]:
+    """Return the sum of squares of the gradients of clusters.
+
+    Args:
+        score: (n, parameters) gradients of changes.
+        changes: The changes.
+        by: "tile", "interval", or "both" for a tile in an interval.
+
+    Returns:
+        (parameters, parameters).
+    """
+    tile, interval = changes.tile, changes.interval
+    both = tile * (interval.max() + 1) + interval
+    _, index = np.unique(
+        {"tile": tile, "interval": interval, "both": both}[by], return_inverse=True
+    )
+    total = np.stack([np.bincount(index, column) for column in score.T], 1)
+    return total.T @ total * len(total) / max(len(total) - 1, 1)

@@ -1,0 +1,116 @@
+"""Variance of images, of errors that the models of filter and smoother leave out.
+
+Filter and smoother take noise as white. Errors of real recordings last: the noise of a frame is
+that of the whole gap after it, thresholds are wrong at every event, a pixel moves below its
+threshold without events, and frames change their brightness. The estimate between two frames rests
+on both, whatever the gains, so its error is that of a bridge between them. Let w = 4 v (1 - v) at
+the part v of the gap. The variance is
+
+    V = r (1 - w / 2) + w (c^2 (s^2 M + e^2 A) + d^2 D^2 / (1 + A) + F / (I + I0)^2)
+
+r is the noise of the frames, A the activity, events of the pixel and of its neighbours, D the
+change between the frames that events do not explain, M how much of the recording moves, F the
+flicker of its frames. Before the first frame and after the last one D is not known, and the
+error walks on: V = r + 4 c^2 (s^2 M + e^2 A) + F / (I + I0)^2.
+
+The filter's gains follow its own P, which falls without bound. P is added: it is the noise of
+events that the filter has not forgotten yet.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxevent.parameters import Positive
+from jaxevent.reconstruction.augment import deblur_frames, integrate_counts
+from jaxevent.reconstruction.features import FrameFeatures, ImagePoints
+
+# Members of a `Params`, in this order: r, e, s and d of the module's formula.
+ERROR_PARAMETERS = (
+    Positive(0.005, "intensity", "noise of a frame's pixel, for the variance of images"),
+    Positive(0.3, "c", "error halfway between frames, per square root of events"),
+    Positive(0.1, "c", "error halfway between frames where no events are"),
+    Positive(0.35, "1", "error halfway between frames, as part of the change without events"),
+)
+NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight neighbours
+ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
+
+
+def activity_variance(params: Any, activity: Array, movement: Array) -> Array:
+    """Return the variance halfway between frames by activity alone, D = 0.
+
+    Args:
+        params: Thresholds, `error_event` and `error_still`.
+        activity: Events of a pixel and its neighbours, A.
+        movement: How much of the recording moves, 0 to 1.
+
+    Returns:
+        The variance, (ln I)^2.
+    """
+    c2 = (params.c_on**2 + params.c_off**2) / 2
+    return c2 * (params.error_still**2 * movement + params.error_event**2 * activity)
+
+
+def gap_variance(params: Any, activity: Array, residual: Array, movement: Array) -> Array:
+    """Return the variance halfway between two frames, beside their noise and flicker.
+
+    Args:
+        params: Thresholds, `error_event`, `error_still` and `error_change`.
+        activity: Events of a pixel and its neighbours between the frames, A.
+        residual: Change between the frames that events do not explain, ln I, D.
+        movement: How much of the recording moves, 0 to 1.
+
+    Returns:
+        The variance, (ln I)^2.
+    """
+    unexplained = (params.error_change * residual) ** 2 / (1 + activity)
+    return activity_variance(params, activity, movement) + unexplained
+
+
+def bridge_weight(part: Array) -> Array:
+    """Return w, 1 halfway between two frames and 0 at them, at a part of the gap."""
+    return 4 * part * (1 - part)
+
+
+class AugmentedFrameErrors(eqx.Module):
+    """Variance of the augmented frame: `steady` + w `halfway` + `per_event` (ON + OFF events)."""
+
+    steady: Float[Array, "pieces pixels"]
+    halfway: Float[Array, "pieces pixels"]
+    per_event: Float[Array, "pieces pixels"]
+
+    def __init__(self, params: Any, frames: FrameFeatures):
+        left, right = deblur_frames(params, frames)
+        span, movement = jnp.asarray(frames.span), frames.movement
+        residual = jnp.roll(right, -1, axis=0) - left - integrate_counts(params, *span)
+        own, around = span[0] + span[1], jnp.asarray(frames.around)
+        activity = (1 - NEIGHBOUR_SHARE) * own + NEIGHBOUR_SHARE / 8 * around
+        slope2 = 1 / (frames.intensity + params.I0) ** 2  # of ln(I + I0), squared
+        noise, flicker = params.frame_noise**2 * slope2, frames.flicker * slope2
+        between = jnp.asarray(frames.blend_rate)[:, None] > 0
+
+        def mean(values: Array) -> Array:
+            return (values + jnp.roll(values, -1, axis=0)) / 2
+
+        still = ONE_SIDED_FACTOR * activity_variance(params, jnp.zeros_like(own), movement)
+        step = ONE_SIDED_FACTOR * activity_variance(params, jnp.ones_like(own), 0.0)
+        alone = noise + flicker + still
+        bridge = gap_variance(params, activity, residual, movement) + mean(flicker)
+        steady = jnp.where(between, mean(noise), alone)
+        halfway = jnp.where(between, bridge - mean(noise) / 2, 0)
+        per_event = jnp.where(between, 0, step)
+        # Before the first frame the events from there to the frame count.
+        first = alone[0] + step[0] * (frames.before[0] + frames.before[1])
+        begin = (first, jnp.zeros_like(first), -step[0])
+        pieces = 1 if frames.head is None else 2  # of a frame: its exposure, and the gap after it
+        self.steady, self.halfway, self.per_event = (
+            jnp.concatenate([before[None], jnp.repeat(table, pieces, axis=0)])
+            for before, table in zip(begin, (steady, halfway, per_event), strict=True)
+        )
+
+    def __call__(self, points: ImagePoints) -> Float[Array, "times pixels"]:
+        events = points.gather_piece(self.per_event) * (points.on + points.off)
+        bridge = bridge_weight(points.blend) * points.gather_piece(self.halfway)
+        return points.gather_piece(self.steady) + bridge + events

@@ -1,0 +1,133 @@
+"""Table and picture of a calibration."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration import Calibration
+from jaxevent.recording import Recording
+from jaxevent.show.images import new_figure
+from jaxevent.show.tables import format_aligned_table
+
+N_SHOWN_INTERVALS = 8  # between frames, whose pixels the picture shows
+COUNT_LIMIT_PERCENTILE = 99.5  # of the counts' sizes, at which the picture ends
+N_BINS = 61  # of the picture's log differences
+
+
+def calibration_table(calibration: Calibration) -> str:
+    """Format the values of a calibration as a table, with intervals and notes.
+
+    Args:
+        calibration: The calibration.
+
+    Returns:
+        Lines of text.
+    """
+    table = [["", "value", "95 % interval", "unit", ""]]
+    for name, one in calibration.values().items():
+        known = one.is_identifiable
+        interval = (
+            f"{one.low:.4g} to {one.high:.4g}" if np.isfinite([one.low, one.high]).all() else ""
+        )
+        unit = "" if one.unit == "1" else one.unit
+        table.append([name, f"{one.value:.4g}" if known else "-", interval, unit * known, one.note])
+    y, x = np.nonzero(calibration.hot_pixels)
+    first = ", ".join(f"({i}, {j})" for i, j in zip(x[:5].tolist(), y[:5].tolist(), strict=True))
+    table.append(["hot pixels", f"{len(x)}", "", "", f"{first}{', ...' * (len(x) > 5)}"])
+    return format_aligned_table(table, (0, 3, 4))
+
+
+def plot_calibration(calibration: Calibration, recording: Recording, I0: float = 1.0) -> Any:
+    """Draw correlation over clock offset, events against changes of frames, and hot pixels.
+
+    Args:
+        calibration: The calibration.
+        recording: The recording that it is of.
+        I0: Offset inside the logarithm that it was made for.
+
+    Returns:
+        A `matplotlib.figure.Figure`.
+
+    Raises:
+        InputError: The extra "plot" is missing.
+    """
+    figure = new_figure(12, 3.8)
+    left, middle, right = figure.subplots(1, 3)
+    _draw_correlations(left, calibration)
+    _draw_counts(middle, calibration, recording, I0)
+    _draw_hot_pixels(right, calibration, recording)
+    return figure
+
+
+def _draw_correlations(axis: Any, calibration: Calibration) -> None:
+    clock = calibration.clock_offset
+    axis.plot(1e3 * calibration.offsets, calibration.correlations, "k.-", lw=1, ms=4)
+    if clock.is_identifiable:
+        axis.axvline(1e3 * clock.value, color="C3", lw=1)
+        if np.isfinite([clock.low, clock.high]).all():
+            axis.axvspan(1e3 * clock.low, 1e3 * clock.high, color="C3", alpha=0.2, lw=0)
+    title = f"clock {1e3 * clock.value:+.2f} ms" if clock.is_identifiable else "clock: not found"
+    axis.set(title=title, xlabel="clock offset (ms)", ylabel="correlation of events and frames")
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_counts(axis: Any, calibration: Calibration, recording: Recording, I0: float) -> None:
+    change, net = _changes(recording, calibration, I0)
+    axis.set(xlabel=f"change of ln(I + {I0:g}) between frames", ylabel="ON minus OFF events")
+    if not len(net):
+        axis.set_title("no events between frames")
+        return
+    most = max(2, int(np.percentile(np.abs(net), COUNT_LIMIT_PERCENTILE)))
+    end = max(float(np.percentile(np.abs(change), COUNT_LIMIT_PERCENTILE)), 1e-3)
+    counts, _, _ = np.histogram2d(
+        change, net, [np.linspace(-end, end, N_BINS), np.arange(-most - 0.5, most + 1)]
+    )
+    extent = (-end, end, -most - 0.5, most + 0.5)
+    axis.imshow(np.log1p(counts.T), "Greys", origin="lower", extent=extent, aspect="auto")
+    lines = ((calibration.c_on, "C3", "ON", 1), (calibration.c_off, "C0", "OFF", -1))
+    for threshold, colour, name, sign in lines:
+        if threshold.is_identifiable:
+            reach = sign * min(end, most * threshold.value)
+            label = f"{name} {threshold.value:.3g}"
+            axis.plot([0, reach], [0, reach / threshold.value], colour, lw=1.5, label=label)
+    axis.set(xlim=(-end, end), ylim=(-most - 0.5, most + 0.5), title="thresholds")
+    if axis.lines:
+        axis.legend(frameon=False, loc="upper left")
+
+
+def _changes(
+    recording: Recording, calibration: Calibration, I0: float
+) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Return changes of log intensity and ON minus OFF events of pixels between frames."""
+    frames = recording.frames
+    late = (
+        round(1e6 * calibration.clock_offset.value)
+        if calibration.clock_offset.is_identifiable
+        else 0
+    )
+    change, net = [np.zeros(0)], [np.zeros(0, np.int64)]
+    if frames is None or len(frames) < 2:
+        return change[0], net[0]
+    pixels = recording.width * recording.height
+    rows = np.linspace(0, len(frames) - 2, N_SHOWN_INTERVALS).round().astype(int)
+    for row in np.unique(rows).tolist():
+        first, last = (recording.events.index(int(t) + late) for t in frames.t[row : row + 2])
+        events = recording.events[first:last]
+        place = events.y.astype(np.int64) * recording.width + events.x
+        both = np.bincount(place, minlength=pixels)
+        levels = np.log(frames[row : row + 2].intensity.reshape(2, -1) + I0)
+        used = (both > 0) & ~calibration.hot_pixels.ravel()
+        net.append((2 * np.bincount(place[events.p], minlength=pixels) - both)[used])
+        change.append((levels[1] - levels[0])[used])
+    return np.concatenate(change), np.concatenate(net)
+
+
+def _draw_hot_pixels(axis: Any, calibration: Calibration, recording: Recording) -> None:
+    y, x = np.nonzero(calibration.hot_pixels)
+    height, width = calibration.hot_pixels.shape
+    if recording.frames is not None:
+        axis.imshow(recording.frames[:1].intensity[0], "gray", vmin=0, vmax=1)
+    axis.plot(x, y, "C3o", ms=4, mfc="none")
+    axis.set(title=f"{len(x)} hot pixels", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    axis.set(xticks=[], yticks=[], aspect="equal")
