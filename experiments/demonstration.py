@@ -197,7 +197,9 @@ def real_noises(data: Path) -> list[dict[str, Any]]:
 def dot_motion(recording: Any) -> KnownMotion:
     """Return the image velocity of the spinning dot, whose phase and sense events tell."""
     events = recording.events
-    x, y = (np.asarray(v, float) - c for v, c in zip((events.x, events.y), DOT["centre"], strict=True))
+    x, y = (
+        np.asarray(v, float) - c for v, c in zip((events.x, events.y), DOT["centre"], strict=True)
+    )
     turn = 2 * np.pi * DOT["rate"] * 1e-6
     angle, t = np.arctan2(y, x), np.asarray(events.t, float)
     means = {sense: np.exp(1j * (angle - sense * turn * t)).mean() for sense in (-1, 1)}

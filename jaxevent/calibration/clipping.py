@@ -14,6 +14,7 @@ NEIGHBOUR_LEVELS = 16  # below a pile-up, with which it is compared
 # Grey values of frames that do not clip end in a tail, which falls: their ratio is below 1.5.
 MIN_PILE_UP_RATIO = 4.0
 MIN_CLIPPED_SHARE = 1e-3  # of the pixels; what is rarer changes no result
+MAX_WHITE_SHARE = 0.05  # of the pixels; where more are white, results rest on events
 MAX_CLIPPED_SHARE = 0.9  # of the pixels; beyond there is nothing to compare with
 BAND = 0.35  # ln I, the range below white whose density is continued beyond it
 # Of the exponential continuation, in simulated scenes: the density has modes beyond white.
@@ -86,7 +87,7 @@ def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     first = max(end - WINDOW_LEVELS - NEIGHBOUR_LEVELS, 0)
     share = float(beyond[first])
     found = ratio >= MIN_PILE_UP_RATIO and MIN_CLIPPED_SHARE <= share <= MAX_CLIPPED_SHARE
-    return ClippedEnd(first - 0.5 if found else None, share, ratio)
+    return ClippedEnd(first - 0.5, share, ratio) if found else ClippedEnd(None, 0.0, ratio)
 
 
 def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.calibration import CalibratedValues, recall_calibration
+from jaxevent.calibration.clipping import MAX_WHITE_SHARE, find_clipping
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
@@ -83,6 +84,9 @@ def calibrated_values(
     Returns:
         The values.
     """
+    further = set(names).intersection(params.calibrated_if_clipped)
+    if further and find_clipping(recording).white.share <= MAX_WHITE_SHARE:
+        names = [name for name in names if name not in further]
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
     I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
@@ -504,11 +508,15 @@ class AugmentedFrame(LogIntensityModel):
             params, frames.span[0], frames.span[1]
         )  # row f: from frame f to f + 1
         following = jnp.roll(right, -1, axis=0)
-        ratio = (following - left) / jnp.where(span == 0, 1, span)
-        share = measured_share(params, frames)
         known = (span != 0) & params.calibrate
-        if share is not None:
-            known &= jnp.minimum(share, jnp.roll(share, -1, axis=0)) > 0.5
+        shown = measured_share(params, frames)
+        if shown is not None:
+            # A clipped frame tells that the level is no lower, an unclipped one beside it how high.
+            here, there = shown > 0.5, jnp.roll(shown, -1, axis=0) > 0.5
+            begin = jnp.where(there & ~here, jnp.maximum(left, following - span), left)
+            following = jnp.where(here & ~there, jnp.maximum(following, left + span), following)
+            left, known = begin, known & (here | there)
+        ratio = (following - left) / jnp.where(span == 0, 1, span)
         ratio = bound_ratio(params, ratio, known)
 
         # Before the first exposure: backwards from its right edge with the nominal threshold.
@@ -535,9 +543,7 @@ class AugmentedFrame(LogIntensityModel):
         self.lag = clock_lag(params, frames) * frames.weight_rate
         self.tilt = None
         if params.weighting == "certainty":
-            share = frame_information(params, frames)
-        if share is not None:
-            trust = share
+            trust = frame_information(params, frames)
             q = jnp.roll(trust, -1, axis=0) / trust
             one = jnp.ones_like(q)
             between = [q] if frames.head is None else [one, q]

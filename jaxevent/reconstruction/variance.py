@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxevent.parameters import Positive
-from jaxevent.reconstruction.augment import deblur_frames, integrate_counts
+from jaxevent.reconstruction.augment import deblur_frames, integrate_counts, measured_share
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints
 
 # Members of a `Params`, in this order: r, e, s and d of the module's formula.
@@ -89,6 +89,9 @@ class AugmentedFrameErrors(eqx.Module):
         activity = (1 - NEIGHBOUR_SHARE) * own + NEIGHBOUR_SHARE / 8 * around
         slope2 = 1 / (frames.intensity + params.I0) ** 2  # of ln(I + I0), squared
         noise, flicker = params.frame_noise**2 * slope2, frames.flicker * slope2
+        shown = measured_share(params, frames)
+        if shown is not None:  # a level beyond white is known to within a threshold
+            noise = noise + (1 - shown) * params.c_on * params.c_off / 3
         between = jnp.asarray(frames.blend_rate)[:, None] > 0
 
         def mean(values: Array) -> Array:
