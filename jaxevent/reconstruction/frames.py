@@ -328,7 +328,8 @@ def make_frame_features(
     return FrameFeatures(
         grey, intensity, certainty, images.response(), gain, images.white, span, around, before,
         head, tail, segments, weight_rate, blend_rate, present, rows,
-        np.asarray(clock.offset, dtype), *np.asarray(unseen, dtype), images.recording.width,
+        np.asarray(clock.offset, dtype), *(np.asarray(v, dtype) for v in unseen),
+        images.recording.width,
     )  # fmt: skip
 
 
