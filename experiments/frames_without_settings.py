@@ -11,6 +11,11 @@ whose brightness is fitted, with the variances that were told. The last column o
 part of the least of its ingredients, `aks` and `blend`. Makes table.md; rows that the folder holds
 are kept.
 
+With --strata z2 is told by strata of pixels, with default parameters and with those of
+`Params.for_recording`: no event in the 3x3 pixels around between the two frames given, events of
+neighbours alone, events of the pixel's own, the tenth of the pixels where the hidden frame is
+steepest, and the quarters of the gap at its ends and in its middle. Makes strata.md.
+
 With --beyond frames of the second half are scored that lie 1, 2 and 4 frames after the last one
 given, and as far before the first: the recording is cut there at three places, its events are not.
 Makes beyond.md; a line is of all places, and its gap is how far away the frame is.
@@ -24,6 +29,7 @@ import numpy as np
 from common import command_line
 from motion_compensated import Row, Store, choose_evenly, noise_of, table
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 import jaxevent
 from jaxevent.metrics import ssim
@@ -34,17 +40,60 @@ RECORDINGS = ("slider_depth.zip", "davis346_street.npz", "evbench_seq3_calibrate
 METHODS = ("last-frame", "blend", "flow", "akf", "aks", "mc")
 INGREDIENTS = ("aks", "blend")
 GAPS, IMAGES = (2, 4, 8), 8
+MIN_STRATUM = 500  # pixels
 CUTS, AWAY = (0.55, 0.7, 0.85), (1, 2, 4)  # parts of a recording's frames; frames from the cut
 COLUMNS = (
     ("MSE x 1e-2", "mse", 100, 4), ("brightness fitted", "fitted", 100, 4), ("SSIM", "ssim", 1, 3),
     ("z2", "z2", 1, 2), ("z2, brightness fitted", "z2_fitted", 1, 2),
     ("of the best ingredient", "ratio", 1, 2),
 )  # fmt: skip
+STRATA = ("z2", "still", "around", "own", "edges", "at the ends", "in the middle")
+STRATA_COLUMNS = tuple((name, name, 1, 2) for name in STRATA)
 
 
 def brightness_fitted(image: NDArray, truth: NDArray) -> NDArray:
     a, b = np.polyfit(image.ravel().astype(float), truth.ravel().astype(float), 1)
     return a * image + b
+
+
+def strata_of(given: Recording, truth: Frames, times: NDArray) -> dict[str, NDArray[np.bool_]]:
+    """Return strata of the pixels of hidden frames, whose times on the events' clock are given."""
+    assert given.frames is not None
+    late, size = times - truth.t, (given.height, given.width)
+    stamps = given.frames.t + late[0]
+    before = np.searchsorted(stamps, times, "right") - 1
+    after = np.minimum(before + 1, len(stamps) - 1)
+    own = []
+    for begin, end in zip(
+        stamps[np.maximum(before, 0)], np.maximum(stamps[after], times), strict=True
+    ):
+        events = given.events[given.events.index(int(begin)) : given.events.index(int(end))]
+        seen = np.zeros(size, bool)
+        seen[events.y, events.x] = True
+        own.append(seen)
+    own, steep = np.stack(own), np.hypot(*np.gradient(truth.intensity, axis=(1, 2)))
+    around = np.stack([maximum_filter(image, 3) for image in own])
+    part = (times - stamps[before]) / np.maximum(stamps[after] - stamps[before], 1)
+    ends = np.broadcast_to((np.abs(part - 0.5) > 0.25)[:, None, None], own.shape)
+    edges = steep >= np.quantile(steep, 0.9, axis=(1, 2), keepdims=True)
+    return {
+        "z2": np.ones_like(own), "still": ~around, "around": around & ~own, "own": own,
+        "edges": edges, "at the ends": ends, "in the middle": ~ends,
+    }  # fmt: skip
+
+
+def score_strata(method: Any, params: Any, given: Recording, truth: Frames, noise: float) -> Row:
+    """Score the variances of a method's images of hidden frames, stratum by stratum."""
+    if isinstance(params, type):
+        params = params.for_recording(given)
+    times, I0 = frame_times(truth, params), float(params.I0)
+    images, P, _ = method.estimate(given, params, progress=False)(times, extrapolate=True)
+    true = truth.intensity
+    squares = np.log((images.clip(0, 1) + I0) / (true + I0)) ** 2
+    squares /= P + noise / (true + I0) ** 2
+    strata = strata_of(given, truth, times).items()
+    means = {n: float(np.nanmean(squares[s])) for n, s in strata if s.sum() >= MIN_STRATUM}
+    return {**means, "images": len(true)}
 
 
 def score(method: Any, params: Any, given: Recording, truth: Frames, noise: float) -> Row:
@@ -99,26 +148,33 @@ def main() -> None:
     parser.add_argument("--recordings", nargs="+", default=RECORDINGS, metavar="NAME")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
     parser.add_argument("--beyond", action="store_true", help="frames after the last, or before")
+    parser.add_argument("--strata", action="store_true", help="variances by strata of pixels")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
     kind, cells = ("beyond", beyond) if arguments.beyond else ("table", between_and_after)
-    store = Store(out / ("beyond.json" if arguments.beyond else "rows.json"))
+    kind = "strata" if arguments.strata else kind
+    store = Store(out / ("rows.json" if kind == "table" else f"{kind}.json"))
     methods = {n: (jaxevent.METHODS[n], jaxevent.METHODS[n].Params()) for n in arguments.methods}
+    if arguments.strata:
+        telling = {n: pair for n, pair in methods.items() if pair[0].has_covariance}
+        calibrated = {f"{n}, calibrated": (m, m.Params) for n, (m, _) in telling.items()}
+        methods = {**telling, **calibrated}
     for name in arguments.recordings:
         recording = jaxevent.load(arguments.data / name)
         assert recording.frames is not None
         noise = noise_of(recording.frames)
         for cell, given, truth in cells(recording):
-            one = functools.partial(score, given=given, truth=truth, noise=noise)
+            scored = score_strata if arguments.strata else score
+            one = functools.partial(scored, given=given, truth=truth, noise=noise)
             store.add({"recording": recording.name, **cell}, methods, one)
     keys = ("recording", "frames", "gap", "method")
     rows = store.means(keys, tuple(methods))
     for row in rows:
         same = [r for r in rows if all(r[k] == row[k] for k in keys[:-1])]
-        least = min((r["mse"] for r in same if r["method"] in INGREDIENTS), default=np.nan)
-        if row["method"] == "mc":
+        if row["method"] == "mc" and "mse" in row:
+            least = min((r["mse"] for r in same if r["method"] in INGREDIENTS), default=np.nan)
             row["ratio"] = row["mse"] / least
-    text = table(rows, {key: key for key in keys}, COLUMNS)
+    text = table(rows, {key: key for key in keys}, STRATA_COLUMNS if arguments.strata else COLUMNS)
     (out / f"{kind}.md").write_text(text)
     print(text)
 

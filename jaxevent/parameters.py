@@ -502,7 +502,7 @@ class Parameters(_Module):
 
         The file holds settings, or one table of them for each of several methods, as `jaxevent fit`
         writes. A table `[calibration]`, as `jaxevent calibrate` writes, gives the numbers that the
-        others leave open; its thresholds hold for its own `I0`, and are left out for another.
+        method's leaves open; its thresholds hold for its own `I0`, and are left out for another.
 
         Args:
             path: The file.
@@ -518,12 +518,12 @@ class Parameters(_Module):
         try:
             calibration = table.pop(CALIBRATION_TABLE, None)
             if table and all(isinstance(part, dict) for part in table.values()):
-                if method is None or method not in table:
+                if method not in table and calibration is None:
                     raise InputError(
                         f"holds parameters of {', '.join(table)}, none of {method}; choose one of "
                         "those methods or give another file"
                     )
-                table = table[method]
+                table = table.get(method or "", {})
             params = cls.of(table)
             if calibration is not None:
                 table = {**cls._take_calibration(calibration, table, params), **table}

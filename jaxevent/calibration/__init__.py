@@ -8,7 +8,7 @@ findings = jaxevent.check_consistency(recording)
 from jaxevent.calibration.estimation import calibrate
 from jaxevent.calibration.faults import Fault, check_consistency
 from jaxevent.calibration.result import CalibratedValues, Calibration, CalibrationValue
-from jaxevent.calibration.storage import format_toml, recall_calibration
+from jaxevent.calibration.storage import format_toml, recall_calibration, recall_numbers
 
 __all__ = [
     "CalibratedValues",
@@ -19,4 +19,5 @@ __all__ = [
     "check_consistency",
     "format_toml",
     "recall_calibration",
+    "recall_numbers",
 ]

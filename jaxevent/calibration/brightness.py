@@ -27,6 +27,16 @@ class PixelEvents(NamedTuple):
     active: NDArray[np.intp]  # (active,) index among the sampled pixels
     clear: NDArray[np.bool_]  # (active, frames)
 
+    def take_every(self, step: int) -> "PixelEvents":
+        """Return the events of every `step`-th pixel."""
+        if step <= 1:
+            return self
+        kept = np.arange(0, len(self.active), step)
+        number = np.diff(self.first)[kept]
+        first = np.concatenate([[0], np.cumsum(number)])
+        rows = np.arange(first[-1]) + np.repeat(self.first[kept] - first[:-1], number)
+        return PixelEvents(self.t[rows], self.p[rows], first, self.active[kept], self.clear[kept])
+
 
 class Interpolation(NamedTuple):
     """Counts of events as functions of time.

@@ -1,5 +1,6 @@
 """Estimation of clock, thresholds and noises from the events between frames."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -21,13 +22,21 @@ from jaxevent.calibration.model import (
     cluster_sums,
 )
 from jaxevent.calibration.result import Calibration, CalibrationValue, not_identifiable
-from jaxevent.calibration.sampling import SEARCH_US, Sample, correlate, take_sample
+from jaxevent.calibration.sampling import (
+    SEARCH_US,
+    Sample,
+    correlate,
+    count_between,
+    log_changes,
+    take_sample,
+)
 from jaxevent.recording import Recording
 
 OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
 MIN_PEAK_RATIO = 2.0  # of the highest correlation to those far from it
 EARLIER_STARTS_S = (0.0, 3e-3, 8e-3)  # counts of whole events are late
+MAX_FIRST_PIXELS = 10_000  # of the fits that choose among starts
 FIRST_VARIANCES = (1e-5, 0.05, 0.01)
 FIRST_EXPOSURE = 0.3  # of the time between frames
 GREY_NOISE = 1.5 / 255  # by which pixels are chosen
@@ -35,6 +44,8 @@ GAUSSIAN_SCALE = 1.204  # standard deviation of Gaussian errors, per scale of St
 # Relative errors of the model itself, found on simulated scenes: of c_on, c_off, clock (of the time
 # between frames), dead time (of the shortest gaps) and exposure.
 MODEL_ERROR = (0.012, 0.012, 0.003, 0.1, 0.1)
+LATENESS_S = (-0.015, 0.005)  # interval about the best offset for whole events
+COARSE_FACTOR = 1.6  # half width of the interval of thresholds by them
 N_PROFILE_STEPS = 4
 DARK_OFFSETS = np.geomspace(1e-3, 3, 15)
 MIN_DRIFT_SPAN_S = 20.0
@@ -85,15 +96,17 @@ def _interval(value: float, error: float, unit: str, note: str = "") -> Calibrat
 
 def _first_fit(model: Model, clock: Clock, is_unknown: bool) -> Fit | None:
     """Fit from several offsets, and return the best fit."""
-    best = None
+    best, quick = None, model.thinned(MAX_FIRST_PIXELS)
     for early in EARLIER_STARTS_S:
         theta = [0.2, 0.2, clock.best - early, 0.0, (FIRST_EXPOSURE * model.interval_s) ** 2]
         start = Physics(np.array(theta), np.array(FIRST_VARIANCES))
-        fit = model.fit(start, (True, True, True, False, False), 5)
+        fit = quick.fit(start, (True, True, True, False, False), 5)
         if fit is not None and (best is None or fit.losses.mean() < best.losses.mean()):
             best = fit
     if best is None:
-        return None
+        theta = [0.2, 0.2, clock.best, 0.0, (FIRST_EXPOSURE * model.interval_s) ** 2]
+        start = Physics(np.array(theta), np.array(FIRST_VARIANCES))
+        return model.fit(start, (True, True, True, False, False))
     return model.fit(best.physics, (True, True, True, True, is_unknown)) or best
 
 
@@ -123,8 +136,7 @@ def calibrate(recording: Recording, I0: float = 1.0) -> Calibration:
     is_unknown = any((s.exposure == 0).any() for s in sample.stretches)
     fit = _first_fit(model, clock, is_unknown)
     if fit is None:
-        why = "too few pixels change brightness while frames are taken"
-        return _without_fit(sample, ratio, dead, why, clock)
+        return _by_whole_events(sample, I0, ratio, dead, clock)
     return _with_fit(sample, fit, model, clock)
 
 
@@ -138,7 +150,7 @@ def _without_fit(
     """Return what is known without a fit to frames."""
     units = {
         "clock_offset": "s", "clock_drift": "s/s", "c_on": "ln I", "c_off": "ln I",
-        "dark_offset": "intensity", "sigma_event": "c", "frame_noise": "grey", "exposure": "s",
+        "dark_offset": "intensity", "event_noise": "c", "frame_noise": "grey", "exposure": "s",
         "exposure_anchor": "exposure",
     }  # fmt: skip
     none = {name: not_identifiable(unit, why) for name, unit in units.items()}
@@ -148,6 +160,36 @@ def _without_fit(
         offsets=empty if clock is None else clock.offsets,
         correlations=empty if clock is None else clock.correlations,
     )  # fmt: skip
+
+
+def _by_whole_events(
+    sample: Sample, I0: float, ratio: CalibrationValue, dead: CalibrationValue, clock: Clock
+) -> Calibration:
+    """Return coarse values where few pixels move while frames are taken.
+
+    Whole events are late, and of small changes they miss a part, so that intervals are wide.
+    """
+    why = "too few pixels change brightness while frames are taken"
+    rest = _without_fit(sample, ratio, dead, why, clock)
+    late = clock.best
+    sums = np.zeros((2, 2))  # of changes and of events, brighter and darker
+    for stretch in sample.stretches:
+        counts = count_between(stretch, round(1e6 * late)).astype(np.float64)
+        change, used = log_changes(stretch, I0)
+        for row, sign in ((0, 1), (1, -1)):
+            net = sign * (counts[:, 0] - counts[:, 1])
+            rising = used & (net > 0) & (sign * change > 0)
+            sums[:, row] += (sign * change)[rising].sum(), net[rising].sum()
+    if not (sums > 0).all():
+        return rest
+    note = "from counts of whole events"
+    c_on, c_off = (sums[0] / sums[1]).tolist()
+    return dataclasses.replace(
+        rest,
+        clock_offset=CalibrationValue(late, late + LATENESS_S[0], late + LATENESS_S[1], "s", note),
+        c_on=CalibrationValue(c_on, c_on / COARSE_FACTOR, c_on * COARSE_FACTOR, "ln I", note),
+        c_off=CalibrationValue(c_off, c_off / COARSE_FACTOR, c_off * COARSE_FACTOR, "ln I", note),
+    )
 
 
 def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibration:
@@ -178,7 +220,7 @@ def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibrati
         c_off=c_off,
         threshold_ratio=_interval(ratio, ratio * ratio_error, "1"),
         dark_offset=_dark_offset(model, fit),
-        sigma_event=event_noise,
+        event_noise=event_noise,
         frame_noise=noise,
         exposure=exposure,
         exposure_anchor=_anchor(offset, exposure),

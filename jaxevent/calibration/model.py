@@ -15,6 +15,7 @@ and of equal polarity: there the intensity is on its way, and interpolation is r
 choice depends neither on the change nor on the number of events, and so does not bias thresholds.
 """
 
+import copy
 import dataclasses
 import functools
 from typing import NamedTuple
@@ -36,7 +37,7 @@ DEGREES_OF_FREEDOM = 4.0  # of Student's t
 CURVATURE = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + 3)
 SHORTEST_US = 50.0  # exposure, below which it is a point in time
 MAX_RELATIVE_NOISE = 0.15  # of a frame's I + I0, beyond which logarithms of noise are biased
-MIN_CHANGES = 150
+MIN_CHANGES = 60
 MAX_CHANGES = 60_000
 N_STEPS = 12
 TRUST = np.array([np.inf, np.inf, 2e-3, 5e-4, np.inf])  # largest steps of the last three
@@ -141,6 +142,15 @@ class Model:
             noise = grey_noise * np.interp(stretch.grey, *slope)
             clear = stretch.clear & (noise < MAX_RELATIVE_NOISE * level)
             self._events.append(sort_by_pixel(stretch, clear))
+
+    def thinned(self, most: int) -> "Model":
+        """Return the likelihood of at most about `most` pixels of each stretch, evenly chosen."""
+        other = copy.copy(self)
+        other._rho = None
+        other._events = [
+            events.take_every(-(-len(events.active) // most)) for events in self._events
+        ]
+        return other
 
     @functools.cached_property
     def interval_s(self) -> float:

@@ -88,7 +88,7 @@ class Calibration:
         threshold_ratio: Ratio of the ON threshold to the OFF threshold.
         dark_offset: Offset inside the logarithm at which thresholds are the same at all
             intensities.
-        sigma_event: Noise of an event's step and spread of thresholds, in thresholds.
+        event_noise: Noise of an event's step and spread of thresholds, in thresholds.
         frame_noise: Standard deviation of a frame's grey value, 1 is white.
         exposure: Length of the exposures, s.
         exposure_anchor: Place of the stamps in the exposures: 0 begin, 0.5 middle, 1 end.
@@ -106,7 +106,7 @@ class Calibration:
     c_off: CalibrationValue
     threshold_ratio: CalibrationValue
     dark_offset: CalibrationValue
-    sigma_event: CalibrationValue
+    event_noise: CalibrationValue
     frame_noise: CalibrationValue
     exposure: CalibrationValue
     exposure_anchor: CalibrationValue
@@ -133,12 +133,13 @@ class Calibration:
         """Return the values of some names, and those that the data do not determine.
 
         Args:
-            names: Names of fields, as of `Parameters.calibrated`.
+            names: Names, as of `Parameters.calibrated`; those of other things are left out.
 
         Returns:
             The values.
         """
-        chosen = {name: getattr(self, name) for name in names}
+        values = self.values()
+        chosen = {name: values[name] for name in names if name in values}
         return CalibratedValues(
             {name: one.value for name, one in chosen.items() if one.is_identifiable},
             {name: one.note for name, one in chosen.items() if not one.is_identifiable},

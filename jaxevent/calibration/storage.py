@@ -1,7 +1,8 @@
 """Calibrations kept in the user's cache folder, by the content of their recordings.
 
 A recording is known again by its sizes and by samples of its events and frames, so that long ones
-are not read whole. The key holds the source of this package too: another estimator finds nothing.
+are not read whole. The key holds the source of estimators and methods too, so that others find
+nothing.
 A file that is damaged or cannot be read is as none, and what cannot be written is not kept.
 """
 
@@ -13,6 +14,7 @@ import io
 import json
 import os
 import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,7 @@ N_KEPT_FILES = 500  # of calibrations; the oldest are removed
 N_KEPT_IN_MEMORY = 32
 
 _FIELDS = "fields"  # name of the array that holds the JSON of all fields
-_memory: collections.OrderedDict[str, Calibration] = collections.OrderedDict()
+_memory: collections.OrderedDict[str, Any] = collections.OrderedDict()
 
 
 def recall_calibration(recording: Recording, I0: float = 1.0) -> Calibration:
@@ -48,22 +50,52 @@ def recall_calibration(recording: Recording, I0: float = 1.0) -> Calibration:
         The same as `jaxevent.calibrate` returns.
     """
     key = hash_content(recording, I0)
-    found = _memory.get(key) or _read(key)
+    return _recall(key, lambda: calibrate(recording, I0), encode, decode)
+
+
+def recall_numbers(
+    recording: Recording, what: str, compute: Callable[[], Mapping[str, float]]
+) -> dict[str, float]:
+    """Return numbers that a recording determines, which are computed once for its content.
+
+    Args:
+        recording: The recording.
+        what: All else that the numbers depend on, in words.
+        compute: A function that finds them.
+
+    Returns:
+        The numbers by name.
+    """
+    key = hash_content(recording, what)
+    found = _recall(key, compute, lambda numbers: json.dumps(numbers).encode(), json.loads)
+    return dict(found)
+
+
+def _recall(
+    key: str,
+    compute: Callable[[], Any],
+    to_bytes: Callable[[Any], bytes],
+    of_bytes: Callable[[bytes], Any],
+) -> Any:
+    """Return what is kept under a key; computed, and kept, if there is none."""
+    found = _memory.get(key)
     if found is None:
-        found = calibrate(recording, I0)
-        _write(key, found)
+        found = _read(key, of_bytes)
+    if found is None:
+        found = compute()
+        _write(key, to_bytes(found))
     _memory[key] = found
     while len(_memory) > N_KEPT_IN_MEMORY:
         _memory.popitem(last=False)
     return found
 
 
-def hash_content(recording: Recording, I0: float) -> str:
-    """Hash samples of a recording, its sizes, `I0` and the source of the estimator.
+def hash_content(recording: Recording, what: float | str) -> str:
+    """Hash samples of a recording, its sizes, the source of the estimator and what is asked.
 
     Args:
         recording: The recording.
-        I0: Offset inside the logarithm.
+        what: Offset inside the logarithm, or words.
 
     Returns:
         Hexadecimal digits.
@@ -76,7 +108,7 @@ def hash_content(recording: Recording, I0: float) -> str:
             whole.update(f"{array.dtype.str} {array.shape};".encode())
             whole.update(array.tobytes())
 
-    whole.update(f"{jaxevent.__version__} {_hash_source()} {I0!r};".encode())
+    whole.update(f"{jaxevent.__version__} {_hash_source()} {what!r};".encode())
     source, frames = recording.events, recording.frames
     feed(recording.width, recording.height, len(source))
     starts = np.arange(0, len(source), SAMPLE_EVENTS)
@@ -101,8 +133,13 @@ def _spread(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
 
 @functools.cache
 def _hash_source() -> str:
-    """Hash the files of this package."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
+    """Hash the files of estimators and of methods that refine what these find."""
+    package = Path(__file__).parents[1]
+    files = [
+        file
+        for folder in ("calibration", "reconstruction")
+        for file in sorted((package / folder).rglob("*.py"))
+    ]
     return hashlib.blake2b(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -148,16 +185,23 @@ def decode(content: bytes) -> Calibration:
     return Calibration(**{**values, **found})
 
 
-def format_toml(calibration: Calibration, I0: float, source: str) -> str:
+def format_toml(
+    calibration: Calibration,
+    I0: float,
+    source: str,
+    methods: Mapping[str, Mapping[str, float]] | None = None,
+) -> str:
     """Format a calibration as a TOML file, which `Parameters.load` reads.
 
     Args:
         calibration: The calibration.
         I0: Offset inside the logarithm that its thresholds hold for.
         source: Name of the recording, for a remark.
+        methods: Numbers of single methods by name, which win over the calibration there.
 
     Returns:
-        The text: a table `[calibration]` of values, and one of their 95 % intervals.
+        The text: a table `[calibration]` of values, one of their 95 % intervals, and one for each
+            of the methods.
     """
     lines = [
         f"# {' '.join(source.split())} by jaxevent {jaxevent.__version__}",
@@ -175,33 +219,35 @@ def format_toml(calibration: Calibration, I0: float, source: str) -> str:
             intervals.append(f"{name} = [{one.low!r}, {one.high!r}]")
     places = np.argwhere(calibration.hot_pixels)[:, ::-1]
     lines.append(f"hot_pixels = {toml.text(places.tolist())}  # [x, y]")
+    for name, numbers in (methods or {}).items():
+        intervals += ["", f"[{toml.key(name)}]"]
+        intervals += [f"{key} = {value!r}" for key, value in numbers.items()]
     return "\n".join([*lines, "", *intervals]) + "\n"
 
 
-def _read(key: str) -> Calibration | None:
+def _read(key: str, of_bytes: Callable[[bytes], Any]) -> Any:
     """Return what is kept under a key; None where it is missing or damaged."""
     folder = cache.folder_for_calibrations()
     with contextlib.suppress(Exception):  # whatever NumPy says of damaged archives
         if folder is not None:
-            return decode((folder / f"{key}.npz").read_bytes())
+            return of_bytes((folder / f"{key}.kept").read_bytes())
     return None
 
 
-def _write(key: str, calibration: Calibration) -> None:
-    """Keep a calibration where this is possible, and at most `N_KEPT_FILES` in all."""
+def _write(key: str, content: bytes) -> None:
+    """Keep what was found where this is possible, and at most `N_KEPT_FILES` in all."""
     folder = cache.folder_for_calibrations()
     if folder is None:
         return
-    content = encode(calibration)
     with contextlib.suppress(OSError):
         descriptor, name = tempfile.mkstemp(dir=folder)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
-            os.replace(name, folder / f"{key}.npz")
+            os.replace(name, folder / f"{key}.kept")
         except BaseException:
             os.unlink(name)
             raise
-        files = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
+        files = sorted(folder.glob("*.kept"), key=lambda path: path.stat().st_mtime_ns)
         for path in files[:-N_KEPT_FILES]:
             path.unlink(missing_ok=True)

@@ -55,7 +55,8 @@ def run(*, path: Path, I0: float | int, reading: dict[str, Any], out: Path | Non
         return
     contents: dict[str, Any] = {}
     if out.suffix != ".png":
-        contents["calibration.toml"] = format_toml(calibration, I0, str(path))
+        numbers = _numbers_of_methods(recording)
+        contents["calibration.toml"] = format_toml(calibration, I0, str(path), numbers)
     if out.suffix != ".toml":
         try:
             contents["calibration.png"] = plot_calibration(calibration, recording, I0)
@@ -71,6 +72,25 @@ def run(*, path: Path, I0: float | int, reading: dict[str, Any], out: Path | Non
             for name, content in contents.items():
                 _write(partial / name, content)
     print(f"\nwritten to {out}{': ' * (not out.suffix)}{', '.join(contents) * (not out.suffix)}")
+
+
+def _numbers_of_methods(recording: Any) -> dict[str, dict[str, float]]:
+    """Return, by method, the numbers by which it predicts the recording's frames best; print them.
+
+    Other methods take the calibration as it is.
+    """
+    from jaxevent.methods import find, names
+    from jaxevent.reconstruction.augment import calibrated_values
+
+    found: dict[str, dict[str, float]] = {}
+    for name in names("reconstruction"):
+        method = find(name)
+        if method.Params.predictor() is method:
+            values = calibrated_values(recording, method.Params(), method.names_left_open({}))
+            if values.found:
+                found[name] = values.found
+                print(f"{'' if len(found) > 1 else chr(10)}best for {name}: {values}")
+    return found
 
 
 def _write(path: Path, content: Any) -> None:

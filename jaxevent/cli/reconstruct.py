@@ -104,12 +104,12 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
 
 
 def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict[str, Any]:
-    """The settings of --params; without a method they may be a calibration alone."""
+    """The settings of --params; without a method they need a calibration."""
     from jaxevent.parameters import CALIBRATION_TABLE, read_toml
 
     if params is None:
         return {}
-    if method is None and set(read_toml(params)) != {CALIBRATION_TABLE}:
+    if method is None and CALIBRATION_TABLE not in read_toml(params):
         raise InputError(f"{params}: parameters are of one method; name it with --method")
     return estimator.Params.load_table(params, method)
 
@@ -179,9 +179,9 @@ def run(
         raise InputError(f"{path}: holds no frames{missing}; give --rate instead of --at frames")
 
     def choose_times(values: Any) -> Any:
-        wanted = (
-            _default_times(recording, estimator, values, rate, start) if times is None else asked
-        )
+        wanted = asked
+        if wanted is None:
+            wanted = _default_times(recording, estimator, values, rate, start)
         return within(wanted, start, stop, str(path))
 
     values = estimator.Params.of(table)
@@ -194,10 +194,9 @@ def run(
         table = _read_table(params, estimator, usual)
         values = estimator.Params.of(table)
     names = estimator.names_left_open(table) if calibrate else ()
-    if recording.frames is not None:
-        if names:
-            check_clocks(recording, values.clock_offset)
-        _warn_of_faults(recording)
+    if names:
+        check_clocks(recording, values.clock_offset)
+    _warn_of_faults(recording)
     found = calibrated_values(recording, values, names)
     if found.found or found.missing:
         print(arguments.describe_calibration(found))

@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.calibration import CalibratedValues, recall_calibration
+from jaxevent.calibration import CalibratedValues, recall_calibration, recall_numbers
 from jaxevent.calibration.clipping import MAX_WHITE_SHARE, find_clipping
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
+from jaxevent.reconstruction.refinement import refine
 from jaxevent.recording import Recording
 
 MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
@@ -54,6 +55,11 @@ class FrameParams(Parameters):
     calibrated = ("clock_offset", "c_on", "c_off")
 
     @classmethod
+    def predictor(cls) -> Any:
+        """Return the method whose predictions of hidden frames refine a calibration, or None."""
+        return None
+
+    @classmethod
     def for_recording(cls: type[T], recording: Recording, **explicit: Any) -> T:
         """Return parameters with the clock and the thresholds that a recording shows.
 
@@ -76,6 +82,9 @@ def calibrated_values(
 ) -> CalibratedValues:
     """Return what a recording says of some numbers, thresholds at the `I0` of parameters.
 
+    Methods with a `predictor` take numbers by which they predict hidden frames of the recording
+    best, sought from the calibration on.
+
     Args:
         recording: Events and frames.
         params: Parameters.
@@ -90,7 +99,18 @@ def calibrated_values(
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
     I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
-    return recall_calibration(recording, I0).select(names)
+    values = recall_calibration(recording, I0).select(names)
+    method = params.predictor()
+    if method is None or values.missing:
+        return values
+    start = params.replace(**values.found)
+    others = [start.replace(**{n: v for n, v in params.values().items() if n in THRESHOLDS})]
+
+    def compute() -> dict[str, float]:
+        return refine(method, recording, start, names, others)
+
+    what = f"{type(params).__module__} {' '.join(names)} {start.values()}"
+    return CalibratedValues({**values.found, **recall_numbers(recording, what, compute)}, {})
 
 
 class CertaintyParams(FrameParams):

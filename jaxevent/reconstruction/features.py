@@ -201,7 +201,7 @@ class FrameFeatures(ShortRepr):
     gain: Float[Numeric, " frames"]  # the frames' exposure relative to the common one
     white: Float[Numeric, " 2"] | None  # as in `augment.GreyFrames`
     span: Float[Numeric, "2 frames pixels"]  # ON, OFF
-    around: Float[Numeric, "frames pixels"] | None  # `span` of the 8 neighbours; None: not counted
+    around: Float[Numeric, "frames pixels"] | None  # `span` of 3x3 pixels; None: not counted
     before: Float[Numeric, "2 pixels"]
     head: Float[Numeric, "2 frames pixels"] | None  # None where no exposure is known
     tail: Float[Numeric, "2 frames pixels"] | None

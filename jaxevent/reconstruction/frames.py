@@ -245,7 +245,7 @@ class FrameImages:
                 for values, out in zip(self.values(images), outs, strict=True):
                     out[:n] = values
             else:
-                for table, out in zip(self.tables(), outs, strict=True):
+                for table, out in zip(self.tables, outs, strict=True):
                     np.take(table, images, out=out[:n])
             for out in outs:
                 out[n:] = out[n - 1]
@@ -266,13 +266,8 @@ class FrameImages:
         """
         assert self.recording.frames is not None
         images = np.asarray(self.recording.frames[frame_range].images)[:, ::step, ::step]
-        made = self.values(images)[1] if images.dtype.kind == "f" else self._levels[images]
+        made = self.values(images)[1] if images.dtype.kind == "f" else self.tables[1][images]
         return made / self._gain[frame_range, None, None]
-
-    @functools.cached_property
-    def _levels(self) -> NDArray:
-        """Intensity of every whole number of an image."""
-        return self.tables()[1]
 
 
 def make_frame_features(
@@ -323,22 +318,22 @@ def make_frame_features(
         rate = 1e6 * interval_rates(times)[: len(out)]
         out[: len(rate)] = rate
 
-    around = sum_neighbours(span.sum(0), images.recording.width) if filtering else None
+    around = sum_around(span.sum(0), images.recording.width) if filtering else None
     present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
         grey, intensity, certainty, images.response(), gain, images.white, span, around, before,
         head, tail, segments, weight_rate, blend_rate, present, rows,
-        np.asarray(clock.offset, dtype), *(np.asarray(v, dtype) for v in unseen),
+        np.asarray(clock.offset, dtype), *(np.asarray(value, dtype) for value in unseen),
         images.recording.width,
     )  # fmt: skip
 
 
-def sum_neighbours(values: NDArray, width: int) -> NDArray:
-    """Sum values (frames, pixels) over the eight neighbours of each pixel of a sensor."""
+def sum_around(values: NDArray, width: int) -> NDArray:
+    """Sum values (frames, pixels) over the 3x3 pixels around each pixel of a sensor."""
     image = np.pad(values.reshape(len(values), -1, width), ((0, 0), (1, 1), (1, 1)))
     rows = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
     around = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]
-    return around.reshape(values.shape) - values
+    return around.reshape(values.shape)
 
 
 def make_segments(

@@ -74,6 +74,10 @@ class Params(AugmentParams):
         },
     }
 
+    @classmethod
+    def predictor(cls) -> Filter:
+        return akf
+
     def without_gradient(self) -> dict[str, str]:
         found = super().without_gradient()
         if not float(self.rho_width) > 0:

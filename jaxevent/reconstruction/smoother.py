@@ -96,6 +96,12 @@ class Params(CertaintyParams):
     )
     one_sided = Choice((True, False), "use clipped frames as evidence that L lies beyond the clip")
 
+    calibrated = ("clock_offset", "c_on", "c_off", "share", "sigma_event")
+
+    @classmethod
+    def predictor(cls) -> "Smoother | None":
+        return aks
+
 
 SHOWN_CERTAINTY = 0.09  # least certainty w of a frame that shows a pixel
 

@@ -14,7 +14,7 @@ from jaxevent.events.tail import Tail
 from jaxevent.reconstruction.frames import FrameClock, FrameImages
 from jaxevent.recording import Recording
 
-MAX_PREDICTED_FRAMES = 16
+MAX_PREDICTED_FRAMES = 8
 STEP_PX = 8  # from one pixel that is looked at to the next, in rows and columns
 MIN_QUIET_PIXELS = 50  # without events around them, of which the median is taken
 MIN_ERROR = 0.02  # intensity; less is motion or noise

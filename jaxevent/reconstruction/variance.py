@@ -24,21 +24,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxevent.parameters import Positive
-from jaxevent.reconstruction.augment import deblur_frames, integrate_counts, measured_share
+from jaxevent.reconstruction.augment import integrate_counts, measured_share
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints
 
 # Members of a `Params`, in this order: r, e, s and d of the module's formula.
 ERROR_PARAMETERS = (
     Positive(0.005, "intensity", "noise of a frame's pixel, for the variance of images"),
-    Positive(0.3, "c", "error halfway between frames, per square root of events"),
-    Positive(0.1, "c", "error halfway between frames where no events are"),
-    Positive(0.35, "1", "error halfway between frames, as part of the change without events"),
+    Positive(0.31, "c", "error halfway between frames, per square root of events"),
+    Positive(0.11, "c", "error halfway between frames where no events are"),
+    Positive(0.36, "1", "error halfway between frames, as part of the change without events"),
 )
 NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight neighbours
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
 
 
-def activity_variance(params: Any, activity: Array, movement: Array) -> Array:
+def activity_variance(params: Any, activity: Any, movement: Any) -> Array:
     """Return the variance halfway between frames by activity alone, D = 0.
 
     Args:
@@ -53,7 +53,7 @@ def activity_variance(params: Any, activity: Array, movement: Array) -> Array:
     return c2 * (params.error_still**2 * movement + params.error_event**2 * activity)
 
 
-def gap_variance(params: Any, activity: Array, residual: Array, movement: Array) -> Array:
+def gap_variance(params: Any, activity: Array, residual: Array, movement: Any) -> Array:
     """Return the variance halfway between two frames, beside their noise and flicker.
 
     Args:
@@ -82,31 +82,35 @@ class AugmentedFrameErrors(eqx.Module):
     per_event: Float[Array, "pieces pixels"]
 
     def __init__(self, params: Any, frames: FrameFeatures):
-        left, right = deblur_frames(params, frames)
-        span, movement = jnp.asarray(frames.span), frames.movement
-        residual = jnp.roll(right, -1, axis=0) - left - integrate_counts(params, *span)
-        own, around = span[0] + span[1], jnp.asarray(frames.around)
+        between = jnp.asarray(frames.blend_rate)[:, None] > 0
+        here = frames.intensity + params.I0
+        there = jnp.where(between, jnp.roll(here, -1, axis=0), here)
+        counts = jnp.asarray(frames.span)
+        if frames.head is not None and frames.tail is not None:  # from the middles of exposures
+            counts = counts - frames.head - jnp.roll(jnp.asarray(frames.tail), -1, axis=1)
+        # ln a - ln b = 2 (a - b) / (a + b), to the third order of the difference.
+        slope = 2 / (here + there)  # of ln(I + I0), between the two frames
+        residual = (there - here) * slope - integrate_counts(params, counts[0], counts[1])
+        own = counts[0] + counts[1]
+        around = jnp.asarray(frames.around) - frames.span[0] - frames.span[1]
         activity = (1 - NEIGHBOUR_SHARE) * own + NEIGHBOUR_SHARE / 8 * around
-        slope2 = 1 / (frames.intensity + params.I0) ** 2  # of ln(I + I0), squared
-        noise, flicker = params.frame_noise**2 * slope2, frames.flicker * slope2
+        noise, flicker = (params.frame_noise * slope) ** 2, frames.flicker * slope**2
         shown = measured_share(params, frames)
         if shown is not None:  # a level beyond white is known to within a threshold
-            noise = noise + (1 - shown) * params.c_on * params.c_off / 3
-        between = jnp.asarray(frames.blend_rate)[:, None] > 0
-
-        def mean(values: Array) -> Array:
-            return (values + jnp.roll(values, -1, axis=0)) / 2
-
-        still = ONE_SIDED_FACTOR * activity_variance(params, jnp.zeros_like(own), movement)
-        step = ONE_SIDED_FACTOR * activity_variance(params, jnp.ones_like(own), 0.0)
-        alone = noise + flicker + still
-        bridge = gap_variance(params, activity, residual, movement) + mean(flicker)
-        steady = jnp.where(between, mean(noise), alone)
-        halfway = jnp.where(between, bridge - mean(noise) / 2, 0)
-        per_event = jnp.where(between, 0, step)
-        # Before the first frame the events from there to the frame count.
-        first = alone[0] + step[0] * (frames.before[0] + frames.before[1])
-        begin = (first, jnp.zeros_like(first), -step[0])
+            both = jnp.minimum(shown, jnp.where(between, jnp.roll(shown, -1, axis=0), shown))
+            noise = noise + (1 - both) * params.c_on * params.c_off / 3
+        # Of neighbours those of the last gap count: half of it lies between frame and time.
+        near = jnp.where(between, around, jnp.roll(around, 1, axis=0)) * NEIGHBOUR_SHARE / 16
+        walk = ONE_SIDED_FACTOR * activity_variance(params, near, frames.movement)
+        step = ONE_SIDED_FACTOR * activity_variance(params, 1 - NEIGHBOUR_SHARE, 0.0)
+        bridge = gap_variance(params, activity, residual, frames.movement) + flicker
+        alone = noise + flicker + walk
+        steady = jnp.where(between, noise, alone)
+        halfway = jnp.where(between, bridge - noise / 2, 0)
+        per_event = jnp.where(between, 0, step) * jnp.ones_like(own)
+        # Before the first frame the events until then count.
+        first = alone[0] + step * (frames.before[0] + frames.before[1])
+        begin = (first, jnp.zeros_like(first), -step * jnp.ones_like(first))
         pieces = 1 if frames.head is None else 2  # of a frame: its exposure, and the gap after it
         self.steady, self.halfway, self.per_event = (
             jnp.concatenate([before[None], jnp.repeat(table, pieces, axis=0)])

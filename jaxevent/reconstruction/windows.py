@@ -266,13 +266,13 @@ class WindowedRecording:
             min(WINDOW_FRAME_BOUNDS[1], MAX_WINDOW_FRAME_PIXELS // self.pixels),
         )
         self.dtype = np.dtype(jnp.result_type(float))
-        self._images = FrameImages(recording, self.dtype)
+        self.images = FrameImages(recording, self.dtype)
         self._memory = TileMemory(reuse, self.dtype)
 
     @functools.cached_property
     def unseen(self) -> UnseenChange:
         """Changes that events do not show."""
-        return measure_unseen_change(self._images, self.clock)
+        return measure_unseen_change(self.images, self.clock)
 
     def __iter__(self) -> Iterator[tuple[EventWindow, Features]]:
         before, start = self.initial(), None
@@ -325,7 +325,7 @@ class WindowedRecording:
         """Go on with the same recording after events or frames were added to its end."""
         self.recording = recording
         self.clock = FrameClock.of(recording, self._timing)
-        self._images = FrameImages(recording, self.dtype)
+        self.images = FrameImages(recording, self.dtype)
 
     def settled_until(self, frames_follow: bool) -> float:
         """Return the time up to which windows stay as they are if more is added to the end.
@@ -456,7 +456,7 @@ class WindowedRecording:
             segments = make_segments(clock, used, stream, weight, counts, self.dtype)
         rows = self._frame_rows(stop, used, before)
         frames = make_frame_features(
-            self._images, clock, used, rows, counts, segments=segments, unseen=self.unseen,
+            self.images, clock, used, rows, counts, segments=segments, unseen=self.unseen,
             filtering=self.filtering, capacity=self.frames,
         )  # fmt: skip
         after, own = before.copy(), self._stream(events.own)

@@ -485,7 +485,6 @@ def score_and_sample(
     measures, normalise = asked.measures, asked.normalise
     named: dict[str, Any] = {"measures": measures, "recording": recording.name}
     hdr = hidden if isinstance(hidden, Reference) else None
-    clock = time.perf_counter()
     seconds, estimated = 0.0, False  # whether the method estimates a variance
     values: dict[str, Any]
     calibrated: list[str] = []
@@ -502,6 +501,7 @@ def score_and_sample(
     scores: list[Scores] = []
     t: list[int] = []
     sample: Sample | None = None
+    clock = time.perf_counter()  # after calibration, which costs the first method alone
     for first, images, variances in estimates:
         seconds += time.perf_counter() - clock
         if not scores:

@@ -62,7 +62,7 @@ def plot_calibration(calibration: Calibration, recording: Recording, I0: float =
 
 def _draw_correlations(axis: Any, calibration: Calibration) -> None:
     clock = calibration.clock_offset
-    axis.plot(1e3 * calibration.offsets, calibration.correlations, "k.-", lw=1, ms=4)
+    axis.plot(1e3 * calibration.offsets, calibration.correlations, "k.-", lw=1, ms=3)
     if clock.is_identifiable:
         axis.axvline(1e3 * clock.value, color="C3", lw=1)
         if np.isfinite([clock.low, clock.high]).all():

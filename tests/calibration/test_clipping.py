@@ -1,5 +1,6 @@
 """Tests of clipped frames: recognised, and what events say beyond white reaches the images."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -114,15 +115,15 @@ def one_pixel(side: float, excess: float | None):
         pass
 
     row = Row()
-    row.side, row.bound = np.float64(side), np.float64(0.7)
-    row.excess = None if excess is None else np.float64(excess)
+    row.side, row.bound = jnp.array(side), jnp.array(0.7)
+    row.excess = None if excess is None else jnp.array(excess)
     return row
 
 
 def test_one_sided_evidence_is_the_truncated_normal():
     """Far on the wrong side it counts fully: its moments are those of scipy's distribution."""
-    state = Gaussian(np.float64(-0.3), np.float64(0.04))
-    message, _ = one_sided_message(state, one_pixel(1, None), 0.0)
+    state = Gaussian(jnp.array(-0.3), jnp.array(0.04))
+    message, _ = one_sided_message(state, one_pixel(1.0, None), 0.0)
     P = 1 / (1 / state.P + message.J)
     m = P * (state.m / state.P + message.h)
     expected = stats.truncnorm((0.7 - state.m) / 0.2, np.inf, loc=state.m, scale=0.2)
@@ -132,15 +133,15 @@ def test_one_sided_evidence_is_the_truncated_normal():
 
 def test_an_unknown_level_is_as_expected_and_no_frame_repeats_it():
     """A state of any variance ends with that of the expectation, also after many frames."""
-    m, P = np.float64(0.4), np.float64(4.0)
+    m, P = jnp.array(0.4), jnp.array(4.0)
     for _ in range(30):
-        message, _ = one_sided_message(Gaussian(m, P), one_pixel(1, 0.3), 0.0)
+        message, _ = one_sided_message(Gaussian(m, P), one_pixel(1.0, 0.3), 0.0)
         after = 1 / (1 / P + message.J)
         m, P = after * (m / P + message.h), after
         assert 0.7 < m < 0.7 + 2 * 0.3
     assert 0.1 < float(P) ** 0.5 < 0.31
-    known = Gaussian(np.float64(1.6), np.float64(0.01))  # far beyond, and known
-    message, _ = one_sided_message(known, one_pixel(1, 0.3), 0.0)
+    known = Gaussian(jnp.array(1.6), jnp.array(0.01))  # far beyond, and known
+    message, _ = one_sided_message(known, one_pixel(1.0, 0.3), 0.0)
     assert float(message.J) < 1e-2 / known.P
 
 

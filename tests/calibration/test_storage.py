@@ -6,6 +6,7 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
+from estimates import NAMES, made_up, make_up
 
 import jaxevent
 from jaxevent import akf, aks, high_pass, last_frame, mc
@@ -24,7 +25,7 @@ def recording():
 def folder(tmp_path, monkeypatch):
     """An empty cache, and nothing in memory."""
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(storage, "_memory", type(storage._memory)())
+    make_up(monkeypatch)
     return tmp_path / "cache" / "calibrations"
 
 
@@ -39,7 +40,7 @@ def count_calibrations(monkeypatch) -> list[float]:
 
     def counted(recording, I0):
         runs.append(I0)
-        return calibrate(recording, I0)
+        return made_up(recording, I0)
 
     monkeypatch.setattr(storage, "calibrate", counted)
     return runs
@@ -52,7 +53,7 @@ def forget(monkeypatch) -> None:
 def test_a_recording_is_calibrated_once(recording, folder, monkeypatch):
     runs = count_calibrations(monkeypatch)
     first = recall_calibration(recording)
-    assert_same(first, calibrate(recording))
+    assert_same(first, made_up(recording))
     again = dataclasses.replace(recording, name="another name")
     assert_same(first, recall_calibration(again))
     forget(monkeypatch)  # as a new process
@@ -118,10 +119,10 @@ def test_a_damaged_file_is_as_none(content, recording, folder, monkeypatch):
 
 
 def test_nothing_is_kept_where_nothing_can_be(recording, tmp_path, monkeypatch):
-    first = calibrate(recording)
+    first = made_up(recording)
     monkeypatch.setenv("JAXEVENT_CACHE", "0")
     assert_same(first, recall_calibration(recording))
-    assert not list(tmp_path.rglob("*.npz"))
+    assert not list(tmp_path.rglob("*.kept"))
     forget(monkeypatch)
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "file"))  # no folder can be made there
@@ -145,22 +146,28 @@ def test_the_oldest_files_are_removed(recording, folder, monkeypatch):
     assert kept == {storage.hash_content(recording, I0) for I0 in (0.4, 0.8)}
 
 
-def test_explicit_values_win_one_by_one(recording):
+def test_all_fields_are_kept(recording):
     found = calibrate(recording)
-    names = ("clock_offset", "c_on", "c_off")
-    clock, on, off = (getattr(found, name).value for name in names)
-    assert min(clock, on, off) > 0
+    whole = dataclasses.replace(found, threshold_factors=np.ones((2, 180, 240), np.float32))
+    for one in (found, whole):
+        assert_same(one, storage.decode(storage.encode(one)))
+
+
+def test_explicit_values_win_one_by_one(recording):
+    found = made_up(recording)
+    clock, on, off = (getattr(found, name).value for name in NAMES)
     for params, expected in (
         (akf.Params.for_recording(recording), (clock, on, off)),
         (akf.Params.for_recording(recording, c_on=0.3), (clock, 0.3, off)),
-        (found.params(akf.Params, clock_offset=0.0), (0.0, on, off)),
         (akf.Params.for_recording(recording, preset="hdr"), (clock, 0.2, 0.2)),
+        (found.params(akf.Params), (clock, on, off)),
+        (found.params(akf.Params, clock_offset=0.0), (0.0, on, off)),
         (mc.Params.for_recording(recording), (clock, 0.2, 0.2)),
     ):
-        values = [float(getattr(params, name)) for name in names]
+        values = [float(getattr(params, name)) for name in NAMES]
         np.testing.assert_allclose(values, expected, rtol=1e-6)
     at_I0 = akf.Params.for_recording(recording, I0=0.3)
-    assert float(at_I0.c_on) == pytest.approx(calibrate(recording, 0.3).c_on.value)
+    assert float(at_I0.c_on) == pytest.approx(made_up(recording, 0.3).c_on.value)
 
 
 def test_estimate_calibrates_what_combines_events_and_frames(recording):
@@ -177,7 +184,7 @@ def test_estimate_calibrates_what_combines_events_and_frames(recording):
 
 
 def test_a_file_of_a_calibration_serves_methods(recording, tmp_path):
-    found = calibrate(recording)
+    found = made_up(recording)
     path = tmp_path / "calibration.toml"
     text = format_toml(found, 1.0, "a\nb")
     path.write_text(text)
@@ -188,6 +195,11 @@ def test_a_file_of_a_calibration_serves_methods(recording, tmp_path):
     assert akf.Params.load(path).values() == found.params(akf.Params, c_on=0.3).values()
     path.write_text(text + "[akf]\nkappa = 3.0\n[aks]\nshare = 0.1\n")
     assert akf.Params.load(path, "akf").values() == found.params(akf.Params, kappa=3.0).values()
+    assert mc.Params.load(path, "mc").values() == found.params(mc.Params).values()
+    numbers = {"akf": {"clock_offset": 0.02, "c_on": 0.4}}
+    path.write_text(format_toml(found, 1.0, "a", numbers))
+    expected = found.params(akf.Params, **numbers["akf"])
+    assert akf.Params.load(path, "akf").values() == expected.values()
     path.write_text("I0 = 0.3\n" + text)
     with pytest.warns(InputWarning, match="hold for I0 = 1, not for 0.3.*calibrate --I0 0.3"):
         params = akf.Params.load(path)

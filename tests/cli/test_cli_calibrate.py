@@ -9,18 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import described, fails
+from estimates import NAMES, made_up, make_up
 from PIL import Image
 
 import jaxevent
 from jaxevent import akf, aks, cli
-from jaxevent.calibration import Fault, calibrate
+from jaxevent.calibration import Fault
 from jaxevent.recording import Frames
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.fit import calibrated_plan
 from jaxevent.runs.fit_config import plan_of
 from jaxevent.runs.protocols import held_out
-
-NAMES = ("clock_offset", "c_on", "c_off")
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,13 @@ def path(recording, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(recording):
-    return calibrate(recording)
+    return made_up(recording)
+
+
+@pytest.fixture(autouse=True)
+def made_up_values(monkeypatch):
+    make_up(monkeypatch)
+    monkeypatch.setenv("JAXEVENT_CACHE", "0")
 
 
 def values_of(params) -> list[float]:
@@ -63,7 +68,9 @@ def test_table_file_and_picture(path, found, tmp_path, capsys):
     assert f"written to {folder}: calibration.toml, calibration.png" in out
     with Image.open(folder / "calibration.png") as picture:
         assert picture.width > 1000
-    table = tomllib.loads((folder / "calibration.toml").read_text())["calibration"]
+    tables = tomllib.loads((folder / "calibration.toml").read_text())
+    assert list(tables) == ["calibration", "akf", "aks"] and "best for aks: clock" in out
+    table = tables["calibration"]
     assert [table[name] for name in NAMES] == [getattr(found, name).value for name in NAMES]
     for name, (low, high) in table["intervals"].items():
         assert low <= table[name] <= high
@@ -79,7 +86,7 @@ def test_other_offsets_have_other_thresholds(path, recording, tmp_path, capsys):
     mine = tmp_path / "mine.toml"
     run(capsys, "calibrate", path, "--I0", 0.3, "--out", mine)
     table = tomllib.loads(mine.read_text())["calibration"]
-    assert table["I0"] == 0.3 and table["c_on"] == calibrate(recording, 0.3).c_on.value
+    assert table["I0"] == 0.3 and table["c_on"] == made_up(recording, 0.3).c_on.value
 
 
 def test_bad_input(path, recording, tmp_path, capsys):
@@ -140,19 +147,14 @@ def test_a_calibration_serves_any_method(path, found, tmp_path, capsys, monkeypa
 
 def test_faults_are_reported(path, tmp_path, capsys, monkeypatch):
     faults = [
-        Fault("polarity", -0.76, -0.3, "ON and OFF are exchanged", "invert the polarity"),
-        Fault("gaps", 0.05, 0.02, "50 ms hold no event", "leave that part out"),
+        Fault("inverted polarity", -0.76, -0.3, "ON and OFF are exchanged", "invert the polarity"),
+        Fault("missing events", 900.0, 50.0, "50 ms hold no event", "leave that part out"),
     ]
     monkeypatch.setattr("jaxevent.calibration.check_consistency", lambda recording: faults)
     out = tmp_path / "out.h5"
-    words = ("reconstruct", path, "--method", "edi", "--rate", 20, "--out", out)
+    words = ("reconstruct", path, "--method", "high-pass", "--rate", 20, "--out", out)
     _, error = run(capsys, *words)
-    assert error.splitlines() == [
-        f"jaxevent: warning: {path}: ON and OFF are exchanged (polarity -0.76, limit -0.3); invert "
-        "the polarity",
-        f"jaxevent: warning: {path}: 50 ms hold no event (gaps 0.05, limit 0.02); leave that part "
-        "out",
-    ]
+    assert error.splitlines() == [f"jaxevent: warning: {path}: {fault}" for fault in faults]
 
 
 def test_evaluations_calibrate_by_the_frames_given(path, recording, tmp_path, capsys):

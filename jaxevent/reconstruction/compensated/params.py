@@ -120,6 +120,11 @@ class Params(smoother.Params):
     # they are relative to the common ones, which alone tell how far beyond white points are.
     calibrated = ("clock_offset",)
     calibrated_if_clipped = ("c_on", "c_off")
+
+    @classmethod
+    def predictor(cls) -> None:
+        return None
+
     presets = {
         "hdr": {
             **smoother.Params.presets["hdr"],

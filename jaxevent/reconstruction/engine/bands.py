@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.graph import TranslationError
 from jaxevent.errors import InputError
-from jaxevent.reconstruction.frames import EventTiming, FrameImages
+from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.reconstruction.stream import EventStream, StreamState, event_weights
 from jaxevent.reconstruction.unseen import UnseenChange
 from jaxevent.reconstruction.windows import WindowedRecording
@@ -275,9 +275,9 @@ class PartitionedRecording:
         self.windows.frames = max(8, MAX_WINDOW_FRAME_PIXELS // self.windows.pixels)
         if events is None:
             self.windows.frames = len(self.windows.clock) + 2
-        self.images = FrameImages(recording, self.dtype)
+        self.images = self.windows.images
         none = np.zeros((3, 1), self.dtype)
-        self._tables = self.images.tables() if len(self.windows.clock) else none
+        self._tables = self.images.tables if len(self.windows.clock) else none
         self._response = self.images.response()
         # Memory of the windows, one after another.
         self._stored: EventColumns | None = None

@@ -167,7 +167,7 @@ STEP_LOAD = 1  # into a field, which of `FrameRows.tables`, and of which frame
 STEP_FILL = 2  # a field, with half of a number
 STEP_SUM = 3  # into a column of `WindowInputs.totals`, the segments of a frame's exposure
 STEP_COUNT = 4  # into two fields, of ON and OFF, events from a time on and until another
-STEP_AROUND = 5  # into a field, the sum of two others over the eight neighbours
+STEP_AROUND = 5  # into a field, the sum of two others over the 3x3 pixels around each
 
 NO_PREVIOUS_FRAME = -9
 
@@ -305,16 +305,17 @@ class WindowInputs(NamedTuple):
 
 
 @njit_noalloc_inlined
-def _sum_neighbours(cells, fields, sums, padded):
-    """Sum two fields over the eight neighbours of a band's own pixels, into another."""
-    stride = len(sums)
-    out = cells[fields[0] : fields[0] + stride]
-    on, off = cells[fields[1] : fields[1] + stride], cells[fields[2] : fields[2] + stride]
-    for z in range(padded, stride - padded):
-        sums[z] = on[z - padded] + on[z] + on[z + padded]
-        sums[z] += off[z - padded] + off[z] + off[z + padded]
-    for z in range(padded + 1, stride - padded - 1):
-        out[z] = sums[z - 1] + sums[z] + sums[z + 1] - on[z] - off[z]
+def _sum_around(cells, fields, sums, shape):
+    """Sum two fields over the 3x3 pixels around each of a band's own pixels, into another."""
+    rows, padded = shape
+    (out_begin, on, off), n = fields, rows * padded
+    above_on, at_on, below_on = cells[on:], cells[on + padded :], cells[on + 2 * padded :]
+    above_off, at_off, below_off = cells[off:], cells[off + padded :], cells[off + 2 * padded :]
+    for z in range(n):
+        sums[z] = above_on[z] + at_on[z] + below_on[z] + above_off[z] + at_off[z] + below_off[z]
+    out, middle, right = cells[out_begin + padded + 1 :], sums[1:], sums[2:]
+    for z in range(n - 2):
+        out[z] = sums[z] + middle[z] + right[z]
 
 
 @njit_noalloc_inlined
@@ -339,9 +340,8 @@ def _take_steps(steps, begin, end, given, band, memory):
             )  # fmt: skip
             sum_exposure_segments(bands, band, frames, of, cells, sums)
         elif kind == STEP_AROUND:
-            _sum_neighbours(
-                cells, (at, of, left), memory.scratch[band, :stride], np.int64(bands.width + 2)
-            )
+            shape = np.int64(bands.edges[band + 1] - bands.edges[band]), np.int64(bands.width + 2)
+            _sum_around(cells, (at, of, left), memory.scratch[band], shape)
         else:
             count_band_events(bands, band, (left, right), cells, at, of)
 
@@ -373,7 +373,7 @@ def filter_events(begin, end, inputs, memory, request):
         last_own, finish = (rows + 1) * padded, first[band + 1]
         cells, whole = memory.cells[band].ctypes, memory.whole[band].ctypes
         last, scratch = memory.last[band].ctypes, memory.scratch[band].ctypes
-        i, s, entering = place[0], place[1], enter[0] >= 0
+        i, s, entering, is_shown = place[0], place[1], enter[0] >= 0, False
         if entering:
             i, s = (
                 find_first_event(bands.events, first[band], finish, np.int64(enter[1])),
@@ -386,7 +386,7 @@ def filter_events(begin, end, inputs, memory, request):
                     line.variant[s], cells, padded, last_own, numbers, uniform,
                     s * line.uniform.shape[1], scratch,
                 )  # fmt: skip
-                entering = False
+                entering = is_shown = False
             stop = np.int64(until)
             if s + 1 < len(starts) and starts[s + 1] < stop:
                 stop = starts[s + 1]
@@ -399,6 +399,12 @@ def filter_events(begin, end, inputs, memory, request):
                 padded, opening, rate, mid, blend_rate, numbers,
             )  # fmt: skip
             if reading:
+                if not is_shown:
+                    functions.image_tables(
+                        line.variant[s], cells, padded, last_own, numbers, uniform,
+                        s * line.uniform.shape[1], scratch,
+                    )  # fmt: skip
+                    is_shown = True
                 t = np.float64(times[row])
                 functions.images(
                     cells, whole, last, rows, width, padded, t, (t - opening) * rate,

@@ -85,6 +85,7 @@ class FilterFunctions(NamedTuple):
     events: Any
     images: Any
     tables: Any
+    image_tables: Any
     excess: Any
 
 
@@ -636,7 +637,7 @@ def images(
 TABLE_PIXELS = 256  # whose derivatives are computed side by side before they go into records
 TABLES_TEMPLATE = f"""
 @cfunc(types.void(I, CELLS, I, I, CELLS, CELLS, I, CELLS), **OPTIONS)
-def tables(variant, cells, begin, end, numbers, uniform, at, scratch):
+def {{name}}(variant, cells, begin, end, numbers, uniform, at, scratch):
     for first in range(begin, end, {TABLE_PIXELS}):
         pixels = min(end - first, {TABLE_PIXELS})
 """
@@ -663,7 +664,8 @@ def write_filter(program: FilterProgram, stride: int) -> ModuleText:
     writer.constants = [f"STRIDE, RECORDS, RECORD = {stride}, {size}, {fields.record}"]
     _define_sums(program, writer, fields)
     parts = [
-        write(program, writer, fields) for write in (_write_events, _write_images, _write_tables)
+        write(program, writer, fields)
+        for write in (_write_events, _write_images, _write_tables, _write_image_tables)
     ]
     lines = writer.write_lines(program.excess, 4)
     lines += [f"    out[{k}] = {writer.node_name(node)}" for k, node in enumerate(program.excess)]
@@ -738,7 +740,7 @@ def _write_images(program: FilterProgram, writer: ModuleWriter, fields: PixelFie
 
 def _write_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
     """Write what a piece says, for the pixels from begin to end."""
-    stored = {k: fields.cells[name] for k, name in fields.slots.items() if name == f"slot{k}"}
+    stored = _stored_slots(program, fields, False)
     out, changes = list[str](), []
     for variant, table in enumerate(program.tables):
         changes = program.table_derivatives(variant)
@@ -759,7 +761,36 @@ def _write_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFie
     for j, (k, lane, _) in enumerate(changes):
         place = f"record + {fields.vectors[k] + lane}"
         out.append(f"            cells[{place}] = scratch[{j * TABLE_PIXELS} + i]")
-    return TABLES_TEMPLATE + "\n".join([*out, ""])
+    return TABLES_TEMPLATE.format(name="tables") + "\n".join([*out, ""])
+
+
+def _write_image_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
+    """Write what a piece says for the variance of images alone."""
+    stored, out = _stored_slots(program, fields, True), ["        pass"]
+    for variant, table in enumerate(program.tables if stored else ()):
+        out.append(f"        if variant == {variant}:")
+        out += ["            for i in range(pixels):", "                z = first + i"]
+        out += writer.write_lines([table[k] for k in stored], 16)
+        for k, at in stored.items():
+            out.append(f"                cells[{at} * STRIDE + z] = {writer.node_name(table[k])}")
+    return TABLES_TEMPLATE.format(name="image_tables") + "\n".join([*out, ""])
+
+
+def _stored_slots(program: FilterProgram, fields: PixelFields, of_variance: bool) -> dict[int, int]:
+    """Return the fields of slots by number: of those for the variance of images, or of all others.
+
+    Slots that derivatives of the variance need are among the others.
+    """
+    rest = {**program.state, "mean": program.mean}
+    needed = _slots(
+        rest | {str(k): node for k, node in enumerate(program.factors(*fields.outputs))}
+    )
+    others = {fields.slots[node.args[0]] for node in needed}
+    return {
+        k: fields.cells[name]
+        for k, name in fields.slots.items()
+        if name == f"slot{k}" and (name not in others) == of_variance
+    }
 
 
 _kernels = KernelCache(FilterFunctions, write_filter)
