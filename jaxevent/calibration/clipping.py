@@ -38,14 +38,14 @@ class ClippedEnd(NamedTuple):
     excess: float = 0.0
 
 
-class Clipping(NamedTuple):
+class ClippedEnds(NamedTuple):
     """Both ends of the grey values of a recording's frames."""
 
     black: ClippedEnd
     white: ClippedEnd
 
 
-def find_clipping(recording: Recording) -> Clipping:
+def find_clipping(recording: Recording) -> ClippedEnds:
     """Find the grey values at which a recording's frames clip, from the frames alone.
 
     Clipped pixels pile up at the last grey value that occurs. Three levels there are compared with
@@ -55,7 +55,7 @@ def find_clipping(recording: Recording) -> Clipping:
     frames = recording.frames
     if frames is None or not len(frames):
         nothing = ClippedEnd(None, 0.0, 0.0)
-        return Clipping(nothing, nothing)
+        return ClippedEnds(nothing, nothing)
     rows = np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))
     stride = -(-recording.width * recording.height // MAX_FRAME_PIXELS)
     grey = np.concatenate([np.asarray(frames[k : k + 1].images).ravel()[::stride] for k in rows])
@@ -71,7 +71,7 @@ def find_clipping(recording: Recording) -> Clipping:
         )
     if black.level is not None:
         black = black._replace(level=(len(counts) - 1 - black.level) * step / top)
-    return Clipping(black, white)
+    return ClippedEnds(black, white)
 
 
 def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:

@@ -205,6 +205,7 @@ class FrameImages:
         found = find_clipping(self.recording).white
         return None if found.level is None else np.array([found.level, found.excess], self.dtype)
 
+    @functools.cached_property
     def tables(self) -> NDArray:
         """Return grey value, intensity and certainty of every whole number of an image."""
         assert self.recording.frames is not None
