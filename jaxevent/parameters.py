@@ -273,6 +273,7 @@ class Parameters(_Module):
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     calibrated: ClassVar[tuple[str, ...]] = ()  # names that calibrations of recordings determine
+    calibrated_if_clipped: ClassVar[tuple[str, ...]] = ()  # further names, where frames are clipped
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
@@ -325,16 +326,17 @@ class Parameters(_Module):
 
     @classmethod
     def names_left_open(cls, explicit: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the names in `calibrated` that neither explicit values nor their preset set.
+        """Return the names that a calibration may set: those that no value and no preset states.
 
         Args:
             explicit: Values by name, and perhaps "preset".
 
         Returns:
-            The names, which a calibration of the recording may set.
+            The names, those in `calibrated_if_clipped` among them.
         """
         stated = {*explicit, *cls.presets.get(explicit.get("preset") or "", {})}
-        return tuple(name for name in cls.calibrated if name not in stated)
+        names = (*cls.calibrated, *cls.calibrated_if_clipped)
+        return tuple(name for name in names if name not in stated)
 
     @property
     def is_gradient(self) -> bool:
@@ -545,7 +547,8 @@ class Parameters(_Module):
                 "holds the calibration of a recording, and this method has no clock or thresholds; "
                 "leave it out"
             )
-        found = {n: calibration[n] for n in cls.names_left_open(table) if n in calibration}
+        names = set(cls.names_left_open(table)) - set(cls.calibrated_if_clipped)
+        found = {n: calibration[n] for n in cls.settings() if n in names and n in calibration}
         if not found.keys() & THRESHOLDS:
             return found
         I0, own = calibration.get("I0", 1.0), params.values()["I0"]

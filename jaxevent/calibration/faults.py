@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.clipping import MAX_WHITE_SHARE, find_clipping
 from jaxevent.calibration.correspondence import (
     I0,
     TRANSFORMS,
@@ -38,7 +39,6 @@ MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half t
 MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
 MAX_DILUTION = 1.25  # of the change per event; slow scenes without blur reach 1.1
 MAX_UNDONE_SHARE = 0.5  # of the events
-WHITE, MAX_WHITE_SHARE = 0.98, 0.05  # of the grey values' range; of the pixels
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 
@@ -86,7 +86,7 @@ def check_consistency(recording: Recording) -> tuple[Fault, ...]:
             _check_hot_pixels(sample),
             _check_times(recording, sample),
             _check_both(recording, sample),
-            _check_white(sample),
+            _check_white(recording),
         )
         for fault in found
         if fault.statistic > fault.limit
@@ -293,12 +293,11 @@ def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iter
     )  # fmt: skip
 
 
-def _check_white(sample: Sample) -> Iterator[Fault]:
+def _check_white(recording: Recording) -> Iterator[Fault]:
     """Check the share of pixels whose frames are white."""
-    white = sum(int((stretch.grey >= WHITE).sum()) for stretch in sample.stretches)
-    share = white / max(sum(stretch.grey.size for stretch in sample.stretches), 1)
+    share = find_clipping(recording).white.share
     yield Fault(
         "clipped frames", share, MAX_WHITE_SHARE,
         f"{100 * share:.2g} % of the frames' pixels are white, where only events tell what happens",
-        'shorten the exposure; use preset="hdr", which takes white for a lower bound',
+        "shorten the exposure; methods with a variance take white for a lower bound",
     )  # fmt: skip

@@ -155,5 +155,7 @@ class Calibration:
         Returns:
             The parameters.
         """
-        found: dict[str, Any] = {**self.select(kind.names_left_open(explicit)).found}
+        left_open = kind.names_left_open(explicit)
+        names = [name for name in left_open if name not in kind.calibrated_if_clipped]
+        found: dict[str, Any] = {**self.select(names).found}
         return kind(**found, **explicit)

@@ -18,12 +18,15 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.calibration import CalibratedValues, recall_calibration, recall_numbers
+from jaxevent.calibration.clipping import MAX_WHITE_SHARE, find_clipping
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.refinement import refine
 from jaxevent.recording import Recording
+
+MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
 
 T = TypeVar("T", bound="FrameParams")
 
@@ -93,6 +96,9 @@ def calibrated_values(
     Returns:
         The values.
     """
+    further = set(names).intersection(params.calibrated_if_clipped)
+    if further and find_clipping(recording).white.share <= MAX_WHITE_SHARE:
+        names = [name for name in names if name not in further]
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
     I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
@@ -194,6 +200,10 @@ class GreyFrames(Protocol):
     def gain(self) -> Any:
         """Exposures (frames,) relative to the common one."""
 
+    @property
+    def white(self) -> Any:
+        """Grey value from which on frames are clipped, and mean ln I beyond; None: they are not."""
+
 
 def unclipped_weight(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
     """Return 1 where a grey value shows the intensity, 0 where it is black or white.
@@ -211,7 +221,8 @@ def unclipped_weight(params: CertaintyParams, frames: GreyFrames) -> Float[Array
     grey = jnp.asarray(frames.grey)
     distance = 255 * jnp.minimum(grey, 1 - grey)
     inside = jax.nn.sigmoid(10 * (distance - params.margin))
-    return jnp.where(params.margin > 0, inside, 1)
+    found = 1 if frames.white is None else jax.nn.sigmoid(2550 * (frames.white[0] - grey))
+    return jnp.where(params.margin > 0, inside, found)
 
 
 @full_precision
@@ -254,6 +265,23 @@ def effective_certainty(
     return clear * certainty(params, frames) + (1 - clear) * params.w_min
 
 
+def measured_share(
+    params: CertaintyParams, frames: GreyFrames
+) -> Float[Array, "frames pixels"] | None:
+    """Return 1 where a frame measures the intensity and hardly anything where it is clipped.
+
+    Args:
+        params: `margin`, grey / 255.
+        frames: The frames.
+
+    Returns:
+        (frames, pixels), above 0; None where frames do not clip.
+    """
+    if frames.white is None:
+        return None
+    return jnp.maximum(unclipped_weight(params, frames), MIN_MEASURED_SHARE)
+
+
 def clipped_side(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
     """Return +1 where a frame is clipped at white, -1 where at black, 0 where it is not.
 
@@ -264,7 +292,16 @@ def clipped_side(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "f
     Returns:
         (frames, pixels); between 0 and 1 in size within the soft edge.
     """
-    return jnp.where(jnp.asarray(frames.grey) > 0.5, 1, -1) * (1 - unclipped_weight(params, frames))
+    return jnp.where(_is_bright(params, frames), 1, -1) * (1 - unclipped_weight(params, frames))
+
+
+def _is_bright(params: CertaintyParams, frames: GreyFrames) -> Array:
+    """Return whether a grey value is nearer to the white end than to the black one.
+
+    Frames that were found to clip do so at white, which may be any grey value.
+    """
+    bright = jnp.asarray(frames.grey) > 0.5
+    return bright if frames.white is None else bright | (params.margin <= 0)
 
 
 def clipping_bound(params: CertaintyParams, frames: GreyFrames) -> Float[Array, "frames pixels"]:
@@ -284,7 +321,32 @@ def clipping_bound(params: CertaintyParams, frames: GreyFrames) -> Float[Array, 
         jnp.log(jnp.interp(margin, greys, end) / gain + params.I0)
         for end in (response, response[::-1])
     )
-    return jnp.where(jnp.asarray(frames.grey) > 0.5, bright, dark)
+    if frames.white is not None:
+        white = jnp.log(_white_intensity(frames) + params.I0)
+        bright = jnp.where(params.margin > 0, bright, white)
+    return jnp.where(_is_bright(params, frames), bright, dark)
+
+
+def _white_intensity(frames: GreyFrames) -> Array:
+    """Return the intensity (frames, 1) at the grey value from which on frames are clipped."""
+    greys, response = jnp.arange(256), jnp.asarray(frames.response)
+    return jnp.interp(255 * frames.white[0], greys, response) / jnp.asarray(frames.gain)[:, None]
+
+
+def expected_excess(params: FrameParams, frames: GreyFrames) -> Float[Array, "frames 1"] | None:
+    """Return the distance beyond white that is expected of clipped pixels.
+
+    Args:
+        params: `I0`.
+        frames: The frames.
+
+    Returns:
+        (frames, 1), ln(I + I0); None where frames do not clip.
+    """
+    if frames.white is None:
+        return None
+    white = _white_intensity(frames)
+    return jnp.log1p(white * jnp.expm1(frames.white[1]) / (white + params.I0))
 
 
 N_SPLINE_SAMPLES = 256
@@ -474,8 +536,16 @@ class AugmentedFrame(LogIntensityModel):
             params, frames.span[0], frames.span[1]
         )  # row f: from frame f to f + 1
         following = jnp.roll(right, -1, axis=0)
+        known = (span != 0) & params.calibrate
+        shown = measured_share(params, frames)
+        if shown is not None:
+            # A clipped frame tells that the level is no lower, an unclipped one beside it how high.
+            here, there = shown > 0.5, jnp.roll(shown, -1, axis=0) > 0.5
+            begin = jnp.where(there & ~here, jnp.maximum(left, following - span), left)
+            following = jnp.where(here & ~there, jnp.maximum(following, left + span), following)
+            left, known = begin, known & (here | there)
         ratio = (following - left) / jnp.where(span == 0, 1, span)
-        ratio = bound_ratio(params, ratio, (span != 0) & params.calibrate)
+        ratio = bound_ratio(params, ratio, known)
 
         # Before the first exposure: backwards from its right edge with the nominal threshold.
         first = right[0] - integrate_counts(params, frames.before[0], frames.before[1])

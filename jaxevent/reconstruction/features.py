@@ -199,6 +199,7 @@ class FrameFeatures(ShortRepr):
     certainty: Float[Numeric, "frames pixels"]  # w of the response, at most 1
     response: Float[Numeric, " 256"]  # intensities of evenly spaced grey values
     gain: Float[Numeric, " frames"]  # the frames' exposure relative to the common one
+    white: Float[Numeric, " 2"] | None  # as in `augment.GreyFrames`
     span: Float[Numeric, "2 frames pixels"]  # ON, OFF
     around: Float[Numeric, "frames pixels"] | None  # `span` of 3x3 pixels; None: not counted
     before: Float[Numeric, "2 pixels"]

@@ -69,6 +69,7 @@ class Observation(eqx.Module):
     # A bound and the rate (1/s) that pulls to it states below (positive) or above it (negative).
     bound: Float[Numeric, "*points"] | None = None
     push: Float[Numeric, "*points"] | None = None
+    excess: Float[Numeric, "*points"] | None = None  # of states beyond the bound, expected; ln I
     # Of errors of the level that last, to be added to the state's in images; (ln I)^2.
     variance: Float[Numeric, "*points"] | None = None
 

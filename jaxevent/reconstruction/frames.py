@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.clipping import find_clipping
 from jaxevent.codegen import njit
 from jaxevent.codegen.graph import evaluate_function
 from jaxevent.reconstruction.features import (
@@ -199,6 +200,12 @@ class FrameImages:
         return evaluate_function(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
 
     @functools.cached_property
+    def white(self) -> NDArray | None:
+        """See `FrameFeatures.white`."""
+        found = find_clipping(self.recording).white
+        return None if found.level is None else np.array([found.level, found.excess], self.dtype)
+
+    @functools.cached_property
     def tables(self) -> NDArray:
         """Return grey value, intensity and certainty of every whole number of an image."""
         assert self.recording.frames is not None
@@ -315,9 +322,10 @@ def make_frame_features(
     around = sum_around(span.sum(0), images.recording.width) if filtering else None
     present = np.asarray(float(frame_range.stop > frame_range.start), dtype)
     return FrameFeatures(
-        grey, intensity, certainty, images.response(), gain, span, around, before, head, tail,
-        segments, weight_rate, blend_rate, present, rows, np.asarray(clock.offset, dtype),
-        *(np.asarray(v, dtype) for v in unseen), images.recording.width,
+        grey, intensity, certainty, images.response(), gain, images.white, span, around, before,
+        head, tail, segments, weight_rate, blend_rate, present, rows,
+        np.asarray(clock.offset, dtype), *(np.asarray(value, dtype) for value in unseen),
+        images.recording.width,
     )  # fmt: skip
 
 

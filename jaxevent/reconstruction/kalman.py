@@ -14,11 +14,14 @@ from jaxevent.reconstruction.augment import (
     AugmentedFrame,
     AugmentParams,
     FrameInterpolation,
+    certainty,
     clipped_side,
     clipping_bound,
     effective_certainty,
     event_change,
+    expected_excess,
     frame_information,
+    measured_share,
 )
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints, Points
 from jaxevent.reconstruction.filtering import Event, Filter, FrameModel, Observation, PixelState
@@ -45,7 +48,7 @@ class Params(AugmentParams):
     above = Number(0.0, "ln I", "initial distance of saturated pixels above the clipping bound")
     below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
     one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
-    clip_rate = Positive(100.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
+    clip_rate = Positive(1000.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
     frame_noise, error_event, error_still, error_change = ERROR_PARAMETERS
 
     presets = {
@@ -116,33 +119,45 @@ class AugmentedFrameModel(FrameModel):
     level: AugmentedFrame
     image: FrameInterpolation | None
     density: FrameInterpolation
+    share: FrameInterpolation | None  # of the rate, where frames clip
     I0: Float[Array, ""]
     present: Float[Array, ""]
     clipped: Float[Array, "frames pixels"]
     begin: Float[Array, "frames pixels"]
     bound: Float[Array, "frames pixels"] | None
     push: Float[Array, "frames pixels"] | None
+    excess: Float[Array, "frames pixels"] | None
     errors: AugmentedFrameErrors
 
     def __init__(self, params: Params, frames: FrameFeatures):
         self.level = AugmentedFrame(params, frames, noise_bias(params, frames))
         self.I0, self.present = params.I0, jnp.asarray(frames.present)
+        self.share = None
         if params.weighting == "certainty":
             self.image = None
             trust = params.kappa * frame_information(params, frames)
             self.density = FrameInterpolation(params, frames, trust)
         else:
             Rbar = 1 / (params.kappa * effective_certainty(params, frames))
+            share = measured_share(params, frames)
+            if share is not None:
+                Rbar = 1 / (params.kappa * certainty(params, frames))
+                self.share = FrameInterpolation(params, frames, share)
             self.image = FrameInterpolation(params, frames, jnp.asarray(frames.intensity))
             self.density = FrameInterpolation(params, frames, Rbar)
         side = clipped_side(params, frames)
         # A clipped value gives its side alone: dark ones differ by the rounding of noise.
         edge = clipping_bound(params, frames)
         self.clipped = abs(side)
-        self.begin = edge + jnp.where(side > 0, params.above, -params.below)
+        above, expected = params.above, expected_excess(params, frames)
+        if expected is not None:
+            above = jnp.where(params.margin > 0, above, expected)
+        self.begin = edge + jnp.where(side > 0, above, -params.below)
         self.errors = AugmentedFrameErrors(params, frames)
-        self.bound = self.push = None
-        if params.one_sided:
+        self.bound = self.push = self.excess = None
+        if expected is not None:
+            self.excess = jnp.broadcast_to(expected, edge.shape)
+        if params.one_sided or expected is not None:
             # Both frames of a gap are needed: where one is not clipped, events show when it began.
             following = jnp.roll(side, -1, axis=0)
             both = jnp.where(side * following > 0, jnp.minimum(abs(side), abs(following)), 0)
@@ -154,13 +169,17 @@ class AugmentedFrameModel(FrameModel):
             rate = self.present * self.density(points)
         else:
             rate = self.present * (self.image(points) + self.I0) ** 2 / self.density(points)
-        bound = push = variance = None
+            if self.share is not None:
+                rate = rate * self.share(points)
+        bound = push = excess = variance = None
         if self.bound is not None and self.push is not None:
             bound = points.gather_frame(self.bound)
             push = self.present * points.gather_frame(self.push)
+        if self.excess is not None:
+            excess = points.gather_frame(self.excess)
         if isinstance(points, ImagePoints):
             variance = self.present * self.errors(points)
-        return Observation(self.level(points), rate, bound, push, variance)
+        return Observation(self.level(points), rate, bound, push, excess, variance)
 
     def initial_level(self, points: Points) -> Array:
         level = self.level(points)
@@ -196,6 +215,15 @@ def predict(params: Params, state: PixelState, dt: Array, frame: Observation) ->
         The state dt later.
     """
     rate, u = frame.rate, frame.level
+    if frame.push is not None and frame.excess is not None:
+        # Events tell the level to within a threshold, whatever their noise; see also
+        # `smoother.one_sided_message`.
+        least = jnp.where(frame.push != 0, params.c_on * params.c_off / 3, 0)
+        P = jnp.maximum(state.P, least)
+        J = jnp.where(frame.push > 0, jnp.maximum(1 / frame.excess**2 - 1 / P, 0), 0)
+        gain = 1 / (1 + P * J)
+        at = frame.bound + frame.excess
+        state = PixelState((state.L - at) * gain + at, P * gain)
     if frame.push is not None:
         wrong = frame.push * (frame.bound - state.L) > 0
         push = jnp.where(wrong, jnp.abs(frame.push), 0)

@@ -41,6 +41,7 @@ from jaxevent.reconstruction.augment import (
     clock_lag,
     deblur_frames,
     deblur_level,
+    expected_excess,
     integrate_counts,
     segment_excess,
     unclipped_weight,
@@ -184,6 +185,7 @@ class FrameMeasurements(eqx.Module):
     slope: Float[Array, "*frames pixels"]  # d z / d I = 1 / (I + I0)
     side: Float[Array, "*frames pixels"]  # +1, -1: L lies above, below `bound`; 0: nothing known
     bound: Float[Array, "*frames pixels"]
+    excess: Float[Array, "*#frames #pixels"] | None  # beyond the bound, expected; None: not known
 
 
 class FrameSteps(eqx.Module):
@@ -205,6 +207,10 @@ class CensoredPixels(Protocol):
     @property
     def bound(self) -> Any:
         """Log intensity at which pixels clip, ln I."""
+
+    @property
+    def excess(self) -> Any:
+        """Distance beyond white that is expected of pixels, ln I; None: not known."""
 
 
 class SmoothedWindow(ShortRepr):
@@ -245,6 +251,7 @@ def measure_frames(
         1 / (frames.intensity + params.I0),
         side * exists,
         jnp.broadcast_to(clipping_bound(params, frames), z.shape),
+        expected_excess(params, frames),
     )
 
 
@@ -400,6 +407,9 @@ def one_sided_message(state: Gaussian, row: CensoredPixels, floor: Array) -> tup
     truncated again at every frame and drift away from the bound without end. So the evidence counts
     by the sigmoid of -2 d: fully where the state contradicts it, not where it is known.
 
+    Of a pixel at white it is expected to lie `excess` beyond, give or take as much. That counts as
+    far as the state is known less well than so, and no more however often a frame repeats it.
+
     Args:
         state: State before the frame.
         row: The frame's censored pixels.
@@ -409,6 +419,12 @@ def one_sided_message(state: Gaussian, row: CensoredPixels, floor: Array) -> tup
         The message, and its log likelihood.
     """
     sign = jnp.sign(row.side)
+    expected = Message(jnp.zeros_like(state.P), jnp.zeros_like(state.P))
+    if row.excess is not None:
+        J = jnp.maximum(row.side, 0) * jnp.maximum(1 / row.excess**2 - 1 / state.P, 0)
+        expected = Message(J * (row.bound + row.excess), J)
+        P = 1 / (1 / state.P + J)
+        state = Gaussian(state.m + P * (expected.h - J * state.m), P)
     s2 = state.P + floor
     s = jnp.sqrt(s2)
     d = jnp.clip(jnp.where(sign < 0, -1, 1) * (state.m - row.bound) / s, -100, 100)
@@ -418,7 +434,8 @@ def one_sided_message(state: Gaussian, row: CensoredPixels, floor: Array) -> tup
     P = state.P * (1 - state.P / s2 * jnp.clip(lam * (lam + d), 0, 0.9999))
     weight = jnp.abs(row.side) * jax.nn.sigmoid(-2 * d)
     J = 1 / P - 1 / state.P
-    return Message(weight * (m / P - state.m / state.P), weight * J), weight * log_Phi
+    beyond = Message(weight * (m / P - state.m / state.P), weight * J)
+    return expected + beyond, weight * log_Phi
 
 
 def frame_update(
@@ -473,7 +490,7 @@ def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> Fr
     none = jnp.zeros((2, 1, 1), gain.dtype)
     return FrameFeatures(
         **image,
-        **fixed,
+        **({"white": None} | fixed),
         gain=gain[0],
         span=none,
         around=None,

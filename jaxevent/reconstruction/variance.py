@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxevent.parameters import Positive
-from jaxevent.reconstruction.augment import integrate_counts
+from jaxevent.reconstruction.augment import integrate_counts, measured_share
 from jaxevent.reconstruction.features import FrameFeatures, ImagePoints
 
 # Members of a `Params`, in this order: r, e, s and d of the module's formula.
@@ -99,6 +99,10 @@ class AugmentedFrameErrors(eqx.Module):
         around = jnp.asarray(frames.around) - frames.span[0] - frames.span[1]
         activity = (1 - NEIGHBOUR_SHARE) * own + NEIGHBOUR_SHARE / 8 * around
         noise, flicker = (params.frame_noise * slope) ** 2, frames.flicker * slope**2
+        shown = measured_share(params, frames)
+        if shown is not None:  # a level beyond white is known to within a threshold
+            both = jnp.minimum(shown, jnp.where(between, jnp.roll(shown, -1, axis=0), shown))
+            noise = noise + (1 - both) * params.c_on * params.c_off / 3
         # Of neighbours those of the last gap count: half of it lies between frame and time.
         near = jnp.where(between, around, jnp.roll(around, 1, axis=0)) * NEIGHBOUR_SHARE / 16
         walk = ONE_SIDED_FACTOR * activity_variance(params, near, frames.movement)

@@ -634,7 +634,9 @@ class CompensatedVideo(ImageSequence[Params]):
             low, high = int(adjacent.frame.min()), int(adjacent.frame.max()) + 1
             grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
             rows = adjacent.frame - low
-            frames = AdjacentFrames(grey[rows], intensity[rows], self._response, gain[rows])
+            frames = AdjacentFrames(
+                grey[rows], intensity[rows], self._response, gain[rows], self._frames.white
+            )
             model = ExposureModel(adjacent, frames, target.paths)
             fused = constrain_image(self.params, fused, model, exposures.samples)
         return dataclasses.replace(fused, P=fused.P + brightness.variance)
@@ -853,10 +855,16 @@ class MotionCompensation(ImageEstimator[Params]):
             fused = fuse(params, *images[:2], warped, layout, squared_reach(paths), noise=factor)
             if out.samples is not None:
                 at = exposures.frame
-                adjacent = (frames.grey[at], frames.intensity[at], frames.response, frames.gain[at])
+                adjacent = AdjacentFrames(
+                    frames.grey[at],
+                    frames.intensity[at],
+                    frames.response,
+                    frames.gain[at],
+                    frames.white,
+                )
                 # Frames of another brightness are no constraint.
                 exposures = exposures._replace(present=exposures.present * steady)
-                model = ExposureModel(exposures, AdjacentFrames(*adjacent), paths)
+                model = ExposureModel(exposures, adjacent, paths)
                 fused = constrain_image_jax(params, fused, model, out.samples)
             weight = after_weight(layout)
             base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)

@@ -22,7 +22,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, run_over_rows
-from jaxevent.reconstruction.augment import clipped_side, clipping_bound, unclipped_weight
+from jaxevent.reconstruction.augment import (
+    clipped_side,
+    clipping_bound,
+    expected_excess,
+    unclipped_weight,
+)
 from jaxevent.reconstruction.compensated.fusion import FusedImage
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
@@ -39,7 +44,7 @@ from jaxevent.reconstruction.compensated.warp import (
     sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import EventTiming, FrameClock
+from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages
 from jaxevent.reconstruction.smoother import Gaussian, Message, one_sided_message
 from jaxevent.recording import Recording
 
@@ -67,6 +72,7 @@ class AdjacentFrames(NamedTuple):
     intensity: Float[Numeric, "n pixels"]
     response: Float[Numeric, " 256"]
     gain: Float[Numeric, " n"]
+    white: Float[Numeric, " 2"] | None = None
 
 
 class _FrameEvidence(NamedTuple):
@@ -83,6 +89,7 @@ class _ClippedSide(NamedTuple):
 
     side: Float[Array, "n h w"]  # +1, -1: B lies above, below `bound`; 0: nothing known
     bound: Float[Array, "n h w"]
+    excess: Float[Array, "n #h #w"] | None
 
 
 def choose_sample_count(motion_px: float) -> int:
@@ -113,7 +120,9 @@ class FrameExposures:
         self._half = np.rint((clock.right - clock.left) / 2).astype(np.int64)  # us
         moved = SPEED_MARGIN * speed * 2e-6 * float(self._half.max(initial=0))
         samples = choose_sample_count(moved) if params.deblur else 1
-        wanted = samples > 1 or (float(params.margin) > 0 and params.one_sided)
+        images = FrameImages(recording, np.dtype(np.float32))
+        clips = float(params.margin) > 0 or images.white is not None
+        wanted = samples > 1 or (clips and params.one_sided)
         self.samples = samples if params.integrate and wanted else None
 
     def __call__(self, t: int, instants: TargetInstants) -> AdjacentExposures:
@@ -246,6 +255,45 @@ class ExposureModel(NamedTuple):
     paths: Float[Numeric, "h w 4"]  # px
 
 
+def clipped_part(params: Params, model: ExposureModel) -> Array | None:
+    """Return 1 (h, w) for points that all frames next to the target show at white, 0 for others.
+
+    Args:
+        params: Parameters of `mc`.
+        model: The frames, and the paths of the image's points.
+
+    Returns:
+        (h, w), 0 to 1; None where frames do not clip.
+    """
+    exposures, frames, paths = model
+    if frames.white is None or not params.one_sided:
+        return None
+    Y, X = path_positions(paths, jnp.asarray(exposures.s))
+    side = jnp.maximum(clipped_side(params, frames), 0).reshape(-1, *Y.shape[1:])
+    absent = 1 - jnp.asarray(exposures.present)[:, None, None]
+    return jnp.maximum(sample_bilinear(side, Y, X), absent).min(0)
+
+
+def clipped_variance(params: Params, fused: FusedImage, model: ExposureModel) -> Array:
+    """Return the variance of an image, no less than events alone can tell of points at white.
+
+    A point that all frames next to the target show clipped is known by events, to within a
+    threshold, and by frames that showed it darker, if they did: no evidence that it is as dark.
+
+    Args:
+        params: Parameters of `mc`.
+        fused: The image.
+        model: The frames, and the paths of the image's points.
+
+    Returns:
+        (h, w), (ln I)^2.
+    """
+    clipped = clipped_part(params, model)
+    if clipped is None:
+        return fused.P
+    return jnp.maximum(fused.P, clipped * params.c_on * params.c_off / 12)
+
+
 def _frame_evidence(
     params: Params, model: ExposureModel, D: Array, B: Array, fused: FusedImage
 ) -> _FrameEvidence:
@@ -266,7 +314,12 @@ def _frame_evidence(
 
     # A clipped pixel acts as the Gaussian that gives the moments of the truncated one.
     side = read(clipped_side(params, frames)) * inside * params.one_sided
-    row = _ClippedSide(side, read(clipping_bound(params, frames)))
+    clipped = clipped_part(params, model)
+    if clipped is not None:  # at an edge one of them may show another point
+        side = jnp.where(side > 0, side * clipped, side)
+    excess = expected_excess(params, frames)
+    excess = None if excess is None else excess[:, :, None]
+    row = _ClippedSide(side, read(clipping_bound(params, frames)), excess)
     state = Gaussian(B, jnp.broadcast_to(fused.P, B.shape))
     message, _ = one_sided_message(state, row, params.sigma_floor**2)
     return _FrameEvidence(
@@ -312,6 +365,7 @@ def constrain_image_jax(
         The image with other `L` and `P`.
     """
     D = exposure_displacements(model.exposures, model.paths, samples)
+    fused = dataclasses.replace(fused, P=clipped_variance(params, fused, model))
     L, P = fused.L.astype(D.dtype), fused.P.astype(D.dtype)
     evidence = _frame_evidence(params, model, D, blur_by_motion_jax(L, D)[0], fused)
 
@@ -333,12 +387,14 @@ def _single(values: Any) -> NDArray[np.float32]:
 _compiled_displacements = jax.jit(exposure_displacements, static_argnums=2)
 _compiled_evidence, _compiled_pull = jax.jit(_frame_evidence), jax.jit(_pull_and_information)
 _compiled_squared_blur = jax.jit(_squared_blur)
+_compiled_variance = jax.jit(clipped_variance)
 
 
 def constrain_image(
     params: Params, fused: FusedImage, model: ExposureModel, samples: int
 ) -> FusedImage:
     """Fit an image to exposures and clipped pixels, as `constrain_image_jax` does."""
+    fused = dataclasses.replace(fused, P=_compiled_variance(params, fused, model))
     L, P = _single(fused.L), _single(fused.P)
     D = _single(_compiled_displacements(model.exposures, model.paths, samples))
     B, _ = blur_by_motion(L, D)

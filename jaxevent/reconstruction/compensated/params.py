@@ -116,8 +116,10 @@ class Params(smoother.Params):
     vague = Positive(
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )
-    # Thresholds are learned (`learn`) along trajectories, from more than events between frames.
+    # Thresholds are learned (`learn`) along trajectories, from more than events between frames. But
+    # they are relative to the common ones, which alone tell how far beyond white points are.
     calibrated = ("clock_offset",)
+    calibrated_if_clipped = ("c_on", "c_off")
 
     @classmethod
     def predictor(cls) -> smoother.Smoother:

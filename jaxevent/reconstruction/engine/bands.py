@@ -304,13 +304,15 @@ class PartitionedRecording:
             Arrays by the names of fields of `FrameFeatures`.
         """
         unseen = self.windows.unseen if has_variance else UnseenChange(0.0, 0.0)
-        return {
+        known = {
             "flicker": np.asarray(unseen.flicker, self.dtype),
             "movement": np.asarray(unseen.movement, self.dtype),
             "clock_offset": np.asarray(clock_offset, self.dtype),
             "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
             "response": self._response,
         }
+        white = self.images.white
+        return known if white is None else known | {"white": white}
 
     def partition(
         self, state: StreamState, begin_row: int, end_row: int

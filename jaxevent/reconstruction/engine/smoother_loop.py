@@ -459,9 +459,7 @@ class SmootherPasses:
         stride = self.layout.stride
         self.kind = KernelKind(self.clock.exposed, self.dtype, stride, directions)
         fixed = recording.fixed_inputs(clock_offset, method.has_unseen_errors)
-        self._fixed = {
-            name: fixed[name] for name in ("clock_offset", "response", "flicker", "movement")
-        }
+        self._fixed = {name: value for name, value in fixed.items() if name != "present"}
         self._program: SmootherProgram | None = None
         self.spare: queue.SimpleQueue[NDArray] = queue.SimpleQueue()  # memory for bands
         self.use_params(params)

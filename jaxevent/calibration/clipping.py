@@ -1,0 +1,103 @@
+"""Recognition of frames that reach their white or black."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.recording import Recording
+
+MAX_FRAMES, MAX_FRAME_PIXELS = 16, 1 << 15  # that are looked at, evenly spaced
+N_LEVELS = 255
+WINDOW_LEVELS = 3  # width of a pile-up: noise of up to about one grey level
+NEIGHBOUR_LEVELS = 16  # below a pile-up, with which it is compared
+# Grey values of frames that do not clip end in a tail, which falls: their ratio is below 1.5.
+MIN_PILE_UP_RATIO = 4.0
+MIN_CLIPPED_SHARE = 1e-3  # of the pixels; what is rarer changes no result
+MAX_WHITE_SHARE = 0.05  # of the pixels; where more are white, results rest on events
+MAX_CLIPPED_SHARE = 0.9  # of the pixels; beyond there is nothing to compare with
+BAND = 0.35  # ln I, the range below white whose density is continued beyond it
+# Of the exponential continuation, in simulated scenes: the density has modes beyond white.
+EXCESS_FACTOR, EXCESS_BOUNDS = 0.4, (0.1, 2.0)
+
+
+class ClippedEnd(NamedTuple):
+    """One end of the grey values, and the pile-up there.
+
+    | field | meaning |
+    |---|---|
+    | level | grey value (0 to 1) beyond which pixels are clipped; None where none are |
+    | share | part of the pixels beyond it |
+    | ratio | pixels in the pile-up for one among its neighbours, at least `MIN_PILE_UP_RATIO` |
+    | excess | mean distance beyond white that is expected of clipped pixels, ln I |
+    """
+
+    level: float | None
+    share: float
+    ratio: float
+    excess: float = 0.0
+
+
+class ClippedEnds(NamedTuple):
+    """Both ends of the grey values of a recording's frames."""
+
+    black: ClippedEnd
+    white: ClippedEnd
+
+
+def find_clipping(recording: Recording) -> ClippedEnds:
+    """Find the grey values at which a recording's frames clip, from the frames alone.
+
+    Clipped pixels pile up at the last grey value that occurs. Three levels there are compared with
+    the fullest three of the 16 levels inside of them. White may be any level. Saturation whose own
+    noise is above about one level is not told from a bright wall and not found.
+    """
+    frames = recording.frames
+    if frames is None or not len(frames):
+        nothing = ClippedEnd(None, 0.0, 0.0)
+        return ClippedEnds(nothing, nothing)
+    rows = np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))
+    stride = -(-recording.width * recording.height // MAX_FRAME_PIXELS)
+    grey = np.concatenate([np.asarray(frames[k : k + 1].images).ravel()[::stride] for k in rows])
+    whole = grey.dtype.kind in "iu"
+    top = float(np.iinfo(grey.dtype).max) if whole else 1.0
+    step = max(float(grey.max()) / N_LEVELS, 1.0 if whole else 1e-9)
+    counts = np.bincount((grey / step + 0.5).astype(np.int64))
+    white, black = _pile_up(counts), _pile_up(counts[::-1])
+    if white.level is not None:
+        level = white.level * step / top
+        white = white._replace(
+            level=level, excess=_expected_excess(recording, grey / top, level, white.share)
+        )
+    if black.level is not None:
+        black = black._replace(level=(len(counts) - 1 - black.level) * step / top)
+    return ClippedEnds(black, white)
+
+
+def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
+    """Find the pile-up at the upper end of a histogram; its level is in bins."""
+    beyond = counts[::-1].cumsum()[::-1] / counts.sum()
+    last = int(np.flatnonzero(beyond >= MIN_CLIPPED_SHARE)[-1])
+    padded = np.concatenate([np.zeros(WINDOW_LEVELS + NEIGHBOUR_LEVELS, np.int64), counts])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, WINDOW_LEVELS).sum(-1)
+    ends = np.arange(last, len(counts)) + NEIGHBOUR_LEVELS + 1  # windows that end there
+    end = int(ends[windows[ends].argmax()])
+    below = int(windows[end - NEIGHBOUR_LEVELS : end - WINDOW_LEVELS + 1].max())
+    ratio = float(windows[end] / below) if below else float("inf")
+    first = max(end - WINDOW_LEVELS - NEIGHBOUR_LEVELS, 0)
+    share = float(beyond[first])
+    found = ratio >= MIN_PILE_UP_RATIO and MIN_CLIPPED_SHARE <= share <= MAX_CLIPPED_SHARE
+    return ClippedEnd(first - 0.5, share, ratio) if found else ClippedEnd(None, 0.0, ratio)
+
+
+def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:
+    """Return how far beyond white clipped pixels lie on average, ln I.
+
+    If the density of ln I falls exponentially, with mean m, from the band below white on, then the
+    band holds exp(BAND / m) - 1 pixels for each one beyond white.
+    """
+    intensity = np.asarray(recording.response.intensity(np.append(grey, level)))
+    light, white = intensity[:-1], intensity[-1]
+    band = float(((light < white) & (light >= white * np.exp(-BAND))).mean())
+    mean = BAND / np.log1p(band / share) if band else np.inf
+    return float(np.clip(EXCESS_FACTOR * mean, *EXCESS_BOUNDS))
