@@ -58,7 +58,7 @@ def integrate(given: Recording, t: NDArray[np.int64]) -> NDArray[np.floating]:
     step = np.where(events.p, float(params.c_on), -float(params.c_off))
     place = events.y.astype(np.int64) * given.width + events.x
     levels = np.log1p(frames.intensity.reshape(len(frames), -1).astype(float))
-    clear = frames.images.reshape(len(frames), -1) < 253
+    clear = np.asarray(frames.images).reshape(len(frames), -1) < 253
     out, level, done, k = [], levels[0], 0, 0
     for now in (t + late).tolist():
         while k < len(frames) and frames.t[k] + late <= now:

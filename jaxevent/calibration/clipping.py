@@ -13,6 +13,7 @@ WINDOW_LEVELS = 3  # width of a pile-up: noise of up to about one grey level
 NEIGHBOUR_LEVELS = 16  # below a pile-up, with which it is compared
 # Grey values of frames that do not clip end in a tail, which falls: their ratio is below 1.5.
 MIN_PILE_UP_RATIO = 4.0
+MIN_PILE_UP_PIXELS = 50  # so that it is no chance
 MIN_CLIPPED_SHARE = 1e-3  # of the pixels; what is rarer changes no result
 MAX_WHITE_SHARE = 0.05  # of the pixels; where more are white, results rest on events
 MAX_CLIPPED_SHARE = 0.9  # of the pixels; beyond there is nothing to compare with
@@ -86,7 +87,8 @@ def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     ratio = float(windows[end] / below) if below else float("inf")
     first = max(end - WINDOW_LEVELS - NEIGHBOUR_LEVELS, 0)
     share = float(beyond[first])
-    found = ratio >= MIN_PILE_UP_RATIO and MIN_CLIPPED_SHARE <= share <= MAX_CLIPPED_SHARE
+    piled = ratio >= MIN_PILE_UP_RATIO and windows[end] >= MIN_PILE_UP_PIXELS
+    found = piled and MIN_CLIPPED_SHARE <= share <= MAX_CLIPPED_SHARE
     return ClippedEnd(first - 0.5, share, ratio) if found else ClippedEnd(None, 0.0, ratio)
 
 
