@@ -346,7 +346,7 @@ def redistribute_events(params: Params, own: Array, around: Array, given: Array)
 
 
 class GapEvidence(eqx.Module):
-    """What is known of the gap between two frames that contains a time."""
+    """Evidence of the gap between two frames that contains a time."""
 
     activity: Float[Numeric, "*pixels"]  # events, part of them from neighbours
     residual: Float[Numeric, "*pixels"]  # change that events do not explain, ln I

@@ -25,7 +25,7 @@ MOVING_RATE_HZ = 1.0  # events of a pixel, where half as much moves as at most
 
 
 class UnseenChange(NamedTuple):
-    """What a recording tells of changes without events."""
+    """Measures of changes without events in a recording."""
 
     flicker: float  # variance of the intensity that all pixels of a frame share
     movement: float  # how much of it moves, 0 to 1, by the mean rate of its events

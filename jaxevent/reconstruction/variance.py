@@ -31,11 +31,11 @@ from jaxevent.reconstruction.features import FrameFeatures, ImagePoints
 # Members of a `Params`, in this order: r, e, s and d of the module's formula.
 ERROR_PARAMETERS = (
     Positive(0.005, "intensity", "noise of a frame's pixel, for the variance of images"),
-    Positive(0.31, "c", "error halfway between frames, per square root of events"),
-    Positive(0.11, "c", "error halfway between frames where no events are"),
-    Positive(0.36, "1", "error halfway between frames, as part of the change without events"),
+    Positive(0.27, "c", "error halfway between frames, per square root of events"),
+    Positive(0.08, "c", "error halfway between frames where no events are"),
+    Positive(0.41, "1", "error halfway between frames, as part of the change without events"),
 )
-# Errors do not shrink in proportion to thresholds that are low, or that a calibration finds too low.
+# Errors do not shrink in proportion to low thresholds, or to those found too low.
 USUAL_THRESHOLD = 0.1  # ln I
 NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight neighbours
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
