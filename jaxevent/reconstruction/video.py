@@ -23,7 +23,7 @@ from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import Features, ReadOut, make_pixel_mesh, shard_over_pixels
-from jaxevent.reconstruction.frames import EventTiming
+from jaxevent.reconstruction.frames import EventTiming, time_span
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import (
     MAX_WINDOW_EVENTS,
@@ -319,7 +319,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
             contradiction = events_contradict_frames(self.recording, self.params)
             if contradiction is not None:
                 warnings.warn(contradiction, InputWarning, stacklevel=2)
-        start, stop = self.recording.start, self.recording.stop
+        start, stop = time_span(self.recording, self.params.clock_offset)
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
             for batch, images in self._turns.iterate(self._read(times)):
                 shape = (len(batch), self.recording.height, self.recording.width)

@@ -183,3 +183,9 @@ def test_images_of_faulty_events_do_not_depend_on_others():
     again = mc.estimate(video.recording, VALUES, progress=False)
     later, earlier = again(t[1:]).mean[0], again(t[:1]).mean[0]
     np.testing.assert_array_equal(video(t).mean, [earlier, later])
+
+
+def test_frames_on_the_events_clock_count_before_the_first_event():
+    recording, _ = drawn()
+    images = InstantImages(recording, PARAMS.replace(clock_offset=-0.2), 1 << 14)
+    assert images(FRAMES - 200_000)[2].all()

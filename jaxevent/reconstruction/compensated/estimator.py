@@ -355,44 +355,26 @@ class TrajectoryEstimator:
         return self._anchors[at, doubted]
 
     def _make_anchor(self, at: int, doubted: bool) -> Anchor:
-        """Seek the motion of the target at a time (us) from nothing."""
+        """Seek the motion of the target at a time (us) from nothing.
+
+        Where events are doubted it is also sought from the frames alone, and by time: the clock of
+        events is in doubt as well.
+        """
         instants = self.schedule(at)
+        if doubted:
+            instants = instants.with_clock(TIME_CLOCK)
         L, V, clear, _ = self._images(instants)
-        framed, size = np.isin(instants.t, self.schedule.frames), L.shape[1:]
-        other = None
-        if doubted and framed.sum() > 1:
-            frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
-            instants, other = self._seek_in_frames(instants, framed, frames, size)
+        size = L.shape[1:]
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
         p = self._seek(pyramid, instants.s, instants.first_horizon, size)
-        if other is not None:
-            images = PackedImages.of(pyramid[1], instants.s)
-            p = choose_trajectories(images, (p, other), self._cost)
-        return instants, p
-
-    def _seek_in_frames(
-        self,
-        instants: TargetInstants,
-        framed: NDArray[np.bool_],
-        pyramid: ImagePyramid,
-        size: tuple[int, ...],
-    ) -> Anchor:
-        """Seek motion in frames alone, on the clock on which they agree better."""
-
-        def sought(clock: TargetInstants) -> tuple[float, NDArray[np.float32]]:
-            s = clock.s[framed]
-            nearest = float(np.abs(clock.s[[clock.before, clock.after]]).max())
-            p = self._seek(pyramid, s, nearest, size)
-            return robust_cost(PackedImages.of(pyramid[1], s), p, self._cost), p
-
-        timed = instants.with_clock(TIME_CLOCK)
-        cost, p = sought(timed)
-        if instants.clock.event_share:
-            other_cost, other = sought(instants)
-            trust = self.event_noise.trust(int(instants.t[instants.target]))
-            if other_cost < MAX_CLOCK_COST_RATIO * trust * cost:
-                return instants, other
-        return timed, p
+        framed = np.isin(instants.t, self.schedule.frames)
+        if not doubted or framed.sum() < 2:
+            return instants, p
+        frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
+        nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
+        other = self._seek(frames, instants.s[framed], nearest, size)
+        images = PackedImages.of(pyramid[1], instants.s)
+        return instants, choose_trajectories(images, (p, other), self._cost)
 
     def _seek(
         self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float, size: tuple[int, ...]

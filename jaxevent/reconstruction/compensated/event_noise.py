@@ -117,14 +117,13 @@ class EventNoise:
 
     def inflate(self, times: NDArray[np.int64], V: NDArray) -> NDArray[np.float32]:
         """Inflate the variances (K, h, w) of images at times (us)."""
-        places = self.locate(times)
-        noise = [self(k) for k in places.interval.tolist()]
-        return np.stack(
-            [
-                v * (one.factor if shape > 0 else 1) + one.excess * shape
-                for v, one, shape in zip(V, noise, places.shape, strict=True)
-            ]
-        )
+        inflated = V.astype(np.float32)
+        for k, (interval, shape) in enumerate(zip(*self.locate(times), strict=True)):
+            if shape > 0:
+                noise = self(int(interval))
+                inflated[k] *= noise.factor
+                inflated[k] += shape * noise.excess
+        return inflated
 
     def _measure(self, interval: int) -> IntervalNoise:
         size = self._images.image_shape
