@@ -14,9 +14,11 @@ NEIGHBOUR_LEVELS = 16  # below a pile-up, with which it is compared
 # Grey values of frames that do not clip end in a tail, which falls: their ratio is below 1.5.
 MIN_PILE_UP_RATIO = 4.0
 MIN_PILE_UP_PIXELS = 50  # so that it is no chance
-MIN_CLIPPED_SHARE = 1e-3  # of the pixels; what is rarer changes no result
-MAX_WHITE_SHARE = 0.05  # of the pixels; where more are white, results rest on events
-MAX_CLIPPED_SHARE = 0.9  # of the pixels; beyond there is nothing to compare with
+MAX_STRAY_SHARE = 1e-3  # of the pixels, beyond a pile-up
+# Of the pixels. A few that are white are taken as they are: what they hide is no loss in frames
+# that clip as well, and a guess of it is carried into the pixels beside them.
+MIN_CLIPPED_SHARE = 0.05
+MAX_CLIPPED_SHARE = 0.9  # beyond there is nothing to compare with
 BAND = 0.35  # ln I, the range below white whose density is continued beyond it
 # Of the exponential continuation, in simulated scenes: the density has modes beyond white.
 EXCESS_FACTOR, EXCESS_BOUNDS = 0.4, (0.1, 2.0)
@@ -28,7 +30,7 @@ class ClippedEnd(NamedTuple):
     | field | meaning |
     |---|---|
     | level | grey value (0 to 1) beyond which pixels are clipped; None where none are |
-    | share | part of the pixels beyond it |
+    | share | part of the pixels in the pile-up and beyond |
     | ratio | pixels in the pile-up for one among its neighbours, at least `MIN_PILE_UP_RATIO` |
     | excess | mean distance beyond white that is expected of clipped pixels, ln I |
     """
@@ -78,7 +80,7 @@ def find_clipping(recording: Recording) -> ClippedEnds:
 def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     """Find the pile-up at the upper end of a histogram; its level is in bins."""
     beyond = counts[::-1].cumsum()[::-1] / counts.sum()
-    last = int(np.flatnonzero(beyond >= MIN_CLIPPED_SHARE)[-1])
+    last = int(np.flatnonzero(beyond >= MAX_STRAY_SHARE)[-1])
     padded = np.concatenate([np.zeros(WINDOW_LEVELS + NEIGHBOUR_LEVELS, np.int64), counts])
     windows = np.lib.stride_tricks.sliding_window_view(padded, WINDOW_LEVELS).sum(-1)
     ends = np.arange(last, len(counts)) + NEIGHBOUR_LEVELS + 1  # windows that end there
@@ -88,8 +90,8 @@ def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     first = max(end - WINDOW_LEVELS - NEIGHBOUR_LEVELS, 0)
     share = float(beyond[first])
     piled = ratio >= MIN_PILE_UP_RATIO and windows[end] >= MIN_PILE_UP_PIXELS
-    found = piled and MIN_CLIPPED_SHARE <= share <= MAX_CLIPPED_SHARE
-    return ClippedEnd(first - 0.5, share, ratio) if found else ClippedEnd(None, 0.0, ratio)
+    found = piled and MIN_CLIPPED_SHARE < share <= MAX_CLIPPED_SHARE
+    return ClippedEnd(first - 0.5 if found else None, share if piled else 0.0, ratio)
 
 
 def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:

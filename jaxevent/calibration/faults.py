@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.clipping import MAX_WHITE_SHARE, find_clipping
+from jaxevent.calibration.clipping import MIN_CLIPPED_SHARE, find_clipping
 from jaxevent.calibration.correspondence import (
     I0,
     TRANSFORMS,
@@ -297,7 +297,7 @@ def _check_white(recording: Recording) -> Iterator[Fault]:
     """Check the share of pixels whose frames are white."""
     share = find_clipping(recording).white.share
     yield Fault(
-        "clipped frames", share, MAX_WHITE_SHARE,
+        "clipped frames", share, MIN_CLIPPED_SHARE,
         f"{100 * share:.2g} % of the frames' pixels are white, where only events tell what happens",
         "shorten the exposure; methods with a variance take white for a lower bound",
     )  # fmt: skip

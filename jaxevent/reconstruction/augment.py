@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.calibration import CalibratedValues, recall_calibration, recall_numbers
-from jaxevent.calibration.clipping import MAX_WHITE_SHARE, find_clipping
+from jaxevent.calibration.clipping import find_clipping
 from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
@@ -97,7 +97,7 @@ def calibrated_values(
         The values.
     """
     further = set(names).intersection(params.calibrated_if_clipped)
-    if further and find_clipping(recording).white.share <= MAX_WHITE_SHARE:
+    if further and find_clipping(recording).white.level is None:
         names = [name for name in names if name not in further]
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
