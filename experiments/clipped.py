@@ -74,7 +74,7 @@ def reconstruct(name: str, given: Recording, t: NDArray[np.int64]) -> tuple[Any,
     """Return images, their variance or None, and I0."""
     if name == "integrated":
         return integrate(given, t), None, 1.0
-    method = jaxevent.METHODS[name]
+    method: Any = jaxevent.METHODS[name]
     params = method.usual_params(given)
     late = round(1e6 * float(params.clock_offset)) if method.has_covariance else 0
     images, P, _ = method.estimate(given, params, progress=False)(t + late, extrapolate=True)

@@ -12,6 +12,7 @@ alike.
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from frames_without_settings import strata_of
@@ -39,7 +40,7 @@ def simulated(k: int) -> tuple[MovingObjects | Pan, Recording, float]:
         SENSORS[SENSOR_NAMES[k % 3]], frame_rate=25.0, exposure=5e-4, exposure_samples=2,
         response=UnknownResponse(), read_noise=noise,
     )  # fmt: skip
-    common = {"size": SIZE, "duration": SECONDS, "seed": seed}
+    common: dict[str, Any] = {"size": SIZE, "duration": SECONDS, "seed": seed}
     if k % 4 < 2:
         source = MovingObjects(speed=rng.uniform(40, 150), background=0.5 * (k % 4), **common)
     else:
@@ -60,9 +61,10 @@ def samples() -> Iterator[tuple[str, NDArray, NDArray]]:
             seen = hidden[choose_evenly(np.arange(last), IMAGES)]
             images = np.stack([source.intensity(t * 1e-6) for t in seen.t.tolist()])
             truth = Frames(seen.t, images.clip(0, 1).astype(np.float32), np.zeros_like(seen.t))
-            for method in (jaxevent.akf, jaxevent.aks):
+            methods: tuple[Any, ...] = (jaxevent.akf, jaxevent.aks)
+            for method in methods:
                 for c in THRESHOLDS:
-                    none = dict.fromkeys(NAMES, 0.0)
+                    none: dict[str, Any] = dict.fromkeys(NAMES, 0.0)
                     params = method.Params(c_on=c, c_off=c, frame_noise=noise, **none)
                     times, parts = frame_times(truth, params), []
                     for name in ("", *NAMES):

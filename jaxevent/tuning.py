@@ -371,8 +371,8 @@ def optimise(
             run.stage, run.iteration, run.tried = run.stage + 1, 0, []
             loop.save(run, True)
         fitted = loop.leader()
-        loss = loop.loss(fitted, loop.watched(fitted))
-        return FitResult(fitted, loss, run.history, run.rough)
+        least = loop.loss(fitted, loop.watched(fitted))
+        return FitResult(fitted, least, run.history, run.rough)
 
 
 def gradient_skill(steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike) -> float:
@@ -708,7 +708,7 @@ class _Loop:
                 self._note(value)
             return value
 
-        def slopes(names: Sequence[str], step: float) -> list[float]:
+        def gradient_along(names: Sequence[str], step: float) -> list[float]:
             at = moved(names, step)
             known = [value for _, value in zip(names, replay, strict=False)]
             if known:
@@ -722,7 +722,7 @@ class _Loop:
         def probe(names: Sequence[str]) -> tuple[list[float], list[float], NDArray[np.float64]]:
             losses = {step: loss(names, step) for step in PROBE_STEPS}
             steps = [step for step, value in losses.items() if math.isfinite(value)]
-            table = np.array([slopes(names, step) for step in steps])
+            table = np.array([gradient_along(names, step) for step in steps])
             return steps, [losses[step] for step in steps], table
 
         names = list(raw)
@@ -817,14 +817,14 @@ def _search_smoothed(objective: Callable[[float], float]) -> float:
     best, width = 0.0, grid[1] - grid[0]
     tried: dict[float, float] = {}
 
-    def look(step: float) -> float:
+    def cached_loss(step: float) -> float:
         step = float(step)
         if step not in tried:
             tried[step] = objective(step)
         return tried[step]
 
     for _ in range(3):
-        losses = np.array([look(step) for step in grid])
+        losses = np.array([cached_loss(step) for step in grid])
         finite = losses[np.isfinite(losses)]
         losses = np.minimum(losses, finite.max(initial=-np.inf))
         smooth = np.convolve(np.pad(losses, 1, "edge"), [0.25, 0.5, 0.25], "valid")

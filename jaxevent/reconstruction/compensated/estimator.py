@@ -364,27 +364,23 @@ class TrajectoryEstimator:
         if doubted:
             instants = instants.with_clock(TIME_CLOCK)
         L, V, clear, _ = self._images(instants)
-        size = L.shape[1:]
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-        p = self._seek(pyramid, instants.s, instants.first_horizon, size)
+        p = self._seek(pyramid, instants.s, instants.first_horizon)
         framed = np.isin(instants.t, self.schedule.frames)
         if not doubted or framed.sum() < 2:
             return instants, p
         frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
         nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        other = self._seek(frames, instants.s[framed], nearest, size)
+        other = self._seek(frames, instants.s[framed], nearest)
         images = PackedImages.of(pyramid[1], instants.s)
         return instants, choose_trajectories(images, (p, other), self._cost)
 
     def _seek(
-        self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float, size: tuple[int, ...]
+        self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float
     ) -> NDArray[np.float32]:
         """Seek trajectories of nodes at half resolution, first within a horizon."""
-        return (
-            estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
-            .at_level(1, size)
-            .p
-        )
+        motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
+        return motion.at_level(1, self.images.image_shape).p
 
     def _initial_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32]:
         """Return the motion that a target starts from, at half resolution."""
