@@ -89,7 +89,9 @@ def test_depth_of_frames_and_gains_do_not_matter(recording, found):
 def test_polarity_swapped(recording):
     events = recording.events
     swapped = dataclasses.replace(recording, events=dataclasses.replace(events, p=~events.p))
-    assert not jaxevent.calibrate(swapped, 0.02).c_on.is_identifiable
+    found = jaxevent.calibrate(swapped, 0.02)
+    assert not found.c_on.is_identifiable and not found.clock_offset.is_identifiable
+    assert "opposite" in found.clock_offset.note
     offsets = np.arange(-20, 21) * 5000
     one, two = (correlate(take_sample(r), offsets, 0.02) for r in (recording, swapped))
     np.testing.assert_allclose(one, -two, atol=1e-12)
