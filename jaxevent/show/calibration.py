@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.calibration import Calibration
+from jaxevent.display import plural
 from jaxevent.recording import Recording
 from jaxevent.show.images import new_figure
 from jaxevent.show.tables import format_aligned_table
@@ -129,5 +130,6 @@ def _draw_hot_pixels(axis: Any, calibration: Calibration, recording: Recording) 
     if recording.frames is not None:
         axis.imshow(recording.frames[:1].intensity[0], "gray", vmin=0, vmax=1)
     axis.plot(x, y, "C3o", ms=4, mfc="none")
-    axis.set(title=f"{len(x)} hot pixels", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    title = f"{len(x)} hot {plural('pixel', len(x))}"
+    axis.set(title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axis.set(xticks=[], yticks=[], aspect="equal")
