@@ -22,6 +22,7 @@ from common import command_line, machine, table_of_rows, write_text
 from recovery import AKF, VOTES, SimulatedGoal, from_akf, from_literal_votes
 
 import jaxevent
+from jaxevent.camera import PinholeCamera
 from jaxevent.confidence import confidence_intervals
 from jaxevent.egomotion.models import Planar
 from jaxevent.egomotion.patches import measure_image_speed
@@ -216,6 +217,8 @@ def real_r_t(data: Path) -> list[dict[str, Any]]:
     rows = []
     slider = jaxevent.load(data / "slider_depth.zip")[0.3:1.9]
     disk = jaxevent.load(data / "rotating_disk_imu.npz")[0.5:1.5]
+    centre = (disk.width - 1) / 2, (disk.height - 1) / 2
+    disk = dataclasses.replace(disk, camera=PinholeCamera(200.0, 200.0, *centre))
     dot = jaxevent.load(data / "spinning_dot.npz")
     for name, recording, model, truth, window in (
         ("slider_depth", slider, "planar", known_motion(slider, "planar", depth=1.94), 0.2),
