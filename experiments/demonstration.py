@@ -266,9 +266,9 @@ def main() -> None:
             tables = {part: rows[:4], f"{part}, recovered": rows[4:]}
         for title, rows in tables.items():
             text += f"\n### {part}: {title}\n\n{table_of_rows(rows)}\n"
-    if curves:
-        plot(curves, arguments.out / "figure.png")
-    write_text(arguments.out / "table.md", text)
+        write_text(arguments.out / "table.md", text)
+        if curves:
+            plot(curves, arguments.out / "figure.png")
     print(text)
 
 
