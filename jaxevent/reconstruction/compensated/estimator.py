@@ -113,9 +113,7 @@ from jaxevent.recording import Recording, Times, microseconds
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
-# In the events of an interval, from which its motion is sought along them and on their clock. Of
-# 0.5, 0.8 and 0.9 chosen on simulated scenes, with and without faults.
-MIN_TRUST = 0.8
+MIN_TRUST = 0.8  # in an interval's events, from which motion is sought along them, on their clock
 N_CACHED_ANCHORS = 2
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
 MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
