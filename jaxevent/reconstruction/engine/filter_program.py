@@ -161,7 +161,8 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         segments = ExposureSegments(*(v[name] for name in SEGMENT_INPUTS)) if exposed else None
         made: dict[str, Any] = {f.name: v.get(f.name) for f in dataclasses.fields(FrameFeatures)}
         made |= {"segments": segments, "width": NO_IMAGE_WIDTH}
-        made |= dict.fromkeys(("flicker", "movement"), jnp.zeros((), dtype))  # of variances alone
+        for name in ("flicker", "movement"):  # which filters without a variance are not given
+            made[name] = v.get(name, jnp.zeros((), dtype))
         return FrameFeatures(**made)
 
     def image_points(v: dict[str, Any], counted: bool) -> ImagePoints:
