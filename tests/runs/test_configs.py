@@ -13,11 +13,12 @@ CONFIGS = sorted((ROOT / "configs").glob("*.toml"))
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
 def test_configurations_are_read(config, tmp_path, monkeypatch):
-    for name in ("AHDR", "AKF_HDR", "IJRR", "RIGS", "JAXEVENT_DATA"):
+    for name in ("AHDR", "AKF_HDR", "DEMONSTRATION", "IJRR", "RIGS", "JAXEVENT_DATA"):
         monkeypatch.setenv(name, str(tmp_path))
-    for part in ("fit", "validation", "test", "."):
-        (tmp_path / part).mkdir(exist_ok=True)
-        (tmp_path / part / f"of_{part.strip('.')}.h5").touch()
+    splits = ("fit", "validation", "test")
+    for part in (*splits, ".", *(f"{of}/{one}" for of in ("noises", "r_t") for one in splits)):
+        (tmp_path / part).mkdir(exist_ok=True, parents=True)
+        (tmp_path / part / f"of_{Path(part).name}.h5").touch()
     (tmp_path / "fitted").mkdir()
     (tmp_path / "fitted" / "params.toml").write_text("[akf]\nc_on = 0.3\n")
     table = tomllib.loads(config.read_text())
