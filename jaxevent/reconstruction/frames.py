@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration.clipping import find_clipping
 from jaxevent.codegen import njit
 from jaxevent.codegen.graph import evaluate_function
+from jaxevent.events.tail import Tail
 from jaxevent.reconstruction.features import (
     ExposureSegments,
     FrameFeatures,
@@ -201,7 +202,9 @@ class FrameImages:
 
     @functools.cached_property
     def white(self) -> NDArray | None:
-        """See `FrameFeatures.white`."""
+        """See `FrameFeatures.white`; of a live recording, whose frames come later, None."""
+        if isinstance(self.recording.events, Tail):
+            return None
         found = find_clipping(self.recording).white
         return None if found.level is None else np.array([found.level, found.excess], self.dtype)
 

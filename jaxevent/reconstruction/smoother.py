@@ -57,6 +57,7 @@ from jaxevent.reconstruction.features import (
 )
 from jaxevent.reconstruction.variance import (
     ERROR_PARAMETERS,
+    MIN_INTENSITY,
     ONE_SIDED_FACTOR,
     activity_variance,
     bridge_weight,
@@ -705,7 +706,7 @@ class Smoother(KernelEstimator[Params]):
         Returns:
             The variance, (ln I)^2.
         """
-        I_plus = jnp.exp(state.m)
+        I_plus = jnp.maximum(jnp.exp(state.m), MIN_INTENSITY)
         noise, common = (params.frame_noise / I_plus) ** 2, flicker / I_plus**2
         w = bridge_weight(gap.part)
         bridge = gap_variance(params, gap.activity, gap.residual, movement) + common

@@ -37,6 +37,7 @@ ERROR_PARAMETERS = (
 )
 # Errors do not shrink in proportion to low thresholds, or to those found too low.
 USUAL_THRESHOLD = 0.1  # ln I
+MIN_INTENSITY = 1e-15  # whose square is in the range of float32
 NEIGHBOUR_SHARE = 0.5  # of an event, that belongs to the activity of its eight neighbours
 ONE_SIDED_FACTOR = 4.0  # of a random walk's variance over that of its bridge, halfway
 

@@ -308,7 +308,9 @@ def test_without_events_the_filter_tends_to_the_augmented_frame():
     recording = random_recording(2, 1, 6)
     recording = dataclasses.replace(recording, events=Events.empty())
     times = recording.frames.t[2:]
-    image, variance, _ = jaxevent.akf.estimate(recording, jaxevent.akf.Params(kappa=7e7))(times)
+    exact = dict.fromkeys(("frame_noise", "error_event", "error_still", "error_change"), 0.0)
+    params = jaxevent.akf.Params(kappa=7e7, **exact)
+    image, variance, _ = jaxevent.akf.estimate(recording, params)(times)
     expected, _, _ = jaxevent.augmented.estimate(recording)(times)
     # What is left of the start is 1 / (1 + P0 t / R) < 1e-4: R < 1.6e-7 s, t > 0.07 s, P0 = 0.09.
     np.testing.assert_allclose(image, expected, atol=1e-4)

@@ -357,6 +357,7 @@ def test_motion_of_objects(tmp_path):
 
 FIT = """
 recordings = ["small.h5"]
+calibrate = false
 iterations = 2
 [[method]]
 name = "edi"

@@ -13,11 +13,11 @@ CONFIGS = sorted((ROOT / "configs").glob("*.toml"))
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
 def test_configurations_are_read(config, tmp_path, monkeypatch):
-    for name in ("AHDR", "AKF_HDR", "DEMONSTRATION", "IJRR", "RIGS", "JAXEVENT_DATA"):
+    for name in ("AHDR", "AKF_HDR", "IJRR", "RIGS", "JAXEVENT_DATA", "DEMONSTRATION"):
         monkeypatch.setenv(name, str(tmp_path))
-    splits = ("fit", "validation", "test")
-    for part in (*splits, ".", *(f"{of}/{one}" for of in ("noises", "r_t") for one in splits)):
-        (tmp_path / part).mkdir(exist_ok=True, parents=True)
+    drawn = [f"{name}/{part}" for name in ("noises", "r_t") for part in ("fit", "test")]
+    for part in ("fit", "validation", "test", ".", *drawn):
+        (tmp_path / part).mkdir(parents=True, exist_ok=True)
         (tmp_path / part / f"of_{Path(part).name}.h5").touch()
     (tmp_path / "fitted").mkdir()
     (tmp_path / "fitted" / "params.toml").write_text("[akf]\nc_on = 0.3\n")

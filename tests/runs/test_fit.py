@@ -624,6 +624,7 @@ def test_the_configuration_of_the_readme():
 
 TWO = """
 recordings = ["moving.h5"]
+calibrate = false
 window = 0.25
 warm_up = 0.05
 batch = 1
@@ -710,7 +711,7 @@ def test_an_interrupted_fit_goes_on(folder, monkeypatch, capsys):
 
 def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder, capsys):
     """kill -9 in a descent; elsewhere the test above lets it die."""
-    one = TWO[: TWO.rindex("[[")].replace("iterations = 6", "calibrate = false\niterations = 100")
+    one = TWO[: TWO.rindex("[[")].replace("iterations = 6", "iterations = 100")
     config = write(folder, one.replace("every = 3", "patience = 100"))
     program = (
         "import jaxevent.runs.fit as f; f.CHECKPOINT_PERIOD_S = 0; "

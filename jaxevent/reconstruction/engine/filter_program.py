@@ -161,6 +161,7 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         segments = ExposureSegments(*(v[name] for name in SEGMENT_INPUTS)) if exposed else None
         made: dict[str, Any] = {f.name: v.get(f.name) for f in dataclasses.fields(FrameFeatures)}
         made |= {"segments": segments, "width": NO_IMAGE_WIDTH}
+        made |= dict.fromkeys(("flicker", "movement"), jnp.zeros((), dtype))  # of variances alone
         return FrameFeatures(**made)
 
     def image_points(v: dict[str, Any], counted: bool) -> ImagePoints:
