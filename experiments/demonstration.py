@@ -136,21 +136,21 @@ def plot(curves: dict[str, Any], path: Path) -> None:
     for ax, (part, (names, (grid, losses), true, found, start, rows)) in zip(
         axes[0], curves.items(), strict=True
     ):
-        points = {"true": (true, "k*"), "start": (start, "C3o"), "found": (found, "C0D")}
+        points = {"start": (start, "C3o"), "found": (found, "C0D"), "true": (true, "C1*")}
         losses = np.reshape(losses, [len(axis) for axis in grid])
         if len(names) == 1:
             ax.loglog(grid[0], losses, "0.6", marker=".", label="loss")
             for label, (params, mark) in points.items():
                 value = float(getattr(params, names[0]))
                 height = np.exp(np.interp(np.log(value), np.log(grid[0]), np.log(losses)))
-                ax.plot(value, height, mark, label=label)
+                ax.plot(value, height, mark, label=label, ms=9)
             ax.axvspan(rows[0]["low"], rows[0]["high"], color="C0", alpha=0.2)
             ax.set(xlabel=f"{names[0]}, px/s", ylabel="relative squared error")
         else:
             levels = losses.min() + np.geomspace(0.01, 30, 9)
             ax.contour(*grid, losses.T, levels=levels, cmap="Greys_r", linewidths=0.8)
             for label, (params, mark) in points.items():
-                ax.plot(*(float(getattr(params, name)) for name in names), mark, label=label)
+                ax.plot(*(float(getattr(params, name)) for name in names), mark, label=label, ms=9)
             (a, b), (c, d) = ((row["low"], row["high"]) for row in rows)
             ax.plot([a, b, b, a, a], [c, c, d, d, c], "C0", lw=1)
             ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])

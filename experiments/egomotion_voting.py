@@ -1,7 +1,7 @@
 """Motion by voting on simulated sequences with known motion, the thesis' literal likelihood beside.
 
     python experiments/egomotion_voting.py --out egomotion_voting [--seeds 10] [--first 100]
-        [--only planar frames rotation]
+        [--only planar frames rotation penalty]
 
 An ideal event camera of 160 x 120 pixels, f = 200 px, and the thesis' generator of frames 50 us
 apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.Params`, which were
@@ -217,10 +217,44 @@ def part_rotation(seeds: range) -> Table:
     return "rotation, 2 rad/s", rows
 
 
+def _turn(source: Any) -> Callable[[NDArray], NDArray]:
+    return lambda t: source.twist(t)[1]
+
+
+def part_penalty(seeds: range) -> Table:
+    """Vary r_t with the speed of the image; errors at once, geometric means over sequences."""
+    rows = []
+    for model, preset, speed in (
+        ("planar", "literal", 60.0), ("planar", "literal", 200.0), ("planar", "literal", 600.0),
+        ("rotation", "literal_latest", 400.0),
+    ):  # fmt: skip
+        for texture in TEXTURES:
+            row: Row = {"motion": model, "px/s": speed, "texture": texture}
+            for r_t in np.geomspace(10, 1e5, 9):
+                errors = []
+                for seed in seeds:
+                    duration = DURATION if speed <= 400 else 0.35
+                    more: Row = {"speed": speed} if model == "planar" else {}
+                    recording, source = motion_scene(
+                        model, "varying", seed, size=SIZE, duration=duration, texture=texture,
+                        **more,
+                    )  # fmt: skip
+                    params = Params(preset=preset, r_t=float(r_t))
+                    motion = voting.estimate(recording, params, model=model, seed=seed)
+                    times = np.arange(SETTLE, duration - 1e-6, 0.005)
+                    truth = source.velocity if model == "planar" else _turn(source)
+                    errors.append(motion_errors(motion, params, truth, times)["at once"])
+                row[f"{r_t:.2g}"] = float(np.exp(np.log(errors).mean()))
+            rows.append(row)
+            print(f"penalty {row}", file=sys.stderr)
+    return "literal likelihood over r_t (px/s): relative error at once (%)", rows
+
+
 PARTS: dict[str, Callable[[range], Table]] = {
     "planar": part_planar,
     "frames": part_frames,
     "rotation": part_rotation,
+    "penalty": part_penalty,
 }
 
 

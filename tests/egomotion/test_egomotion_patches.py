@@ -77,6 +77,8 @@ def test_image_speed(speed, seconds):
     assert float(given.params.duration) == pytest.approx(0.07)  # a number that is given wins
     params = voting.adapt_params(recording, voting.Params(), speed=found).params
     assert float(params.tau_max) * speed > float(params.baseline)
+    literal = voting.adapt_params(recording, voting.Params(preset="literal"), speed=found).params
+    assert float(literal.r_t) == pytest.approx(25 * found.median), "a speed grows with the image's"
     half = float(batch.adapt_params(recording, batch.Params(), speed=found).params.half_window)
     assert 20 < 2 * half * speed < 151
 
