@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events
@@ -29,6 +30,12 @@ N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
 # The curvature of S is that of the image before it is blurred, which is sharper.
 CURVATURE = 3.0
+# The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
+POOLING = 1.0  # nodes whose information counts, of those of a Gaussian of one node
+MIN_INFORMATION = 0.04  # 1/px^2
+SPREAD = 1.0  # of neighbours' variance
+MIN_VARIANCE = 0.003  # px^2
+RELATIVE_VARIANCE = 0.0004  # of the square of the displacement
 
 
 @njit_noalloc_inlined
@@ -218,6 +225,27 @@ class Aligned(NamedTuple):
         order = np.argsort(length)
         total = np.cumsum(weight[order])
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])
+
+
+def covariance_of(aligned: Aligned) -> NDArray[np.float64]:
+    """Return the covariance of the nodes' displacement.
+
+    It is the inverse of the information of a node and its neighbours, and the variance among them,
+    which is large at borders of objects.
+
+    Args:
+        aligned: Displacement and information.
+
+    Returns:
+        (rows, columns, 2, 2), px^2.
+    """
+    near = POOLING * gaussian_filter(aligned.information, (1, 1, 0))
+    C = np.linalg.inv(near[..., [[0, 1], [1, 2]]] + MIN_INFORMATION * np.eye(2))
+    off = np.stack([np.roll(aligned.u, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    off = off - aligned.u
+    spread = np.einsum("n...i,n...j->...ij", off, off) / len(off)
+    length2 = (aligned.u**2).sum(-1)[..., None, None]
+    return C + SPREAD * spread + (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
 
 
 class Alignment:

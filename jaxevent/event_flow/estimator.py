@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents
+from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents, covariance_of
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
 from jaxevent.recording import Recording, Times, check_times, microseconds
@@ -24,9 +24,7 @@ MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from
 class FlowParams(Parameters):
     """Parameters of the flow from events."""
 
-    density = Positive(
-        0.23, "1/px", "events per pixel on either side of a time, at first"
-    )
+    density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
     displacement = Positive(2.5, "px", "typical displacement before and after a time; windows grow")
     spacing = Count(8, "px", "distance between nodes of the flow")
     smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
@@ -44,6 +42,11 @@ class Anchor(NamedTuple):
     def velocity(self) -> NDArray[np.float64]:
         """Velocity (rows, columns, 2), px/s."""
         return self.aligned.u / self.unit
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of the velocity (rows, columns, 2, 2), (px/s)^2."""
+        return covariance_of(self.aligned) / self.unit**2
 
 
 class Chain(NamedTuple):
@@ -157,7 +160,8 @@ class EventFlow:
             anchors = self._around(min(start, at), max(stop, at))
         knots = np.array([anchor.t for anchor in anchors], np.int64)
         velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
-        return WindowPaths(int(at), knots, np.stack(velocity), None)
+        covariance = [self._align.fill(anchor.covariance) for anchor in anchors]
+        return WindowPaths(int(at), knots, np.stack(velocity), np.stack(covariance))
 
     def __call__(
         self, times: Times, extrapolate: bool = False
