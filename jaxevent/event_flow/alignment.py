@@ -31,12 +31,12 @@ NUMBER_FLOOR = 0.1  # events per cell, added to their number
 # The curvature of S is that of the image before it is blurred, which is sharper.
 CURVATURE = 3.0
 OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
-# More than it is on average (0.055), so that noise alone has no information.
-NOISE = 0.08  # variance of the gradient of an image of events without order, per event
+NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
 POOLING = 1.5  # nodes, of the Gaussian whose nodes tell of one
 MIN_INFORMATION = 0.1  # 1/px^2
 MIN_VARIANCE = 0.001  # px^2
+MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
 
@@ -228,14 +228,6 @@ class Aligned(NamedTuple):
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
     score: float  # per event
 
-    def typical(self) -> float:
-        """Return the median length of displacements, weighted by information, px."""
-        length = np.hypot(self.u[..., 0], self.u[..., 1]).ravel()
-        weight = np.maximum(self.information[..., 0] + self.information[..., 2], 0).ravel()
-        order = np.argsort(length, kind="stable")
-        total = np.cumsum(weight[order])
-        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
-
 
 class Alignment:
     """Displacements of windows of events: `align(events, start, cells)`.
@@ -280,6 +272,20 @@ class Alignment:
         length2 = (aligned.u**2).sum(-1)[..., None, None]
         floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
         return C + spread + floor
+
+    def typical(self, aligned: Aligned) -> float:
+        """Return the median length of displacements where events determine them, px; 0 if nowhere.
+
+        Args:
+            aligned: Displacement and information.
+        """
+        known = np.linalg.eigvalsh(self.covariance(aligned))[..., 1] < MAX_VARIANCE
+        weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0) * known
+        length = np.hypot(aligned.u[..., 0], aligned.u[..., 1]).ravel()
+        order = np.argsort(length, kind="stable")
+        total = np.cumsum(weight.ravel()[order])
+        middle = np.searchsorted(total, total[-1] / 2)
+        return float(length[order[middle]]) if total[-1] > 0 else 0.0
 
     def __call__(
         self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]

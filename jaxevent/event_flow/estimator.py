@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents
+from jaxevent.event_flow.alignment import MAX_VARIANCE, Aligned, Alignment, WindowEvents
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
 from jaxevent.recording import Recording, Times, check_times, microseconds
@@ -98,7 +98,7 @@ class EventFlow:
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
-                and (whole or found.aligned.typical() >= float(self.params.displacement))
+                and (whole or self._align.typical(found.aligned) >= float(self.params.displacement))
             ):
                 break
         assert found is not None
@@ -217,7 +217,7 @@ class EventFlow:
             covariance[row] = np.tensordot(weights, uncertainty, 1)
             unit = float(weights @ np.array([anchor.unit for anchor in anchors] or [0.0]))
             largest = np.linalg.eigvalsh(covariance[row])[..., 1]
-            valid[row] = (unit > 0) & (largest * unit**2 < MAX_DEVIATION_PX**2)
+            valid[row] = (unit > 0) & (largest * unit**2 < MAX_VARIANCE)
         return mean, covariance, valid
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
