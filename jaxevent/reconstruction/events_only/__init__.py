@@ -1,0 +1,1 @@
+"""Video from events alone: motion and log images from the same events."""
