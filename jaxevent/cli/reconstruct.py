@@ -30,8 +30,8 @@ def add(commands: Any) -> None:
         "--method",
         metavar="NAME",
         help="mc, akf, aks, cf, cf-augmented, high-pass, events-only, edi, augmented, flow, blend, "
-        "last-frame, or package.module:object of your own; default: mc, the best, or aks where mc would take "
-        "over ten minutes, or events-only where there are no frames",
+        "last-frame, or package.module:object of your own; default: mc, the best, or aks where mc "
+        "would take over ten minutes, or events-only where there are no frames",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
