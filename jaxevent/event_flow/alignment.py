@@ -26,10 +26,16 @@ from jaxevent.recording import Events
 
 N_STEPS = 5  # Gauss-Newton steps at each size of cells
 N_SWEEPS = 30  # of Gauss-Seidel
+N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
-SEARCH_REACH = 7  # cells, along x and y
-SEARCH_SIGMAS = (4.0, 12.0)  # cells, over which scores are summed
-FAR_WEIGHT = 0.5  # of the wider sum
+# The curvature of S is that of the image before it is blurred, which is sharper.
+CURVATURE = 3.0
+# The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
+POOLING = 1.0  # nodes whose information counts, of those of a Gaussian of one node
+MIN_INFORMATION = 0.04  # 1/px^2
+SPREAD = 1.0  # of neighbours' variance
+MIN_VARIANCE = 0.003  # px^2
+RELATIVE_VARIANCE = 0.0004  # of the square of the displacement
 
 
 @njit_noalloc_inlined
@@ -96,7 +102,7 @@ def blur(image, scratch, passes):
 
 
 @njit_noalloc
-def accumulate(warped, s, p, x, y, u, spacing, cell, image, floor, normal):
+def accumulate(warped, s, p, x, y, u, spacing, cell, image, normal):
     """Add the derivatives (1) of each event to the nodes around it; return the score.
 
     `normal` (rows, columns, 5) gets g, and xx, xy, yy of H, px.
@@ -123,10 +129,10 @@ def accumulate(warped, s, p, x, y, u, spacing, cell, image, floor, normal):
                 value += weight * image[0, a, b]
         gx, gy = gx * per_px, gy * per_px
         age = s[k] - late / max(number, 1e-9)
-        w = 1.0 / (number + floor)
+        w = 1.0 / (number + NUMBER_FLOOR)
         score += p[k] * value * w
         c = -p[k] * age * w
-        h = age * age * w / (number + floor)
+        h = CURVATURE * age * age * w / (number + NUMBER_FLOOR)
         i, j, fx, fy = node_cell(u, spacing, x[k], y[k])
         for dj in range(2):
             for di in range(2):
@@ -163,21 +169,6 @@ def solve_step(u, normal, smoothness, edge, sweeps, step):
                 if det > 1e-12:
                     step[j, i, 0] = (yy * gx - xy * gy) / det
                     step[j, i, 1] = (xx * gy - xy * gx) / det
-
-
-@njit_noalloc
-def vote_moved(x, y, s, p, dx, dy, cell, image):
-    """Add signed events, moved by one displacement, to the cells of an image (rows, columns)."""
-    image[:] = 0
-    for k in range(len(x)):
-        a, b = (x[k] - s[k] * dx + 0.5) / cell + 0.5, (y[k] - s[k] * dy + 0.5) / cell + 0.5
-        if 0 <= a < image.shape[1] - 1 and 0 <= b < image.shape[0] - 1:
-            i, j = int(a), int(b)
-            fx, fy = a - i, b - j
-            image[j, i] += p[k] * (1 - fx) * (1 - fy)
-            image[j, i + 1] += p[k] * fx * (1 - fy)
-            image[j + 1, i] += p[k] * (1 - fx) * fy
-            image[j + 1, i + 1] += p[k] * fx * fy
 
 
 def image_shape(shape: tuple[int, int], cell: float) -> tuple[int, int]:
@@ -220,8 +211,45 @@ class WindowEvents(NamedTuple):
         return cls(*(np.asarray(c, np.float32) for c in columns), unit)
 
 
+class Aligned(NamedTuple):
+    """Displacement of nodes and what events tell of it."""
+
+    u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
+    information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
+    score: float  # per event
+
+    def typical(self) -> float:
+        """Return the median length of displacements, weighted by information, px."""
+        length = np.hypot(self.u[..., 0], self.u[..., 1]).ravel()
+        weight = (self.information[..., 0] + self.information[..., 2]).ravel()
+        order = np.argsort(length)
+        total = np.cumsum(weight[order])
+        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
+
+
+def covariance_of(aligned: Aligned) -> NDArray[np.float64]:
+    """Return the covariance of the nodes' displacement.
+
+    It is the inverse of the information of a node and its neighbours, and the variance among them,
+    which is large at borders of objects.
+
+    Args:
+        aligned: Displacement and information.
+
+    Returns:
+        (rows, columns, 2, 2), px^2.
+    """
+    near = POOLING * gaussian_filter(aligned.information, (1, 1, 0))
+    C = np.linalg.inv(near[..., [[0, 1], [1, 2]]] + MIN_INFORMATION * np.eye(2))
+    off = np.stack([np.roll(aligned.u, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    off = off - aligned.u
+    spread = np.einsum("n...i,n...j->...ij", off, off) / len(off)
+    length2 = (aligned.u**2).sum(-1)[..., None, None]
+    return C + SPREAD * spread + (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
+
+
 class Alignment:
-    """Displacements of windows of events: `u, covariance = align(events, start)`.
+    """Displacements of windows of events: `align(events, start, cells)`.
 
     Args:
         shape: Height and width of the sensor.
@@ -229,72 +257,41 @@ class Alignment:
     """
 
     def __init__(self, shape: tuple[int, int], params: Any):
-        self.shape = shape
-        scale = 2.0 ** max(round(np.log2(np.sqrt(shape[0] * shape[1] / 43200))), 0)
-        self.spacing = float(params.spacing) * scale
-        self.cells = [c for c in (32.0, 16.0, 8.0, 4.0, 2.0, 1.0) if c <= 4 * scale]
+        self.shape, self.spacing = shape, float(params.spacing)
+        self.nodes = node_shape(shape, self.spacing)
         self.smoothness, self.edge = float(params.smoothness), float(params.edge)
 
     def fill(self, values: NDArray) -> NDArray[np.float32]:
         """Interpolate values of nodes to all pixels."""
         return fill_pixels(values, self.shape, self.spacing)
 
-    def __call__(self, events: WindowEvents, start: NDArray | None) -> tuple[NDArray, NDArray]:
+    def __call__(
+        self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]
+    ) -> Aligned:
         """Align the events of a window.
 
         Args:
             events: The events.
-            start: Displacement (rows, columns, 2) to start from; None: it is sought.
+            start: Displacement (rows, columns, 2) to start from, px; None: no displacement.
+            cells: Sizes of the cells, px, one after the other.
 
         Returns:
-            Displacement of the nodes (rows, columns, 2), px per unit of s, and its covariance.
+            The displacement.
         """
-        u = self._search(events) if start is None else start.copy()
-        cells = self.cells if start is None else self.cells[-2:]
-        normal, step = np.zeros((*u.shape[:2], 5)), np.zeros_like(u)
+        u = np.zeros((*self.nodes, 2)) if start is None else start.copy()
+        normal, step = np.zeros((*self.nodes, 5)), np.zeros_like(u)
         warped = np.empty((len(events.x), 2), np.float32)
         x, y, s, p, _ = events
+        score = 0.0
         for cell in cells:
-            image = np.zeros((3, *image_shape(self.shape, cell)))
+            image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)
             scratch = np.empty_like(image[0])
             for _ in range(N_STEPS):
                 warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
-                blur(image[0], scratch, 1)
-                blur(image[1], scratch, 2)
-                blur(image[2], scratch, 2)
-                accumulate(warped, s, p, x, y, u, self.spacing, cell, image, NUMBER_FLOOR, normal)
+                for channel, passes in zip(image, N_BLURS, strict=True):
+                    blur(channel, scratch, passes)
+                score = accumulate(warped, s, p, x, y, u, self.spacing, cell, image, normal)
                 solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
                 length = np.hypot(step[..., :1], step[..., 1:])
                 u += step * np.minimum(1, cell / np.maximum(length, 1e-9))
-        return u, self._covariance(normal)
-
-    def _covariance(self, normal: NDArray) -> NDArray:
-        """Return the covariance (rows, columns, 2, 2) of the displacement, px^2."""
-        pooled = gaussian_filter(normal[..., 2:], (1, 1, 0)) * 6 + [1e-4, 0, 1e-4]
-        information = pooled[..., [[0, 1], [1, 2]]]
-        return np.linalg.inv(information)
-
-    def _search(self, events: WindowEvents) -> NDArray[np.float64]:
-        """Seek the displacement of each node among those of the coarsest cells."""
-        cell, nodes = self.cells[0], node_shape(self.shape, self.spacing)
-        image = np.zeros(image_shape(self.shape, cell))
-        scratch = np.empty_like(image)
-        rows, columns = (
-            np.clip(((np.arange(n) + 0.5) * self.spacing / cell + 0.5).astype(int), 0, m - 1)
-            for n, m in zip(nodes, image.shape, strict=True)
-        )
-        tried = [
-            (float(np.hypot(i, j)), i * cell, j * cell)
-            for i in range(-SEARCH_REACH, SEARCH_REACH + 1)
-            for j in range(-SEARCH_REACH, SEARCH_REACH + 1)
-        ]
-        best, u = np.full(nodes, -np.inf), np.zeros((*nodes, 2))
-        for _, dx, dy in sorted(tried):  # equal scores: the slowest
-            vote_moved(*events[:4], dx, dy, cell, image)
-            blur(image, scratch, 1)
-            energy = image**2
-            near, far = (gaussian_filter(energy, sigma) for sigma in SEARCH_SIGMAS)
-            score = (near + FAR_WEIGHT * far)[rows][:, columns]
-            better = score > best
-            best[better], u[better] = score[better], (dx, dy)
-        return u
+        return Aligned(u, normal[..., 2:].copy(), score / max(len(x), 1))

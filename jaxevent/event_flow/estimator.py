@@ -1,6 +1,6 @@
 """Dense optical flow of a recording's events, as a function of time."""
 
-import collections
+import functools
 import threading
 from typing import NamedTuple
 
@@ -8,31 +8,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.event_flow.alignment import Alignment, WindowEvents
+from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents, covariance_of
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
-ANCHORS_PER_CHAIN = 8  # of which the first is sought from nothing
-N_CACHED_ANCHORS = 32
+CELLS = (4, 2, 1)  # px, for motion sought from nothing
+LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
+LEVELS = range(-4, 5)  # powers of 2 of the window's size
+CHAIN_WINDOWS = 16  # half windows of a chain of anchors
+N_CACHED_ANCHORS = 64
+MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
 
 
 class FlowParams(Parameters):
     """Parameters of the flow from events."""
 
-    density = Positive(0.23, "1/px", "events per pixel before and after a time that make a window")
-    spacing = Count(8, "px", "distance between nodes of the flow, at 240 x 180 pixels")
-    smoothness = Positive(2.0, "1/px^2", "weight of differences between neighbouring nodes")
-    edge = Positive(1.0, "px", "difference from which neighbours are taken for different objects")
+    density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
+    displacement = Positive(2.5, "px", "typical displacement before and after a time; windows grow")
+    spacing = Count(8, "px", "distance between nodes of the flow")
+    smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
+    edge = Positive(0.5, "px", "difference from which neighbours are taken for different objects")
 
 
 class Anchor(NamedTuple):
-    """Flow at one time: nodes' velocity (rows, columns, 2), px/s, and its covariance."""
+    """Flow at one time, at nodes."""
 
     t: int  # us
-    displacement: NDArray[np.float64]  # px in `unit`
-    unit: float  # s
-    covariance: NDArray[np.float64]  # (rows, columns, 2, 2), px^2
+    unit: float  # s in which points are displaced
+    aligned: Aligned
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Velocity (rows, columns, 2), px/s."""
+        return self.aligned.u / self.unit
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of the velocity (rows, columns, 2, 2), (px/s)^2."""
+        return covariance_of(self.aligned) / self.unit**2
+
+
+class Chain(NamedTuple):
+    """Anchors that start one from the other: the first of them, and how many events apart."""
+
+    first: Anchor
+    half: int  # events on either side of an anchor
 
 
 class EventFlow:
@@ -51,57 +72,74 @@ class EventFlow:
         self.recording, self.params, self.causal = recording, params, causal
         self.shape = (recording.height, recording.width)
         pixels = self.shape[0] * self.shape[1]
-        self.half = max(int(round(float(params.density) * pixels)), 1)  # events
-        self.step = self.half
-        self._aligner = Alignment(self.shape, params)
-        self._anchors: collections.OrderedDict[int, Anchor] = collections.OrderedDict()
+        self._base = max(round(float(params.density) * pixels), 2 ** -LEVELS[0])  # events
+        self._align = Alignment(self.shape, params)
+        self._chain = functools.lru_cache(N_CACHED_ANCHORS)(self._make_chain)
+        self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
         self._lock = threading.RLock()
 
-    @property
-    def n_anchors(self) -> int:
-        """Number of anchors."""
-        n = len(self.recording.events)
-        return 0 if n == 0 else (n - 1) // self.step + 1
+    def _window(self, row: int, half: int) -> tuple[int, WindowEvents]:
+        """Return the time (us) of an event, and the events around it."""
+        events = self.recording.events[max(row - half, 0) : row + half]
+        at = int(events.t[min(row, half)])
+        return at, WindowEvents.of(events, at)
 
-    def _anchor_time(self, k: int) -> int:
-        return int(self.recording.events[k * self.step : k * self.step + 1].t[0])
+    def _seek(self, row: int, most: int | None = None) -> Chain:
+        """Find the motion around an event from nothing, in windows that double.
 
-    def _anchor(self, k: int) -> Anchor:
-        """Return the anchor of a number; those of its chain are estimated before it."""
-        with self._lock:
-            if k not in self._anchors:
-                before = self._anchor(k - 1) if k % ANCHORS_PER_CHAIN else None
-                self._anchors[k] = self._estimate(k, before)
-                if len(self._anchors) > N_CACHED_ANCHORS:
-                    self._anchors.popitem(last=False)
-            self._anchors.move_to_end(k)
-            return self._anchors[k]
+        They grow until points are displaced far enough, or to `most` events.
+        """
+        start, found = None, None
+        for level in LEVELS:
+            half = int(self._base * 2.0**level)
+            at, window = self._window(row, half)
+            start = None if found is None else found.aligned.u * (window.unit / found.unit)
+            found = Anchor(at, window.unit, self._align(window, start, CELLS))
+            whole = row + half >= len(self.recording.events) and row - half <= 0
+            if half == most or (
+                most is None
+                and (whole or found.aligned.typical() >= float(self.params.displacement))
+            ):
+                break
+        assert found is not None
+        return Chain(found, half)
 
-    def _estimate(self, k: int, before: Anchor | None) -> Anchor:
-        row = k * self.step
-        events = self.recording.events[max(row - self.half, 0) : row + self.half]
-        at = self._anchor_time(k)
-        window = WindowEvents.of(events, at)
-        start = None
-        if before is not None and before.unit > 0:
-            start = before.displacement * (window.unit / before.unit)
-        u, covariance = self._aligner(window, start)
-        return Anchor(at, u, window.unit, covariance)
+    def _make_chain(self, number: int) -> Chain:
+        return self._seek(number * CHAIN_WINDOWS * self._base)
+
+    def _make_anchor(self, number: int, k: int) -> Anchor:
+        """Return an anchor of a chain; those before it are estimated first."""
+        first, half = self._chain(number)
+        if k == 0:
+            return first
+        before = self._anchor(number, k - 1)
+        row = number * CHAIN_WINDOWS * self._base + k * half
+        at, window = self._window(row, half)
+        found = self._align(window, before.velocity * window.unit, LAST_CELLS)
+        if found.score < MIN_SCORE_RATIO * before.aligned.score:
+            other = self._seek(row, half).first
+            if other.aligned.score > found.score:
+                return other
+        return Anchor(at, window.unit, found)
 
     def _around(self, start: int, stop: int) -> list[Anchor]:
         """Return the anchors that determine flow from start to stop (us), of different times."""
-        events, last = self.recording.events, self.n_anchors - 1
-        low = min(max((events.index(start + 1) - 1) // self.step, 0), last)
-        high = min(-(-events.index(stop) // self.step), last)
-        if self.causal:
-            # An anchor rests on `half` events after it.
-            newest = max((events.index(stop + 1) - self.half) // self.step, 0)
-            low, high = min(low, newest), min(high, newest)
-        found: dict[int, Anchor] = {}
-        for k in range(low, high + 1):
-            anchor = self._anchor(k)
-            found.setdefault(anchor.t, anchor)
-        return list(found.values())
+        events = self.recording.events
+        low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), len(events) - 1)
+        length = CHAIN_WINDOWS * self._base
+        found: list[Anchor] = []
+        for number in range(
+            low // length, min(high // length + 2, (len(events) - 1) // length + 1)
+        ):
+            half = self._chain(number).half
+            count = -(-(min(length, len(events) - number * length)) // half)
+            first = max((low - number * length) // half, 0)
+            last = min(-(-(high - number * length) // half), count - 1)
+            for k in range(first, last + 1):
+                anchor = self._anchor(number, k)
+                if not found or anchor.t > found[-1].t:
+                    found.append(anchor)
+        return found
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
@@ -114,22 +152,15 @@ class EventFlow:
         Returns:
             The paths.
         """
-        if self.n_anchors == 0:
+        if not len(self.recording.events):
             still = np.zeros((1, *self.shape, 2), np.float32)
-            unknown = np.broadcast_to(
-                np.float32(1e6) * np.eye(2, dtype=np.float32), (*still.shape, 2)
-            )
+            unknown = np.full((*still.shape, 2), np.inf, np.float32) * np.eye(2, dtype=np.float32)
             return WindowPaths(int(at), np.array([at], np.int64), still, unknown)
-        anchors = self._around(min(start, at), max(stop, at))
-        per_second = [1 / a.unit if a.unit > 0 else 0.0 for a in anchors]
-        velocity = [
-            self._aligner.fill(a.displacement * s) for a, s in zip(anchors, per_second, strict=True)
-        ]
-        covariance = [
-            self._aligner.fill(a.covariance * s**2)
-            for a, s in zip(anchors, per_second, strict=True)
-        ]
-        knots = np.array([a.t for a in anchors], np.int64)
+        with self._lock:
+            anchors = self._around(min(start, at), max(stop, at))
+        knots = np.array([anchor.t for anchor in anchors], np.int64)
+        velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
+        covariance = [self._align.fill(anchor.covariance) for anchor in anchors]
         return WindowPaths(int(at), knots, np.stack(velocity), np.stack(covariance))
 
     def __call__(
