@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jaxevent.calibration import calibrate, check_consistency
     from jaxevent.errors import InputError, InputWarning
     from jaxevent.estimator import Estimate, Estimator
+    from jaxevent.event_flow import flow_from_events
     from jaxevent.io import load, save
     from jaxevent.methods import METHODS
     from jaxevent.parameters import Parameters
@@ -58,6 +59,7 @@ _HOMES = {
     "jaxevent.calibration": ("calibrate", "check_consistency"),
     "jaxevent.errors": ("InputError", "InputWarning"),
     "jaxevent.estimator": ("Estimate", "Estimator"),
+    "jaxevent.event_flow": ("flow_from_events",),
     "jaxevent.io": ("load", "save"),
     "jaxevent.methods": ("METHODS",),
     "jaxevent.parameters": ("Parameters",),
@@ -107,6 +109,7 @@ __all__ = [
     "events",
     "fit",
     "flow",
+    "flow_from_events",
     "high_pass",
     "last_frame",
     "load",
