@@ -3,29 +3,41 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.estimator import ImageEstimator
+from jaxevent.reconstruction.events_only.gradient import (
+    WindowEquations,
+    pack_equations,
+    sample_variance,
+    solve_equations,
+    threshold,
+)
 from jaxevent.reconstruction.events_only.params import Params
-from jaxevent.reconstruction.events_only.video import GREY, EventsOnlyVideo
-from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.events_only.video import EventsOnlyVideo, read_intensity
+from jaxevent.reconstruction.events_only.windows import WindowSolver
 from jaxevent.recording import Recording, Times, microseconds
 
 
 class WindowFeatures(ShortRepr):
-    """Windows of events around the prepared times."""
+    """Windows of events around the prepared times, the features that `run` takes."""
 
-    counts: Float[Numeric, "times 2 pixels"]
+    equations: WindowEquations  # stacked
+
+    def over(self, devices: Any) -> "WindowFeatures":
+        """Return the windows as they are: pixels depend on each other and are not shared out."""
+        return self
 
 
 class WindowImages(NamedTuple):
-    """Solutions of windows."""
+    """Log images of windows."""
 
-    L: Float[Array, "times pixels"]
-    P: Float[Array, "times pixels"]
+    L: Float[Array, "times pixels"]  # ln I
+    P: Float[Array, "times pixels"]  # variance, (ln I)^2
 
 
 class PreparedTimes(ShortRepr):
@@ -45,6 +57,10 @@ class PreparedTimes(ShortRepr):
 @dataclasses.dataclass(frozen=True, repr=False)
 class EventsOnly(ImageEstimator[Params]):
     """Video from events alone."""
+
+    options: frozenset[str] = dataclasses.field(
+        default=frozenset({"causal", "motion"}), kw_only=True
+    )
 
     def prepare(
         self,
@@ -73,14 +89,15 @@ class EventsOnly(ImageEstimator[Params]):
         wanted = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.check_span(recording, wanted, params)
-        pixels = recording.width * recording.height
-        number = round(float(params.window) * pixels)
-        counts = np.zeros((len(wanted), 2, pixels), np.float32)
-        for one, t in zip(counts, wanted.tolist(), strict=True):
-            last = recording.events.index(t)
-            events = recording.events[max(last - number, 0) : last]
-            np.add.at(one, (1 - events.p, events.y.astype(int) * recording.width + events.x), 1)
-        return WindowFeatures(counts), PreparedTimes(np.arange(len(wanted)))
+        if not len(wanted):
+            raise InputError(f"{recording.name}: no times to prepare images for; give some")
+        windows = WindowSolver(recording, params)
+        solved = [windows(t, variance=False) for t in wanted.tolist()]
+        count = max(len(one.rows.kind) for one in solved)
+        packed = [pack_equations(one, windows.relative, params, count) for one in solved]
+        equations = jax.tree.map(lambda *leaves: np.stack(leaves), *packed)
+        features = WindowFeatures(jax.device_put(equations))
+        return features, PreparedTimes(np.arange(len(wanted)))
 
     def run(
         self, params: Params, features: WindowFeatures, state: Any = None
@@ -95,10 +112,14 @@ class EventsOnly(ImageEstimator[Params]):
         Returns:
             The solutions, and None: nothing passes from run to run.
         """
-        on, off = features.counts[:, 0], features.counts[:, 1]
-        L = params.c_on * on - params.c_off * off
-        P = params.c_on * params.c_off * (1 + 100 * jnp.exp(-on - off))
-        return WindowImages(L, P), None
+
+        @jax.checkpoint
+        def solve(equations: WindowEquations) -> WindowImages:
+            u, c = solve_equations(equations, params), threshold(equations, params)
+            variance = sample_variance(u, equations, params)
+            return WindowImages((c * u).ravel(), (c**2 * variance).ravel())
+
+        return jax.lax.map(solve, features.equations), None
 
     def read(self, params: Params, trajectory: WindowImages, out: PreparedTimes) -> Estimate:
         """Read the prepared images; pure and differentiable.
@@ -112,8 +133,7 @@ class EventsOnly(ImageEstimator[Params]):
             Images (T, pixels), their variance (ln I)^2, and which pixels are valid.
         """
         L, P = (leaf[out.rows] for leaf in trajectory)
-        image = (GREY + params.I0) * jnp.exp(L) - params.I0
-        return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))
+        return Estimate(*read_intensity(params, L, P))
 
     def estimate(
         self, recording: Recording, params: Params | None = None, **options: Any

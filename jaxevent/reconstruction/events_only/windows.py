@@ -1,0 +1,103 @@
+"""The windows of a recording's events: equations, and their solutions on the host."""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration.event_calibration import calibrate_events
+from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
+from jaxevent.reconstruction.events_only.params import Params
+from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
+from jaxevent.reconstruction.events_only.rows import Rows, make_rows
+from jaxevent.reconstruction.events_only.solve import Solution, solve
+from jaxevent.recording import Recording, Times
+
+N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
+
+
+@runtime_checkable
+class FlowSource(Protocol):
+    """A source of optical flow: a `RigidFlow` of egomotion, or a video with flow."""
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
+        """Return the optical flow at some times.
+
+        Args:
+            times: (T,) times, us or seconds as of images.
+            extrapolate: Whether times may lie outside the data.
+
+        Returns:
+            (T, H, W, 2) flow along x and y, px/s; not finite where it is not known.
+        """
+        ...
+
+
+class SolvedWindow(NamedTuple):
+    """The equations of a window, and their solution."""
+
+    rows: Rows
+    prior: GradientPrior
+    solution: Solution
+
+
+class WindowSolver:
+    """Solves for the image at a time: `solved = windows(t)`, t in us.
+
+    Args:
+        recording: Events.
+        params: Parameters.
+        causal: Whether images rest on earlier events alone.
+        motion: Optical flow that is known beforehand; None: that of the events.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params,
+        *,
+        causal: bool = False,
+        motion: FlowSource | None = None,
+    ):
+        self.recording, self.params, self.causal = recording, params, causal
+        self.shape = (recording.height, recording.width)
+        self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
+        self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
+        self.relative = np.ones((2, *self.shape), np.float32)
+        self.hot = np.zeros(self.shape, bool)
+        if params.learn:
+            found = calibrate_events(recording)
+            self.relative, self.hot = found.thresholds, found.hot
+        c = np.float32([params.c_on, params.c_off])
+        self.thresholds = self.relative * c[:, None, None]
+        self.numbers = SolverParams(*(float(value) for value in params.solver()))
+
+    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+        """Return the paths of points through a window, see `EventFlow.paths`."""
+        if isinstance(self.flow, EventFlow):
+            return self.flow.paths(start, stop, at)
+        low, high = min(start, at), max(stop, at)
+        knots = np.unique(np.linspace(low, high, N_MOTION_KNOTS).astype(np.int64))
+        velocity = np.nan_to_num(np.asarray(self.flow.flow(knots, extrapolate=True), np.float32))
+        return WindowPaths(at, knots, velocity)
+
+    def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
+        """Solve for the image at a time.
+
+        Args:
+            t: Time, us.
+            variance: Whether the variance is wanted.
+
+        Returns:
+            The window's equations and solution.
+        """
+        source = self.recording.events
+        place = source.index(t)
+        ahead = 0 if self.causal else self.n_side
+        events = source[max(place - 2 * self.n_side + ahead, 0) : place + ahead]
+        events = events[~self.hot[events.y, events.x]]
+        span = (int(events.t[0]), int(events.t[-1])) if len(events) else (t, t)
+        rows = make_rows(events, self.paths(*span, t), self.thresholds, self.shape, span)
+        still = np.zeros((*self.shape, 2), np.float32)
+        prior = GradientPrior(still, np.zeros((*still.shape, 2), np.float32))
+        return SolvedWindow(rows, prior, solve(rows, None, self.numbers, variance=variance))
