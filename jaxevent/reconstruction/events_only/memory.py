@@ -16,15 +16,17 @@ where P grows with time by the flow's covariance and by `drift`, and q by `forge
 information is added. No image is solved for: memory costs little more than the rows themselves.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior
 from jaxevent.reconstruction.events_only.rows import EVENT, Paths, Rows
+from jaxevent.recording import Recording
 
+KEYS_PER_BLOCK = 16  # whose memories are kept at a time, for each direction
+KEYS_BEYOND_BLOCK = 8  # from which a block's memories begin with nothing
 LEAST_INFORMATION = 1e-3  # (px / c)^2; with less a gradient counts as 0
 
 
@@ -175,10 +177,18 @@ def _carry(px, py, memory, noise, out):
                     gx += w * v[0]
                     gy += w * v[1]
             # G: derivative of the gradient along x and y.
-            p = (1 - fy) * (g[j, i + 1, 0] - g[j, i, 0]) + fy * (g[j + 1, i + 1, 0] - g[j + 1, i, 0])
-            s = (1 - fy) * (g[j, i + 1, 1] - g[j, i, 1]) + fy * (g[j + 1, i + 1, 1] - g[j + 1, i, 1])
-            r = (1 - fx) * (g[j + 1, i, 0] - g[j, i, 0]) + fx * (g[j + 1, i + 1, 0] - g[j, i + 1, 0])
-            t = (1 - fx) * (g[j + 1, i, 1] - g[j, i, 1]) + fx * (g[j + 1, i + 1, 1] - g[j, i + 1, 1])
+            p = (1 - fy) * (g[j, i + 1, 0] - g[j, i, 0]) + fy * (
+                g[j + 1, i + 1, 0] - g[j + 1, i, 0]
+            )
+            s = (1 - fy) * (g[j, i + 1, 1] - g[j, i, 1]) + fy * (
+                g[j + 1, i + 1, 1] - g[j + 1, i, 1]
+            )
+            r = (1 - fx) * (g[j + 1, i, 0] - g[j, i, 0]) + fx * (
+                g[j + 1, i + 1, 0] - g[j, i + 1, 0]
+            )
+            t = (1 - fx) * (g[j + 1, i, 1] - g[j, i, 1]) + fx * (
+                g[j + 1, i + 1, 1] - g[j, i + 1, 1]
+            )
             Qx, Qxy, Qy = q + P * (p * p + r * r), P * (p * s + r * t), q + P * (s * s + t * t)
             # (Lambda^-1 + Q)^-1 = (1 + Lambda Q)^-1 Lambda
             A, B = 1 + xx * Qx + xy * Qxy, xx * Qxy + xy * Qy
@@ -190,3 +200,137 @@ def _carry(px, py, memory, noise, out):
             out.information[row, column, 1, 1] = scale * (A * yy - C * xy)
             out.gradient[row, column, 0] = gx
             out.gradient[row, column, 1] = gy
+
+
+def join_memories(
+    before: GradientPrior | None,
+    after: GradientPrior | None,
+    shape: tuple[int, int],
+    threshold: float,
+) -> GradientPrior:
+    """Return what the windows before and after one say of its image, if any do.
+
+    Args:
+        before: Memory of earlier windows.
+        after: Memory of later ones.
+        shape: (height, width) of the sensor.
+        threshold: Threshold c, ln I.
+
+    Returns:
+        Both together; without any the information is 0.
+    """
+    if before is not None and after is not None:
+        return fuse(before, after, threshold)
+    if before is None and after is None:
+        zeros = np.zeros((*shape, 2), np.float32)
+        return GradientPrior(zeros, np.zeros((*shape, 2, 2), np.float32))
+    return before if after is None else after
+
+
+class Windows(Protocol):
+    """A source of a recording's paths and equations."""
+
+    def paths(self, start: int, stop: int, at: int) -> Paths:
+        """Return the paths between two times (us) towards the time `at`."""
+        ...
+
+    def rows(self, first: int, last: int, at: int, span: tuple[int, int]) -> Rows:
+        """Return the equations of some rows of events for the image at a time."""
+        ...
+
+
+class KeyMemories:
+    """Memories of a recording at keys: times one for so many events.
+
+    A memory is that of the windows between keys on one side, the oldest at least
+    `KEYS_BEYOND_BLOCK` away. Keys are in blocks. A block's memories are found from a key beyond it,
+    so that they do not depend on what was asked for before, and one block is kept for each side.
+
+    Args:
+        windows: Source of paths and equations.
+        recording: Events.
+        step: Events between keys.
+        silence: Weight of rows without an event at one end.
+        params: Numbers of the memory.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        recording: Recording,
+        step: int,
+        silence: float,
+        params: MemoryParams | None = None,
+    ):
+        self.windows, self.recording, self.step, self.silence = windows, recording, step, silence
+        self.params = MemoryParams() if params is None else params
+        self.last = -(-len(recording.events) // step)  # the key at the recording's end
+        self._blocks: dict[int, tuple[int, dict[int, GradientPrior | None]]] = {}
+        self._threshold = 1.0
+
+    def row(self, key: int) -> int:
+        """Return the number of events before a key."""
+        return min(key * self.step, len(self.recording.events))
+
+    def time(self, key: int) -> int:
+        """Return the time of a key, us: that of its first event."""
+        row = min(self.row(key), max(len(self.recording.events) - 1, 0))
+        first = self.recording.events[row : row + 1].t
+        return int(first[0]) if len(first) else self.recording.start
+
+    def key_after(self, row: int) -> int:
+        """Return the first key with so many events before it, or the last one."""
+        return min(-(-row // self.step), self.last)
+
+    def before(self, key: int, at: int) -> GradientPrior | None:
+        """Return the memory of the windows before a key, carried to a time (us)."""
+        return self._carried(self._at_key(key, 1), key, at)
+
+    def after(self, key: int, at: int) -> GradientPrior | None:
+        """Return the memory of the windows after a key, carried to a time (us)."""
+        return self._carried(self._at_key(key, -1), key, at)
+
+    def _carried(self, memory: GradientPrior | None, key: int, at: int) -> GradientPrior | None:
+        start = self.time(key)
+        if memory is None or start == at:
+            return memory
+        seconds = 1e-6 * abs(at - start)
+        noise = self.params.forgetting * self._threshold**2 * seconds, self.params.drift * seconds
+        paths = self.windows.paths(min(start, at), max(start, at), start)
+        return carry(memory, paths, at, noise)
+
+    def _at_key(self, key: int, side: int) -> GradientPrior | None:
+        """Return the memory at a key of the windows before (side 1) or after it (side -1)."""
+        block = key // KEYS_PER_BLOCK
+        number, memories = self._blocks.get(side, (-1, {}))
+        if number != block:
+            memories = {}
+            self._blocks[side] = block, memories
+        if key not in memories:
+            low = block * KEYS_PER_BLOCK
+            nearest = [k for k in memories if (key - k) * side > 0]
+            if nearest:
+                k = max(nearest, key=lambda k: k * side)
+            elif side > 0:
+                k = max(low - KEYS_BEYOND_BLOCK, 0)
+            else:
+                k = min(low + KEYS_PER_BLOCK - 1 + KEYS_BEYOND_BLOCK, self.last)
+            memory = memories.get(k)
+            while k != key:
+                memory = self._extend(memory, k, side)
+                k += side
+                if k // KEYS_PER_BLOCK == block:
+                    memories[k] = memory
+            memories[key] = memory
+        return memories[key]
+
+    def _extend(self, memory: GradientPrior | None, key: int, side: int) -> GradientPrior:
+        """Return the memory at the next key on the way."""
+        other = key + side
+        first, last = min(key, other), max(key, other)
+        start, stop, at = self.time(first), self.time(last), self.time(other)
+        rows = self.windows.rows(self.row(first), self.row(last), at, (start, stop))
+        self._threshold = rows.threshold
+        new = measure_gradient(rows, self.silence)
+        carried = self._carried(memory, key, at)
+        return new if carried is None else fuse(carried, new, rows.threshold)
