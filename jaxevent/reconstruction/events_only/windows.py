@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration.event_calibration import calibrate_events
 from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
+from jaxevent.reconstruction.events_only.memory import KeyMemories, join_memories
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import Rows, make_rows
@@ -71,6 +72,7 @@ class WindowSolver:
         c = np.float32([params.c_on, params.c_off])
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
+        self.memory = KeyMemories(self, recording, self.n_side, self.numbers.silence)
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
         """Return the paths of points through a window, see `EventFlow.paths`."""
@@ -81,8 +83,26 @@ class WindowSolver:
         velocity = np.nan_to_num(np.asarray(self.flow.flow(knots, extrapolate=True), np.float32))
         return WindowPaths(at, knots, velocity)
 
+    def rows(self, first: int, last: int, at: int, span: tuple[int, int]) -> Rows:
+        """Return the equations of the events of some rows of the recording.
+
+        Args:
+            first: First row of the events.
+            last: Row after their last.
+            at: Time of the image, us.
+            span: Begin and end of the window, us.
+
+        Returns:
+            The equations for the image at that time.
+        """
+        events = self.recording.events[first:last]
+        events = events[~self.hot[events.y, events.x]]
+        return make_rows(events, self.paths(*span, at), self.thresholds, self.shape, span)
+
     def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
         """Solve for the image at a time.
+
+        A window begins at a key of the memory, and ends at one or, where images are causal, at t.
 
         Args:
             t: Time, us.
@@ -91,13 +111,15 @@ class WindowSolver:
         Returns:
             The window's equations and solution.
         """
-        source = self.recording.events
-        place = source.index(t)
-        ahead = 0 if self.causal else self.n_side
-        events = source[max(place - 2 * self.n_side + ahead, 0) : place + ahead]
-        events = events[~self.hot[events.y, events.x]]
-        span = (int(events.t[0]), int(events.t[-1])) if len(events) else (t, t)
-        rows = make_rows(events, self.paths(*span, t), self.thresholds, self.shape, span)
-        still = np.zeros((*self.shape, 2), np.float32)
-        prior = GradientPrior(still, np.zeros((*still.shape, 2), np.float32))
-        return SolvedWindow(rows, prior, solve(rows, None, self.numbers, variance=variance))
+        memory, place = self.memory, self.recording.events.index(t)
+        ahead = 0 if self.causal else min(self.n_side, len(self.recording.events) - place)
+        first = max(place + ahead - 2 * self.n_side, 0) // memory.step
+        if self.causal:
+            end, stop, later = place, t, None
+        else:
+            last = memory.key_after(max(place + ahead, 2 * self.n_side))
+            end, stop, later = memory.row(last), memory.time(last), memory.after(last, t)
+        start = memory.time(first)
+        rows = self.rows(memory.row(first), end, t, (min(start, t), max(stop, t)))
+        prior = join_memories(memory.before(first, t), later, self.shape, rows.threshold)
+        return SolvedWindow(rows, prior, solve(rows, prior, self.numbers, variance=variance))
