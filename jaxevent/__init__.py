@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jaxevent.calibration import calibrate, check_consistency
     from jaxevent.errors import InputError, InputWarning
     from jaxevent.estimator import Estimate, Estimator
+    from jaxevent.event_flow import flow_from_events
     from jaxevent.io import load, save
     from jaxevent.methods import METHODS
     from jaxevent.parameters import Parameters
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
         cf_augmented,
         colour,
         edi,
+        events_only,
         flow,
         high_pass,
         last_frame,
@@ -58,12 +60,13 @@ _HOMES = {
     "jaxevent.calibration": ("calibrate", "check_consistency"),
     "jaxevent.errors": ("InputError", "InputWarning"),
     "jaxevent.estimator": ("Estimate", "Estimator"),
+    "jaxevent.event_flow": ("flow_from_events",),
     "jaxevent.io": ("load", "save"),
     "jaxevent.methods": ("METHODS",),
     "jaxevent.parameters": ("Parameters",),
     "jaxevent.reconstruction": (
         *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
-        *("flow", "last_frame", "mc"),
+        *("events_only", "flow", "last_frame", "mc"),
     ),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.runs.evaluate": ("evaluate",),
@@ -105,8 +108,10 @@ __all__ = [
     "egomotion",
     "evaluate",
     "events",
+    "events_only",
     "fit",
     "flow",
+    "flow_from_events",
     "high_pass",
     "last_frame",
     "load",

@@ -1,0 +1,297 @@
+"""Alignment of a window's events by a dense displacement, from coarse to fine.
+
+An event of polarity p at x and at relative time s, -1..1, is moved along the displacement u (px per
+unit of s) to x' = x - s u(x - s u(x) / 2). Signed events there make the image I, their number n.
+Where u is right the image is sharp (Gallego et al., CVPR 2018). With weights w = 1 / n, as the
+variance of a count is its mean, the sum S of w I^2 has about these derivatives:
+
+    dS/du / 2 = -sum p (s - m) w grad I,    H = sum (s - m)^2 w / n (grad I) (grad I)^T        (1)
+
+over events, m the mean time of the events at x'. H is what S loses in curvature when all times show
+the same image. Displacements are those of nodes, bilinear between; each step solves
+
+    min_d  sum (d - H^-1 g)^T H (d - H^-1 g) + smoothness sum rho(u_i + d_i - u_j - d_j)        (2)
+
+over neighbours i, j with the robust rho(e) = log(1 + e^2 / edge^2).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.recording import Events
+
+N_STEPS = 5  # Gauss-Newton steps at each size of cells
+N_SWEEPS = 30  # of Gauss-Seidel
+N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
+NUMBER_FLOOR = 0.1  # events per cell, added to their number
+# The curvature of S is that of the image before it is blurred, which is sharper.
+CURVATURE = 3.0
+# The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
+POOLING = 1.0  # nodes whose information counts, of those of a Gaussian of one node
+MIN_INFORMATION = 0.04  # 1/px^2
+SPREAD = 1.0  # of neighbours' variance
+MIN_VARIANCE = 0.003  # px^2
+RELATIVE_VARIANCE = 0.0004  # of the square of the displacement
+
+
+@njit_noalloc_inlined
+def node_cell(u, spacing, x, y):
+    """Return the node before a place and the distance from it, in nodes."""
+    rows, columns = u.shape[0], u.shape[1]
+    a = min(max(x / spacing - 0.5, 0.0), columns - 1.0)
+    b = min(max(y / spacing - 0.5, 0.0), rows - 1.0)
+    i, j = min(int(a), max(columns - 2, 0)), min(int(b), max(rows - 2, 0))
+    return i, j, a - i, b - j
+
+
+@njit_noalloc_inlined
+def displacement_at(u, spacing, x, y):
+    """Return the displacement at a place, bilinear between nodes at (k + 1/2) spacing."""
+    i, j, fx, fy = node_cell(u, spacing, x, y)
+    i2, j2 = min(i + 1, u.shape[1] - 1), min(j + 1, u.shape[0] - 1)
+    a, b, c, d = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    return (
+        a * u[j, i, 0] + b * u[j, i2, 0] + c * u[j2, i, 0] + d * u[j2, i2, 0],
+        a * u[j, i, 1] + b * u[j, i2, 1] + c * u[j2, i, 1] + d * u[j2, i2, 1],
+    )
+
+
+@njit_noalloc
+def warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
+    """Move events along the displacement and add each to sum, number and mean time of cells.
+
+    `image` (3, rows, columns) has a border of one cell; `warped` (n, 2) gets the places in cells.
+    """
+    rows, columns = image.shape[1], image.shape[2]
+    image[:] = 0
+    for k in range(len(x)):
+        dx, dy = displacement_at(u, spacing, x[k], y[k])
+        dx, dy = displacement_at(u, spacing, x[k] - 0.5 * s[k] * dx, y[k] - 0.5 * s[k] * dy)
+        a, b = (x[k] - s[k] * dx + 0.5) / cell + 0.5, (y[k] - s[k] * dy + 0.5) / cell + 0.5
+        warped[k, 0], warped[k, 1] = a, b
+        if not (0 <= a < columns - 1 and 0 <= b < rows - 1):
+            warped[k, 0] = -1
+            continue
+        i, j = int(a), int(b)
+        fx, fy = a - i, b - j
+        for dj in range(2):
+            for di in range(2):
+                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+                image[0, j + dj, i + di] += weight * p[k]
+                image[1, j + dj, i + di] += weight
+                image[2, j + dj, i + di] += weight * s[k]
+
+
+@njit_noalloc
+def blur(image, scratch, passes):
+    """Convolve an image with (1, 2, 1) / 4 along both axes, some times; edges repeat."""
+    rows, columns = image.shape
+    for _ in range(passes):
+        for j in range(rows):
+            for i in range(columns):
+                left, right = image[j, max(i - 1, 0)], image[j, min(i + 1, columns - 1)]
+                scratch[j, i] = 0.25 * (left + right) + 0.5 * image[j, i]
+        for j in range(rows):
+            up, down = max(j - 1, 0), min(j + 1, rows - 1)
+            for i in range(columns):
+                image[j, i] = 0.25 * (scratch[up, i] + scratch[down, i]) + 0.5 * scratch[j, i]
+
+
+@njit_noalloc
+def accumulate(warped, s, p, x, y, u, spacing, cell, image, normal):
+    """Add the derivatives (1) of each event to the nodes around it; return the score.
+
+    `normal` (rows, columns, 5) gets g, and xx, xy, yy of H, px.
+    """
+    normal[:] = 0
+    score = 0.0
+    per_px = 1.0 / cell
+    for k in range(len(s)):
+        if warped[k, 0] < 1:
+            continue
+        i, j = int(warped[k, 0]), int(warped[k, 1])
+        if i < 1 or j < 1 or i > image.shape[2] - 3 or j > image.shape[1] - 3:
+            continue
+        fx, fy = warped[k, 0] - i, warped[k, 1] - j
+        gx = gy = number = late = value = 0.0
+        for dj in range(2):
+            for di in range(2):
+                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+                a, b = j + dj, i + di
+                gx += weight * 0.5 * (image[0, a, b + 1] - image[0, a, b - 1])
+                gy += weight * 0.5 * (image[0, a + 1, b] - image[0, a - 1, b])
+                number += weight * image[1, a, b]
+                late += weight * image[2, a, b]
+                value += weight * image[0, a, b]
+        gx, gy = gx * per_px, gy * per_px
+        age = s[k] - late / max(number, 1e-9)
+        w = 1.0 / (number + NUMBER_FLOOR)
+        score += p[k] * value * w
+        c = -p[k] * age * w
+        h = CURVATURE * age * age * w / (number + NUMBER_FLOOR)
+        i, j, fx, fy = node_cell(u, spacing, x[k], y[k])
+        for dj in range(2):
+            for di in range(2):
+                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+                a, b = min(j + dj, u.shape[0] - 1), min(i + di, u.shape[1] - 1)
+                normal[a, b, 0] += weight * c * gx
+                normal[a, b, 1] += weight * c * gy
+                normal[a, b, 2] += weight * h * gx * gx
+                normal[a, b, 3] += weight * h * gx * gy
+                normal[a, b, 4] += weight * h * gy * gy
+    return score
+
+
+@njit_noalloc
+def solve_step(u, normal, smoothness, edge, sweeps, step):
+    """Solve (2) for the step (rows, columns, 2) of the displacement, by Gauss-Seidel."""
+    rows, columns = u.shape[0], u.shape[1]
+    step[:] = 0
+    for _ in range(sweeps):
+        for j in range(rows):
+            for i in range(columns):
+                gx, gy = normal[j, i, 0], normal[j, i, 1]
+                xx, xy, yy = normal[j, i, 2], normal[j, i, 3], normal[j, i, 4]
+                for n in range(4):
+                    b, a = i + (n == 0) - (n == 1), j + (n == 2) - (n == 3)
+                    if 0 <= a < rows and 0 <= b < columns:
+                        ex, ey = u[a, b, 0] - u[j, i, 0], u[a, b, 1] - u[j, i, 1]
+                        w = smoothness / (1 + (ex * ex + ey * ey) / (edge * edge))
+                        gx += w * (ex + step[a, b, 0])
+                        gy += w * (ey + step[a, b, 1])
+                        xx += w
+                        yy += w
+                det = xx * yy - xy * xy
+                if det > 1e-12:
+                    step[j, i, 0] = (yy * gx - xy * gy) / det
+                    step[j, i, 1] = (xx * gy - xy * gx) / det
+
+
+def image_shape(shape: tuple[int, int], cell: float) -> tuple[int, int]:
+    """Return rows and columns of an image of cells, with a border of one."""
+    return int(np.ceil(shape[0] / cell)) + 2, int(np.ceil(shape[1] / cell)) + 2
+
+
+def node_shape(shape: tuple[int, int], spacing: float) -> tuple[int, int]:
+    """Return rows and columns of the nodes of a sensor (H, W)."""
+    return tuple(max(int(np.ceil(n / spacing)), 1) for n in shape)
+
+
+def fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[np.float32]:
+    """Interpolate values of nodes (rows, columns, ...) bilinearly to all pixels (H, W, ...)."""
+    for axis in (0, 1):
+        a = np.clip((np.arange(shape[axis])) / spacing - 0.5, 0, u.shape[axis] - 1)
+        i = np.minimum(a.astype(int), max(u.shape[axis] - 2, 0))
+        f = (a - i).reshape([-1 if k == axis else 1 for k in range(u.ndim)])
+        after = np.minimum(i + 1, u.shape[axis] - 1)
+        u = (1 - f) * u.take(i, axis) + f * u.take(after, axis)
+    return u.astype(np.float32)
+
+
+class WindowEvents(NamedTuple):
+    """Events of a window: places (px), times relative to the middle in units of half of it."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    s: NDArray[np.float32]
+    p: NDArray[np.float32]  # 1 ON, -1 OFF
+    unit: float  # s
+
+    @classmethod
+    def of(cls, events: Events, at: int) -> "WindowEvents":
+        """Make them of events, with s = 0 at a time (us)."""
+        late = (events.t - at) * 1e-6
+        unit = max(float(np.abs(late).max(initial=0.0)), 1e-6)
+        p = np.where(events.p, 1, -1)
+        columns = (events.x, events.y, late / unit, p)
+        return cls(*(np.asarray(c, np.float32) for c in columns), unit)
+
+
+class Aligned(NamedTuple):
+    """Displacement of nodes and what events tell of it."""
+
+    u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
+    information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
+    score: float  # per event
+
+    def typical(self) -> float:
+        """Return the median length of displacements, weighted by information, px."""
+        length = np.hypot(self.u[..., 0], self.u[..., 1]).ravel()
+        weight = (self.information[..., 0] + self.information[..., 2]).ravel()
+        order = np.argsort(length)
+        total = np.cumsum(weight[order])
+        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
+
+
+def covariance_of(aligned: Aligned) -> NDArray[np.float64]:
+    """Return the covariance of the nodes' displacement.
+
+    It is the inverse of the information of a node and its neighbours, and the variance among them,
+    which is large at borders of objects.
+
+    Args:
+        aligned: Displacement and information.
+
+    Returns:
+        (rows, columns, 2, 2), px^2.
+    """
+    near = POOLING * gaussian_filter(aligned.information, (1, 1, 0))
+    C = np.linalg.inv(near[..., [[0, 1], [1, 2]]] + MIN_INFORMATION * np.eye(2))
+    off = np.stack([np.roll(aligned.u, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    off = off - aligned.u
+    spread = np.einsum("n...i,n...j->...ij", off, off) / len(off)
+    length2 = (aligned.u**2).sum(-1)[..., None, None]
+    return C + SPREAD * spread + (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
+
+
+class Alignment:
+    """Displacements of windows of events: `align(events, start, cells)`.
+
+    Args:
+        shape: Height and width of the sensor.
+        params: `FlowParams`.
+    """
+
+    def __init__(self, shape: tuple[int, int], params: Any):
+        self.shape, self.spacing = shape, float(params.spacing)
+        self.nodes = node_shape(shape, self.spacing)
+        self.smoothness, self.edge = float(params.smoothness), float(params.edge)
+
+    def fill(self, values: NDArray) -> NDArray[np.float32]:
+        """Interpolate values of nodes to all pixels."""
+        return fill_pixels(values, self.shape, self.spacing)
+
+    def __call__(
+        self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]
+    ) -> Aligned:
+        """Align the events of a window.
+
+        Args:
+            events: The events.
+            start: Displacement (rows, columns, 2) to start from, px; None: no displacement.
+            cells: Sizes of the cells, px, one after the other.
+
+        Returns:
+            The displacement.
+        """
+        u = np.zeros((*self.nodes, 2)) if start is None else start.copy()
+        normal, step = np.zeros((*self.nodes, 5)), np.zeros_like(u)
+        warped = np.empty((len(events.x), 2), np.float32)
+        x, y, s, p, _ = events
+        score = 0.0
+        for cell in cells:
+            image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)
+            scratch = np.empty_like(image[0])
+            for _ in range(N_STEPS):
+                warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
+                for channel, passes in zip(image, N_BLURS, strict=True):
+                    blur(channel, scratch, passes)
+                score = accumulate(warped, s, p, x, y, u, self.spacing, cell, image, normal)
+                solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
+                length = np.hypot(step[..., :1], step[..., 1:])
+                u += step * np.minimum(1, cell / np.maximum(length, 1e-9))
+        return Aligned(u, normal[..., 2:].copy(), score / max(len(x), 1))

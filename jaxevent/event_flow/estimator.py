@@ -1,0 +1,236 @@
+"""Dense optical flow of a recording's events, as a function of time."""
+
+import functools
+import threading
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents, covariance_of
+from jaxevent.event_flow.paths import WindowPaths
+from jaxevent.parameters import Count, Parameters, Positive
+from jaxevent.recording import Recording, Times, check_times, microseconds
+
+CELLS = (4, 2, 1)  # px, for motion sought from nothing
+LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
+LEVELS = range(-4, 5)  # powers of 2 of the window's size
+CHAIN_WINDOWS = 16  # half windows of a chain of anchors
+N_CACHED_ANCHORS = 64
+MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
+
+
+class FlowParams(Parameters):
+    """Parameters of the flow from events."""
+
+    density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
+    displacement = Positive(2.5, "px", "typical displacement before and after a time; windows grow")
+    spacing = Count(8, "px", "distance between nodes of the flow")
+    smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
+    edge = Positive(0.5, "px", "difference from which neighbours are taken for different objects")
+
+
+class Anchor(NamedTuple):
+    """Flow at one time, at nodes."""
+
+    t: int  # us
+    unit: float  # s in which points are displaced
+    aligned: Aligned
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Velocity (rows, columns, 2), px/s."""
+        return self.aligned.u / self.unit
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of the velocity (rows, columns, 2, 2), (px/s)^2."""
+        return covariance_of(self.aligned) / self.unit**2
+
+
+class Chain(NamedTuple):
+    """Anchors that start one from the other: the first of them, and how many events apart."""
+
+    first: Anchor
+    half: int  # events on either side of an anchor
+
+
+class EventFlow:
+    """Dense optical flow of a recording, estimated where it is asked for: `flow(times)`.
+
+    Flow is estimated at anchors, one for so many events. Between them it is linear in time. What is
+    returned does not depend on what was asked for before.
+
+    Attributes:
+        recording: The recording; only its events are used.
+        params: The parameters.
+        causal: Whether flow at a time uses no later events.
+    """
+
+    def __init__(self, recording: Recording, params: FlowParams, causal: bool = False):
+        self.recording, self.params, self.causal = recording, params, causal
+        self.shape = (recording.height, recording.width)
+        pixels = self.shape[0] * self.shape[1]
+        self._base = max(round(float(params.density) * pixels), 2 ** -LEVELS[0])  # events
+        self._align = Alignment(self.shape, params)
+        self._chain = functools.lru_cache(N_CACHED_ANCHORS)(self._make_chain)
+        self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
+        self._lock = threading.RLock()
+
+    def _window(self, row: int, half: int) -> tuple[int, WindowEvents]:
+        """Return the time (us) of an event, and the events around it."""
+        events = self.recording.events[max(row - half, 0) : row + half]
+        at = int(events.t[min(row, half)])
+        return at, WindowEvents.of(events, at)
+
+    def _seek(self, row: int, most: int | None = None) -> Chain:
+        """Find the motion around an event from nothing, in windows that double.
+
+        They grow until points are displaced far enough, or to `most` events.
+        """
+        start, found = None, None
+        for level in LEVELS:
+            half = int(self._base * 2.0**level)
+            at, window = self._window(row, half)
+            start = None if found is None else found.aligned.u * (window.unit / found.unit)
+            found = Anchor(at, window.unit, self._align(window, start, CELLS))
+            whole = row + half >= len(self.recording.events) and row - half <= 0
+            if half == most or (
+                most is None
+                and (whole or found.aligned.typical() >= float(self.params.displacement))
+            ):
+                break
+        assert found is not None
+        return Chain(found, half)
+
+    def _make_chain(self, number: int) -> Chain:
+        return self._seek(number * CHAIN_WINDOWS * self._base)
+
+    def _make_anchor(self, number: int, k: int) -> Anchor:
+        """Return an anchor of a chain; those before it are estimated first."""
+        first, half = self._chain(number)
+        if k == 0:
+            return first
+        before = self._anchor(number, k - 1)
+        row = number * CHAIN_WINDOWS * self._base + k * half
+        at, window = self._window(row, half)
+        found = self._align(window, before.velocity * window.unit, LAST_CELLS)
+        if found.score < MIN_SCORE_RATIO * before.aligned.score:
+            other = self._seek(row, half).first
+            if other.aligned.score > found.score:
+                return other
+        return Anchor(at, window.unit, found)
+
+    def _around(self, start: int, stop: int) -> list[Anchor]:
+        """Return the anchors that determine flow from start to stop (us), of different times."""
+        events = self.recording.events
+        low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), len(events) - 1)
+        length = CHAIN_WINDOWS * self._base
+        found: list[Anchor] = []
+        for number in range(
+            low // length, min(high // length + 2, (len(events) - 1) // length + 1)
+        ):
+            half = self._chain(number).half
+            count = -(-(min(length, len(events) - number * length)) // half)
+            first = max((low - number * length) // half, 0)
+            last = min(-(-(high - number * length) // half), count - 1)
+            for k in range(first, last + 1):
+                anchor = self._anchor(number, k)
+                if not found or anchor.t > found[-1].t:
+                    found.append(anchor)
+        return found
+
+    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+        """Return the paths of the points that events of a window saw.
+
+        Args:
+            start: First time of the events, us.
+            stop: Last time of the events, us.
+            at: Time to which points are carried, us.
+
+        Returns:
+            The paths.
+        """
+        if not len(self.recording.events):
+            still = np.zeros((1, *self.shape, 2), np.float32)
+            unknown = np.full((*still.shape, 2), np.inf, np.float32) * np.eye(2, dtype=np.float32)
+            return WindowPaths(int(at), np.array([at], np.int64), still, unknown)
+        with self._lock:
+            anchors = self._around(min(start, at), max(stop, at))
+        knots = np.array([anchor.t for anchor in anchors], np.int64)
+        velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
+        covariance = [self._align.fill(anchor.covariance) for anchor in anchors]
+        return WindowPaths(int(at), knots, np.stack(velocity), np.stack(covariance))
+
+    def __call__(
+        self, times: Times, extrapolate: bool = False
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        """Return the flow at some times.
+
+        Args:
+            times: (T,) integers (us) or floats (s).
+            extrapolate: Whether times outside the recording are allowed.
+
+        Returns:
+            Flow (T, H, W, 2) along x and y, px/s; its covariance (T, H, W, 2, 2), (px/s)^2; and
+            whether events determine it (T, H, W).
+
+        Raises:
+            InputError: A time is outside the recording without `extrapolate`.
+        """
+        wanted = np.atleast_1d(microseconds(times))
+        if not extrapolate:
+            check_times(wanted, self.recording.start, self.recording.stop, self.recording.name)
+        mean = np.zeros((len(wanted), *self.shape, 2), np.float32)
+        covariance = np.zeros((*mean.shape, 2), np.float32)
+        for row, t in enumerate(wanted.tolist()):
+            paths = self.paths(t, t, t)
+            weights = _weights(paths.knots, t)
+            mean[row] = np.tensordot(weights, paths.velocity, 1)
+            covariance[row] = np.tensordot(weights, paths.covariance, 1)
+        valid = np.isfinite(covariance[..., 0, 0]) & (covariance[..., 0, 0] < 1e6)
+        return mean, covariance, valid
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
+        """Return the flow alone, as `mc` takes it.
+
+        Args:
+            times: (T,) integers (us) or floats (s).
+            extrapolate: Whether times outside the recording are allowed.
+
+        Returns:
+            (T, H, W, 2) flow along x and y, px/s.
+
+        Raises:
+            InputError: A time is outside the recording without `extrapolate`.
+        """
+        return self(times, extrapolate)[0]
+
+
+def _weights(knots: NDArray[np.int64], t: int) -> NDArray[np.float32]:
+    """Return the weights of knots in a value at a time, linear between and constant outside."""
+    eye = np.eye(len(knots))
+    return np.array([np.interp(t, knots, row) for row in eye], np.float32)
+
+
+def flow_from_events(
+    recording: Recording, params: FlowParams | None = None, *, causal: bool = False
+) -> EventFlow:
+    """Estimate dense optical flow from events alone, as a function of time.
+
+    Args:
+        recording: The recording; frames are not used.
+        params: The parameters; None: the defaults.
+        causal: Whether flow at a time uses no later events.
+
+    Returns:
+        The flow: `mean, covariance, valid = flow(times)`.
+
+    Raises:
+        InputError: The parameters are of another method.
+    """
+    params = FlowParams() if params is None else params
+    if not isinstance(params, FlowParams):
+        raise InputError(f"params are {type(params).__name__}; give FlowParams")
+    return EventFlow(recording, params, causal)
