@@ -5,8 +5,8 @@ Its information is shared out equally among the path's pixels, so that with d = 
 
     Lambda += r d d' / (c^2 n),    eta += r d change / (c^2 n)        at each of n places     (4)
 
-is a Gaussian measurement of the gradient of M: Lambda (grad M - g) = 0 with g = Lambda^-1 eta. Along
-the motion it is known, across it is not, until the motion turns. From time to time it is carried
+is a Gaussian measurement of the gradient of M: Lambda (grad M - g) = 0 with g = Lambda^-1 eta.
+Along the motion it is known, across it is not, until the motion turns. In time it is carried
 along the flow. A path that is uncertain by the covariance P displaces the gradient's image, so with
 its derivative G the information fades to
 
@@ -16,7 +16,7 @@ where P grows with time by the flow's covariance and by `drift`, and q by `forge
 information is added. No image is solved for: memory costs little more than the rows themselves.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -227,6 +227,7 @@ def join_memories(
     return before if after is None else after
 
 
+@runtime_checkable
 class Windows(Protocol):
     """A source of a recording's paths and equations."""
 

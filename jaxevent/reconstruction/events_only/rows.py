@@ -18,7 +18,7 @@ and would lag behind. The shares are means over simulated scenes (`experiments/s
 The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is new.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int32
@@ -31,6 +31,7 @@ EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
 FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
 
 
+@runtime_checkable
 class Paths(Protocol):
     """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
 

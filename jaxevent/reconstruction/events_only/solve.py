@@ -112,12 +112,31 @@ def solve(
     return Solution(u * c, V, residual, weight, iterations)
 
 
+def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
+    """Factor information, which may be singular, as F F'.
+
+    Args:
+        xx: (height, width) information along x.
+        xy: That of both.
+        yy: That along y.
+
+    Returns:
+        (height, width, 2, 2) F, a lower triangle.
+    """
+    factor = np.zeros((*xx.shape, 2, 2), np.float32)
+    factor[..., 0, 0] = np.sqrt(xx)
+    factor[..., 1, 0] = xy / np.sqrt(np.maximum(xx, np.finfo(np.float32).tiny))
+    factor[..., 1, 1] = np.sqrt(np.maximum(yy - factor[..., 1, 0] ** 2, 0))
+    return factor
+
+
 def _sample_variance(system, scratch, rng):
     """Perturb and solve: with b of covariance A, the solution has the covariance A^-1."""
     from scipy.ndimage import gaussian_filter
 
     height, width = system.across.shape
     total = np.zeros((height, width))
+    factor = factor_information(*np.moveaxis(system.information, -1, 0))
     for _ in range(SAMPLES):
         b = np.zeros((height, width), np.float32)
         noise = rng.standard_normal(len(system.weight), np.float32)
@@ -128,10 +147,6 @@ def _sample_variance(system, scratch, rng):
         b[:, 1:] += across[:, :-1]
         b[1:] += down[:-1]
         b += np.sqrt(system.leak) * n[2]
-        factor = np.linalg.cholesky(
-            system.information[..., [0, 1, 1, 2]].reshape(height, width, 2, 2)
-            + 1e-9 * np.eye(2, dtype=np.float32)
-        )
         noise = rng.standard_normal((height, width, 2), np.float32)
         _add_gradient_transposed(np.einsum("hwij,hwj->hwi", factor, noise).astype(np.float32), b)
         z = np.zeros_like(b)
