@@ -29,7 +29,7 @@ REWEIGHTINGS = 20
 REWEIGHTING_TOLERANCE = 1e-4  # of the gradient of E, against that of the data, to stop at
 CG_ITERATIONS = 200
 CG_TOLERANCE = 1e-4
-TINY_INFORMATION = 1e-9  # as that of `solve`
+TINY_FACTOR = 1e-6  # px / threshold, as that of `solve`
 BLUR_PX = 1.5  # of the variance, as that of `solve`
 
 
@@ -298,9 +298,12 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
     weights = _weights(u, equations, params)
     product = _product(weights, equations, params.leak)
     diagonal = jax.lax.stop_gradient(_diagonal(weights, equations, params.leak))
-    factor = jnp.linalg.cholesky(
-        equations.information + TINY_INFORMATION * jnp.eye(2, dtype=u.dtype)
-    )
+    # Cholesky factors of matrices that, up to rounding, may be singular.
+    xx, xy, yy = (equations.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    first = jnp.sqrt(jnp.maximum(xx, 0))
+    cross = xy / jnp.maximum(first, TINY_FACTOR)
+    rest = jnp.sqrt(jnp.maximum(yy - cross**2, 0))
+    factor = jnp.stack([first, 0 * first, cross, rest], -1).reshape(*xx.shape, 2, 2)
 
     def sample(noise: Perturbation) -> Array:
         def spread(v: Array) -> Array:

@@ -5,7 +5,7 @@ Its information is shared out equally among the path's pixels, so that with d = 
 
     Lambda += r d d' / (c^2 n),    eta += r d change / (c^2 n)        at each of n places     (4)
 
-is a Gaussian measurement of the gradient of M: Lambda (grad M - g) = 0 with g = Lambda^-1 eta. Along
+is a Gaussian measurement of the gradient of M: Lambda (grad M - g) = 0, g = Lambda^-1 eta. Along
 the motion it is known, across it is not, until the motion turns. From time to time it is carried
 along the flow. A path that is uncertain by the covariance P displaces the gradient's image, so with
 its derivative G the information fades to

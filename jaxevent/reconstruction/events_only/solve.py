@@ -116,6 +116,7 @@ def _sample_variance(system, scratch, rng):
 
     height, width = system.across.shape
     total = np.zeros((height, width))
+    factor = _factorise(system.information)
     for _ in range(SAMPLES):
         b = np.zeros((height, width), np.float32)
         noise = rng.standard_normal(len(system.weight), np.float32)
@@ -126,16 +127,21 @@ def _sample_variance(system, scratch, rng):
         b[:, 1:] += across[:, :-1]
         b[1:] += down[:-1]
         b += np.sqrt(system.leak) * n[2]
-        factor = np.linalg.cholesky(
-            system.information[..., [0, 1, 1, 2]].reshape(height, width, 2, 2)
-            + 1e-9 * np.eye(2, dtype=np.float32)
-        )
         noise = rng.standard_normal((height, width, 2), np.float32)
         _add_gradient_transposed(np.einsum("hwij,hwj->hwi", factor, noise).astype(np.float32), b)
         z = np.zeros_like(b)
         _conjugate_gradients(system, b, z, scratch, 1e-2, CG_ITERATIONS)
         total += (z - z.mean()) ** 2
     return gaussian_filter(total / SAMPLES, 1.5).astype(np.float32)
+
+
+def _factorise(information):
+    """Cholesky factors (..., 2, 2) of matrices xx, xy, yy, which up to rounding may be singular."""
+    xx, xy, yy = np.moveaxis(information, -1, 0)
+    first = np.sqrt(np.maximum(xx, 0))
+    cross = xy / np.maximum(first, np.float32(1e-6))
+    rest = np.sqrt(np.maximum(yy - cross**2, 0))
+    return np.stack([first, np.zeros_like(first), cross, rest], -1).reshape(*xx.shape, 2, 2)
 
 
 @njit_noalloc_inlined
