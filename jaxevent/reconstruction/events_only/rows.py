@@ -15,7 +15,7 @@ image M at the target time, so L(x, t) = M(X(x, t)). Each row looks twice at M, 
 The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is new.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int32
@@ -27,6 +27,7 @@ from jaxevent.recording import Events
 EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
 
 
+@runtime_checkable
 class Paths(Protocol):
     """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
 
