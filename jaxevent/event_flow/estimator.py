@@ -18,6 +18,10 @@ LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
 LEVELS = range(-4, 5)  # powers of 2 of the window's size
 CHAIN_WINDOWS = 16  # half windows of a chain of anchors
 N_CACHED_ANCHORS = 64
+UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
+MAX_DEVIATION_PX = (
+    1.0  # standard deviation of a valid displacement from an anchor to a window's end
+)
 MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
 
 
@@ -34,6 +38,7 @@ class FlowParams(Parameters):
 class Anchor(NamedTuple):
     """Flow at one time, at nodes."""
 
+    row: int  # of the event there
     t: int  # us
     unit: float  # s in which points are displaced
     aligned: Aligned
@@ -94,7 +99,7 @@ class EventFlow:
             half = int(self._base * 2.0**level)
             at, window = self._window(row, half)
             start = None if found is None else found.aligned.u * (window.unit / found.unit)
-            found = Anchor(at, window.unit, self._align(window, start, CELLS))
+            found = Anchor(row, at, window.unit, self._align(window, start, CELLS))
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
@@ -120,26 +125,48 @@ class EventFlow:
             other = self._seek(row, half).first
             if other.aligned.score > found.score:
                 return other
-        return Anchor(at, window.unit, found)
+        return Anchor(row, at, window.unit, found)
+
+    def _rows(self, number: int) -> NDArray[np.int64]:
+        """Return the events at which the anchors of a chain are."""
+        length = CHAIN_WINDOWS * self._base
+        end = min((number + 1) * length, len(self.recording.events))
+        return np.arange(number * length, end, self._chain(number).half)
 
     def _around(self, start: int, stop: int) -> list[Anchor]:
         """Return the anchors that determine flow from start to stop (us), of different times."""
-        events = self.recording.events
-        low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), len(events) - 1)
-        length = CHAIN_WINDOWS * self._base
+        events, length = self.recording.events, CHAIN_WINDOWS * self._base
+        n = len(events)
+        if not n:
+            return []
+        seen = events.index(stop + 1)  # events that a causal flow may use
+        low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), n - 1)
         found: list[Anchor] = []
-        for number in range(
-            low // length, min(high // length + 2, (len(events) - 1) // length + 1)
-        ):
-            half = self._chain(number).half
-            count = -(-(min(length, len(events) - number * length)) // half)
-            first = max((low - number * length) // half, 0)
-            last = min(-(-(high - number * length) // half), count - 1)
-            for k in range(first, last + 1):
+        first = max(low // length - self.causal, 0)
+        for number in range(first, min(high // length + 2, (n - 1) // length + 1)):
+            if found and found[-1].row >= high:
+                break
+            rows = self._rows(number)
+            if self.causal:
+                rows = rows[rows + self._chain(number).half <= seen]
+            for k in range(len(rows)):
+                next_row = rows[k + 1] if k + 1 < len(rows) else n
+                if next_row <= low and not (self.causal and k + 1 == len(rows)):
+                    continue
                 anchor = self._anchor(number, k)
                 if not found or anchor.t > found[-1].t:
                     found.append(anchor)
+                if rows[k] >= high:
+                    break
         return found
+
+    def _fields(self, anchors: list[Anchor]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return velocity and covariance of all pixels at anchors."""
+        if not anchors:
+            still = np.zeros((1, *self.shape, 2), np.float32)
+            return still, np.full((*still.shape, 2), UNKNOWN_VARIANCE * np.eye(2), np.float32)
+        velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
+        return np.stack(velocity), np.stack([self._align.fill(a.covariance) for a in anchors])
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
@@ -152,16 +179,10 @@ class EventFlow:
         Returns:
             The paths.
         """
-        if not len(self.recording.events):
-            still = np.zeros((1, *self.shape, 2), np.float32)
-            unknown = np.full((*still.shape, 2), np.inf, np.float32) * np.eye(2, dtype=np.float32)
-            return WindowPaths(int(at), np.array([at], np.int64), still, unknown)
         with self._lock:
             anchors = self._around(min(start, at), max(stop, at))
-        knots = np.array([anchor.t for anchor in anchors], np.int64)
-        velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
-        covariance = [self._align.fill(anchor.covariance) for anchor in anchors]
-        return WindowPaths(int(at), knots, np.stack(velocity), np.stack(covariance))
+        knots = np.array([anchor.t for anchor in anchors] or [at], np.int64)
+        return WindowPaths(int(at), knots, *self._fields(anchors))
 
     def __call__(
         self, times: Times, extrapolate: bool = False
@@ -184,12 +205,18 @@ class EventFlow:
             check_times(wanted, self.recording.start, self.recording.stop, self.recording.name)
         mean = np.zeros((len(wanted), *self.shape, 2), np.float32)
         covariance = np.zeros((*mean.shape, 2), np.float32)
+        valid = np.zeros(mean.shape[:3], bool)
         for row, t in enumerate(wanted.tolist()):
-            paths = self.paths(t, t, t)
-            weights = _weights(paths.knots, t)
-            mean[row] = np.tensordot(weights, paths.velocity, 1)
-            covariance[row] = np.tensordot(weights, paths.covariance, 1)
-        valid = np.isfinite(covariance[..., 0, 0]) & (covariance[..., 0, 0] < 1e6)
+            with self._lock:
+                anchors = self._around(t, t)
+            knots = [anchor.t for anchor in anchors] or [t]
+            weights = np.array([np.interp(t, knots, one) for one in np.eye(len(knots))], np.float32)
+            velocity, uncertainty = self._fields(anchors)
+            mean[row] = np.tensordot(weights, velocity, 1)
+            covariance[row] = np.tensordot(weights, uncertainty, 1)
+            unit = float(weights @ np.array([anchor.unit for anchor in anchors] or [0.0]))
+            largest = np.linalg.eigvalsh(covariance[row])[..., 1]
+            valid[row] = (unit > 0) & (largest * unit**2 < MAX_DEVIATION_PX**2)
         return mean, covariance, valid
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
@@ -206,12 +233,6 @@ class EventFlow:
             InputError: A time is outside the recording without `extrapolate`.
         """
         return self(times, extrapolate)[0]
-
-
-def _weights(knots: NDArray[np.int64], t: int) -> NDArray[np.float32]:
-    """Return the weights of knots in a value at a time, linear between and constant outside."""
-    eye = np.eye(len(knots))
-    return np.array([np.interp(t, knots, row) for row in eye], np.float32)
 
 
 def flow_from_events(
