@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from common import command_line, write_text
+from common import command_line, machine, markdown_table, write_text
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -401,9 +401,8 @@ def accumulate(recording, times):
     """Return sums of the polarities of the last events, half an event per pixel, (T, H, W)."""
     e, shape = recording.events[:], (recording.height, recording.width)
     images = np.zeros((len(times), *shape))
-    for image, time in zip(images, times, strict=True):
-        last = e[max(np.searchsorted(e.t, time) - shape[0] * shape[1] // 2, 0) :]
-        last = last[: np.searchsorted(last.t, time)]
+    for image, stop in zip(images, np.searchsorted(e.t, times), strict=True):
+        last = e[max(stop - shape[0] * shape[1] // 2, 0) : stop]
         np.add.at(image, (last.y, last.x), np.where(last.p, 1.0, -1.0))
     return images, None
 
@@ -466,54 +465,74 @@ def match_tone(image, truth):
 
 def write_sheet(path, images, truth):
     """Write a picture of a case: times downwards, methods across, the truth last."""
-    rows = [
-        np.hstack(
-            [*(match_tone(one[k], truth[k]) for one in images), match_tone(truth[k], truth[k])]
-        )
-        for k in range(len(truth))
-    ]
-    write_png(path, np.vstack(rows[::3] if len(rows) > 3 else rows))
+    chosen = np.unique(np.linspace(0, len(truth) - 1, 3).astype(int))
+    columns = [*images, truth]
+    rows = [np.hstack([match_tone(one[k], truth[k]) for one in columns]) for k in chosen]
+    write_png(path, np.vstack(rows))
+
+
+def run_part(name, options):
+    """Run the methods on a recording, or on a scene with all seeds; return rows of the table."""
+    real = name in REAL
+    found = {}
+    for seed in (None,) if real else SEEDS:
+        case = real_case(options.data, name) if real else simulated_case(name, seed)
+        images = {}
+        for label in (*options.methods, *case.networks):
+            row, images[label] = run_case(case, label)
+            found.setdefault(label, []).append(row)
+            quality = f"; z2 {np.mean(row['z2']):.2f}" if "z2" in row else ""
+            print(f"{case.recording.name}, {label}: {format_scores(row['scores'])}{quality}; "
+                  f"{row['seconds']:.2f} s", flush=True)  # fmt: skip
+        write_sheet(options.out / f"{name}{seed or ''}.png", images.values(), case.truth)
+    return {
+        label: {
+            "scores": np.concatenate([row["scores"] for row in rows]).tolist(),
+            "z2": np.concatenate([row.get("z2", []) for row in rows]).tolist(),
+            "seconds": float(np.mean([row["seconds"] for row in rows])),
+        }
+        for label, rows in found.items()
+    }
+
+
+def make_tables(results):
+    """Return the tables of scores, of variances and of CPU seconds, in Markdown."""
+    if "slider_depth" in results:
+        last = {k: {**v, "scores": v["scores"][-1:]} for k, v in results["slider_depth"].items()}
+        results = {**results, "slider_depth, last image": last}
+    methods = list(dict.fromkeys(label for case in results.values() for label in case))
+    kinds = {
+        "100 MSE / SSIM after the affine fit; after matching histograms": lambda one: format_scores(
+            one["scores"]
+        ),
+        "z2 of the log image, mean and median over the images": lambda one: (
+            f"{np.mean(one['z2']):.2f}, {np.median(one['z2']):.2f}" if one["z2"] else "-"
+        ),
+        "CPU s an image": lambda one: f"{one['seconds']:.2f}",
+    }
+    parts = []
+    for title, text in kinds.items():
+        rows = [
+            [label, *(text(case[label]) if label in case else "-" for case in results.values())]
+            for label in methods
+        ]
+        parts.append(f"{title}\n\n{markdown_table(['', *results], rows)}\n")
+    return "\n".join([*parts, machine(), ""])
 
 
 def main():
+    """Run the parts, and write tables, results and sheets of pictures."""
     parser = command_line(__doc__, out=True, data=True, parts=(*REAL, *SCENES))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     options = parser.parse_args()
-    rows = []
+    stored = options.out / "results.json"
+    results = json.loads(stored.read_text()) if stored.exists() else {}
     for name in options.only:
-        cases = (
-            [real_case(options.data, name)]
-            if name in REAL
-            else [simulated_case(name, s) for s in SEEDS]
-        )
-        found = {}
-        for case in cases:
-            images = {}
-            for label in (*options.methods, *case.networks):
-                row, images[label] = run_case(case, label)
-                found.setdefault(label, []).append(row)
-                print(
-                    name,
-                    label,
-                    format_scores(row["scores"]),
-                    f"{row['seconds']:.2f} s",
-                    row.get("z2", ""),
-                    flush=True,
-                )
-            write_sheet(
-                options.out / f"{case.recording.name.replace(' ', '_')}.png",
-                images.values(),
-                case.truth,
-            )
-        rows += [
-            {
-                "case": name,
-                "method": label,
-                **{k: sum((o[k] for o in r), []) for k in ("scores",)},
-            }
-            for label, r in found.items()
-        ]
-    write_text(options.out / "results.json", json.dumps(rows))
+        results[name] = {**results.get(name, {}), **run_part(name, options)}
+        write_text(stored, json.dumps(results))
+    table = make_tables(results)
+    write_text(options.out / "table.md", table)
+    print(table)
 
 
 if __name__ == "__main__":
