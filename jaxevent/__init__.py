@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         last_frame,
         mc,
     )
+    from jaxevent.reconstruction.events_only import events_only
     from jaxevent.recording import Events, Frames, Recording
     from jaxevent.runs.evaluate import evaluate
     from jaxevent.runs.fit import fit
@@ -67,6 +68,7 @@ _HOMES = {
         *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
         *("flow", "last_frame", "mc"),
     ),
+    "jaxevent.reconstruction.events_only": ("events_only",),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.runs.evaluate": ("evaluate",),
     "jaxevent.runs.fit": ("fit",),
@@ -107,6 +109,7 @@ __all__ = [
     "egomotion",
     "evaluate",
     "events",
+    "events_only",
     "fit",
     "flow",
     "flow_from_events",
