@@ -274,18 +274,20 @@ class Alignment:
         return C + spread + floor
 
     def typical(self, aligned: Aligned) -> float:
-        """Return the median length of displacements where events determine them, px; 0 if nowhere.
+        """Return the median length of displacements, weighted by information, px.
+
+        It is 0 where events determine none of them.
 
         Args:
             aligned: Displacement and information.
         """
-        known = np.linalg.eigvalsh(self.covariance(aligned))[..., 1] < MAX_VARIANCE
-        weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0) * known
+        if not (np.linalg.eigvalsh(self.covariance(aligned)) < MAX_VARIANCE).all(-1).any():
+            return 0.0
+        weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0)
         length = np.hypot(aligned.u[..., 0], aligned.u[..., 1]).ravel()
         order = np.argsort(length, kind="stable")
         total = np.cumsum(weight.ravel()[order])
-        middle = np.searchsorted(total, total[-1] / 2)
-        return float(length[order[middle]]) if total[-1] > 0 else 0.0
+        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
 
     def __call__(
         self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]
