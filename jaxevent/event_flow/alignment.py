@@ -249,11 +249,12 @@ class Clock(NamedTuple):
             at: Time at which s = 0, us.
             half: Number of events around it on either side.
         """
-        rows = np.arange(0, len(events), max(half // CLOCK_PARTS, 1))
-        t, first = np.unique(events.t[np.append(rows, len(events) - 1)], return_index=True)
+        parts = max(round(CLOCK_PARTS * len(events) / half), 1)
+        rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
+        t, first = np.unique(events.t[rows], return_index=True)
         if len(t) < 2:
             return cls(at + np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
-        s = np.append(rows, len(events) - 1)[first] / half
+        s = rows[first] / half
         s = (s + (t - t[0]) * (s[-1] / (t[-1] - t[0]))) / 2
         return cls(t.astype(float), s - np.interp(at, t, s))
 
@@ -264,8 +265,8 @@ class Clock(NamedTuple):
 
     def rate(self, t: float) -> float:
         """Return how fast s goes at a time (us), 1/s."""
-        rates = np.pad(np.gradient(self.s, self.t), 1, mode="edge")
-        smooth = (rates[:-2] + 2 * rates[1:-1] + rates[2:]) / 4
+        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
+        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
         return float(np.interp(t, self.t, smooth)) * 1e6
 
 
