@@ -12,10 +12,10 @@ reweighted least squares replace E by the quadratic with
 
     r_k = w_k / (1 + e_k^2 / (2 tail^2)),    s = gradient / (2 (q + edge^2))
 
-for rows, and for each of the four differences of a cell, whose normal equations A u = b conjugate
-gradients solve. Their preconditioner is the sum of the reciprocal diagonals of P' A P, where the
-columns of P are pixels, and blocks of 2, 4, 8, ... pixels a side (Bramble, Pasciak and Xu 1990):
-large regions, which rows tie together at their edges alone, move as a whole.
+for rows, and for each of the four differences of a cell. Conjugate gradients solve its normal
+equations A u = b, preconditioned by the sum of the reciprocal diagonals of P' A P: the columns of P
+are pixels, and blocks of 2, 4, 8, ... pixels a side (Bramble, Pasciak and Xu 1990), so that large
+regions, which only their edges tie together, move as a whole.
 
 At the solution dE/du = A u - b = 0 with the weights of u itself.
 """
