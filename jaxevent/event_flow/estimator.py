@@ -133,13 +133,16 @@ class EventFlow:
         end = min((number + 1) * length, len(self.recording.events))
         return np.arange(number * length, end, self._chain(number).half)
 
-    def _around(self, start: int, stop: int) -> list[Anchor]:
-        """Return the anchors that determine flow from start to stop (us), of different times."""
+    def _around(self, start: int, stop: int, until: int) -> list[Anchor]:
+        """Return the anchors that determine flow from start to stop (us), of different times.
+
+        A causal flow uses events up to the time `until`.
+        """
         events, length = self.recording.events, CHAIN_WINDOWS * self._base
         n = len(events)
         if not n:
             return []
-        seen = events.index(stop + 1)  # events that a causal flow may use
+        seen = events.index(until + 1)  # events that a causal flow may use
         low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), n - 1)
         found: list[Anchor] = []
         first = max(low // length - self.causal, 0)
@@ -168,19 +171,21 @@ class EventFlow:
         velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
         return np.stack(velocity), np.stack([self._align.fill(a.covariance) for a in anchors])
 
-    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
 
         Args:
             start: First time of the events, us.
             stop: Last time of the events, us.
             at: Time to which points are carried, us.
+            until: Time up to which a causal flow may use events, us; None: the latest of the three.
 
         Returns:
             The paths.
         """
         with self._lock:
-            anchors = self._around(min(start, at), max(stop, at))
+            last = max(stop, at)
+            anchors = self._around(min(start, at), last, last if until is None else until)
         knots = np.array([anchor.t for anchor in anchors] or [at], np.int64)
         return WindowPaths(int(at), knots, *self._fields(anchors))
 
@@ -208,7 +213,7 @@ class EventFlow:
         valid = np.zeros(mean.shape[:3], bool)
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
-                anchors = self._around(t, t)
+                anchors = self._around(t, t, t)
             knots = [anchor.t for anchor in anchors] or [t]
             weights = np.array([np.interp(t, knots, one) for one in np.eye(len(knots))], np.float32)
             velocity, uncertainty = self._fields(anchors)

@@ -37,7 +37,8 @@ class MemoryParams(NamedTuple):
     forgetting: float = 0.6  # variance that a gradient gains in time, (c / px)^2 / s
     drift: float = 1.0  # variance that a path gains in time, px^2 / s
     blur: float = 0.3  # variance of a path when the memory enters an image, px^2
-    tail: float = 2.0  # difference, in standard deviations, beyond which memory counts less
+    detail: float = 0.5  # mean square of gradients, that errors of paths act by, (c / px)^2
+    tail: float = 1.5  # difference, in standard deviations, beyond which memory counts less
 
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
@@ -92,10 +93,11 @@ def _add_rows(rows, weight, c, information, eta):
 
 
 @njit_noalloc
-def _add_span(events, positions, numbers, information, eta):
+def _add_span(events, positions, errors, numbers, information, eta):
     """Add the rows of a span; events are in order of time, or in reverse order for the side -1."""
     pixel, change, last = events
     begin, middle, at_event = positions
+    variance, time, ends = errors
     n_before, side, weight, silence = numbers
     width = eta.shape[1]
     for k in range(len(pixel)):
@@ -108,15 +110,18 @@ def _add_span(events, positions, numbers, information, eta):
         if previous < 0:
             # In reverse order nothing happens between the event and the span's end.
             half = 0.5 * change[k] if side > 0 else np.float32(0)
-            _add_row((begin[x, 0], begin[x, 1]), here, half, silence, information, eta)
+            w = silence / (1 + variance[x] * (ends[0] - time[k]) ** 2)
+            _add_row((begin[x, 0], begin[x, 1]), here, half, w, information, eta)
         else:
             step = change[k] if side > 0 else change[previous]
             there = at_event[previous, 0], at_event[previous, 1]
-            _add_row(there, here, step, weight, information, eta)
+            w = weight / (1 + variance[x] * (time[previous] - time[k]) ** 2)
+            _add_row(there, here, step, w, information, eta)
     for x in range(len(last)):
         if last[x] < n_before:
             here = np.float32(x % width), np.float32(x // width)
-            _add_row((middle[x, 0], middle[x, 1]), here, np.float32(0), silence, information, eta)
+            w = silence / (1 + variance[x] * ends[1] ** 2)
+            _add_row((middle[x, 0], middle[x, 1]), here, np.float32(0), w, information, eta)
 
 
 @njit_noalloc
@@ -300,8 +305,8 @@ class Windows(Protocol):
         """Return the events of some rows, without those of hot pixels."""
         ...
 
-    def paths(self, start: int, stop: int, at: int) -> Paths:
-        """Return the paths between two times (us) towards the time `at`."""
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> Paths:
+        """Return the paths between two times (us) towards `at`, by events up to `until`."""
         ...
 
 
@@ -345,6 +350,9 @@ class KeyMemories:
     def prior(self, rows: Rows, at: int, first: int, last: int | None) -> GradientPrior:
         """Return what the windows before and after one say of its image.
 
+        Where images are causal, a window begins at least two steps before its image: flow for the
+        memory rests on so many events after the key.
+
         Args:
             rows: Equations of the window for the image.
             at: Time of the image, us.
@@ -355,7 +363,7 @@ class KeyMemories:
             The memories together; where no window saw anything the information is 0.
         """
         ends = [(first, 1)] + ([] if last is None else [(last, -1)])
-        found = [self._carried(self._at_key(k, s), k, at, self.params.blur) for k, s in ends]
+        found = [self._carried(self._at_key(k, s), k, at, at, self.params.blur) for k, s in ends]
         known = [memory for memory in found if memory is not None]
         if not known:
             zeros = np.zeros((*rows.shape, 2), np.float32)
@@ -365,14 +373,14 @@ class KeyMemories:
         return discount(joint, new, self.threshold, self.params.tail)
 
     def _carried(
-        self, memory: GradientPrior | None, key: int, at: int, blur: float = 0.0
+        self, memory: GradientPrior | None, key: int, at: int, until: int, blur: float = 0.0
     ) -> GradientPrior | None:
         if memory is None:
             return None
         start = self.time(key)
         seconds = 1e-6 * abs(at - start)
         gain = self.params.forgetting * self.threshold**2 * seconds
-        paths = self.windows.paths(min(start, at), max(start, at), start)
+        paths = self.windows.paths(min(start, at), max(start, at), start, until=until)
         return carry(memory, paths, at, (gain, self.params.drift * seconds + blur))
 
     def _at_key(self, key: int, side: int) -> GradientPrior | None:
@@ -403,7 +411,7 @@ class KeyMemories:
     def _extend(self, memory: GradientPrior | None, key: int, side: int) -> GradientPrior:
         """Return the memory at the next key on the way."""
         new = self._measure(key, side)
-        carried = self._carried(memory, key, self.time(key + side))
+        carried = self._carried(memory, key, self.time(key + side), self.time(key + side + 2))
         if carried is None:
             return new
         return fuse(discount(carried, new, self.threshold, self.params.tail), new, self.threshold)
@@ -424,7 +432,8 @@ class KeyMemories:
             for name in "xytp"
         )
         height, width = shape = self.windows.shape
-        paths = self.windows.paths(min(times), max(times), times[2])
+        until = self.time(key + side + 2)
+        paths = self.windows.paths(min(times), max(times), times[2], until=until)
         pixels = [v.ravel().astype(np.float32) for v in np.indices(shape)[::-1]]
         begin, middle = (
             np.stack(paths.carry(*pixels, np.full(height * width, time)), -1) for time in times[:2]
@@ -433,11 +442,16 @@ class KeyMemories:
         pixel = y.astype(np.int32) * width + x
         on, off = self.windows.thresholds.reshape(2, -1)
         change = side * np.where(p, on[pixel], -off[pixel])
+        variance = np.zeros(height * width, np.float32)
+        if paths.covariance is not None:
+            variance = np.trace(paths.covariance.mean(0), axis1=-2, axis2=-1).ravel()
         information = np.zeros((*shape, 2, 2), np.float32)
         eta, gradient = np.zeros((2, *shape, 2), np.float32)
+        seconds = 1e-6 * np.abs(t - times[2]), 1e-6 * np.abs(np.subtract(times[:2], times[2]))
         _add_span(
             (pixel, change, np.full(height * width, -1, np.int32)),
             (begin, middle, at_event),
+            (self.params.detail * variance, *seconds),
             (len(before), side, 1 / self.threshold**2, self.silence / self.threshold**2),
             information,
             eta,

@@ -80,10 +80,10 @@ class WindowSolver:
             threshold=float(self.thresholds.mean()),
         )
 
-    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of points through a window, see `EventFlow.paths`."""
         if isinstance(self.flow, EventFlow):
-            return self.flow.paths(start, stop, at)
+            return self.flow.paths(start, stop, at, until=until)
         low, high = min(start, at), max(stop, at)
         knots = np.unique(np.linspace(low, high, N_MOTION_KNOTS).astype(np.int64))
         velocity = np.nan_to_num(np.asarray(self.flow.flow(knots, extrapolate=True), np.float32))
