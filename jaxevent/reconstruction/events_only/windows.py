@@ -12,7 +12,7 @@ from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import Rows, make_rows
 from jaxevent.reconstruction.events_only.solve import Solution, solve
-from jaxevent.recording import Recording, Times
+from jaxevent.recording import Events, Recording, Times
 
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
 
@@ -80,30 +80,27 @@ class WindowSolver:
             threshold=float(self.thresholds.mean()),
         )
 
-    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of points through a window, see `EventFlow.paths`."""
         if isinstance(self.flow, EventFlow):
-            return self.flow.paths(start, stop, at)
+            return self.flow.paths(start, stop, at, until=until)
         low, high = min(start, at), max(stop, at)
         knots = np.unique(np.linspace(low, high, N_MOTION_KNOTS).astype(np.int64))
         velocity = np.nan_to_num(np.asarray(self.flow.flow(knots, extrapolate=True), np.float32))
         return WindowPaths(at, knots, velocity)
 
-    def rows(self, first: int, last: int, at: int, span: tuple[int, int]) -> Rows:
-        """Return the equations of the events of some rows of the recording.
+    def events(self, first: int, last: int) -> Events:
+        """Return the events of some rows of the recording, without those of hot pixels.
 
         Args:
-            first: First row of the events.
-            last: Row after their last.
-            at: Time of the image, us.
-            span: Begin and end of the window, us.
+            first: First row.
+            last: Row after the last one.
 
         Returns:
-            The equations for the image at that time.
+            The events.
         """
         events = self.recording.events[first:last]
-        events = events[~self.hot[events.y, events.x]]
-        return make_rows(events, self.paths(*span, at), self.thresholds, self.shape, span)
+        return events[~self.hot[events.y, events.x]]
 
     def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
         """Solve for the image at a time.
@@ -126,6 +123,8 @@ class WindowSolver:
             last = memory.key_after(max(place + ahead, 2 * self.n_side))
             end, stop = memory.row(last), memory.time(last)
         start = memory.time(first)
-        rows = self.rows(memory.row(first), end, t, (min(start, t), max(stop, t)))
+        span = min(start, t), max(stop, t)
+        events = self.events(memory.row(first), end)
+        rows = make_rows(events, self.paths(*span, t), self.thresholds, self.shape, span)
         prior = memory.prior(rows, t, first, last)
         return SolvedWindow(rows, prior, solve(rows, prior, self.numbers, variance=variance))
