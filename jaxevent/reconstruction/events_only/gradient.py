@@ -27,6 +27,7 @@ from jaxevent.reconstruction.features import Numeric
 
 REWEIGHTINGS = 100  # at most
 CG_ITERATIONS = 300  # at most
+LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 BLUR_PX = 1.5  # of the variance, as that of `solve`
 
 
@@ -310,6 +311,30 @@ def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
 
     _, right = jax.jvp(lambda numbers: _slope(u, equations, numbers), (params,), (changes[2],))
     return u, -jax.lax.custom_linear_solve(times, right, solve, symmetric=True)
+
+
+def held_out_likelihood(equations: WindowEquations, held: Array, params: Params) -> Array:
+    """Return the log likelihood of events that the image was not solved for.
+
+    A residual e, in thresholds, has Student's t distribution of the energy's robust loss,
+
+        p(e) = Gamma(a) / (sqrt(2 pi) tail Gamma(a - 1/2)) (1 + e^2 / (2 tail^2))^-a,  a = tail^2.
+
+    Args:
+        equations: Equations of a window.
+        held: (rows,) 1 for the rows of events to predict, else 0.
+        params: Parameters; a `tail` whose distribution has no integral counts as the least.
+
+    Returns:
+        (), a sum over these rows.
+    """
+    others = equations._replace(weight=equations.weight * (1 - held))
+    u = solve_equations(others, params)
+    e = _residuals(u, equations, params)[1]
+    a = jnp.maximum(params.tail**2, LEAST_STUDENT_SHAPE)
+    norm = jax.scipy.special.gammaln(a) - jax.scipy.special.gammaln(a - 0.5)
+    each = norm - 0.5 * jnp.log(2 * jnp.pi * a) - a * jnp.log1p(e**2 / (2 * a))
+    return (held * each).sum()
 
 
 def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Array:
