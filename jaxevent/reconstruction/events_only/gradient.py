@@ -26,7 +26,7 @@ from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
 REWEIGHTINGS = 100  # at most
-CG_ITERATIONS = 300  # at most
+CG_ITERATIONS = 1000  # at most
 LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 BLUR_PX = 1.5  # of the variance, as that of `solve`
 
@@ -99,8 +99,8 @@ def pack_equations(
         fill(rows.fraction),
         fill(np.maximum(rows.change, 0) * (c / float(params.c_on))),
         fill(np.maximum(-rows.change, 0) * (c / float(params.c_off))),
-        fill(event.astype(dtype)),
-        fill((~event).astype(dtype)),
+        fill(event * rows.weight),
+        fill(~event * rows.weight),
         (prior.gradient / c).astype(dtype),
         information.astype(dtype),
         (solution.log_image / c).astype(dtype),
@@ -165,7 +165,7 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
     total = (weight * numbers.tail**2 * jnp.log1p(e**2 / (2 * numbers.tail**2))).sum()
-    total += numbers.gradient * (jnp.sqrt(_cells(u) + numbers.edge**2) - numbers.edge).sum()
+    total += numbers.gradient / 2 * jnp.log1p(_cells(u) / numbers.edge**2).sum()
     return total + _quadratic(u, equations, numbers.leak)
 
 
@@ -200,7 +200,7 @@ class _Weights(NamedTuple):
 def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
-    s = numbers.gradient / (2 * jnp.sqrt(_cells(u) + numbers.edge**2))
+    s = numbers.gradient / (2 * (_cells(u) + numbers.edge**2))
     across = jnp.pad(s, [(0, 1), (0, 0)]) + jnp.pad(s, [(1, 0), (0, 0)])
     down = jnp.pad(s, [(0, 0), (0, 1)]) + jnp.pad(s, [(0, 0), (1, 0)])
     return _Weights(weight / (1 + e**2 / (2 * numbers.tail**2)), across, down)
