@@ -3,9 +3,10 @@
 Gradients of log images are heavy-tailed. A cell is a square of four neighbouring pixels, with the
 mean square q of its two differences across and two down, in squared thresholds. The prior has
 
-    phi(q) = sqrt(q + edge^2) - edge                                                          (2)
+    phi(q) = gradient / 2 log(1 + q / edge^2)                                                 (2)
 
-for each cell, so that an edge costs about its height in whatever direction it runs.
+for each cell: gradients have Student's distribution, the same for edges of all directions. Where
+events show an edge, its sides may differ in height along it, too.
 """
 
 from typing import NamedTuple
@@ -17,11 +18,11 @@ from jaxtyping import Float
 class SolverParams(NamedTuple):
     """Numbers of the model of one image; log intensity is in thresholds."""
 
-    silence: float = 0.5  # weight of rows without an event at one end, against those of events
+    silence: float = 1.0  # weight of rows without an event at one end, against those of events
     tail: float = 1.4  # residual, in thresholds, beyond which a row counts less
-    gradient: float = 0.2  # weight of the prior of gradients (2)
-    edge: float = 0.1  # gradient below which (2) is quadratic
-    leak: float = 2e-4  # weight of M^2
+    gradient: float = 0.03  # weight of the prior (2)
+    edge: float = 0.1  # gradient, in thresholds per px, below which (2) is quadratic
+    leak: float = 2e-5  # weight of u^2
 
 
 class GradientPrior(NamedTuple):

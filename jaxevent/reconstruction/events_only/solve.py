@@ -3,16 +3,17 @@
 With u = M / c, the log image in thresholds, the image minimises
 
     E(u) = sum_k w_k tail^2 log(1 + (a_k u - d_k)^2 / (2 tail^2))                      rows (1)
-         + gradient sum_cells phi(q(u))                                                prior (2)
+         + sum_cells phi(q(u))                                                         prior (2)
          + 1/2 sum_x (grad u - g)' Lambda (grad u - g)                      other windows' events
          + leak / 2 sum_x u^2                                                                 (3)
 
-a_k is the difference of two bilinear look-ups, w_k is 1 for rows of events and `silence` for the
-others. E is smooth. Iteratively reweighted least squares replace E by the quadratic with
+a_k is the difference of two bilinear look-ups, w_k the weight of the row. E is smooth. Iteratively
+reweighted least squares replace E by the quadratic with
 
-    r_k = w_k / (1 + e_k^2 / (2 tail^2)),    s = gradient / (2 sqrt(q + edge^2))
+    r_k = w_k / (1 + e_k^2 / (2 tail^2)),    s = gradient / (2 (q + edge^2))
 
-whose normal equations A u = b conjugate gradients solve, preconditioned by the diagonal of A. At
+for rows, and for each of the four differences of a cell, whose normal equations A u = b conjugate gradients solve, preconditioned by the diagonals of A over pixels and
+over blocks of pixels of several sizes (Bramble, Pasciak and Xu 1990). At
 the solution dE/du = A u - b = 0 with the weights of u itself.
 """
 
@@ -24,11 +25,12 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
-from jaxevent.reconstruction.events_only.rows import Rows
+from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 
 REWEIGHTINGS = 8
-CG_ITERATIONS = 100
+CG_ITERATIONS = 25
 CG_TOLERANCE = 1e-3
+BLOCK_FACTOR = 3  # between the sides of blocks that precondition
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
 
 
@@ -80,7 +82,6 @@ def solve(
     height, width = rows.shape
     c = np.float32(rows.threshold)
     u = np.zeros(rows.shape, np.float32) if start is None else (start / c).astype(np.float32)
-    base = np.where(rows.kind == 0, 1, params.silence).astype(np.float32)
     information = np.zeros((height, width, 3), np.float32)
     pull = np.zeros(rows.shape, np.float32)
     if prior is not None:
@@ -89,9 +90,10 @@ def solve(
         _add_gradient_transposed(
             np.einsum("hwij,hwj->hwi", L, prior.gradient / c).astype(np.float32), pull
         )
-    residual, weight = np.empty_like(rows.change), base.copy()
+    base = np.where(rows.kind == EVENT, 1, params.silence).astype(np.float32) * rows.weight
+    residual, weight = np.empty_like(rows.change), np.empty_like(rows.change)
     across, down = np.zeros(rows.shape, np.float32), np.zeros(rows.shape, np.float32)
-    scratch = np.zeros((4, height, width), np.float32)
+    scratch = np.zeros((5, height, width), np.float32)
     system = _System(
         rows.corner, rows.fraction, weight, across, down, information, np.float32(params.leak)
     )
@@ -298,7 +300,7 @@ def _reweight(system, u, data, numbers, residual):
             a, b = u[y, x + 1] - u[y, x], u[y + 1, x + 1] - u[y + 1, x]
             c, d = u[y + 1, x] - u[y, x], u[y + 1, x + 1] - u[y, x + 1]
             q = (a * a + b * b + c * c + d * d) / 2
-            s = gradient / (2 * np.sqrt(q + edge * edge))
+            s = gradient / (2 * (q + edge * edge))
             system.across[y, x] += s
             system.across[y + 1, x] += s
             system.down[y, x] += s
@@ -314,39 +316,141 @@ def _dot(a, b):
 
 
 @njit_noalloc
+def _write_block_diagonal(system, side, out):
+    """Write 1 / (P' A P), with a block of side x side pixels as column of P, to `out`."""
+    height, width = system.across.shape
+    columns = (width + side - 1) // side
+    for k in range(len(out)):
+        out[k] = 0
+    for y in range(height):
+        for x in range(width):
+            i = (y // side) * columns + x // side
+            out[i] += system.leak
+            if x + 1 < width and (x + 1) % side == 0:
+                out[i] += system.across[y, x]
+                out[i + 1] += system.across[y, x]
+            if y + 1 < height and (y + 1) % side == 0:
+                out[i] += system.down[y, x]
+                out[i + columns] += system.down[y, x]
+    for k in range(len(system.weight)):
+        # Only blocks that the look-ups do not share as a whole.
+        i0, j0 = system.corner[k, 0], system.corner[k, 1]
+        ay, ax = i0 // width, i0 % width
+        by, bx = j0 // width, j0 % width
+        ya, xa, yb, xb = ay // side, ax // side, by // side, bx // side
+        if (
+            ya == yb
+            and xa == xb
+            and ya == (ay + 1) // side
+            and xa == (ax + 1) // side
+            and yb == (by + 1) // side
+            and xb == (bx + 1) // side
+        ):
+            continue
+        a0, a1, a2, a3 = _bilinear(system.fraction, 0, k)
+        b0, b1, b2, b3 = _bilinear(system.fraction, 1, k)
+        y0, x0 = min(ya, yb), min(xa, xb)
+        y1, x1 = max((ay + 1) // side, (by + 1) // side), max((ax + 1) // side, (bx + 1) // side)
+        w = system.weight[k]
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                e = np.float32(0)
+                if ya == y:
+                    e += (a0 if xa == x else 0) + (a1 if (ax + 1) // side == x else 0)
+                if (ay + 1) // side == y:
+                    e += (a2 if xa == x else 0) + (a3 if (ax + 1) // side == x else 0)
+                if yb == y:
+                    e -= (b0 if xb == x else 0) + (b1 if (bx + 1) // side == x else 0)
+                if (by + 1) // side == y:
+                    e -= (b2 if xb == x else 0) + (b3 if (bx + 1) // side == x else 0)
+                out[y * columns + x] += w * e * e
+    for k in range(len(out)):
+        out[k] = 1 / out[k] if out[k] > 0 else np.float32(0)
+
+
+@njit_noalloc
+def _precondition(inverse, blocks, sums, r, z):
+    """Write the sum of diagonal preconditioners of pixels and blocks, applied to r, to z."""
+    height, width = r.shape
+    for y in range(height):
+        for x in range(width):
+            z[y, x] = inverse[y, x] * r[y, x]
+    side, begin = BLOCK_FACTOR, 0
+    while begin < len(blocks):
+        columns, rows = (width + side - 1) // side, (height + side - 1) // side
+        for k in range(rows * columns):
+            sums[k] = 0
+        for y in range(height):
+            i = (y // side) * columns
+            for x in range(width):
+                sums[i + x // side] += r[y, x]
+        for k in range(rows * columns):
+            sums[k] *= blocks[begin + k]
+        for y in range(height):
+            i = (y // side) * columns
+            for x in range(width):
+                z[y, x] += sums[i + x // side]
+        begin += rows * columns
+        side *= BLOCK_FACTOR
+
+
+def _block_diagonals(system, shape):
+    """Return the reciprocal diagonals of blocks of all sides, one after another."""
+    height, width = shape
+    side, parts = BLOCK_FACTOR, []
+    while side < max(shape):
+        part = np.empty(-(-height // side) * -(-width // side), np.float32)
+        _write_block_diagonal(system, side, part)
+        parts.append(part)
+        side *= BLOCK_FACTOR
+    return np.concatenate(parts) if parts else np.empty(0, np.float32)
+
+
 def _conjugate_gradients(system, b, u, scratch, tolerance, limit):
+    _write_diagonal(system, scratch[0])
+    blocks = _block_diagonals(system, u.shape)
+    return _iterate(system, (b, u), scratch, blocks, np.empty_like(blocks), (tolerance, limit))
+
+
+@njit_noalloc
+def _iterate(system, images, scratch, blocks, sums, stop):
     """Solve A u = b from u on, in place; return the number of iterations."""
-    inverse, r, p, Ap = scratch[0], scratch[1], scratch[2], scratch[3]
-    _write_diagonal(system, inverse)
-    _apply(system, u, Ap)
+    b, u = images
+    tolerance, limit = stop
+    inverse, r, p, Ap, z = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     n = u.size
-    fu, fb, fi, fr, fp, fA = (
+    fu, fb, fi, fr, fp, fA, fz = (
         u.reshape(-1),
         b.reshape(-1),
         inverse.reshape(-1),
         r.reshape(-1),
         p.reshape(-1),
         Ap.reshape(-1),
+        z.reshape(-1),
     )
-    rho, norm = 0.0, 0.0
     for k in range(n):
         fi[k] = 1 / fi[k] if fi[k] > 0 else np.float32(1)
+    _precondition(inverse, blocks, sums, b, z)
+    norm = _dot(fb, fz)
+    _apply(system, u, Ap)
+    for k in range(n):
         fr[k] = fb[k] - fA[k]
-        fp[k] = fi[k] * fr[k]
-        rho += fr[k] * fp[k]
-        norm += fi[k] * fb[k] * fb[k]
+    _precondition(inverse, blocks, sums, r, z)
+    rho = _dot(fr, fz)
+    for k in range(n):
+        fp[k] = fz[k]
     for iteration in range(limit):
         if rho <= tolerance * tolerance * norm:
             return iteration
         _apply(system, p, Ap)
         alpha = np.float32(rho / _dot(fp, fA))
-        new = 0.0
         for k in range(n):
             fu[k] += alpha * fp[k]
             fr[k] -= alpha * fA[k]
-            new += fr[k] * fi[k] * fr[k]
+        _precondition(inverse, blocks, sums, r, z)
+        new = _dot(fr, fz)
         beta = np.float32(new / rho)
         for k in range(n):
-            fp[k] = fi[k] * fr[k] + beta * fp[k]
+            fp[k] = fz[k] + beta * fp[k]
         rho = new
     return limit
