@@ -1,7 +1,6 @@
 """Memory of video from events alone: closed forms of a ramp, fading, and requests in any order."""
 
 import numpy as np
-import pytest
 
 from jaxevent import Recording
 from jaxevent.reconstruction.events_only.memory import (
