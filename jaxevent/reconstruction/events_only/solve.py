@@ -12,9 +12,10 @@ reweighted least squares replace E by the quadratic with
 
     r_k = w_k / (1 + e_k^2 / (2 tail^2)),    s = gradient / (2 (q + edge^2))
 
-for rows, and for each of the four differences of a cell, whose normal equations A u = b conjugate gradients solve, preconditioned by the diagonals of A over pixels and
-over blocks of pixels of several sizes (Bramble, Pasciak and Xu 1990). At
-the solution dE/du = A u - b = 0 with the weights of u itself.
+for rows, and for each of the four differences of a cell. Conjugate gradients solve its normal
+equations A u = b, preconditioned by the diagonals of A over pixels and over blocks of pixels of
+several sizes (Bramble, Pasciak and Xu 1990). At the solution dE/du = A u - b = 0 with the weights
+of u itself.
 """
 
 from typing import NamedTuple
