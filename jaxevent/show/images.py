@@ -39,7 +39,7 @@ def display_limits(
     "linear" has the limits 0 and 1, whatever the images. The other tones leave out the darkest and
     the brightest 0.5 % of the values as outliers; "log" and "clahe" use positive values only.
     "changes" leaves out the largest 5 % of the values that differ from 0, and is symmetric about 0.
-    "relative" has the limits of "log", or wider ones: at least four standard deviations of most
+    "relative" leaves out 1 %, and has limits that are at least four standard deviations of most
     pixels apart, so that noise is not stretched to black and white. With the same limits for all
     frames of a video its brightness does not pump.
 
@@ -65,7 +65,8 @@ def display_limits(
     values = images[images > 0] if logarithmic else images.ravel()
     if not len(values):
         return (2.0**-MAX_OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
-    low, high = (float(limit) for limit in np.percentile(values.astype(np.float64), [0.5, 99.5]))
+    rare = 1.0 if how == "relative" else 0.5
+    low, high = np.percentile(values.astype(np.float64), [rare, 100 - rare]).tolist()
     if logarithmic:
         low = max(low, high * 2.0**-MAX_OCTAVES)
         if how == "relative" and np.isfinite(variance := _fill_unknown(variance, images)).any():

@@ -44,9 +44,8 @@ def view(
     Args:
         recording: Events and frames.
         results: Reconstructions (shown at the frames' times, or 30 per second), tracks, motions,
-            or paths: images
-            with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of
-            `jaxevent track` and `jaxevent motion`.
+            or paths: images with times, as `jaxevent reconstruct` writes in HDF5, or the folder or
+            table (CSV) of `jaxevent track` and `jaxevent motion`.
         out: File .rrd that is written; None to open a viewer.
         window: Length of the windows in which events are shown, s.
 
