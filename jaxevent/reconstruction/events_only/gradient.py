@@ -26,7 +26,7 @@ from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
 REWEIGHTINGS = 100  # at most
-CG_ITERATIONS = 1000  # at most
+CG_ITERATIONS = 200  # at most
 LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 BLUR_PX = 1.5  # of the variance, as that of `solve`
 
@@ -249,8 +249,8 @@ def _solve_linear(product: Callable[[Array], Array], right: Array, diagonal: Arr
 
 
 def _tolerance(dtype: Any) -> float:
-    """Return the relative size of a residual to stop at: the root of the precision."""
-    return float(jnp.finfo(dtype).eps) ** 0.5
+    """Return the relative size of a residual to stop at: the third root of the precision."""
+    return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
 def solve_equations(equations: WindowEquations, params: Params) -> Array:
