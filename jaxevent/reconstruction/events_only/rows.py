@@ -15,6 +15,12 @@ image M at the target time, so L(x, t) = M(X(x, t)). Each row looks twice at M, 
 An edge that passes makes events only when its level reaches a threshold, so a part of the change
 comes before the first event and after the last one. Without that part the edge would be too low,
 and would lag behind. The shares are means over simulated scenes (`experiments/studies`).
+A path whose velocity has the covariance C is uncertain by C (t_b - t_a)^2, so that the image there
+is another. With the mean square `ROUGHNESS` of a gradient of log images, the row has the variance
+
+    1 + ROUGHNESS trace C (t_b - t_a)^2                                                      (1b)
+
+against that of a row with a known path. Where no event shows the motion, silence says nothing.
 The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is new.
 """
 
@@ -29,11 +35,14 @@ from jaxevent.recording import Events
 
 EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
 FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
+ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^2
 
 
 @runtime_checkable
 class Paths(Protocol):
     """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
+
+    covariance: NDArray | None  # (K, height, width, 2, 2) of the velocity, (px/s)^2; None: known
 
     def carry(self, x: NDArray, y: NDArray, t: NDArray) -> tuple[NDArray, NDArray]:
         """Return the positions at the target time of what pixels (x, y) see at times t."""
@@ -86,6 +95,11 @@ def make_rows(
     )
     pixel = events.y.astype(np.int32) * width + events.x
     change = np.where(events.p, c[0].reshape(-1)[pixel], -c[1].reshape(-1)[pixel]) / threshold
+    doubt = np.zeros(height * width, np.float32)  # (c / s)^2
+    if paths.covariance is not None:
+        doubt[:] = (
+            ROUGHNESS * np.einsum("khwii->hw", paths.covariance).ravel() / len(paths.covariance)
+        )
     n = len(pixel) + height * width
     rows = Rows(
         shape,
@@ -93,32 +107,39 @@ def make_rows(
         np.empty((n, 2), np.uint32),
         np.empty((n, 2, 2), np.float32),
         np.empty(n, np.float32),
-        np.ones(n, np.float32),
+        np.ones(n + 1, np.float32),
         np.empty(n, np.uint8),
         np.empty(n, np.int32),
     )
     last = np.full(height * width, -1, np.int32)
     ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
-    n = _lay_rows(pixel, change.astype(np.float32), ends, last, rows)
+    times = (1e-6 * (events.t - span[0]), 1e-6 * (span[1] - span[0]), doubt)
+    n = _lay_rows(pixel, change.astype(np.float32), ends, times, last, rows)
     return Rows(shape, threshold, *(column[:n] for column in rows[2:]))
 
 
 @njit_noalloc
-def _lay_rows(pixel, change, positions, last, rows):
+def _lay_rows(pixel, change, positions, times, last, rows):
     begin, at_event, end = positions
+    t, stop, doubt = times
     n = 0
     for k in range(len(pixel)):
-        x = pixel[k]
-        if last[x] < 0:
+        x, before = pixel[k], last[pixel[k]]
+        if before < 0:
+            rows.weight[n] = 1 / (1 + doubt[x] * t[k] ** 2)
             n += _lay_row(n, at_event[k], begin[x], FIRST_SHARE * change[k], FIRST, x, rows)
         else:
-            n += _lay_row(n, at_event[k], at_event[last[x]], change[k], EVENT, x, rows)
+            rows.weight[n] = 1 / (1 + doubt[x] * (t[k] - t[before]) ** 2)
+            n += _lay_row(n, at_event[k], at_event[before], change[k], EVENT, x, rows)
         last[x] = k
     for x in range(len(last)):
-        if last[x] < 0:
+        before = last[x]
+        if before < 0:
+            rows.weight[n] = 1 / (1 + doubt[x] * stop**2)
             n += _lay_row(n, end[x], begin[x], 0.0, SILENT, x, rows)
         else:
-            n += _lay_row(n, end[x], at_event[last[x]], LAST_SHARE * change[last[x]], LAST, x, rows)
+            rows.weight[n] = 1 / (1 + doubt[x] * (stop - t[before]) ** 2)
+            n += _lay_row(n, end[x], at_event[before], LAST_SHARE * change[before], LAST, x, rows)
     return n
 
 

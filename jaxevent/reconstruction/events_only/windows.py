@@ -1,5 +1,6 @@
 """The windows of a recording's events: equations, and their solutions on the host."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxevent.reconstruction.events_only.rows import Rows, make_rows
 from jaxevent.reconstruction.events_only.solve import Solution, solve
 from jaxevent.recording import Events, Recording, Times
 
+ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
 
 
@@ -102,7 +104,9 @@ class WindowSolver:
         events = self.recording.events[first:last]
         return events[~self.hot[events.y, events.x]]
 
-    def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
+    def __call__(
+        self, t: int, *, variance: bool = True, held_out: Callable[[Rows], NDArray] | None = None
+    ) -> SolvedWindow:
         """Solve for the image at a time.
 
         A window begins at a key of the memory, and ends at one or, where images are causal, at t.
@@ -110,6 +114,7 @@ class WindowSolver:
         Args:
             t: Time, us.
             variance: Whether the variance is wanted.
+            held_out: Chooses rows (booleans) that the solution does not see.
 
         Returns:
             The window's equations and solution.
@@ -127,4 +132,8 @@ class WindowSolver:
         events = self.events(memory.row(first), end)
         rows = make_rows(events, self.paths(*span, t), self.thresholds, self.shape, span)
         prior = memory.prior(rows, t, first, last)
-        return SolvedWindow(rows, prior, solve(rows, prior, self.numbers, variance=variance))
+        seen = rows
+        if held_out is not None:
+            kept = ~held_out(rows)
+            seen = rows._replace(**{name: getattr(rows, name)[kept] for name in ROW_COLUMNS})
+        return SolvedWindow(rows, prior, solve(seen, prior, self.numbers, variance=variance))
