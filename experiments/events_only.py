@@ -5,17 +5,22 @@ python experiments/events_only.py --out DIR [--only ...]
 
 import dataclasses
 import functools
+import json
 import math
+import time
 from typing import NamedTuple
 
 import numba
 import numpy as np
+from common import command_line, machine, markdown_table, write_text
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
+from tile_images import tile_images
 
 import jaxevent
 from jaxevent.metrics import mse, ssim
+from jaxevent.show.images import write_png
 
 TEXELS = 2  # per pixel at the depth of the farthest plane
 SCENES = ("rotation", "slider", "objects", "hdr", "large", "turn")
@@ -318,3 +323,217 @@ def score(image, truth):
     fitted = fit.reshape(truth.shape).clip(0, 1)
     matched = match_histograms(image, truth)
     return np.array([m(one, truth) for one in (fitted, matched) for m in (mse, ssim)])
+
+
+class Case(NamedTuple):
+    """A recording without frames, and true images at some times that no method is given."""
+
+    recording: jaxevent.Recording
+    times: np.ndarray  # (T,) int64, us
+    truth: np.ndarray  # (T, height, width) in [0, 1]
+    log_truth: np.ndarray  # (T, height, width), up to an offset and a factor
+    logarithmic: bool  # whether `truth` is a logarithm
+    networks: dict  # images (T, height, width) by the networks' names
+
+
+# File, clock offset of the frames (us), and the networks' images of real recordings
+REAL = {
+    "slider_depth": ("slider_depth.zip", 7500, "slider_depth"),
+    "slider_depth, first 0.3 s": ("slider_depth.zip", 7500, None),
+    "evbench_seq3": ("evbench_seq3_calibrated.npz", 0, "evbench_seq3"),
+    "davis346_street": ("davis346_street.npz", 0, None),
+}
+SEEDS = (0, 1)  # of the simulated scenes
+FRAME_DARK = 0.1  # intensity added inside the logarithm of frames, whose dark pixels are noisy
+
+
+def real_case(data, name):
+    """Load a real recording: eight frames from 0.3 s on, or all before, and networks' images."""
+    file, offset, golden = REAL[name]
+    recording = jaxevent.load(data / file)
+    t = recording.frames.t + offset
+    begin, end = recording.events[:1].t[0], recording.events[-1:].t[0]
+    if "first" in name:
+        chosen = np.flatnonzero((t > begin + 50_000) & (t <= begin + 300_000))[::2]
+    else:
+        chosen = np.flatnonzero((t > begin + 300_000) & (t <= end))
+        chosen = chosen[np.linspace(0, len(chosen) - 1, 8).astype(int)]
+    networks = {}
+    if golden and (path := data.parent / "golden/firenet" / f"{golden}.npz").exists():
+        held = np.load(path)
+        assert (held["frames"] == chosen).all()
+        networks = {
+            label: held[key].astype(np.float64)
+            for label, key in (("FireNet", "firenet"), ("FireNet+", "firenet_plus"))
+        }
+    truth = recording.frames.intensity[chosen].astype(np.float64)
+    alone = dataclasses.replace(recording, frames=None)
+    return Case(alone, t[chosen], truth, np.log(truth + FRAME_DARK), False, networks)
+
+
+def simulated_case(name, seed):
+    """Simulate a scene; every second of its times."""
+    scene, every = make_scene(name, seed), slice(1, None, 2)
+    log_truth = np.log(scene.intensity[every] + scene.sensor.dark_offset)
+    times, truth = scene.times[every], scene.shown[every]
+    return Case(scene.recording, times, truth, log_truth, name == "hdr", {})
+
+
+# Methods: log images (T, height, width), and their variances or None
+
+
+def constant(recording, times):
+    """Return images of nothing but noise, the least that a measure can be worth."""
+    shape = (len(times), recording.height, recording.width)
+    return np.random.default_rng(0).normal(0, 1e-3, shape), None
+
+
+def high_pass(recording, times, alpha=None):
+    """Return the images of the high-pass filter, with its default rate or another."""
+    params = (
+        jaxevent.high_pass.Params() if alpha is None else jaxevent.high_pass.Params(alpha=alpha)
+    )
+    mean = jaxevent.high_pass.estimate(recording, params)(times).mean
+    return np.log1p(np.maximum(mean, -0.999)), None
+
+
+def accumulate(recording, times):
+    """Return sums of the polarities of the last events, half an event per pixel, (T, H, W)."""
+    e, shape = recording.events[:], (recording.height, recording.width)
+    images = np.zeros((len(times), *shape))
+    for image, stop in zip(images, np.searchsorted(e.t, times), strict=True):
+        last = e[max(stop - shape[0] * shape[1] // 2, 0) : stop]
+        np.add.at(image, (last.y, last.x), np.where(last.p, 1.0, -1.0))
+    return images, None
+
+
+def events_only(recording, times, **options):
+    """Return the images of the method `events-only`."""
+    mean, variance, _ = jaxevent.events_only.estimate(recording, **options)(times)
+    return np.log(np.asarray(mean) + jaxevent.events_only.Params().I0), np.asarray(variance)
+
+
+METHODS = {
+    "constant": constant,
+    "accumulated events": accumulate,
+    "high-pass": high_pass,
+    "high-pass, alpha 3": functools.partial(high_pass, alpha=3.0),
+    "tiles": lambda recording, times: (tile_images(recording, times), None),
+    "events-only, causal": functools.partial(events_only, causal=True),
+    "events-only": events_only,
+}
+EXPONENTIAL = ("tiles", "events-only, causal", "events-only")  # methods whose images are ln I
+
+
+def honesty(log_image, variance, log_truth):
+    """Return the mean of squared errors of an affine fit to the truth, over its variance."""
+    columns = np.stack([log_image.ravel(), np.ones(log_image.size)], 1)
+    weight = 1 / np.sqrt(variance.ravel())
+    fit = np.linalg.lstsq(columns * weight[:, None], log_truth.ravel() * weight, rcond=None)[0]
+    error = (columns @ fit).reshape(log_truth.shape) - log_truth
+    return np.mean(error**2 / (fit[0] ** 2 * variance))
+
+
+def run_case(case, label):
+    """Score one method at the case's times; return a row, and images for the eye."""
+    start = time.process_time()
+    if label in case.networks:
+        images, variance = case.networks[label], None
+    else:
+        images, variance = METHODS[label](case.recording, case.times)
+    seconds = (time.process_time() - start) / len(case.times)
+    shown = np.exp(images) if label in EXPONENTIAL and not case.logarithmic else images
+    scores = np.array([score(*pair) for pair in zip(shown, case.truth, strict=True)])
+    row = {"method": label, "scores": scores.tolist(), "seconds": seconds}
+    if variance is not None:
+        pairs = zip(images, variance, case.log_truth, strict=True)
+        row["z2"] = [honesty(*one) for one in pairs]
+    return row, shown
+
+
+def format_scores(scores):
+    """Return scores (images, 4) as text: 100 MSE / SSIM of the affine fit; of equal histograms."""
+    a, b, c, d = np.mean(scores, axis=0)
+    return f"{100 * a:.2f}/{b:.3f}; {100 * c:.2f}/{d:.3f}"
+
+
+def match_tone(image, truth):
+    """Return the affine fit of an image to the truth in 8 bit, for a picture."""
+    slope, offset = np.polyfit(image.ravel(), truth.ravel(), 1)
+    return np.rint(255 * np.clip(slope * image + offset, 0, 1)).astype(np.uint8)
+
+
+def write_sheet(path, images, truth):
+    """Write a picture of a case: times downwards, methods across, the truth last."""
+    chosen = np.unique(np.linspace(0, len(truth) - 1, 3).astype(int))
+    columns = [*images, truth]
+    rows = [np.hstack([match_tone(one[k], truth[k]) for one in columns]) for k in chosen]
+    write_png(path, np.vstack(rows))
+
+
+def run_part(name, options):
+    """Run the methods on a recording, or on a scene with all seeds; return rows of the table."""
+    real = name in REAL
+    found = {}
+    for seed in (None,) if real else SEEDS:
+        case = real_case(options.data, name) if real else simulated_case(name, seed)
+        images = {}
+        for label in (*options.methods, *case.networks):
+            row, images[label] = run_case(case, label)
+            found.setdefault(label, []).append(row)
+            quality = f"; z2 {np.mean(row['z2']):.2f}" if "z2" in row else ""
+            print(f"{case.recording.name}, {label}: {format_scores(row['scores'])}{quality}; "
+                  f"{row['seconds']:.2f} s", flush=True)  # fmt: skip
+        write_sheet(options.out / f"{name}{seed or ''}.png", images.values(), case.truth)
+    return {
+        label: {
+            "scores": np.concatenate([row["scores"] for row in rows]).tolist(),
+            "z2": np.concatenate([row.get("z2", []) for row in rows]).tolist(),
+            "seconds": float(np.mean([row["seconds"] for row in rows])),
+        }
+        for label, rows in found.items()
+    }
+
+
+def make_tables(results):
+    """Return the tables of scores, of variances and of CPU seconds, in Markdown."""
+    if "slider_depth" in results:
+        last = {k: {**v, "scores": v["scores"][-1:]} for k, v in results["slider_depth"].items()}
+        results = {**results, "slider_depth, last image": last}
+    methods = list(dict.fromkeys(label for case in results.values() for label in case))
+    kinds = {
+        "100 MSE / SSIM after the affine fit; after matching histograms": lambda one: format_scores(
+            one["scores"]
+        ),
+        "z2 of the log image, mean and median over the images": lambda one: (
+            f"{np.mean(one['z2']):.2f}, {np.median(one['z2']):.2f}" if one["z2"] else "-"
+        ),
+        "CPU s an image": lambda one: f"{one['seconds']:.2f}",
+    }
+    parts = []
+    for title, text in kinds.items():
+        rows = [
+            [label, *(text(case[label]) if label in case else "-" for case in results.values())]
+            for label in methods
+        ]
+        parts.append(f"{title}\n\n{markdown_table(['', *results], rows)}\n")
+    return "\n".join([*parts, machine(), ""])
+
+
+def main():
+    """Run the parts, and write tables, results and sheets of pictures."""
+    parser = command_line(__doc__, out=True, data=True, parts=(*REAL, *SCENES))
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    options = parser.parse_args()
+    stored = options.out / "results.json"
+    results = json.loads(stored.read_text()) if stored.exists() else {}
+    for name in options.only:
+        results[name] = {**results.get(name, {}), **run_part(name, options)}
+        write_text(stored, json.dumps(results))
+    table = make_tables(results)
+    write_text(options.out / "table.md", table)
+    print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -42,12 +42,12 @@ if TYPE_CHECKING:
         cf_augmented,
         colour,
         edi,
-        events_only,
         flow,
         high_pass,
         last_frame,
         mc,
     )
+    from jaxevent.reconstruction.events_only import events_only
     from jaxevent.recording import Events, Frames, Recording
     from jaxevent.runs.evaluate import evaluate
     from jaxevent.runs.fit import fit
@@ -66,8 +66,9 @@ _HOMES = {
     "jaxevent.parameters": ("Parameters",),
     "jaxevent.reconstruction": (
         *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
-        *("events_only", "flow", "last_frame", "mc"),
+        *("flow", "last_frame", "mc"),
     ),
+    "jaxevent.reconstruction.events_only": ("events_only",),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.runs.evaluate": ("evaluate",),
     "jaxevent.runs.fit": ("fit",),

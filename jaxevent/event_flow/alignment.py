@@ -30,12 +30,14 @@ N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
 # The curvature of S is that of the image before it is blurred, which is sharper.
 CURVATURE = 3.0
+OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
+# More than it is on average (0.055), so that noise alone has no information.
+NOISE = 0.08  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
-POOLING = 1.0  # nodes whose information counts, of those of a Gaussian of one node
-MIN_INFORMATION = 0.04  # 1/px^2
-SPREAD = 1.0  # of neighbours' variance
-MIN_VARIANCE = 0.003  # px^2
-RELATIVE_VARIANCE = 0.0004  # of the square of the displacement
+POOLING = 1.5  # nodes, of the Gaussian whose nodes tell of one
+MIN_INFORMATION = 0.1  # 1/px^2
+MIN_VARIANCE = 0.001  # px^2
+RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
 
 @njit_noalloc_inlined
@@ -70,7 +72,8 @@ def warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
     image[:] = 0
     for k in range(len(x)):
         dx, dy = displacement_at(u, spacing, x[k], y[k])
-        dx, dy = displacement_at(u, spacing, x[k] - 0.5 * s[k] * dx, y[k] - 0.5 * s[k] * dy)
+        for _ in range(2):
+            dx, dy = displacement_at(u, spacing, x[k] - s[k] * dx, y[k] - s[k] * dy)
         a, b = (x[k] - s[k] * dx + 0.5) / cell + 0.5, (y[k] - s[k] * dy + 0.5) / cell + 0.5
         warped[k, 0], warped[k, 1] = a, b
         if not (0 <= a < columns - 1 and 0 <= b < rows - 1):
@@ -105,7 +108,8 @@ def blur(image, scratch, passes):
 def accumulate(warped, s, p, x, y, u, spacing, cell, image, normal):
     """Add the derivatives (1) of each event to the nodes around it; return the score.
 
-    `normal` (rows, columns, 5) gets g, and xx, xy, yy of H, px.
+    `normal` (rows, columns, 6) gets g, xx, xy, yy of H, and what noise adds to xx and to yy
+    per variance of the gradient, px.
     """
     normal[:] = 0
     score = 0.0
@@ -133,7 +137,10 @@ def accumulate(warped, s, p, x, y, u, spacing, cell, image, normal):
         score += p[k] * value * w
         c = -p[k] * age * w
         h = CURVATURE * age * age * w / (number + NUMBER_FLOOR)
-        i, j, fx, fy = node_cell(u, spacing, x[k], y[k])
+        others = max(number - OWN_NUMBER, 0.0)
+        i, j, fx, fy = node_cell(
+            u, spacing, (warped[k, 0] - 0.5) * cell - 0.5, (warped[k, 1] - 0.5) * cell - 0.5
+        )
         for dj in range(2):
             for di in range(2):
                 weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
@@ -143,6 +150,7 @@ def accumulate(warped, s, p, x, y, u, spacing, cell, image, normal):
                 normal[a, b, 2] += weight * h * gx * gx
                 normal[a, b, 3] += weight * h * gx * gy
                 normal[a, b, 4] += weight * h * gy * gy
+                normal[a, b, 5] += weight * h * others * per_px * per_px
     return score
 
 
@@ -198,7 +206,7 @@ class WindowEvents(NamedTuple):
     x: NDArray[np.float32]
     y: NDArray[np.float32]
     s: NDArray[np.float32]
-    p: NDArray[np.float32]  # 1 ON, -1 OFF
+    p: NDArray[np.float32]  # polarity, of mean 0 and variance 1
     unit: float  # s
 
     @classmethod
@@ -206,7 +214,9 @@ class WindowEvents(NamedTuple):
         """Make them of events, with s = 0 at a time (us)."""
         late = (events.t - at) * 1e-6
         unit = max(float(np.abs(late).max(initial=0.0)), 1e-6)
-        p = np.where(events.p, 1, -1)
+        # What goes up comes down: the mean is 0. A polarity that is always the same tells nothing.
+        p = np.where(events.p, 1.0, -1.0)
+        p = (p - p.mean()) / max(float(p.std()), 1e-3) if len(p) else p
         columns = (events.x, events.y, late / unit, p)
         return cls(*(np.asarray(c, np.float32) for c in columns), unit)
 
@@ -221,31 +231,10 @@ class Aligned(NamedTuple):
     def typical(self) -> float:
         """Return the median length of displacements, weighted by information, px."""
         length = np.hypot(self.u[..., 0], self.u[..., 1]).ravel()
-        weight = (self.information[..., 0] + self.information[..., 2]).ravel()
-        order = np.argsort(length)
+        weight = np.maximum(self.information[..., 0] + self.information[..., 2], 0).ravel()
+        order = np.argsort(length, kind="stable")
         total = np.cumsum(weight[order])
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])
-
-
-def covariance_of(aligned: Aligned) -> NDArray[np.float64]:
-    """Return the covariance of the nodes' displacement.
-
-    It is the inverse of the information of a node and its neighbours, and the variance among them,
-    which is large at borders of objects.
-
-    Args:
-        aligned: Displacement and information.
-
-    Returns:
-        (rows, columns, 2, 2), px^2.
-    """
-    near = POOLING * gaussian_filter(aligned.information, (1, 1, 0))
-    C = np.linalg.inv(near[..., [[0, 1], [1, 2]]] + MIN_INFORMATION * np.eye(2))
-    off = np.stack([np.roll(aligned.u, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    off = off - aligned.u
-    spread = np.einsum("n...i,n...j->...ij", off, off) / len(off)
-    length2 = (aligned.u**2).sum(-1)[..., None, None]
-    return C + SPREAD * spread + (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
 
 
 class Alignment:
@@ -265,6 +254,33 @@ class Alignment:
         """Interpolate values of nodes to all pixels."""
         return fill_pixels(values, self.shape, self.spacing)
 
+    def covariance(self, aligned: Aligned) -> NDArray[np.float64]:
+        """Return the covariance of the nodes' displacement.
+
+        It is the inverse of what a node and those around tell, and what they differ by, which is
+        large at borders of objects.
+
+        Args:
+            aligned: Displacement and information.
+
+        Returns:
+            (rows, columns, 2, 2), px^2.
+        """
+        pooled = gaussian_filter(aligned.information, (POOLING, POOLING, 0), mode="constant")
+        pooled *= 4 * np.pi * POOLING**2
+        values, axes = np.linalg.eigh(pooled[..., [[0, 1], [1, 2]]])
+        variances = 1 / np.maximum(values, MIN_INFORMATION)
+        C = (axes * variances[..., None, :]) @ np.swapaxes(axes, -1, -2)
+        # Differences of second order around a node: 0 where flow is affine, large at borders.
+        near = np.pad(aligned.u, ((2, 2), (2, 2), (0, 0)), mode="edge")
+        rows, columns = self.nodes
+        around = [near[j : j + rows, i : i + columns] for j in range(5) for i in range(5)]
+        off = np.stack([(around[k] + around[24 - k]) / 2 - aligned.u for k in range(12)])
+        spread = (off**2).sum(-1).max(0)[..., None, None] * np.eye(2)
+        length2 = (aligned.u**2).sum(-1)[..., None, None]
+        floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
+        return C + spread + floor
+
     def __call__(
         self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]
     ) -> Aligned:
@@ -279,19 +295,25 @@ class Alignment:
             The displacement.
         """
         u = np.zeros((*self.nodes, 2)) if start is None else start.copy()
-        normal, step = np.zeros((*self.nodes, 5)), np.zeros_like(u)
+        normal, step = np.zeros((*self.nodes, 6)), np.zeros_like(u)
         warped = np.empty((len(events.x), 2), np.float32)
         x, y, s, p, _ = events
         score = 0.0
         for cell in cells:
             image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)
             scratch = np.empty_like(image[0])
+            reach, before = np.full((*self.nodes, 1), float(cell)), np.zeros_like(u)
             for _ in range(N_STEPS):
                 warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
                 for channel, passes in zip(image, N_BLURS, strict=True):
                     blur(channel, scratch, passes)
                 score = accumulate(warped, s, p, x, y, u, self.spacing, cell, image, normal)
                 solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
+                # Sharp images have a smaller range than their curvature tells: steps that turn
+                # back are halved.
+                reach *= np.where((step * before).sum(-1, keepdims=True) < 0, 0.5, 1)
                 length = np.hypot(step[..., :1], step[..., 1:])
-                u += step * np.minimum(1, cell / np.maximum(length, 1e-9))
-        return Aligned(u, normal[..., 2:].copy(), score / max(len(x), 1))
+                before = step * np.minimum(1, reach / np.maximum(length, 1e-9))
+                u += before
+        information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
+        return Aligned(u, information, score / max(len(x), 1))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents, covariance_of
+from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
 from jaxevent.recording import Recording, Times, check_times, microseconds
@@ -29,7 +29,7 @@ class FlowParams(Parameters):
     """Parameters of the flow from events."""
 
     density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
-    displacement = Positive(2.5, "px", "typical displacement before and after a time; windows grow")
+    displacement = Positive(3.0, "px", "typical displacement before and after a time; windows grow")
     spacing = Count(8, "px", "distance between nodes of the flow")
     smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
     edge = Positive(0.5, "px", "difference from which neighbours are taken for different objects")
@@ -47,11 +47,6 @@ class Anchor(NamedTuple):
     def velocity(self) -> NDArray[np.float64]:
         """Velocity (rows, columns, 2), px/s."""
         return self.aligned.u / self.unit
-
-    @property
-    def covariance(self) -> NDArray[np.float64]:
-        """Covariance of the velocity (rows, columns, 2, 2), (px/s)^2."""
-        return covariance_of(self.aligned) / self.unit**2
 
 
 class Chain(NamedTuple):
@@ -127,6 +122,11 @@ class EventFlow:
                 return other
         return Anchor(row, at, window.unit, found)
 
+    def window_events(self, t: int) -> int:
+        """Return how many events on either side of a time (us) the flow there rests on."""
+        row = max(self.recording.events.index(t + 1) - 1, 0)
+        return self._chain(row // (CHAIN_WINDOWS * self._base)).half
+
     def _rows(self, number: int) -> NDArray[np.int64]:
         """Return the events at which the anchors of a chain are."""
         length = CHAIN_WINDOWS * self._base
@@ -166,7 +166,8 @@ class EventFlow:
             still = np.zeros((1, *self.shape, 2), np.float32)
             return still, np.full((*still.shape, 2), UNKNOWN_VARIANCE * np.eye(2), np.float32)
         velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
-        return np.stack(velocity), np.stack([self._align.fill(a.covariance) for a in anchors])
+        covariance = [self._align.covariance(a.aligned) / a.unit**2 for a in anchors]
+        return np.stack(velocity), np.stack([self._align.fill(one) for one in covariance])
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
         """Return the paths of the points that events of a window saw.

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from jaxevent.reconstruction.compensated import mc
     from jaxevent.reconstruction.complementary import cf, cf_augmented, high_pass
     from jaxevent.reconstruction.direct import augmented, blend, edi, last_frame
-    from jaxevent.reconstruction.events_only import events_only
     from jaxevent.reconstruction.kalman import akf
     from jaxevent.reconstruction.optical_flow import flow
     from jaxevent.reconstruction.smoother import aks
@@ -19,7 +18,6 @@ _HOMES = {
     "compensated": ("mc",),
     "complementary": ("cf", "cf_augmented", "high_pass"),
     "direct": ("augmented", "blend", "edi", "last_frame"),
-    "events_only": ("events_only",),
     "kalman": ("akf",),
     "optical_flow": ("flow",),
     "smoother": ("aks",),
@@ -34,7 +32,6 @@ __all__ = [
     "cf",
     "cf_augmented",
     "edi",
-    "events_only",
     "flow",
     "high_pass",
     "last_frame",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.rows import EVENT
-from jaxevent.reconstruction.events_only.solve import SAMPLES
+from jaxevent.reconstruction.events_only.solve import SAMPLES, factor_information
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
@@ -29,7 +29,6 @@ REWEIGHTINGS = 20
 REWEIGHTING_TOLERANCE = 1e-4  # of the gradient of E, against that of the data, to stop at
 CG_ITERATIONS = 200
 CG_TOLERANCE = 1e-4
-TINY_FACTOR = 1e-6  # px / threshold, as that of `solve`
 BLUR_PX = 1.5  # of the variance, as that of `solve`
 
 
@@ -38,7 +37,7 @@ class Perturbation(NamedTuple):
 
     rows: Float[Numeric, "*times samples rows"]
     pixels: Float[Numeric, "*times samples 3 height width"]  # across, down, leak
-    gradient: Float[Numeric, "*times samples height width 2"]  # of other windows
+    pull: Float[Numeric, "*times samples height width 2"]  # times the root of `information`
 
     @classmethod
     def draw(cls, n_rows: int, shape: tuple[int, int]) -> "Perturbation":
@@ -93,6 +92,8 @@ def pack_equations(
         whole[:n] = column
         return whole
 
+    information = prior.information * c**2
+    xx, xy, yy = information[..., 0, 0], information[..., 0, 1], information[..., 1, 1]
     event, noise = rows.kind == EVENT, Perturbation.draw(n, rows.shape)
     return WindowEquations(
         fill(rows.corner, np.int32),
@@ -102,13 +103,13 @@ def pack_equations(
         fill(event.astype(dtype)),
         fill((~event).astype(dtype)),
         (prior.gradient / c).astype(dtype),
-        (prior.information * c**2).astype(dtype),
+        information.astype(dtype),
         (solution.log_image / c).astype(dtype),
         relative.mean((1, 2)).astype(dtype),
         Perturbation(
             np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
             noise.pixels.astype(dtype),
-            noise.gradient.astype(dtype),
+            np.einsum("hwij,nhwj->nhwi", factor_information(xx, xy, yy), noise.pull).astype(dtype),
         ),
     )
 
@@ -264,7 +265,7 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
     scale = jnp.linalg.norm(residual(jnp.zeros_like(equations.start)))
 
     def find(f: Callable[[Array], Array], start: Array) -> Array:
-        def goes_on(state: tuple[Array, Array, Array]) -> Array:
+        def should_continue(state: tuple[Array, Array, Array]) -> Array:
             _, slope, n = state
             return (n < REWEIGHTINGS) & (jnp.linalg.norm(slope) > REWEIGHTING_TOLERANCE * scale)
 
@@ -275,7 +276,7 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
             u = u - _solve_linear(product, slope, _diagonal(weights, equations, params.leak))
             return u, f(u), n + 1
 
-        return jax.lax.while_loop(goes_on, reweight, (start, f(start), 0))[0]
+        return jax.lax.while_loop(should_continue, reweight, (start, f(start), 0))[0]
 
     def solve_tangent(product: Callable[[Array], Array], right: Array) -> Array:
         weights = _weights(equations.start, equations, params)
@@ -298,12 +299,6 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
     weights = _weights(u, equations, params)
     product = _product(weights, equations, params.leak)
     diagonal = jax.lax.stop_gradient(_diagonal(weights, equations, params.leak))
-    # Cholesky factors of matrices that, up to rounding, may be singular.
-    xx, xy, yy = (equations.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    first = jnp.sqrt(jnp.maximum(xx, 0))
-    cross = xy / jnp.maximum(first, TINY_FACTOR)
-    rest = jnp.sqrt(jnp.maximum(yy - cross**2, 0))
-    factor = jnp.stack([first, 0 * first, cross, rest], -1).reshape(*xx.shape, 2, 2)
 
     def sample(noise: Perturbation) -> Array:
         def spread(v: Array) -> Array:
@@ -312,7 +307,7 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
             total = (rows * look_up(v, equations.corner, equations.fraction)).sum()
             total += (n[0, :, :-1] * jnp.sqrt(weights.across) * jnp.diff(v, axis=1)).sum()
             total += (n[1, :-1] * jnp.sqrt(weights.down) * jnp.diff(v, axis=0)).sum()
-            total += jnp.einsum("hwi,hwij,hwj->", _gradient(v), factor, noise.gradient)
+            total += (_gradient(v) * noise.pull).sum()
             return total + jnp.sqrt(params.leak) * (n[2] * v).sum()
 
         z = _solve_linear(product, jax.grad(spread)(jnp.zeros_like(u)), diagonal)

@@ -5,18 +5,18 @@ Its information is shared out equally among the path's pixels, so that with d = 
 
     Lambda += r d d' / (c^2 n),    eta += r d change / (c^2 n)        at each of n places     (4)
 
-is a Gaussian measurement of the gradient of M: Lambda (grad M - g) = 0, g = Lambda^-1 eta. Along
-the motion it is known, across it is not, until the motion turns. From time to time it is carried
-along the flow. A path that is uncertain by the covariance P displaces the gradient's image, so with
-its derivative G the information fades to
+is a Gaussian measurement of the gradient of M: Lambda (grad M - g) = 0 with g = Lambda^-1 eta.
+Along the motion it is known, across it is not, until the motion turns. It is carried along the
+flow. A path that is uncertain by the variance P displaces the gradient's image, so with its
+derivative G the information fades to
 
-    (Lambda^-1 + G P G' + q I)^-1                                                            (5)
+    (Lambda^-1 + P G G' + q I)^-1                                                            (5)
 
-where P grows with time by the flow's covariance and by `drift`, and q by `forgetting`. Independent
-information is added. No image is solved for: memory costs little more than the rows themselves.
+where P and q grow with time. What contradicts newer events loses, and independent information is
+added. No image is solved for: memory costs little more than the rows themselves.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -34,7 +34,9 @@ class MemoryParams(NamedTuple):
     """Numbers of the memory; log intensity is in thresholds."""
 
     forgetting: float = 0.6  # variance that a gradient gains in time, (c / px)^2 / s
-    drift: float = 1.0  # variance that a path gains in time beside the flow's, px^2 / s
+    drift: float = 1.0  # variance that a path gains in time, px^2 / s
+    blur: float = 0.3  # variance of a path when the memory enters an image, px^2
+    tail: float = 2.0  # difference, in standard deviations, beyond which memory counts less
 
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
@@ -104,15 +106,64 @@ def fuse(one: GradientPrior, other: GradientPrior, threshold: float) -> Gradient
     Returns:
         The gradient that both give, and the sum of the information.
     """
-    eta = _times(one) + _times(other)
     information = one.information + other.information
-    gradient = np.empty_like(eta)
+    eta, gradient = np.empty_like(one.gradient), np.empty_like(one.gradient)
+    _add_products(one, other, eta)
     _solve_gradient(information, eta, LEAST_INFORMATION / threshold**2, gradient)
     return GradientPrior(gradient, information)
 
 
-def _times(prior):
-    return np.einsum("hwij,hwj->hwi", prior.information, prior.gradient)
+@njit_noalloc
+def _add_products(one, other, out):
+    height, width = out.shape[:2]
+    for y in range(height):
+        for x in range(width):
+            g, h = one.gradient[y, x], other.gradient[y, x]
+            A, B = one.information[y, x], other.information[y, x]
+            for i in range(2):
+                out[y, x, i] = A[i, 0] * g[0] + A[i, 1] * g[1] + B[i, 0] * h[0] + B[i, 1] * h[1]
+
+
+def discount(
+    memory: GradientPrior, new: GradientPrior, threshold: float, tail: float
+) -> GradientPrior:
+    """Reduce a memory's information where a new measurement contradicts it, as at occlusions.
+
+    With the squared difference q = d' (Lambda^-1 + Lambda_new^-1)^-1 d of both gradients the
+    information is divided by 1 + q / tail^2.
+
+    Args:
+        memory: A gradient and its information.
+        new: Another measurement of it.
+        threshold: Threshold c, ln I.
+        tail: Difference, in standard deviations, from which the memory counts less.
+
+    Returns:
+        The memory, with less information.
+    """
+    information = np.empty_like(memory.information)
+    _discount(memory, new, (LEAST_INFORMATION / threshold**2, tail**-2), information)
+    return GradientPrior(memory.gradient, information)
+
+
+@njit_noalloc
+def _discount(memory, new, numbers, out):
+    height, width = out.shape[:2]
+    least, scale = np.float32(numbers[0]), np.float32(numbers[1])
+    for y in range(height):
+        for x in range(width):
+            A, B = memory.information[y, x], new.information[y, x]
+            dx = memory.gradient[y, x, 0] - new.gradient[y, x, 0]
+            dy = memory.gradient[y, x, 1] - new.gradient[y, x, 1]
+            a, b, d = A[0, 0] + B[0, 0] + least, A[0, 1] + B[0, 1], A[1, 1] + B[1, 1] + least
+            # q = d' A (A + B)^-1 B d
+            ux, uy = A[0, 0] * dx + A[0, 1] * dy, A[0, 1] * dx + A[1, 1] * dy
+            vx, vy = B[0, 0] * dx + B[0, 1] * dy, B[0, 1] * dx + B[1, 1] * dy
+            q = (ux * (d * vx - b * vy) + uy * (a * vy - b * vx)) / (a * d - b * b)
+            weight = 1 / (1 + scale * max(q, np.float32(0)))
+            for i in range(2):
+                for k in range(2):
+                    out[y, x, i, k] = weight * A[i, k]
 
 
 def carry(
@@ -202,31 +253,7 @@ def _carry(px, py, memory, noise, out):
             out.gradient[row, column, 1] = gy
 
 
-def join_memories(
-    before: GradientPrior | None,
-    after: GradientPrior | None,
-    shape: tuple[int, int],
-    threshold: float,
-) -> GradientPrior:
-    """Return what the windows before and after one say of its image, if any do.
-
-    Args:
-        before: Memory of earlier windows.
-        after: Memory of later ones.
-        shape: (height, width) of the sensor.
-        threshold: Threshold c, ln I.
-
-    Returns:
-        Both together; without any the information is 0.
-    """
-    if before is not None and after is not None:
-        return fuse(before, after, threshold)
-    if before is None and after is None:
-        zeros = np.zeros((*shape, 2), np.float32)
-        return GradientPrior(zeros, np.zeros((*shape, 2, 2), np.float32))
-    return before if after is None else after
-
-
+@runtime_checkable
 class Windows(Protocol):
     """A source of a recording's paths and equations."""
 
@@ -251,22 +278,16 @@ class KeyMemories:
         recording: Events.
         step: Events between keys.
         silence: Weight of rows without an event at one end.
-        params: Numbers of the memory.
+        threshold: Mean threshold c, ln I.
     """
 
     def __init__(
-        self,
-        windows: Windows,
-        recording: Recording,
-        step: int,
-        silence: float,
-        params: MemoryParams | None = None,
+        self, windows: Windows, recording: Recording, step: int, *, silence: float, threshold: float
     ):
-        self.windows, self.recording, self.step, self.silence = windows, recording, step, silence
-        self.params = MemoryParams() if params is None else params
+        self.windows, self.recording, self.step = windows, recording, step
+        self.silence, self.threshold, self.params = silence, threshold, MemoryParams()
         self.last = -(-len(recording.events) // step)  # the key at the recording's end
         self._blocks: dict[int, tuple[int, dict[int, GradientPrior | None]]] = {}
-        self._threshold = 1.0
 
     def row(self, key: int) -> int:
         """Return the number of events before a key."""
@@ -282,22 +303,38 @@ class KeyMemories:
         """Return the first key with so many events before it, or the last one."""
         return min(-(-row // self.step), self.last)
 
-    def before(self, key: int, at: int) -> GradientPrior | None:
-        """Return the memory of the windows before a key, carried to a time (us)."""
-        return self._carried(self._at_key(key, 1), key, at)
+    def prior(self, rows: Rows, at: int, first: int, last: int | None) -> GradientPrior:
+        """Return what the windows before and after one say of its image.
 
-    def after(self, key: int, at: int) -> GradientPrior | None:
-        """Return the memory of the windows after a key, carried to a time (us)."""
-        return self._carried(self._at_key(key, -1), key, at)
+        Args:
+            rows: Equations of the window for the image.
+            at: Time of the image, us.
+            first: Key at which the window begins.
+            last: Key at which it ends; None: no later window is used.
 
-    def _carried(self, memory: GradientPrior | None, key: int, at: int) -> GradientPrior | None:
+        Returns:
+            The memories together; where no window saw anything the information is 0.
+        """
+        ends = [(first, 1)] + ([] if last is None else [(last, -1)])
+        found = [self._carried(self._at_key(k, s), k, at, self.params.blur) for k, s in ends]
+        known = [memory for memory in found if memory is not None]
+        if not known:
+            zeros = np.zeros((*rows.shape, 2), np.float32)
+            return GradientPrior(zeros, np.zeros((*zeros.shape, 2), np.float32))
+        joint = known[0] if len(known) == 1 else fuse(*known, self.threshold)
+        new = measure_gradient(rows, self.silence)
+        return discount(joint, new, self.threshold, self.params.tail)
+
+    def _carried(
+        self, memory: GradientPrior | None, key: int, at: int, blur: float = 0.0
+    ) -> GradientPrior | None:
+        if memory is None:
+            return None
         start = self.time(key)
-        if memory is None or start == at:
-            return memory
         seconds = 1e-6 * abs(at - start)
-        noise = self.params.forgetting * self._threshold**2 * seconds, self.params.drift * seconds
+        gain = self.params.forgetting * self.threshold**2 * seconds
         paths = self.windows.paths(min(start, at), max(start, at), start)
-        return carry(memory, paths, at, noise)
+        return carry(memory, paths, at, (gain, self.params.drift * seconds + blur))
 
     def _at_key(self, key: int, side: int) -> GradientPrior | None:
         """Return the memory at a key of the windows before (side 1) or after it (side -1)."""
@@ -330,7 +367,8 @@ class KeyMemories:
         first, last = min(key, other), max(key, other)
         start, stop, at = self.time(first), self.time(last), self.time(other)
         rows = self.windows.rows(self.row(first), self.row(last), at, (start, stop))
-        self._threshold = rows.threshold
         new = measure_gradient(rows, self.silence)
         carried = self._carried(memory, key, at)
-        return new if carried is None else fuse(carried, new, rows.threshold)
+        if carried is None:
+            return new
+        return fuse(discount(carried, new, self.threshold, self.params.tail), new, self.threshold)

@@ -24,7 +24,7 @@ against that of a row with a known path. Where no event shows the motion, silenc
 The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is new.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int32
@@ -38,6 +38,7 @@ FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
 ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^2
 
 
+@runtime_checkable
 class Paths(Protocol):
     """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
 

@@ -12,9 +12,10 @@ reweighted least squares replace E by the quadratic with
 
     r_k = w_k / (1 + e_k^2 / (2 tail^2)),    s = gradient / (2 (q + edge^2))
 
-for rows, and for each of the four differences of a cell, whose normal equations A u = b conjugate gradients solve, preconditioned by the diagonals of A over pixels and
-over blocks of pixels of several sizes (Bramble, Pasciak and Xu 1990). At
-the solution dE/du = A u - b = 0 with the weights of u itself.
+for rows, and for each of the four differences of a cell. Conjugate gradients solve its normal
+equations A u = b, preconditioned by the diagonals of A over pixels and over blocks of pixels of
+several sizes (Bramble, Pasciak and Xu 1990). At the solution dE/du = A u - b = 0 with the weights
+of u itself.
 """
 
 from typing import NamedTuple
@@ -112,13 +113,31 @@ def solve(
     return Solution(u * c, V, residual, weight, iterations)
 
 
+def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
+    """Factor information, which may be singular, as F F'.
+
+    Args:
+        xx: (height, width) information along x.
+        xy: That of both.
+        yy: That along y.
+
+    Returns:
+        (height, width, 2, 2) F, a lower triangle.
+    """
+    factor = np.zeros((*xx.shape, 2, 2), np.float32)
+    factor[..., 0, 0] = np.sqrt(xx)
+    factor[..., 1, 0] = xy / np.sqrt(np.maximum(xx, np.finfo(np.float32).tiny))
+    factor[..., 1, 1] = np.sqrt(np.maximum(yy - factor[..., 1, 0] ** 2, 0))
+    return factor
+
+
 def _sample_variance(system, scratch, rng):
     """Perturb and solve: with b of covariance A, the solution has the covariance A^-1."""
     from scipy.ndimage import gaussian_filter
 
     height, width = system.across.shape
     total = np.zeros((height, width))
-    factor = _factorise(system.information)
+    factor = factor_information(*np.moveaxis(system.information, -1, 0))
     for _ in range(SAMPLES):
         b = np.zeros((height, width), np.float32)
         noise = rng.standard_normal(len(system.weight), np.float32)
@@ -135,15 +154,6 @@ def _sample_variance(system, scratch, rng):
         _conjugate_gradients(system, b, z, scratch, 1e-2, CG_ITERATIONS)
         total += (z - z.mean()) ** 2
     return gaussian_filter(total / SAMPLES, 1.5).astype(np.float32)
-
-
-def _factorise(information):
-    """Cholesky factors (..., 2, 2) of matrices xx, xy, yy, which up to rounding may be singular."""
-    xx, xy, yy = np.moveaxis(information, -1, 0)
-    first = np.sqrt(np.maximum(xx, 0))
-    cross = xy / np.maximum(first, np.float32(1e-6))
-    rest = np.sqrt(np.maximum(yy - cross**2, 0))
-    return np.stack([first, np.zeros_like(first), cross, rest], -1).reshape(*xx.shape, 2, 2)
 
 
 @njit_noalloc_inlined

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration.event_calibration import calibrate_events
 from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
-from jaxevent.reconstruction.events_only.memory import KeyMemories, join_memories
+from jaxevent.reconstruction.events_only.memory import KeyMemories
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import Rows, make_rows
@@ -72,7 +72,13 @@ class WindowSolver:
         c = np.float32([params.c_on, params.c_off])
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
-        self.memory = KeyMemories(self, recording, self.n_side, self.numbers.silence)
+        self.memory = KeyMemories(
+            self,
+            recording,
+            self.n_side,
+            silence=self.numbers.silence,
+            threshold=float(self.thresholds.mean()),
+        )
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
         """Return the paths of points through a window, see `EventFlow.paths`."""
@@ -115,11 +121,11 @@ class WindowSolver:
         ahead = 0 if self.causal else min(self.n_side, len(self.recording.events) - place)
         first = max(place + ahead - 2 * self.n_side, 0) // memory.step
         if self.causal:
-            end, stop, later = place, t, None
+            last, end, stop = None, place, t
         else:
             last = memory.key_after(max(place + ahead, 2 * self.n_side))
-            end, stop, later = memory.row(last), memory.time(last), memory.after(last, t)
+            end, stop = memory.row(last), memory.time(last)
         start = memory.time(first)
         rows = self.rows(memory.row(first), end, t, (min(start, t), max(stop, t)))
-        prior = join_memories(memory.before(first, t), later, self.shape, rows.threshold)
+        prior = memory.prior(rows, t, first, last)
         return SolvedWindow(rows, prior, solve(rows, prior, self.numbers, variance=variance))
