@@ -166,7 +166,7 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
     total = (weight * numbers.tail**2 * jnp.log1p(e**2 / (2 * numbers.tail**2))).sum()
-    total += numbers.gradient * (jnp.sqrt(_cells(u) + numbers.edge**2) - numbers.edge).sum()
+    total += numbers.gradient / 2 * jnp.log1p(_cells(u) / numbers.edge**2).sum()
     return total + _quadratic(u, equations, numbers.leak)
 
 
@@ -201,7 +201,7 @@ class _Weights(NamedTuple):
 def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
-    s = numbers.gradient / (2 * jnp.sqrt(_cells(u) + numbers.edge**2))
+    s = numbers.gradient / (2 * (_cells(u) + numbers.edge**2))
     across = jnp.pad(s, [(0, 1), (0, 0)]) + jnp.pad(s, [(1, 0), (0, 0)])
     down = jnp.pad(s, [(0, 0), (0, 1)]) + jnp.pad(s, [(0, 0), (1, 0)])
     return _Weights(weight / (1 + e**2 / (2 * numbers.tail**2)), across, down)

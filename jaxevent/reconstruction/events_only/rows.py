@@ -27,7 +27,7 @@ The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, UInt32
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
@@ -54,7 +54,7 @@ class Rows(NamedTuple):
 
     shape: tuple[int, int]  # (height, width)
     threshold: float  # ln I, mean of both polarities
-    corner: Int32[np.ndarray, "rows 2"]  # flat index of the look-up's pixel above and left
+    corner: UInt32[np.ndarray, "rows 2"]  # flat index of the look-up's pixel above and left
     fraction: Float[np.ndarray, "rows 2 2"]  # px from there, x before y
     change: Float[np.ndarray, " rows"]  # in thresholds
     weight: Float[np.ndarray, " rows"]  # reciprocal variance, against that of a common row
@@ -104,7 +104,7 @@ def make_rows(
     rows = Rows(
         shape,
         threshold,
-        np.empty((n, 2), np.int32),
+        np.empty((n, 2), np.uint32),
         np.empty((n, 2, 2), np.float32),
         np.empty(n, np.float32),
         np.ones(n + 1, np.float32),
@@ -151,7 +151,7 @@ def _lay_row(n, after, before, change, kind, pixel, rows):
         x, y = (after[0], after[1]) if side == 0 else (before[0], before[1])
         if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
             return 0
-        i, j = min(int(x), width - 2), min(int(y), height - 2)
+        i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
         rows.corner[n, side] = j * width + i
         rows.fraction[n, side, 0] = x - i
         rows.fraction[n, side, 1] = y - j
