@@ -25,18 +25,19 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events
 
 N_STEPS = 5  # Gauss-Newton steps at each size of cells
+CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
 N_SWEEPS = 30  # of Gauss-Seidel
 N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
 # The curvature of S is that of the image before it is blurred, which is sharper.
 CURVATURE = 3.0
 OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
-# More than it is on average (0.055), so that noise alone has no information.
-NOISE = 0.08  # variance of the gradient of an image of events without order, per event
+NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
 POOLING = 1.5  # nodes, of the Gaussian whose nodes tell of one
 MIN_INFORMATION = 0.1  # 1/px^2
 MIN_VARIANCE = 0.001  # px^2
+MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
 
@@ -200,25 +201,62 @@ def fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[n
     return u.astype(np.float32)
 
 
+class Clock(NamedTuple):
+    """Relative times s of a window, linear between some times; s = 1 is its end."""
+
+    t: NDArray[np.float64]  # (K,) us
+    s: NDArray[np.float64]  # (K,)
+
+    def rate(self, t: float) -> float:
+        """Return how fast s goes at a time (us), 1/s."""
+        return float(np.interp(t, self.t, np.gradient(self.s, self.t))) * 1e6
+
+
+def time_clock(events: Events, at: int) -> Clock:
+    """Make the clock of a window that goes as fast as time, with s = 0 at a time (us)."""
+    unit = max(float(np.abs(events.t - at).max(initial=0)), 1.0)
+    return Clock(at + np.array([-unit, unit]), np.array([-1.0, 1.0]))
+
+
+def event_clock(events: Events, at: int, half: int) -> Clock:
+    """Make the clock of a window that goes as fast as events come.
+
+    Events come as fast as a scene moves, so that a camera that brakes has a constant velocity.
+
+    Args:
+        events: The events.
+        at: Time at which s = 0, us.
+        half: Number of events after which s = 1.
+
+    Returns:
+        The clock.
+    """
+    rows = np.unique(
+        np.append(np.arange(0, len(events), max(half // CLOCK_PARTS, 1)), len(events) - 1)
+    )
+    t, first = np.unique(events.t[rows], return_index=True)
+    s = rows[first] / half
+    if len(t) < 2:
+        return time_clock(events, at)
+    return Clock(t.astype(float), s - np.interp(at, t, s))
+
+
 class WindowEvents(NamedTuple):
-    """Events of a window: places (px), times relative to the middle in units of half of it."""
+    """Events of a window: places (px) and relative times."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
     s: NDArray[np.float32]
     p: NDArray[np.float32]  # polarity, of mean 0 and variance 1
-    unit: float  # s
 
     @classmethod
-    def of(cls, events: Events, at: int) -> "WindowEvents":
-        """Make them of events, with s = 0 at a time (us)."""
-        late = (events.t - at) * 1e-6
-        unit = max(float(np.abs(late).max(initial=0.0)), 1e-6)
+    def of(cls, events: Events, clock: Clock) -> "WindowEvents":
+        """Make them of events, with relative times of a clock."""
         # What goes up comes down: the mean is 0. A polarity that is always the same tells nothing.
         p = np.where(events.p, 1.0, -1.0)
         p = (p - p.mean()) / max(float(p.std()), 1e-3) if len(p) else p
-        columns = (events.x, events.y, late / unit, p)
-        return cls(*(np.asarray(c, np.float32) for c in columns), unit)
+        columns = (events.x, events.y, np.interp(events.t, clock.t, clock.s), p)
+        return cls(*(np.asarray(c, np.float32) for c in columns))
 
 
 class Aligned(NamedTuple):
@@ -227,14 +265,6 @@ class Aligned(NamedTuple):
     u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
     score: float  # per event
-
-    def typical(self) -> float:
-        """Return the median length of displacements, weighted by information, px."""
-        length = np.hypot(self.u[..., 0], self.u[..., 1]).ravel()
-        weight = np.maximum(self.information[..., 0] + self.information[..., 2], 0).ravel()
-        order = np.argsort(length, kind="stable")
-        total = np.cumsum(weight[order])
-        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
 
 
 class Alignment:
@@ -281,6 +311,22 @@ class Alignment:
         floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
         return C + spread + floor
 
+    def typical(self, aligned: Aligned) -> float:
+        """Return the median length of displacements, weighted by information, px.
+
+        It is 0 where events determine none of them.
+
+        Args:
+            aligned: Displacement and information.
+        """
+        if not (np.linalg.eigvalsh(self.covariance(aligned)) < MAX_VARIANCE).all(-1).any():
+            return 0.0
+        weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0)
+        length = np.hypot(aligned.u[..., 0], aligned.u[..., 1]).ravel()
+        order = np.argsort(length, kind="stable")
+        total = np.cumsum(weight.ravel()[order])
+        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
+
     def __call__(
         self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]
     ) -> Aligned:
@@ -297,7 +343,7 @@ class Alignment:
         u = np.zeros((*self.nodes, 2)) if start is None else start.copy()
         normal, step = np.zeros((*self.nodes, 6)), np.zeros_like(u)
         warped = np.empty((len(events.x), 2), np.float32)
-        x, y, s, p, _ = events
+        x, y, s, p = events
         score = 0.0
         for cell in cells:
             image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)

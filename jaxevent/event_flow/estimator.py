@@ -2,26 +2,33 @@
 
 import functools
 import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents
+from jaxevent.event_flow.alignment import (
+    MAX_VARIANCE,
+    Aligned,
+    Alignment,
+    Clock,
+    WindowEvents,
+    event_clock,
+    time_clock,
+)
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Events, Recording, Times, check_times, microseconds
 
 CELLS = (4, 2, 1)  # px, for motion sought from nothing
 LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
 LEVELS = range(-4, 5)  # powers of 2 of the window's size
 CHAIN_WINDOWS = 16  # half windows of a chain of anchors
-N_CACHED_ANCHORS = 64
+N_CACHED_ANCHORS = 256
 UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
-MAX_DEVIATION_PX = (
-    1.0  # standard deviation of a valid displacement from an anchor to a window's end
-)
+MIN_CLOCK_CHANGE = 0.1  # of s, from which the clock of events is tried beside time
+MIN_CLOCK_GAIN = 1.01  # of the score, with which it is taken
 MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
 
 
@@ -40,13 +47,13 @@ class Anchor(NamedTuple):
 
     row: int  # of the event there
     t: int  # us
-    unit: float  # s in which points are displaced
+    clock: Clock  # of displacements
     aligned: Aligned
 
     @property
-    def velocity(self) -> NDArray[np.float64]:
-        """Velocity (rows, columns, 2), px/s."""
-        return self.aligned.u / self.unit
+    def rate(self) -> float:
+        """Displacements per second."""
+        return self.clock.rate(self.t)
 
 
 class Chain(NamedTuple):
@@ -78,31 +85,44 @@ class EventFlow:
         self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
         self._lock = threading.RLock()
 
-    def _window(self, row: int, half: int) -> tuple[int, WindowEvents]:
+    def _events(self, row: int, half: int) -> tuple[int, Events]:
         """Return the time (us) of an event, and the events around it."""
         events = self.recording.events[max(row - half, 0) : row + half]
-        at = int(events.t[min(row, half)])
-        return at, WindowEvents.of(events, at)
+        return int(events.t[min(row, half)]), events
 
     def _seek(self, row: int, most: int | None = None) -> Chain:
         """Find the motion around an event from nothing, in windows that double.
 
         They grow until points are displaced far enough, or to `most` events.
         """
-        start, found = None, None
+        start, rate, half = None, 0.0, 0
         for level in LEVELS:
             half = int(self._base * 2.0**level)
-            at, window = self._window(row, half)
-            start = None if found is None else found.aligned.u * (window.unit / found.unit)
-            found = Anchor(row, at, window.unit, self._align(window, start, CELLS))
+            at, events = self._events(row, half)
+            clock = time_clock(events, at)
+            start = None if start is None else start * (rate / clock.rate(at))
+            found = self._align(WindowEvents.of(events, clock), start, CELLS)
+            start, rate = found.u, clock.rate(at)
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
-                and (whole or found.aligned.typical() >= float(self.params.displacement))
+                and (whole or self._align.typical(found) >= float(self.params.displacement))
             ):
                 break
-        assert found is not None
-        return Chain(found, half)
+        return Chain(self._choose_clock(row, half, start, start), half)
+
+    def _choose_clock(self, row: int, half: int, by_time: Any, by_events: Any) -> Anchor:
+        """Refine displacements by time and by the clock of events, and choose by their scores."""
+        at, events = self._events(row, half)
+        clock, other = time_clock(events, at), event_clock(events, at, half)
+        window = WindowEvents.of(events, clock)
+        found = Anchor(row, at, clock, self._align(window, by_time, LAST_CELLS))
+        moved = WindowEvents.of(events, other)
+        if np.abs(moved.s - window.s).max() < MIN_CLOCK_CHANGE:
+            return found
+        second = Anchor(row, at, other, self._align(moved, by_events, LAST_CELLS))
+        better = second.aligned.score > MIN_CLOCK_GAIN * found.aligned.score
+        return second if better else found
 
     def _make_chain(self, number: int) -> Chain:
         return self._seek(number * CHAIN_WINDOWS * self._base)
@@ -114,13 +134,15 @@ class EventFlow:
             return first
         before = self._anchor(number, k - 1)
         row = number * CHAIN_WINDOWS * self._base + k * half
-        at, window = self._window(row, half)
-        found = self._align(window, before.velocity * window.unit, LAST_CELLS)
-        if found.score < MIN_SCORE_RATIO * before.aligned.score:
+        at, events = self._events(row, half)
+        velocity = before.aligned.u * before.clock.rate(at)
+        start = velocity / time_clock(events, at).rate(at)
+        found = self._choose_clock(row, half, start, before.aligned.u)
+        if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
             other = self._seek(row, half).first
-            if other.aligned.score > found.score:
+            if other.aligned.score > found.aligned.score:
                 return other
-        return Anchor(row, at, window.unit, found)
+        return found
 
     def window_events(self, t: int) -> int:
         """Return how many events on either side of a time (us) the flow there rests on."""
@@ -160,14 +182,25 @@ class EventFlow:
                     break
         return found
 
-    def _fields(self, anchors: list[Anchor]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return velocity and covariance of all pixels at anchors."""
+    def _fields(
+        self, anchors: list[Anchor], knots: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return velocity and covariance of all pixels at some times (us)."""
+        velocity = np.zeros((len(knots), *self.shape, 2), np.float32)
+        covariance = np.zeros((*velocity.shape, 2), np.float32)
         if not anchors:
-            still = np.zeros((1, *self.shape, 2), np.float32)
-            return still, np.full((*still.shape, 2), UNKNOWN_VARIANCE * np.eye(2), np.float32)
-        velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
-        covariance = [self._align.covariance(a.aligned) / a.unit**2 for a in anchors]
-        return np.stack(velocity), np.stack([self._align.fill(one) for one in covariance])
+            covariance[:] = UNKNOWN_VARIANCE * np.eye(2)
+            return velocity, covariance
+        fields = [self._align.fill(anchor.aligned.u) for anchor in anchors]
+        spreads = [self._align.fill(self._align.covariance(a.aligned)) for a in anchors]
+        times = [anchor.t for anchor in anchors]
+        for n, t in enumerate(knots.tolist()):
+            for k, anchor in enumerate(anchors):
+                weight = np.interp(t, times, np.eye(len(times))[k])
+                if weight > 0:
+                    velocity[n] += np.float32(weight * anchor.clock.rate(t)) * fields[k]
+                    covariance[n] += np.float32(weight * anchor.rate**2) * spreads[k]
+        return velocity, covariance
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
@@ -180,10 +213,15 @@ class EventFlow:
         Returns:
             The paths.
         """
+        start, stop = min(start, at), max(stop, at)
         with self._lock:
-            anchors = self._around(min(start, at), max(stop, at))
-        knots = np.array([anchor.t for anchor in anchors] or [at], np.int64)
-        return WindowPaths(int(at), knots, *self._fields(anchors))
+            anchors = self._around(start, stop)
+        times = [np.array([anchor.t for anchor in anchors] or [at])]
+        for anchor in anchors:
+            inner = anchor.clock.t[1:-1]
+            times.append(inner[(inner >= start) & (inner <= stop)])
+        knots = np.unique(np.concatenate(times).astype(np.int64))
+        return WindowPaths(int(at), knots, *self._fields(anchors, knots))
 
     def __call__(
         self, times: Times, extrapolate: bool = False
@@ -210,14 +248,10 @@ class EventFlow:
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
                 anchors = self._around(t, t)
-            knots = [anchor.t for anchor in anchors] or [t]
-            weights = np.array([np.interp(t, knots, one) for one in np.eye(len(knots))], np.float32)
-            velocity, uncertainty = self._fields(anchors)
-            mean[row] = np.tensordot(weights, velocity, 1)
-            covariance[row] = np.tensordot(weights, uncertainty, 1)
-            unit = float(weights @ np.array([anchor.unit for anchor in anchors] or [0.0]))
-            largest = np.linalg.eigvalsh(covariance[row])[..., 1]
-            valid[row] = (unit > 0) & (largest * unit**2 < MAX_DEVIATION_PX**2)
+            (mean[row],), (covariance[row],) = self._fields(anchors, wanted[row : row + 1])
+            if anchors:
+                rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])
+                valid[row] = np.linalg.eigvalsh(covariance[row])[..., 1] < MAX_VARIANCE * rate**2
         return mean, covariance, valid
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
