@@ -36,7 +36,7 @@ from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
-from jaxevent.recording import Recording
+from jaxevent.recording import Imu, Recording
 
 PATCH_PX = 24
 MAX_GRID_DISPLACEMENT_PX = 7  # of the grid, in x and y
@@ -55,6 +55,7 @@ IMAGE_PIXEL_PX = 2
 FRAME_WINDOW_DISPLACEMENT_PX = 5.0  # of the image around a frame whose edges are counted
 EDGE_PIXEL_FRACTION = 0.1  # of the pixels, those of the steepest log intensity
 DARK_GREY_OFFSET = 0.05  # of full scale, added before the logarithm: darker greys are noise
+MIN_GYRO_SPEED_RAD_S = 0.3  # of a camera that turns; biases are up to 0.2
 MAX_STATIC_EDGE_FRACTION = 0.3  # fraction of edges with events, below which the camera is static
 
 N_FIT_TIMES = 4  # at which patches are evaluated for fits
@@ -322,6 +323,29 @@ def is_camera_static(recording: Recording, speed: ImageSpeed | None) -> bool:
     """
     fraction = None if speed is None else edge_event_fraction(recording, speed)
     return fraction is not None and fraction < MAX_STATIC_EDGE_FRACTION
+
+
+def is_camera_known_to_move(recording: Recording, camera: PinholeCamera | None = None) -> bool:
+    """Return whether frames or a gyro show that the camera moves.
+
+    Args:
+        recording: The recording.
+        camera: The camera; by default the recording's.
+
+    Returns:
+        A boolean; false where nothing tells.
+    """
+    if recording.imu is not None and gyro_speed(recording.imu) > MIN_GYRO_SPEED_RAD_S:
+        return True
+    if not recording.frames:
+        return False
+    fraction = edge_event_fraction(recording, measure_image_speed(recording, camera))
+    return fraction is not None and fraction >= MAX_STATIC_EDGE_FRACTION
+
+
+def gyro_speed(imu: Imu) -> float:
+    """Return the root mean square of a gyro's rates, rad/s, of which the least is its bias."""
+    return float(np.sqrt((np.asarray(imu.gyro, np.float64) ** 2).sum(1).mean()))
 
 
 def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -> float | None:

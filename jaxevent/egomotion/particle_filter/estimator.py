@@ -24,6 +24,7 @@ from jaxevent.egomotion.estimator import (
     TrainingRuns,
     TrainingSegment,
 )
+from jaxevent.egomotion.evidence import EvidenceTest, Lock, tell_from_later
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
@@ -31,7 +32,7 @@ from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter
 from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
-from jaxevent.egomotion.patches import ImageSpeed
+from jaxevent.egomotion.patches import ImageSpeed, is_camera_known_to_move
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.progress import bar
@@ -188,7 +189,8 @@ class VotingEstimator(MotionEstimator[Params]):
         camera: PinholeCamera | None = None,
         seed: int = 0,
         progress: bool | None = None,
-        smooth: bool = False,
+        causal: bool = False,
+        smooth: bool | None = None,
         cloud: int = 0,
         compiler: str | None = None,
     ) -> MotionEstimate:
@@ -202,7 +204,10 @@ class VotingEstimator(MotionEstimator[Params]):
             camera: The calibration; by default the recording's.
             seed: Seed of the random numbers; it makes the estimate reproducible.
             progress: Whether to show a progress bar; by default in a terminal.
-            smooth: Whether to smooth by later events, for use after the recording.
+            causal: Whether estimates use events before their times alone, as those of a live stream
+                do. They lag, and their covariance has what the motion changes meanwhile.
+            smooth: Whether to smooth by later events; by default unless `causal`. Without, estimates
+                hold for the time `lag` before their own.
             cloud: Number of particles of each batch, drawn by weight, in the result's `cloud`.
             compiler: "numba" runs a kernel made of the filter's own functions, "xla" the `run` that
                 is differentiated. Their log-likelihoods are equal to rounding, and weights to
@@ -217,7 +222,9 @@ class VotingEstimator(MotionEstimator[Params]):
             InputError: The model is unknown, it needs a camera and there is none, or the compiler
                 is "numba" and there is no kernel.
         """
-        self.check_options(seed=seed, progress=progress, smooth=smooth, cloud=cloud)
+        self.check_options(seed=seed, progress=progress, causal=causal, smooth=smooth, cloud=cloud)
+        if causal and smooth:
+            raise InputError("a causal estimate cannot be smoothed; leave out causal or smooth")
         dispatch.check_not_forked()
         if params is None:
             found, _ = self.find_model_and_camera(recording, model, camera)
@@ -228,6 +235,7 @@ class VotingEstimator(MotionEstimator[Params]):
         events = len(recording.events) // params.every
         run = self._kernel(params, kind, compiler, events) or functools.partial(_run, params, kind)
         key, corners = jax.random.key(seed), _basis_at_corners(kind, sampler)
+        lock = self._make_lock(recording, params, kind, sampler, camera)
         state, parts, number, span = None, [], 0, MAX_CHUNK_TAUS * float(params.tau_max)
         with bar(
             total=len(recording.events), desc="find motion", unit="event", unit_scale=True,
@@ -242,17 +250,47 @@ class VotingEstimator(MotionEstimator[Params]):
                 state, info = run(sample.candidates, noise, state, cloud)
                 used = int((sample.row >= 0).any(1).sum())
                 info = jax.tree.map(lambda a, n=used: np.asarray(a)[:n], info)
-                parts.append((sample.t[:used], info))
+                t, told = sample.t[:used], ~info.searching
+                if lock is not None:
+                    told = lock.update(
+                        recording.events, t, info.mean, info.covariance, info.searching
+                    )
+                parts.append((t, info, told))
                 shown.update(int(sample.row.max(initial=0)) + 1 - shown.n)
                 number += 1
 
         motion = _join_reports(kind, parts, cloud > 0).with_recording(recording)
         if not parts:
             return motion
+        if lock is not None and not causal:
+            searching = np.concatenate([info.searching for _, info, _ in parts])
+            valid = tell_from_later(
+                motion.t, motion.mean, motion.covariance, searching, motion.valid, lock.diffusion
+            )
+            motion = dataclasses.replace(motion, valid=valid)
+        motion = dataclasses.replace(motion, causal=causal)._with_gaps(float(params.tau_max))
         calibration = PLANAR_CALIBRATION if kind.uniform else CAMERA_MOTION_CALIBRATION
         calibration = calibration.with_lens(camera or recording.camera)
-        smoothed = filtering.smooth(motion, params) if smooth else motion
+        if causal:
+            return motion.with_calibrated_covariance(calibration._replace(change=0.0))
+        smoothed = motion if smooth is False else filtering.smooth(motion, params)
         return smoothed.with_calibrated_covariance(calibration, 2 * motion.lag)
+
+    def _make_lock(
+        self,
+        recording: Recording,
+        params: Params,
+        model: Model,
+        sampler: CandidateSampler,
+        camera: PinholeCamera | None,
+    ) -> Lock | None:
+        """Return the test of what the filter finds; None for likelihoods and models without one."""
+        if params.likelihood == "literal" or model.half_line:
+            return None
+        diffusion = jax.jit(functools.partial(model.diffusion, params))
+        moves = is_camera_known_to_move(recording, camera)
+        test = EvidenceTest(model, sampler.xi)
+        return Lock(test, float(params.baseline), float(params.tau_max), diffusion, moves)
 
     def _kernel(
         self, params: Params, model: Model, compiler: str | None, events: int
@@ -379,20 +417,22 @@ class WarmStartedRuns(TrainingRuns):
         )
 
 
-def _join_reports(model: Model, parts: list[tuple[NDArray, Any]], cloud: bool) -> MotionEstimate:
+def _join_reports(
+    model: Model, parts: list[tuple[NDArray, Any, NDArray]], cloud: bool
+) -> MotionEstimate:
     """Join the times and reports of chunks to an estimate."""
     if not parts:
         return MotionEstimate.empty(type(model))
 
     def join(name: str) -> NDArray:
-        return np.concatenate([getattr(info, name) for _, info in parts])
+        return np.concatenate([getattr(info, name) for _, info, _ in parts])
 
     return MotionEstimate(
         type(model),
-        np.concatenate([t for t, _ in parts]),
+        np.concatenate([t for t, *_ in parts]),
         join("mean"),
         join("covariance"),
-        ~join("searching"),
+        np.concatenate([told for *_, told in parts]),
         join("lag"),
         join("contrast"),
         join("evidence"),
@@ -497,7 +537,7 @@ voting = VotingEstimator(
     "voting",
     Params,
     lengths=lengths,
-    options=COMMON_OPTIONS | {"smooth", "cloud", "compiler"},
+    options=COMMON_OPTIONS | {"causal", "smooth", "cloud", "compiler"},
     about="Motion by voting: a particle filter whose likelihood is the vote of the earlier "
     "neighbours of events (Egomotion thesis, chapters 5 and 6, with soft votes of all neighbours).",
 )
