@@ -54,8 +54,8 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--causal",
         action="store_true",
-        help="estimate each row from the events before it alone, as on a live stream, with --method "
-        "voting; it lags. By default later events are used too",
+        help="estimate each row from the events before it alone, as on a live stream; it lags; "
+        "with --method voting; by default later events are used too",
     )
     one.add_argument(
         "--centred",

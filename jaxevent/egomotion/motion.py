@@ -197,8 +197,8 @@ class MotionEstimate(HtmlRepr):
         Args:
             calibration: The coefficients.
             length: Time span of the data of an estimate, s; one number or (n,).
-            lone_change: (d,) change of the motion within the time span, if there is one estimate;
-                of several it is measured between neighbours.
+            lone_change: (d,) or (n, d) change of the motion within the time span, measured there;
+                it counts where it is more than that between neighbours.
 
         Returns:
             The estimate with the calibrated covariance.
@@ -222,8 +222,9 @@ class MotionEstimate(HtmlRepr):
                 change[:, i], bend[:, i] = late - early, late + early - 2 * now
                 if inner.any():
                     bend[:, i] = np.interp(self.t, self.t[inner], bend[inner, i])
-        elif lone_change is not None:
-            change[:] = lone_change
+        if lone_change is not None:
+            larger = (lone_change**2).sum(-1) > (change**2).sum(1)
+            change = np.where(larger[:, None], lone_change, change)
         covariance = calibration.factor * self.covariance
         for d in (change, bend):
             covariance = covariance + calibration.change**2 * d[:, :, None] * d[:, None, :]
@@ -236,8 +237,8 @@ class MotionEstimate(HtmlRepr):
         """Add the spread of the motions of parts of the image to the covariance.
 
         One velocity of the whole image is at most as certain as its parts are alike. Where they
-        differ from a rotation, translation may have caused all of the motion. Where the camera is
-        static and objects move, the objects alone determine the estimate.
+        differ from a rotation, translation may have caused all of the motion. Where the camera may
+        be static while objects move (`still`), the estimate is lost.
 
         Args:
             recording: The recording of the estimate.
@@ -245,19 +246,16 @@ class MotionEstimate(HtmlRepr):
         Returns:
             The estimate with the larger covariance, and a warning; "" if nothing was added.
         """
-        from jaxevent.egomotion.patches import (
-            flow_consistency,
-            is_camera_static,
-            measure_image_speed,
-        )
+        from jaxevent.egomotion.patches import flow_consistency
+        from jaxevent.egomotion.still import find_undecided
 
-        speed = measure_image_speed(recording) if recording.frames else None
-        if self.valid.any() and is_camera_static(recording, speed):
-            return self._with_full_uncertainty(), (
-                "the camera seems to stand still while objects move: edges in the frames make no "
-                "events; sigmas include that, and jaxevent track follows objects"
-            )
-        found = flow_consistency(recording, self.model, speed=speed)
+        undecided, still = find_undecided(recording, self)
+        if undecided.any():
+            unsure = self._with_full_uncertainty().covariance
+            covariance = np.where(undecided[:, None, None], unsure, self.covariance)
+            told = dataclasses.replace(self, valid=self.valid & ~undecided, covariance=covariance)
+            return told, still
+        found = flow_consistency(recording, self.model)
         if found is None or not found.is_inconsistent:
             return self, ""
         mean = np.nan_to_num(self.mean)
@@ -390,8 +388,8 @@ class MotionEstimate(HtmlRepr):
 
         Returns:
             An `Estimate` of mean (times, d), covariance (times, d, d) and valid (times,). Invalid
-            are times next to a lost estimate, before the first one, and outside the recording. There
-            the mean is NaN, and so are the components of a direction that is not observable.
+            are times next to a lost estimate, before the first one, and outside the recording.
+            There the mean is NaN, and so are the components of an unobservable direction.
 
         Raises:
             InputError: A time is not finite, or outside the recording without `extrapolate`.

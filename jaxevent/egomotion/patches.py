@@ -152,12 +152,24 @@ def describe_windows(recording: Recording) -> str:
     """Describe the durations of the windows that are evaluated, those that fit, in words."""
     if len(recording.events) < MIN_PATCH_EVENTS:
         return "in so few events"
-    fitting = [float(duration) for duration in WINDOW_DURATIONS_S if _fits(recording, duration)]
+    fitting = window_durations(recording).tolist()
     if not fitting:
         return "in so short a recording"
     ends = sorted({fitting[0], fitting[-1]})
     words = [f"{1e3 * one:.2g} ms" if one < 0.1 else f"{one:.2g} s" for one in ends]
     return f"in windows of {' to '.join(words)}"
+
+
+def window_durations(recording: Recording) -> NDArray[np.float64]:
+    """Return the durations (s) of windows that fit in a recording, the last one its whole length.
+
+    Of a recording longer than all of them, they are `WINDOW_DURATIONS_S`.
+    """
+    whole = 1e-6 * (recording.stop - recording.start)
+    fitting = WINDOW_DURATIONS_S[[_fits(recording, float(one)) for one in WINDOW_DURATIONS_S]]
+    if whole >= WINDOW_DURATIONS_S[-1] or not len(fitting):
+        return fitting
+    return np.append(fitting, whole)
 
 
 def _fits(recording: Recording, duration: float) -> bool:
@@ -172,7 +184,7 @@ def _measure_speed(recording: Recording, camera: PinholeCamera | None) -> ImageS
     speeds, by_time, n_patches = [], [], 0
     for middle in spread_times(recording, N_EVALUATED_TIMES):
         best: dict[tuple[float, ...], tuple[float, float]] = {}  # sharpness and speed by position
-        for duration in WINDOW_DURATIONS_S:
+        for duration in window_durations(recording):
             window = measure_sharpness(
                 recording, middle, float(duration), MAX_GRID_DISPLACEMENT_PX, xi
             )
@@ -491,9 +503,11 @@ def measure_windows(
     for middle in spread_times(recording, N_FIT_TIMES):
         near = [(abs(t - middle), v) for t, v in speed.by_time if np.isfinite(v)]
         here = min(near)[1] if near else speed.median
-        duration = WINDOW_DURATIONS_S[
-            np.abs(np.log(WINDOW_DURATIONS_S * here / FIT_WINDOW_DISPLACEMENT_PX)).argmin()
-        ]
+        durations = window_durations(recording)
+        if not len(durations):
+            return windows
+        ratio = durations * here / FIT_WINDOW_DISPLACEMENT_PX
+        duration = durations[np.abs(np.log(ratio)).argmin()]
         window = measure_sharpness(recording, middle, float(duration), MAX_FIT_DISPLACEMENT_PX, xi)
         if window is not None:
             windows.append(window)

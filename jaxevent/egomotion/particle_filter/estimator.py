@@ -204,10 +204,10 @@ class VotingEstimator(MotionEstimator[Params]):
             camera: The calibration; by default the recording's.
             seed: Seed of the random numbers; it makes the estimate reproducible.
             progress: Whether to show a progress bar; by default in a terminal.
-            causal: Whether estimates use events before their times alone, as those of a live stream
-                do. They lag, and their covariance has what the motion changes meanwhile.
-            smooth: Whether to smooth by later events; by default unless `causal`. Without, estimates
-                hold for the time `lag` before their own.
+            causal: Whether estimates use events before their times alone, as live ones do. They
+                lag, and their covariance has the change of the motion meanwhile.
+            smooth: Whether to smooth by later events; by default unless `causal`. Without,
+                estimates hold for the time `lag` before their own.
             cloud: Number of particles of each batch, drawn by weight, in the result's `cloud`.
             compiler: "numba" runs a kernel made of the filter's own functions, "xla" the `run` that
                 is differentiated. Their log-likelihoods are equal to rounding, and weights to
