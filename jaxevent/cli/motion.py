@@ -175,10 +175,13 @@ def run(
     if recording.imu is not None and still is not None:
         bias = gyro_bias(recording.imu, *still)
     whole, recording = recording, _stretch(recording, start, stop)
+    choice = None
     if kind is None:
         choice = select_model(recording)
         print("\n".join(choice.lines))
         kind = choice.model
+        if choice.camera is not None:
+            recording = dataclasses.replace(recording, camera=choice.camera)
     estimator = find_estimator(method or kind.best_method)
     _check(estimator, kind, imu, causal, smooth)
     _need_camera(recording, kind)
@@ -191,6 +194,8 @@ def run(
         settings["smooth"] = smooth or not centred
     gyro, other = (imu, bias, turned), not (method or params or causal or smooth)
     estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
+    if choice is not None:
+        told = choice.include_doubt(told)
     told, warning = told.with_flow_consistency(recording)
     if warning:
         print(warning)

@@ -585,6 +585,27 @@ def fit_rotation(
     return _minimise(loss, [one / unit for one in starts], 1.0) * unit
 
 
+def refine_rotation(
+    window: PatchSharpness, basis: NDArray[np.float64], turn: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Refine a rotation whose displacements are linear.
+
+    Args:
+        window: The patches.
+        basis: (patches, 2, 3) displacements per rad, px.
+        turn: (3,) rotation vector over the window at the start, rad.
+
+    Returns:
+        (3,) rotation vector, rad.
+    """
+    unit = 1 / np.sqrt(np.maximum((basis**2).sum(1).mean(0), 1e-12))
+
+    def loss(v: NDArray) -> float:
+        return -float(log_sharpness(window, 0, basis @ (v * unit)).sum())
+
+    return _minimise(loss, [turn / unit], 1.0) * unit
+
+
 def half_line_displacements(
     window: PatchSharpness, f: float, T: NDArray, turn: NDArray
 ) -> NDArray[np.float64]:

@@ -74,8 +74,8 @@ class Params(Parameters):
 def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     """Estimate the motion between pairs of frames, at the middle of their times.
 
-    The covariance is that of the fit, with an error that all points share and that of a motion which
-    changes between the frames. With too few points the motion is lost, and its mean that of
+    The covariance is that of the fit, with an error that all points share and that of a motion
+    which changes between the frames. With too few points the motion is lost, and its mean that of
     the pair before. The samples of five points are drawn with a fixed seed.
 
     Args:
