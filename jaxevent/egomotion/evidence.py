@@ -118,7 +118,7 @@ class EvidenceTest:
         size = float(np.linalg.norm(m))
         flow = self.basis[::8, ::8].reshape(-1, 2, len(m)) @ (m * self._unit)
         length = min(displacement / max(float(np.sqrt((flow**2).sum(1).mean())), 1e-9), longest)
-        part = events[events.index(round(time - 1e6 * length)) : events.index(time + 1)]
+        part = events[events.index(round(time - 1e6 * length)) : events.index(time)]
         if len(part) < MIN_WINDOW_EVENTS or not size:
             return None
         tau = (part.t - time) * 1e-6 + length / 2

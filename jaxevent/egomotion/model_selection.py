@@ -165,7 +165,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     found = select_by_z(z, lambda: translation_z(recording, camera, guesses[::step]))
     doubt, doubts = _model_doubt(found, fits)
     return dataclasses.replace(
-        found, lines=(*lines, *found.lines, *doubts), doubt=doubt, camera=camera if lines else None
+        found, lines=(*lines, *doubts, *found.lines), doubt=doubt, camera=camera if lines else None
     )
 
 
