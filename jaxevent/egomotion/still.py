@@ -2,14 +2,14 @@
 
 A gyro measures a rotation directly: where its rates contradict an estimate, the events are those of
 moving things, or of another motion. Without a gyro, edges of frames make events where the camera
-moves (`patches`). Without either, one object covers a part of the image only (`evidence`).
+moves (`patches`). Without either, one object covers a part of the image only, in which all events
+are.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.egomotion.candidates import pixel_coordinates
-from jaxevent.egomotion.evidence import MIN_BLOCKS, N_BLOCKS, EvidenceTest
+from jaxevent.egomotion.evidence import MIN_BLOCKS, N_BLOCKS
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
     FIT_WINDOW_DISPLACEMENT_PX,
@@ -60,12 +60,13 @@ def find_undecided(recording: Recording, motion: MotionEstimate) -> tuple[NDArra
                 "events; rows are empty, and jaxevent track follows objects"
             )
         return none, ""
-    blocks = _moving_blocks(recording, motion, speed)
-    if blocks is None or blocks >= MIN_BLOCKS:
+    blocks = N_BLOCKS**2 if speed is None else _active_blocks(recording, speed)
+    if blocks >= MIN_BLOCKS:
         return none, ""
     return motion.valid, (
         f"the camera may stand still while objects move: only about {blocks:.1f} of "
-        f"{N_BLOCKS**2} parts of the image move; rows are empty, and jaxevent track follows objects"
+        f"{N_BLOCKS**2} parts of the image make events; rows are empty, and jaxevent track "
+        "follows objects"
     )
 
 
@@ -84,25 +85,6 @@ def _contradicts(imu: Imu, motion: MotionEstimate, rows: slice) -> NDArray[np.bo
     allowed = GYRO_SIGMAS * sigma + np.sqrt(3) * MAX_GYRO_BIAS_RAD_S
     allowed = allowed + GYRO_RELATIVE_ERROR * np.maximum(told, measured)
     return (last > first) & (np.abs(told - measured) > allowed)
-
-
-def _moving_blocks(
-    recording: Recording, motion: MotionEstimate, speed: ImageSpeed | None
-) -> float | None:
-    """Return the median effective number of blocks that move, of some windows."""
-    if motion.model.half_line:
-        return None if speed is None else _active_blocks(recording, speed)
-    xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
-    test, found = EvidenceTest(motion.model(f), xi), []
-    valid = np.flatnonzero(motion.valid)
-    for k in valid[np.linspace(0, len(valid) - 1, N_TESTED_WINDOWS).astype(int)]:
-        one = test.measure(
-            recording.events, int(motion.t[k]), motion.mean[k], motion.covariance[k],
-            FIT_WINDOW_DISPLACEMENT_PX, 1.0,
-        )  # fmt: skip
-        if one is not None:
-            found.append(one.blocks)
-    return float(np.median(found)) if found else None
 
 
 def _active_blocks(recording: Recording, speed: ImageSpeed) -> float:
