@@ -17,14 +17,13 @@ from jaxevent.calibration.correspondence import (
     Correspondence,
     measure_correspondence,
 )
+from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording
 
 MAX_HOT_SHARE = 0.01  # of the pixels
-MIN_GAP_US, MIN_GAP_STEPS = 1_000, 5  # steps of the stamps, which may be of ms
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
-MAX_MISSED_EVENTS = 100  # expected in a gap: by chance none come with e^-100, in clusters e^-10
 MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
 MAX_BURST_SHARE = 0.05  # of the events
@@ -118,17 +117,9 @@ def _check_times(recording: Recording, sample: Sample) -> Iterator[Fault]:
     gaps, total, in_bursts = [], 0, 0
     for t in _times(recording, sample):
         total += len(t)
-        steps = np.diff(t)
-        least = MIN_GAP_STEPS * np.median(steps[steps > 0]) if steps.any() else 0
-        rows = np.flatnonzero(steps >= max(MIN_GAP_US, least))
-        begin, end = t[rows], t[rows + 1]
-        # The lesser rate of the two sides, each over the length of the gap.
-        before = rows + 1 - np.searchsorted(t, 2 * begin - end)
-        after = np.searchsorted(t, 2 * end - begin, side="right") - rows - 1
-        missed = np.minimum(before, after)
-        gaps += zip(missed.tolist(), begin.tolist(), end.tolist(), strict=True)
+        found = find_gaps(t)
+        gaps += zip(found.missed.tolist(), found.begin.tolist(), found.end.tolist(), strict=True)
         in_bursts += _count_bursts(t)
-    gaps = [gap for gap in gaps if gap[0] > MAX_MISSED_EVENTS]
     long = [gap for gap in gaps if gap[2] - gap[1] >= MAX_PAUSE_US]
     lost = sum(gap[0] for gap in gaps)
     if long or lost > MAX_MISSED_SHARE * (total + lost):

@@ -29,9 +29,9 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--method",
         metavar="NAME",
-        help="mc, akf, aks, cf, cf-augmented, high-pass, edi, augmented, flow, blend, last-frame, "
-        "or package.module:object of your own; default: mc, the best, or aks where mc would take "
-        "over ten minutes, or high-pass where there are no frames",
+        help="mc, akf, aks, cf, cf-augmented, high-pass, events-only, edi, augmented, flow, blend, "
+        "last-frame, or package.module:object of your own; default: mc, the best, or aks where mc "
+        "would take over ten minutes, or events-only where there are no frames",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
@@ -94,7 +94,7 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
     """The method where none is named, for images of so many pixels in all; says why it is that."""
     seconds = _MC_SECONDS_PER_PIXEL * pixels
     if not has_frames:
-        method, why = "high-pass", f"there are no frames{missing}, so images show changes alone"
+        method, why = "events-only", f"there are no frames{missing}, so the scale is unknown"
     elif seconds > _MAX_MC_SECONDS:
         method, why = "aks", f"mc, the best, would take {seconds / 60:.0f} minutes of a core"
     else:

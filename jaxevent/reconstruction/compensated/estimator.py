@@ -113,7 +113,7 @@ from jaxevent.recording import Recording, Times, microseconds
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
-MIN_TRUST = 0.8  # in an interval's events, from which motion is sought along them, on their clock
+MIN_TRUST = 0.8  # in an interval's events, from which motion is not sought in frames alone
 N_CACHED_ANCHORS = 2
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
 MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
@@ -355,12 +355,9 @@ class TrajectoryEstimator:
     def _make_anchor(self, at: int, doubted: bool) -> Anchor:
         """Seek the motion of the target at a time (us) from nothing.
 
-        Where events are doubted it is also sought from the frames alone, and by time: the clock of
-        events is in doubt as well.
+        Where events are doubted it is also sought from the frames alone.
         """
         instants = self.schedule(at)
-        if doubted:
-            instants = instants.with_clock(TIME_CLOCK)
         L, V, clear, _ = self._images(instants)
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
         p = self._seek(pyramid, instants.s, instants.first_horizon)
@@ -393,7 +390,13 @@ class TrajectoryEstimator:
     def _improve(
         self, pixels: NDArray[np.float32], instants: TargetInstants, p: NDArray[np.float32]
     ) -> tuple[TargetInstants, NDArray[np.float32]]:
-        """Take a few steps at half resolution, on the clock on which images agree better."""
+        """Take a few steps at half resolution, on the clock on which frames agree better.
+
+        Images from events have the faults of their clock, so that they do not judge it.
+        """
+        judges = np.isin(instants.t, self.schedule.frames)
+        if judges.sum() <= 2:  # agree on any clock
+            judges[:] = True
 
         def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
             for _ in range(N_TARGET_STEPS):
@@ -401,7 +404,7 @@ class TrajectoryEstimator:
             return p
 
         def cost(clock: TargetInstants, p: NDArray[np.float32]) -> float:
-            return robust_cost(PackedImages.of(pixels, clock.s), p, self._cost)
+            return robust_cost(PackedImages.of(pixels[judges], clock.s[judges]), p, self._cost)
 
         found = improved(instants, p)
         if not instants.clock.event_share:

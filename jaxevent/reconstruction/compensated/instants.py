@@ -4,7 +4,9 @@ The clock goes as fast as the scene moves. Where the camera speeds up, slows dow
 points do so together. Trajectories that are parabolas of time miss that over a few frames. Events
 come in proportion to motion, so parabolas of the number of events do not miss it. Where objects
 move independently, no clock suits all of them, and the clock is time. Parts of the image decide
-between both: the rate of events in one part is regressed on the rate in all others.
+between both: the rate of events in one part is regressed on the rate in all others. Events that are
+missing in gaps of the stream are counted as they would have come, evenly over the gap, and where
+some are missing between two frames the clock is nearer to time.
 """
 
 import dataclasses
@@ -14,6 +16,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.gaps import Gaps, find_gaps
 from jaxevent.recording import Recording
 
 GRID_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # distances of instants from the target
@@ -30,7 +33,39 @@ N_RATE_SEGMENTS = 8  # of a recording, in which parts of the image are compared
 SEGMENT_FRAME_INTERVALS = 4  # intervals of frames, the length of a segment
 N_PARTS, N_BINS = 4, 16  # of the image along each axis, and of a segment
 N_CACHED_TIMES = 4096  # times whose number of earlier events is remembered
+N_CACHED_GAP_BLOCKS = 64  # stretches of a recording whose gaps are remembered
 MIN_RATE_DEVIATION = 0.05  # deviations of the rate, as a part of it, that do not matter
+
+
+class MissedEvents:
+    """Estimates the events that are missing in gaps: `missed = missed_events(times)`.
+
+    Args:
+        recording: The recording.
+        block_us: Length of the stretches in which gaps are sought, us.
+    """
+
+    def __init__(self, recording: Recording, block_us: int):
+        self._events, self._origin, self._block = recording.events, recording.start, block_us
+        self._gaps = functools.lru_cache(N_CACHED_GAP_BLOCKS)(self._find_gaps)
+
+    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the events missing before times (us), beside a number common to all of them."""
+        first, last = ((int(t) - self._origin) // self._block for t in (times.min(), times.max()))
+        missed = np.zeros(len(times))
+        for block in range(first - 1, last + 1):
+            begin, end, _, number = (part[:, None] for part in self._gaps(block))
+            missed += (number * ((times - begin) / (end - begin)).clip(0, 1)).sum(0)
+        return missed
+
+    def _find_gaps(self, block: int) -> Gaps:
+        """Find the gaps that begin in a stretch, by events up to a stretch before and after."""
+        begin = self._origin + block * self._block
+        end, events = begin + self._block, self._events
+        rows = slice(events.index(begin - self._block), events.index(end + self._block))
+        found = find_gaps(events[rows].t)
+        chosen = (found.begin >= begin) & (found.begin < end)
+        return Gaps(*(part[chosen] for part in found))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,14 +79,29 @@ class MotionClock:
     origin: int  # us
     event_interval: float  # us, mean over the recording
     event_share: float  # weight of the event count, 0..1
+    # Events missing before times (us), beside a common number; None: none are.
+    missed: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None
 
     def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the motion time (us) at times (us)."""
+        """Return the motion time (us) at times (us), beside a constant where events are missing."""
         elapsed = np.asarray(times - self.origin, float)
         if not self.event_share:
             return elapsed
         counts = np.array([self.count_before(t) for t in times.tolist()], float)
+        if self.missed is not None:
+            counts += self.missed(times)
         return (1 - self.event_share) * elapsed + self.event_share * self.event_interval * counts
+
+    def between(self, begin_us: int, end_us: int) -> "MotionClock":
+        """Return the clock whose weight of events is lower by the share that is missing."""
+        if not self.event_share or self.missed is None:
+            return self
+        missed = float(np.ptp(self.missed(np.array([begin_us, end_us]))))
+        if not missed:
+            return self
+        here = self.count_before(end_us) - self.count_before(begin_us)
+        share = self.event_share * here / (here + missed)
+        return dataclasses.replace(self, event_share=share)
 
     def relative_event_rate(self, begin_us: int, end_us: int) -> float:
         """Return the rate of events between two times (us), in units of the mean rate."""
@@ -84,9 +134,9 @@ def fit_motion_clock(
     event_interval = (recording.stop - recording.start) / max(len(recording.events), 1)
     # Targets share instants, and formats that are decoded are slow to search.
     count_before = functools.lru_cache(N_CACHED_TIMES)(recording.events.index)
-    return MotionClock(
-        count_before, first, event_interval, common_motion_fraction(np.stack(counts))
-    )
+    event_share = common_motion_fraction(np.stack(counts))
+    missed = MissedEvents(recording, max(frame_interval_us, 1))
+    return MotionClock(count_before, first, event_interval, event_share, missed)
 
 
 def common_motion_fraction(counts: NDArray[np.floating]) -> float:
@@ -204,13 +254,14 @@ class InstantSchedule:
         left = int(np.searchsorted(frames, t, "left"))
         times = np.array(sorted({t, *self._near_frames(t), *self._grid(t)}), np.int64)
         target = int(np.searchsorted(times, t))
-        s, unit = _relative_times(self.clock, times, target)
         nearest = [
             int(np.searchsorted(times, frames[k]))
             for k in (left - 1, right)
             if 0 <= k < len(frames)
         ]
         before, after = (nearest[0], nearest[-1]) if nearest else (target, target)
+        clock = self.clock.between(int(times[before]), int(times[after]))
+        s, unit = _relative_times(clock, times, target)
         far = np.sort(np.abs(s))
         # At least two instants on either side, where there are.
         first_step = FIRST_HORIZON_STEPS * self.step * 1e-6 / unit
@@ -219,7 +270,7 @@ class InstantSchedule:
         if len(nearest) == 1 and left == right:
             rate = self.clock.relative_event_rate(*sorted((int(times[nearest[0]]), t)))
             rest = 1 / (1 + (rate / MAX_REST_RATE) ** 2)
-        return TargetInstants(times, target, before, after, s, unit, horizon, self.clock, rest)
+        return TargetInstants(times, target, before, after, s, unit, horizon, clock, rest)
 
     def _near_frames(self, t: int) -> set[int]:
         """Return the times (us) of the frames to use around a time (us)."""
