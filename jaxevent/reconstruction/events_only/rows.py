@@ -28,6 +28,7 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events
 
 EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
+NONE, MUTED = -1, -2  # in place of the number of a pixel's last event
 FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
 
 
@@ -57,7 +58,7 @@ def make_rows(
     events: Events,
     paths: Paths,
     thresholds: NDArray,
-    shape: tuple[int, int],
+    muted: NDArray[np.bool_],
     span: tuple[int, int],
 ) -> Rows:
     """Make the equations of a window's events and of its silence.
@@ -66,13 +67,14 @@ def make_rows(
         events: Events of the window, in order of time.
         paths: Paths towards the target time.
         thresholds: (2,) or (2, height, width) ln I, of ON and OFF events.
-        shape: (height, width) of the sensor.
+        muted: (height, width), true for pixels whose events and silence tell nothing.
         span: Begin and end of the window, us.
 
     Returns:
         The rows whose look-ups are both inside the image.
     """
-    height, width = shape
+    height, width = shape = muted.shape
+    events = events[~muted[events.y, events.x]]
     c = np.broadcast_to(
         np.asarray(thresholds, np.float32).reshape(2, *np.shape(thresholds)[1:] or (1, 1)),
         (2, height, width),
@@ -97,7 +99,7 @@ def make_rows(
         np.empty(n, np.uint8),
         np.empty(n, np.int32),
     )
-    last = np.full(height * width, -1, np.int32)
+    last = np.where(muted.ravel(), MUTED, NONE).astype(np.int32)
     ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
     n = _lay_rows(pixel, change.astype(np.float32), ends, last, rows)
     return Rows(shape, threshold, *(column[:n] for column in rows[2:]))
@@ -115,9 +117,9 @@ def _lay_rows(pixel, change, positions, last, rows):
             n += _lay_row(n, at_event[k], at_event[last[x]], change[k], EVENT, x, rows)
         last[x] = k
     for x in range(len(last)):
-        if last[x] < 0:
+        if last[x] == NONE:
             n += _lay_row(n, end[x], begin[x], 0.0, SILENT, x, rows)
-        else:
+        elif last[x] != MUTED:
             n += _lay_row(n, end[x], at_event[last[x]], LAST_SHARE * change[last[x]], LAST, x, rows)
     return n
 

@@ -65,10 +65,10 @@ class WindowSolver:
         self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
         self.relative = np.ones((2, *self.shape), np.float32)
-        self.hot = np.zeros(self.shape, bool)
+        self.muted = np.zeros(self.shape, bool)
         if params.learn:
             found = calibrate_events(recording)
-            self.relative, self.hot = found.thresholds, found.hot
+            self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
         c = np.float32([params.c_on, params.c_off])
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
@@ -102,8 +102,7 @@ class WindowSolver:
             The equations for the image at that time.
         """
         events = self.recording.events[first:last]
-        events = events[~self.hot[events.y, events.x]]
-        return make_rows(events, self.paths(*span, at), self.thresholds, self.shape, span)
+        return make_rows(events, self.paths(*span, at), self.thresholds, self.muted, span)
 
     def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
         """Solve for the image at a time.
