@@ -67,10 +67,10 @@ class WindowSolver:
         self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
         self.relative = np.ones((2, *self.shape), np.float32)
-        self.hot = np.zeros(self.shape, bool)
+        self.muted = np.zeros(self.shape, bool)
         if params.learn:
             found = calibrate_events(recording)
-            self.relative, self.hot = found.thresholds, found.hot
+            self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
         c = np.float32([params.c_on, params.c_off])
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
@@ -92,7 +92,7 @@ class WindowSolver:
         return WindowPaths(at, knots, velocity)
 
     def events(self, first: int, last: int) -> Events:
-        """Return the events of some rows of the recording, without those of hot pixels.
+        """Return the events of some rows of the recording, without those of pixels that are not used.
 
         Args:
             first: First row.
@@ -102,7 +102,7 @@ class WindowSolver:
             The events.
         """
         events = self.recording.events[first:last]
-        return events[~self.hot[events.y, events.x]]
+        return events[~self.muted[events.y, events.x]]
 
     def __call__(
         self, t: int, *, variance: bool = True, held_out: Callable[[Rows], NDArray] | None = None
@@ -130,7 +130,8 @@ class WindowSolver:
         start = memory.time(first)
         span = min(start, t), max(stop, t)
         events = self.events(memory.row(first), end)
-        rows = make_rows(events, self.paths(*span, t), self.thresholds, self.shape, span)
+        paths = self.paths(*span, t)
+        rows = make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
         prior = memory.prior(rows, t, first, last)
         seen = rows
         if held_out is not None:
