@@ -26,6 +26,8 @@ TURN_US = 200_000  # the motion is horizontal before, vertical from then on
 class Turning:
     """Motion of the whole image: a `Paths` towards the time `at` and a `FlowSource`."""
 
+    covariance = None
+
     def __init__(self, at=0):
         self.at = at
 
