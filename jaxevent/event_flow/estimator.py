@@ -8,20 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.event_flow.alignment import Aligned, Alignment, WindowEvents
+from jaxevent.event_flow.alignment import (
+    MAX_VARIANCE,
+    Aligned,
+    Alignment,
+    Clock,
+    WindowEvents,
+)
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Events, Recording, Times, check_times, microseconds
 
 CELLS = (4, 2, 1)  # px, for motion sought from nothing
 LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
 LEVELS = range(-4, 5)  # powers of 2 of the window's size
 CHAIN_WINDOWS = 16  # half windows of a chain of anchors
-N_CACHED_ANCHORS = 64
+N_CACHED_ANCHORS = 256
 UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
-MAX_DEVIATION_PX = (
-    1.0  # standard deviation of a valid displacement from an anchor to a window's end
-)
 MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
 
 
@@ -40,13 +43,12 @@ class Anchor(NamedTuple):
 
     row: int  # of the event there
     t: int  # us
-    unit: float  # s in which points are displaced
     aligned: Aligned
 
     @property
-    def velocity(self) -> NDArray[np.float64]:
-        """Velocity (rows, columns, 2), px/s."""
-        return self.aligned.u / self.unit
+    def rate(self) -> float:
+        """Displacements per second."""
+        return self.aligned.clock.rate(self.t)
 
 
 class Chain(NamedTuple):
@@ -78,31 +80,39 @@ class EventFlow:
         self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
         self._lock = threading.RLock()
 
-    def _window(self, row: int, half: int) -> tuple[int, WindowEvents]:
+    def _events(self, row: int, half: int) -> tuple[int, Events]:
         """Return the time (us) of an event, and the events around it."""
         events = self.recording.events[max(row - half, 0) : row + half]
-        at = int(events.t[min(row, half)])
-        return at, WindowEvents.of(events, at)
+        return int(events.t[min(row, half)]), events
 
     def _seek(self, row: int, most: int | None = None) -> Chain:
         """Find the motion around an event from nothing, in windows that double.
 
         They grow until points are displaced far enough, or to `most` events.
         """
-        start, found = None, None
+        start, rate, half = None, 0.0, 0
         for level in LEVELS:
             half = int(self._base * 2.0**level)
-            at, window = self._window(row, half)
-            start = None if found is None else found.aligned.u * (window.unit / found.unit)
-            found = Anchor(row, at, window.unit, self._align(window, start, CELLS))
+            found = self._refine(row, half, start, rate, grow=True)
+            start, rate = found.aligned.u, found.aligned.clock.mean_rate
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
-                and (whole or found.aligned.typical() >= float(self.params.displacement))
+                and (whole or self._align.typical(found.aligned) >= float(self.params.displacement))
             ):
                 break
-        assert found is not None
-        return Chain(found, half)
+        return Chain(self._refine(row, half, start, rate), half)
+
+    def _refine(
+        self, row: int, half: int, start: NDArray | None, rate: float, grow: bool = False
+    ) -> Anchor:
+        """Align the window around an event from displacements that went at a rate (1/s)."""
+        at, events = self._events(row, half)
+        clock = Clock.of(events, at, half)
+        if start is not None:
+            start = start * (rate / clock.mean_rate)
+        window, cells = WindowEvents.of(events), CELLS if grow else LAST_CELLS
+        return Anchor(row, at, self._align(window, clock, at, start, cells, not grow))
 
     def _make_chain(self, number: int) -> Chain:
         return self._seek(number * CHAIN_WINDOWS * self._base)
@@ -114,13 +124,12 @@ class EventFlow:
             return first
         before = self._anchor(number, k - 1)
         row = number * CHAIN_WINDOWS * self._base + k * half
-        at, window = self._window(row, half)
-        found = self._align(window, before.velocity * window.unit, LAST_CELLS)
-        if found.score < MIN_SCORE_RATIO * before.aligned.score:
+        found = self._refine(row, half, before.aligned.u, before.aligned.clock.mean_rate)
+        if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
             other = self._seek(row, half).first
-            if other.aligned.score > found.score:
+            if other.aligned.score > found.aligned.score:
                 return other
-        return Anchor(row, at, window.unit, found)
+        return found
 
     def window_events(self, t: int) -> int:
         """Return how many events on either side of a time (us) the flow there rests on."""
@@ -163,14 +172,25 @@ class EventFlow:
                     break
         return found
 
-    def _fields(self, anchors: list[Anchor]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return velocity and covariance of all pixels at anchors."""
+    def _fields(
+        self, anchors: list[Anchor], knots: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return velocity and covariance of all pixels at some times (us)."""
+        velocity = np.zeros((len(knots), *self.shape, 2), np.float32)
+        covariance = np.zeros((*velocity.shape, 2), np.float32)
         if not anchors:
-            still = np.zeros((1, *self.shape, 2), np.float32)
-            return still, np.full((*still.shape, 2), UNKNOWN_VARIANCE * np.eye(2), np.float32)
-        velocity = [self._align.fill(anchor.velocity) for anchor in anchors]
-        covariance = [self._align.covariance(a.aligned) / a.unit**2 for a in anchors]
-        return np.stack(velocity), np.stack([self._align.fill(one) for one in covariance])
+            covariance[:] = UNKNOWN_VARIANCE * np.eye(2)
+            return velocity, covariance
+        fields = [self._align.fill(anchor.aligned.u) for anchor in anchors]
+        spreads = [self._align.fill(self._align.covariance(a.aligned)) for a in anchors]
+        times = [anchor.t for anchor in anchors]
+        for n, t in enumerate(knots.tolist()):
+            for k, anchor in enumerate(anchors):
+                weight = np.interp(t, times, np.eye(len(times))[k])
+                if weight > 0:
+                    velocity[n] += np.float32(weight * anchor.aligned.clock.rate(t)) * fields[k]
+                    covariance[n] += np.float32(weight * anchor.rate**2) * spreads[k]
+        return velocity, covariance
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
@@ -184,11 +204,15 @@ class EventFlow:
         Returns:
             The paths.
         """
+        start, stop = min(start, at), max(stop, at)
         with self._lock:
-            last = max(stop, at)
-            anchors = self._around(min(start, at), last, last if until is None else until)
-        knots = np.array([anchor.t for anchor in anchors] or [at], np.int64)
-        return WindowPaths(int(at), knots, *self._fields(anchors))
+            anchors = self._around(start, stop, stop if until is None else until)
+        times = [np.array([anchor.t for anchor in anchors] or [at])]
+        for anchor in anchors:
+            inner = anchor.aligned.clock.t[1:-1]
+            times.append(inner[(inner >= start) & (inner <= stop)])
+        knots = np.unique(np.concatenate(times).astype(np.int64))
+        return WindowPaths(int(at), knots, *self._fields(anchors, knots))
 
     def __call__(
         self, times: Times, extrapolate: bool = False
@@ -215,14 +239,10 @@ class EventFlow:
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
                 anchors = self._around(t, t, t)
-            knots = [anchor.t for anchor in anchors] or [t]
-            weights = np.array([np.interp(t, knots, one) for one in np.eye(len(knots))], np.float32)
-            velocity, uncertainty = self._fields(anchors)
-            mean[row] = np.tensordot(weights, velocity, 1)
-            covariance[row] = np.tensordot(weights, uncertainty, 1)
-            unit = float(weights @ np.array([anchor.unit for anchor in anchors] or [0.0]))
-            largest = np.linalg.eigvalsh(covariance[row])[..., 1]
-            valid[row] = (unit > 0) & (largest * unit**2 < MAX_DEVIATION_PX**2)
+            (mean[row],), (covariance[row],) = self._fields(anchors, wanted[row : row + 1])
+            if anchors:
+                rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])
+                valid[row] = np.linalg.eigvalsh(covariance[row])[..., 1] < MAX_VARIANCE * rate**2
         return mean, covariance, valid
 
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:

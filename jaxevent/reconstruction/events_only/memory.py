@@ -54,7 +54,7 @@ def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
     c = np.float32(rows.threshold)
     information = np.zeros((*rows.shape, 2, 2), np.float32)
     eta = np.zeros((*rows.shape, 2), np.float32)
-    weight = np.where(rows.kind == EVENT, 1, silence).astype(np.float32) / c**2
+    weight = np.where(rows.kind == EVENT, 1, silence).astype(np.float32) * rows.weight / c**2
     _add_rows(rows, weight, c, information, eta)
     gradient = np.empty_like(eta)
     _solve_gradient(information, eta, LEAST_INFORMATION / c**2, gradient)

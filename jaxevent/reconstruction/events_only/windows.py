@@ -1,5 +1,6 @@
 """The windows of a recording's events: equations, and their solutions on the host."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxevent.reconstruction.events_only.rows import Rows, make_rows
 from jaxevent.reconstruction.events_only.solve import Solution, solve
 from jaxevent.recording import Events, Recording, Times
 
+ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
 
 
@@ -65,10 +67,10 @@ class WindowSolver:
         self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
         self.relative = np.ones((2, *self.shape), np.float32)
-        self.hot = np.zeros(self.shape, bool)
+        self.muted = np.zeros(self.shape, bool)
         if params.learn:
             found = calibrate_events(recording)
-            self.relative, self.hot = found.thresholds, found.hot
+            self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
         c = np.float32([params.c_on, params.c_off])
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
@@ -90,7 +92,7 @@ class WindowSolver:
         return WindowPaths(at, knots, velocity)
 
     def events(self, first: int, last: int) -> Events:
-        """Return the events of some rows of the recording, without those of hot pixels.
+        """Return the events of some rows of the recording, without those of pixels that are not used.
 
         Args:
             first: First row.
@@ -100,9 +102,11 @@ class WindowSolver:
             The events.
         """
         events = self.recording.events[first:last]
-        return events[~self.hot[events.y, events.x]]
+        return events[~self.muted[events.y, events.x]]
 
-    def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
+    def __call__(
+        self, t: int, *, variance: bool = True, held_out: Callable[[Rows], NDArray] | None = None
+    ) -> SolvedWindow:
         """Solve for the image at a time.
 
         A window begins at a key of the memory, and ends at one or, where images are causal, at t.
@@ -110,6 +114,7 @@ class WindowSolver:
         Args:
             t: Time, us.
             variance: Whether the variance is wanted.
+            held_out: Chooses rows (booleans) that the solution does not see.
 
         Returns:
             The window's equations and solution.
@@ -125,6 +130,11 @@ class WindowSolver:
         start = memory.time(first)
         span = min(start, t), max(stop, t)
         events = self.events(memory.row(first), end)
-        rows = make_rows(events, self.paths(*span, t), self.thresholds, self.shape, span)
+        paths = self.paths(*span, t)
+        rows = make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
         prior = memory.prior(rows, t, first, last)
-        return SolvedWindow(rows, prior, solve(rows, prior, self.numbers, variance=variance))
+        seen = rows
+        if held_out is not None:
+            kept = ~held_out(rows)
+            seen = rows._replace(**{name: getattr(rows, name)[kept] for name in ROW_COLUMNS})
+        return SolvedWindow(rows, prior, solve(seen, prior, self.numbers, variance=variance))
