@@ -1,6 +1,6 @@
 """Motion of a live stream of events: from a camera, a socket, any iterator.
 
-    live = jaxevent.voting.live((240, 180), model="rotation", camera=camera)
+    live = jaxevent.egomotion.voting.live((240, 180), model="rotation", camera=camera)
     for events in camera:  # `jaxevent.Events`, one chunk after another
         live.add(events)
         mean, covariance, valid = live(live.stop)
