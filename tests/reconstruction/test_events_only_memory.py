@@ -26,6 +26,8 @@ TURN_US = 200_000  # the motion is horizontal before, vertical from then on
 class Turning:
     """Motion of the whole image: a `Paths` towards the time `at` and a `FlowSource`."""
 
+    covariance = None  # the paths are known
+
     def __init__(self, at=0):
         self.at = at
 
@@ -181,3 +183,15 @@ def test_causal_images_do_not_depend_on_later_events():
     ]
     assert images[0].prior.information.any()
     assert (images[0].solution.log_image == images[1].solution.log_image).all()
+
+
+def test_information_of_one_direction_stays_finite_and_positive():
+    along = np.random.default_rng(5).normal(size=(*SHAPE, 2)).astype(np.float32) * 1e4
+    memory = GradientPrior(along, (along[..., None] * along[..., None, :]).astype(np.float32))
+    faded = carry(memory, Turning(0), 0, (1e3, 1e3))
+    both = fuse(discount(faded, memory, 0.1, 2.0), memory, 0.1)
+    for one in (faded, both):
+        assert np.isfinite(one.gradient).all()
+        values = np.linalg.eigvalsh(one.information.astype(np.float64))
+        assert np.isfinite(values).all()
+        assert (values >= -1e-6 * np.abs(values).max()).all()
