@@ -26,7 +26,7 @@ TURN_US = 200_000  # the motion is horizontal before, vertical from then on
 class Turning:
     """Motion of the whole image: a `Paths` towards the time `at` and a `FlowSource`."""
 
-    covariance = None
+    covariance = None  # the paths are known
 
     def __init__(self, at=0):
         self.at = at
@@ -103,14 +103,12 @@ def test_an_image_after_a_turn_has_the_edges_seen_before_it():
     recording = ramp_recording()
     params = Params().replace(c_on=THRESHOLD, c_off=THRESHOLD, learn=False, window=1.0)
     windows = WindowSolver(recording, params, motion=Turning(), causal=True)
+    windows.memory.params = MemoryParams(forgetting=0.1)
     image = windows(TURN_US + 150_000).solution.log_image
     slopes = [np.diff(image, axis=axis)[17:20, 10:20].mean() for axis in (1, 0)]
     assert np.allclose(slopes, SLOPE, rtol=0.25)
+    windows = WindowSolver(recording, params, motion=Turning(), causal=True)
     windows.memory.params = MemoryParams(forgetting=1e12)
-    blind = windows.memory.__class__(
-        windows, recording, windows.n_side, silence=0.5, threshold=THRESHOLD
-    )
-    blind.params, windows.memory = windows.memory.params, blind
     forgotten = windows(TURN_US + 150_000).solution.log_image
     assert abs(np.diff(forgotten, axis=1)[17:20, 10:20].mean()) < 0.3 * abs(SLOPE[0])
 
@@ -183,3 +181,15 @@ def test_causal_images_do_not_depend_on_later_events():
     ]
     assert images[0].prior.information.any()
     assert (images[0].solution.log_image == images[1].solution.log_image).all()
+
+
+def test_information_of_one_direction_stays_finite_and_positive():
+    along = np.random.default_rng(5).normal(size=(*SHAPE, 2)).astype(np.float32) * 1e4
+    memory = GradientPrior(along, (along[..., None] * along[..., None, :]).astype(np.float32))
+    faded = carry(memory, Turning(0), 0, (1e3, 1e3))
+    both = fuse(discount(faded, memory, 0.1, 2.0), memory, 0.1)
+    for one in (faded, both):
+        assert np.isfinite(one.gradient).all()
+        values = np.linalg.eigvalsh(one.information.astype(np.float64))
+        assert np.isfinite(values).all()
+        assert (values >= -1e-6 * np.abs(values).max()).all()

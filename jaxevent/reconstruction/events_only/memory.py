@@ -28,13 +28,14 @@ from jaxevent.recording import Events, Recording
 
 KEYS_PER_BLOCK = 16  # whose memories are kept at a time, for each direction
 KEYS_BEYOND_BLOCK = 8  # from which a block's memories begin with nothing
+RELATIVE_RIDGE = 1e-6  # of the information's trace, so that rounding leaves it invertible
 LEAST_INFORMATION = 1e-3  # (px / c)^2; with less a gradient counts as 0
 
 
 class MemoryParams(NamedTuple):
     """Numbers of the memory; log intensity is in thresholds."""
 
-    forgetting: float = 0.6  # variance that a gradient gains in time, (c / px)^2 / s
+    forgetting: float = 4.0  # variance that a gradient gains in time, (c / px)^2 / s
     drift: float = 1.0  # variance that a path gains in time, px^2 / s
     blur: float = 0.3  # variance of a path when the memory enters an image, px^2
     detail: float = 0.5  # mean square of gradients, that errors of paths act by, (c / px)^2
@@ -130,7 +131,9 @@ def _solve_gradient(information, eta, least, out):
     for y in range(height):
         for x in range(width):
             L = information[y, x]
-            a, b, d = L[0, 0] + least, L[0, 1], L[1, 1] + least
+            xx, b, yy = np.float64(L[0, 0]), np.float64(L[0, 1]), np.float64(L[1, 1])
+            ridge = least + RELATIVE_RIDGE * (xx + yy)
+            a, d = xx + ridge, yy + ridge
             scale = 1 / (a * d - b * b)
             out[y, x, 0] = scale * (d * eta[y, x, 0] - b * eta[y, x, 1])
             out[y, x, 1] = scale * (a * eta[y, x, 1] - b * eta[y, x, 0])
@@ -196,12 +199,14 @@ def _discount(memory, new, numbers, out):
             A, B = memory.information[y, x], new.information[y, x]
             dx = memory.gradient[y, x, 0] - new.gradient[y, x, 0]
             dy = memory.gradient[y, x, 1] - new.gradient[y, x, 1]
-            a, b, d = A[0, 0] + B[0, 0] + least, A[0, 1] + B[0, 1], A[1, 1] + B[1, 1] + least
+            xx, yy = np.float64(A[0, 0]) + B[0, 0], np.float64(A[1, 1]) + B[1, 1]
+            ridge = least + RELATIVE_RIDGE * (xx + yy)
+            a, b, d = xx + ridge, np.float64(A[0, 1]) + B[0, 1], yy + ridge
             # q = d' A (A + B)^-1 B d
             ux, uy = A[0, 0] * dx + A[0, 1] * dy, A[0, 1] * dx + A[1, 1] * dy
             vx, vy = B[0, 0] * dx + B[0, 1] * dy, B[0, 1] * dx + B[1, 1] * dy
             q = (ux * (d * vx - b * vy) + uy * (a * vy - b * vx)) / (a * d - b * b)
-            weight = 1 / (1 + scale * max(q, np.float32(0)))
+            weight = 1 / (1 + scale * max(q, 0.0))
             for i in range(2):
                 for k in range(2):
                     out[y, x, i, k] = weight * A[i, k]
@@ -282,14 +287,16 @@ def _carry(px, py, memory, noise, out):
                 g[j + 1, i + 1, 1] - g[j, i + 1, 1]
             )
             Qx, Qxy, Qy = q + P * (p * p + r * r), P * (p * s + r * t), q + P * (s * s + t * t)
-            # (Lambda^-1 + Q)^-1 = (1 + Lambda Q)^-1 Lambda
-            A, B = 1 + xx * Qx + xy * Qxy, xx * Qxy + xy * Qy
-            C, D = xy * Qx + yy * Qxy, 1 + xy * Qxy + yy * Qy
-            scale = 1 / (A * D - B * C)
-            out.information[row, column, 0, 0] = scale * (D * xx - B * xy)
-            out.information[row, column, 0, 1] = scale * (D * xy - B * yy)
+            # (Lambda^-1 + Q)^-1 = (Lambda + |Lambda| adj Q) / (1 + tr Lambda Q + |Lambda| |Q|),
+            # in double precision: Lambda of one direction of motion is nearly singular.
+            det_L = max(np.float64(xx) * yy - np.float64(xy) * xy, 0.0)
+            det_Q = max(np.float64(Qx) * Qy - np.float64(Qxy) * Qxy, 0.0)
+            trace = np.float64(xx) * Qx + 2 * np.float64(xy) * Qxy + np.float64(yy) * Qy
+            scale = 1 / (1 + max(trace, 0.0) + det_L * det_Q)
+            out.information[row, column, 0, 0] = scale * (xx + det_L * Qy)
+            out.information[row, column, 0, 1] = scale * (xy - det_L * Qxy)
             out.information[row, column, 1, 0] = out.information[row, column, 0, 1]
-            out.information[row, column, 1, 1] = scale * (A * yy - C * xy)
+            out.information[row, column, 1, 1] = scale * (yy + det_L * Qx)
             out.gradient[row, column, 0] = gx
             out.gradient[row, column, 1] = gy
 

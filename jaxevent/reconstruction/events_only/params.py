@@ -17,7 +17,7 @@ class Params(FrameParams):
     c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
     c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
     I0 = Positive(0.02, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
-    window = Positive(0.23, "events / px", "events of the window on each side", gradient=False)
+    window = Positive(0.35, "events / px", "events of the window on each side", gradient=False)
     silence = Positive(_SOLVER.silence, "1", "weight of silence, against that of an event")
     tail = Positive(_SOLVER.tail, "c", "residual from which an equation counts less", least=1e-6)
     gradient = Positive(_SOLVER.gradient, "1", "weight of the prior of gradients")

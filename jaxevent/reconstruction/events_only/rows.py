@@ -43,7 +43,10 @@ ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^
 class Paths(Protocol):
     """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
 
-    covariance: NDArray | None  # (K, height, width, 2, 2) of the velocity, (px/s)^2; None: known
+    @property
+    def covariance(self) -> NDArray | None:
+        """Return the covariance of the velocity, (K, height, width, 2, 2), (px/s)^2, or None."""
+        ...
 
     def carry(self, x: NDArray, y: NDArray, t: NDArray) -> tuple[NDArray, NDArray]:
         """Return the positions at the target time of what pixels (x, y) see at times t."""
