@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jaxevent.calibration import calibrate, check_consistency
     from jaxevent.errors import InputError, InputWarning
     from jaxevent.estimator import Estimate, Estimator
+    from jaxevent.event_flow import flow_from_events
     from jaxevent.io import load, save
     from jaxevent.methods import METHODS
     from jaxevent.parameters import Parameters
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
         last_frame,
         mc,
     )
+    from jaxevent.reconstruction.events_only import events_only
     from jaxevent.recording import Events, Frames, Recording
     from jaxevent.runs.evaluate import evaluate
     from jaxevent.runs.fit import fit
@@ -58,6 +60,7 @@ _HOMES = {
     "jaxevent.calibration": ("calibrate", "check_consistency"),
     "jaxevent.errors": ("InputError", "InputWarning"),
     "jaxevent.estimator": ("Estimate", "Estimator"),
+    "jaxevent.event_flow": ("flow_from_events",),
     "jaxevent.io": ("load", "save"),
     "jaxevent.methods": ("METHODS",),
     "jaxevent.parameters": ("Parameters",),
@@ -65,6 +68,7 @@ _HOMES = {
         *("akf", "aks", "augmented", "blend", "cf", "cf_augmented", "edi", "high_pass"),
         *("flow", "last_frame", "mc"),
     ),
+    "jaxevent.reconstruction.events_only": ("events_only",),
     "jaxevent.recording": ("Events", "Frames", "Recording"),
     "jaxevent.runs.evaluate": ("evaluate",),
     "jaxevent.runs.fit": ("fit",),
@@ -105,8 +109,10 @@ __all__ = [
     "egomotion",
     "evaluate",
     "events",
+    "events_only",
     "fit",
     "flow",
+    "flow_from_events",
     "high_pass",
     "last_frame",
     "load",

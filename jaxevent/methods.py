@@ -17,6 +17,7 @@ METHOD_HOMES = {
         "cf": "jaxevent.reconstruction.complementary:cf",
         "cf-augmented": "jaxevent.reconstruction.complementary:cf_augmented",
         "high-pass": "jaxevent.reconstruction.complementary:high_pass",
+        "events-only": "jaxevent.reconstruction.events_only:events_only",
         "edi": "jaxevent.reconstruction.direct:edi",
         "augmented": "jaxevent.reconstruction.direct:augmented",
         "flow": "jaxevent.reconstruction.optical_flow:flow",

@@ -6,6 +6,7 @@ findings = jaxevent.check_consistency(recording)
 """
 
 from jaxevent.calibration.estimation import calibrate
+from jaxevent.calibration.event_calibration import EventCalibration, calibrate_events
 from jaxevent.calibration.faults import Fault, check_consistency
 from jaxevent.calibration.result import CalibratedValues, Calibration, CalibrationValue
 from jaxevent.calibration.storage import format_toml, recall_calibration, recall_numbers
@@ -14,8 +15,10 @@ __all__ = [
     "CalibratedValues",
     "Calibration",
     "CalibrationValue",
+    "EventCalibration",
     "Fault",
     "calibrate",
+    "calibrate_events",
     "check_consistency",
     "format_toml",
     "recall_calibration",

@@ -26,6 +26,7 @@ from jaxevent.cli import (
     evaluate,
     filter,
     fit,
+    flow,
     info,
     motion,
     reconstruct,
@@ -39,8 +40,8 @@ from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
 COMMANDS = (
-    demo, info, calibrate, convert, filter, register, camera, reconstruct, track, motion, evaluate,
-    fit, simulate, view,
+    demo, info, calibrate, convert, filter, register, camera, reconstruct, track, motion, flow,
+    evaluate, fit, simulate, view,
 )  # fmt: skip
 
 

@@ -29,9 +29,9 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--method",
         metavar="NAME",
-        help="mc, akf, aks, cf, cf-augmented, high-pass, edi, augmented, flow, blend, last-frame, "
-        "or package.module:object of your own; default: mc, the best, or aks where mc would take "
-        "over ten minutes, or high-pass where there are no frames",
+        help="mc, akf, aks, cf, cf-augmented, high-pass, events-only, edi, augmented, flow, blend, "
+        "last-frame, or package.module:object of your own; default: mc, the best, or aks where mc "
+        "would take over ten minutes, or events-only where there are no frames",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
@@ -67,12 +67,13 @@ def add(commands: Any) -> None:
     arguments.add_no_calibrate(one)
     one.add_argument(
         "--tone",
-        choices=["linear", "log", "percentile", "clahe", "changes"],
+        choices=["linear", "log", "percentile", "clahe", "changes", "relative"],
         help="how intensity becomes grey in PNG and MP4: linear (default), from the frames' black "
         "to their white, so that images are as bright as frames and what is brighter is cut off; "
         "log, the logarithm of 99 %% of the intensities, for high dynamic range; percentile, their "
-        "intensity; clahe, log with contrast evened out; changes (default where there are no "
-        "frames), grey where nothing changed. All images have the same limits",
+        "intensity; clahe, log with contrast evened out; relative (default where there are no "
+        "frames), log that fades to grey where nothing is known; changes (default of high-pass "
+        "then), grey where nothing changed. All images have the same limits",
     )
     one.add_argument(
         "--colour",
@@ -94,7 +95,7 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
     """The method where none is named, for images of so many pixels in all; says why it is that."""
     seconds = _MC_SECONDS_PER_PIXEL * pixels
     if not has_frames:
-        method, why = "high-pass", f"there are no frames{missing}, so images show changes alone"
+        method, why = "events-only", f"there are no frames{missing}, so the scale is unknown"
     elif seconds > _MAX_MC_SECONDS:
         method, why = "aks", f"mc, the best, would take {seconds / 60:.0f} minutes of a core"
     else:
@@ -163,7 +164,7 @@ def run(
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.reconstruction.augment import calibrated_values
-    from jaxevent.show.export import within, write_hdf5, writer
+    from jaxevent.show.export import default_tone, within, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
@@ -209,8 +210,7 @@ def run(
         from jaxevent.reconstruction.colour import colour_video
 
         colours = colour_video(video, recording)
-    tone = tone or ("changes" if recording.frames is None else "linear")
-    how = write(video, chosen, out, tone, name, colours)
+    how = write(video, chosen, out, tone or default_tone(estimator, recording), name, colours)
     seconds = time.perf_counter() - clock
     print(
         f"{out}: {len(chosen):,} images{how}, {seconds:.2f} s, "

@@ -1,0 +1,205 @@
+"""Thresholds and noise of a sensor from its events alone, for methods without frames.
+
+Between two times the log intensity of a pixel with U ON and D OFF events changes by
+
+    c_on U - c_off D = change + (less than a threshold).                                  (1)
+
+Two estimates of c_on / c_off follow, which are weighted by their precision:
+
+- What rises falls again: the sum of (1) over all pixels is small. A scene that grows brighter on
+  the whole biases it, by about half of the standard deviation of (1) among pixels.
+- Neighbours grow brighter together. The differences of U and of D between pixels a few pixels apart
+  scatter about a line of slope c_off / c_on. Both have errors: `QUANTISATION` of whole events, and
+  differences of the change, which are treated alike in ON and OFF by the geometric mean of both
+  regressions. These bound the slope (Frisch 1934).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration.events_alone import CONFIDENCE_Z
+from jaxevent.calibration.hot import find_hot_pixels
+from jaxevent.calibration.result import CalibrationValue, not_identifiable
+from jaxevent.recording import Recording
+
+N_PARTS = 8
+MAX_PART_EVENTS = 2_000_000
+BLOCK_EVENTS = 1_000_000
+DISTANCES_PX = (1, 2, 4)  # between pixels that are compared
+CAUCHY_SCALE = 2.0  # thresholds, of the errors of (1)
+QUANTISATION = 1 / 3  # variance of a difference of counts, whose four ends are uniform in an event
+MIN_PART_KEPT = 0.25  # of a second moment, after the quantisation is subtracted
+COUNTS_ERROR = 0.5  # standard deviation of the image's mean change, of that of its pixels
+RATIO_SPREAD = 0.7  # standard deviation of ln(c_on / c_off) among sensors
+N_STEPS = 50  # of reweighted least squares
+MIN_EVENTS = 200  # of either polarity
+MIN_RHO = 1e-3
+MIN_ERROR = 0.03  # of ln(c_on / c_off)
+
+
+class EventCalibration(NamedTuple):
+    """Numbers of a sensor that its events alone determine.
+
+    Absolute contrast is not observable from events alone. So thresholds are relative: the geometric
+    mean of the common ON and OFF thresholds is 1.
+
+    | field | meaning |
+    |---|---|
+    | thresholds | (2, height, width) ON and OFF thresholds of each pixel, relative |
+    | ratio | ratio of the ON threshold to the OFF threshold; 1 is used where it is unknown |
+    | spread | standard deviation of the logarithm of this ratio among pixels |
+    | hot | (height, width), true for pixels that fire without cause |
+    | read_out | (height, width), true within the rows and columns that the sensor reads out |
+    """
+
+    thresholds: NDArray[np.float32]
+    ratio: CalibrationValue
+    spread: float
+    hot: NDArray[np.bool_]
+    read_out: NDArray[np.bool_]
+
+
+def count_parts(recording: Recording) -> NDArray[np.int32]:
+    """Count the events of each pixel in parts of a recording.
+
+    Long recordings are sampled: from each part the first `MAX_PART_EVENTS` events.
+
+    Args:
+        recording: The recording, in memory or in a file.
+
+    Returns:
+        (parts, 2, height, width) ON and OFF events.
+    """
+    source, width, height = recording.events, recording.width, recording.height
+    counts = np.zeros((N_PARTS, 2 * height * width), np.int32)
+    edges = np.linspace(0, len(source), N_PARTS + 1).astype(int).tolist()
+    for part, first, last in zip(counts, edges[:-1], edges[1:], strict=True):
+        last = min(last, first + MAX_PART_EVENTS)
+        for begin in range(first, last, BLOCK_EVENTS):
+            events = source[begin : min(begin + BLOCK_EVENTS, last)]
+            place = (~events.p * height + events.y) * width + events.x
+            part += np.bincount(place, minlength=len(part)).astype(np.int32)
+    return counts.reshape(N_PARTS, 2, height, width)
+
+
+def calibrate_events(recording: Recording) -> EventCalibration:
+    """Calibrate a sensor from the events of a recording alone.
+
+    Args:
+        recording: The recording, in memory or in a file. Its frames are not used.
+
+    Returns:
+        Thresholds and hot pixels.
+    """
+    parts = count_parts(recording)
+    hot = find_hot_pixels(parts.sum(1))
+    ratio = _estimate_ratio(parts.sum(0), hot)
+    root = np.sqrt(ratio.value if ratio.is_identifiable else 1.0)
+    change = root * parts[:, 0] - parts[:, 1] / root
+    gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
+    s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
+    thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
+    return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(parts.sum((0, 1))))
+
+
+def _find_read_out(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Find the region of interest: rows and columns between the first and the last with events."""
+    inside = np.ones(counts.shape, bool)
+    for axis in (0, 1):
+        (used,) = np.nonzero(counts.any(axis))
+        along = np.arange(counts.shape[1 - axis])
+        if len(used):
+            within = (used[0] <= along) & (along <= used[-1])
+            inside &= within[:, None] if axis else within
+    return inside
+
+
+def _differences(
+    counts: NDArray[np.integer], hot: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return differences of ON and of OFF counts between pixels `DISTANCES_PX` apart."""
+    found = []
+    for distance in DISTANCES_PX:
+        for near, far in (
+            (np.s_[..., :-distance, :], np.s_[..., distance:, :]),
+            (np.s_[..., :-distance], np.s_[..., distance:]),
+        ):
+            difference = (counts[far] - counts[near])[:, ~(hot[far] | hot[near])]
+            found.append(difference[:, difference.any(0)])
+    U, D = np.concatenate(found, 1).astype(np.float64)
+    return U, D
+
+
+def _estimate_ratio(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> CalibrationValue:
+    """Estimate c_on / c_off from ON and OFF counts (2, height, width)."""
+    on, off = counts[:, ~hot]
+    if min(on.sum(), off.sum()) < MIN_EVENTS:
+        return not_identifiable("1", "too few events of one polarity")
+    whole = np.log(off.sum() / on.sum())
+    root, active = np.exp(whole / 2), on + off > 0
+    change, gain = (root * on - off / root)[active], (root * on + off / root)[active] / 2
+    error = COUNTS_ERROR * float(change.std() / gain.mean()) + MIN_ERROR
+    estimates = [(whole, error), _compare_neighbours(counts, hot)]
+    value = precision = 0.0
+    for log_ratio, error in estimates:
+        value += log_ratio / error**2
+        precision += error**-2
+    # Sensors' ratios have the mean 1.
+    precision += RATIO_SPREAD**-2
+    ratio, wide = np.exp([value / precision, CONFIDENCE_Z / np.sqrt(precision)]).tolist()
+    return CalibrationValue(ratio, ratio / wide, ratio * wide, "1", "from events alone")
+
+
+def _compare_neighbours(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return ln(c_on / c_off) from differences between pixels, and its standard deviation."""
+    U, D = _differences(counts, hot)
+    root, rho = 1.0, 0.0
+    for _ in range(N_STEPS):
+        w = 1 / (1 + (root * U - D / root) ** 2 / (2 * CAUCHY_SCALE**2))
+        UU, UD, DD = (w * U * U).sum(), (w * U * D).sum(), (w * D * D).sum()
+        if not UU * DD > 0:
+            return 0.0, np.inf
+        rho = UD / np.sqrt(UU * DD)
+        UU, DD = (max(v - QUANTISATION * w.sum(), MIN_PART_KEPT * v) for v in (UU, DD))
+        root = (DD / UU) ** 0.25
+    rho = max(rho, MIN_RHO)
+    # The regressions of U on D and of D on U have slopes rho times smaller and larger.
+    error = -np.log(rho) / CONFIDENCE_Z + np.sqrt((1 - rho**2) / len(U)) / rho + MIN_ERROR
+    return 2 * float(np.log(root)), error
+
+
+def _estimate_deviations(
+    change: NDArray[np.float64], gain: NDArray[np.float64], is_used: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], float]:
+    """Estimate the deviations of pixels from the common ratio by empirical Bayes.
+
+    A deviation s of ln(c_on / c_off) changes (1) by s (c_on U + c_off D) / 2 in every part of the
+    recording. Changes of parts that are not adjacent share no end, so that their product shows the
+    variance of s alone. What neighbours have in common belongs to the scene.
+
+    Args:
+        change: (parts, height, width) c_on U - c_off D.
+        gain: (parts, height, width) (c_on U + c_off D) / 2.
+        is_used: (height, width) pixels that are not hot.
+
+    Returns:
+        (height, width) deviations, and their standard deviation.
+    """
+    from scipy.ndimage import median_filter
+
+    own = change - median_filter(change, (1, 5, 5), mode="reflect")
+    own, gain = own[:, is_used], gain[:, is_used]
+    products, moments = np.zeros((2, own.shape[1]))
+    for k in range(2, len(own)):
+        products += own[k] * own[: k - 1].sum(0)
+        moments += gain[k] * gain[: k - 1].sum(0)
+    chance = CONFIDENCE_Z * float(np.sqrt((products**2).sum()))
+    found = float(products.sum())
+    variance = found / max(float(moments.sum()), 1e-9) if found > chance else 0.0
+    own, gain = own.sum(0), gain.sum(0)
+    noise = max(float((own**2 - variance * gain**2).mean()), 1.0) if len(own) else 1.0
+    s = np.zeros(is_used.shape)
+    s[is_used] = -variance * gain * own / (variance * gain**2 + noise)
+    return s, float(np.sqrt(variance))

@@ -1,0 +1,449 @@
+"""Alignment of a window's events by a dense displacement, from coarse to fine.
+
+An event of polarity p at x and at relative time s, -1..1, is moved along the displacement u (px per
+unit of s) to x' = x - s u(x - s u(x) / 2). Signed events there make the image I, their number n.
+Where u is right the image is sharp (Gallego et al., CVPR 2018). With weights w = 1 / n, as the
+variance of a count is its mean, the sum S of w I^2 has about these derivatives:
+
+    dS/du / 2 = -sum p (s - m) w grad I,    H = sum (s - m)^2 w / n (grad I) (grad I)^T        (1)
+
+over events, m the mean time of the events at x'. H is what S loses in curvature when all times show
+the same image. Displacements are those of nodes, bilinear between; each step solves
+
+    min_d  sum (d - H^-1 g)^T H (d - H^-1 g) + smoothness sum rho(u_i + d_i - u_j - d_j)        (2)
+
+over neighbours i, j with the robust rho(e) = log(1 + e^2 / edge^2).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.recording import Events
+
+N_STEPS = 5  # Gauss-Newton steps at each size of cells
+CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
+CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
+CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
+MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
+N_SWEEPS = 30  # of Gauss-Seidel
+N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
+NUMBER_FLOOR = 0.1  # events per cell, added to their number
+# The curvature of S is that of the image before it is blurred, which is sharper.
+CURVATURE = 3.0
+OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
+NOISE = 0.055  # variance of the gradient of an image of events without order, per event
+# The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
+POOLING = (1, 2, 4)  # nodes, of the Gaussian whose nodes tell of one
+MIN_INFORMATION = 0.1  # 1/px^2
+MIN_VARIANCE = 0.001  # px^2
+FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
+MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
+RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
+
+
+@njit_noalloc_inlined
+def node_cell(u, spacing, x, y):
+    """Return the node before a place and the distance from it, in nodes."""
+    rows, columns = u.shape[0], u.shape[1]
+    a = min(max(x / spacing - 0.5, 0.0), columns - 1.0)
+    b = min(max(y / spacing - 0.5, 0.0), rows - 1.0)
+    i, j = min(int(a), max(columns - 2, 0)), min(int(b), max(rows - 2, 0))
+    return i, j, a - i, b - j
+
+
+@njit_noalloc_inlined
+def displacement_at(u, spacing, x, y):
+    """Return the displacement at a place, bilinear between nodes at (k + 1/2) spacing."""
+    i, j, fx, fy = node_cell(u, spacing, x, y)
+    i2, j2 = min(i + 1, u.shape[1] - 1), min(j + 1, u.shape[0] - 1)
+    a, b, c, d = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    return (
+        a * u[j, i, 0] + b * u[j, i2, 0] + c * u[j2, i, 0] + d * u[j2, i2, 0],
+        a * u[j, i, 1] + b * u[j, i2, 1] + c * u[j2, i, 1] + d * u[j2, i2, 1],
+    )
+
+
+@njit_noalloc
+def warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
+    """Move events along the displacement and add each to sum, number and mean time of cells.
+
+    `image` (3, rows, columns) has a border of one cell; `warped` (n, 2) gets the places in cells.
+    """
+    rows, columns = image.shape[1], image.shape[2]
+    image[:] = 0
+    for k in range(len(x)):
+        dx, dy = displacement_at(u, spacing, x[k], y[k])
+        for _ in range(2):
+            dx, dy = displacement_at(u, spacing, x[k] - s[k] * dx, y[k] - s[k] * dy)
+        a, b = (x[k] - s[k] * dx + 0.5) / cell + 0.5, (y[k] - s[k] * dy + 0.5) / cell + 0.5
+        warped[k, 0], warped[k, 1] = a, b
+        if not (0 <= a < columns - 1 and 0 <= b < rows - 1):
+            warped[k, 0] = -1
+            continue
+        i, j = int(a), int(b)
+        fx, fy = a - i, b - j
+        for dj in range(2):
+            for di in range(2):
+                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+                image[0, j + dj, i + di] += weight * p[k]
+                image[1, j + dj, i + di] += weight
+                image[2, j + dj, i + di] += weight * s[k]
+
+
+@njit_noalloc
+def blur(image, scratch, passes):
+    """Convolve an image with (1, 2, 1) / 4 along both axes, some times; edges repeat."""
+    rows, columns = image.shape
+    for _ in range(passes):
+        for j in range(rows):
+            for i in range(columns):
+                left, right = image[j, max(i - 1, 0)], image[j, min(i + 1, columns - 1)]
+                scratch[j, i] = 0.25 * (left + right) + 0.5 * image[j, i]
+        for j in range(rows):
+            up, down = max(j - 1, 0), min(j + 1, rows - 1)
+            for i in range(columns):
+                image[j, i] = 0.25 * (scratch[up, i] + scratch[down, i]) + 0.5 * scratch[j, i]
+
+
+@njit_noalloc_inlined
+def look_up(image, a, b):
+    """Return gradient, sum, number and mean time of an image's cells at a place; bilinear."""
+    i, j = int(a), int(b)
+    fx, fy = a - i, b - j
+    gx = gy = value = number = late = 0.0
+    for dj in range(2):
+        for di in range(2):
+            weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+            y, x = j + dj, i + di
+            gx += weight * 0.5 * (image[0, y, x + 1] - image[0, y, x - 1])
+            gy += weight * 0.5 * (image[0, y + 1, x] - image[0, y - 1, x])
+            value += weight * image[0, y, x]
+            number += weight * image[1, y, x]
+            late += weight * image[2, y, x]
+    return gx, gy, value, number, late
+
+
+@njit_noalloc
+def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
+    """Add the derivatives (1) of each event to the nodes and clock's times around it.
+
+    Args:
+        warped: (n, 2) places in cells.
+        s: (n,) relative times.
+        p: (n,) polarities.
+        place: (n,) place among the clock's times, from 0.
+        u: (rows, columns, 2) displacement of nodes, px.
+        spacing: Distance of nodes, px.
+        cell: Size of cells, px.
+        image: (3, ...) blurred images of `warp_and_vote`.
+        normal: (rows, columns, 6) gets g, xx, xy, yy of H, and what noise adds to xx and yy per
+            variance of the gradient, px.
+        clock: (K, 2) gets derivative and curvature by the clock's s.
+
+    Returns:
+        The score.
+    """
+    normal[:] = 0
+    clock[:] = 0
+    score = 0.0
+    per_px = 1.0 / cell
+    for k in range(len(s)):
+        a, b = warped[k, 0], warped[k, 1]
+        if a < 1 or b < 1 or a >= image.shape[2] - 2 or b >= image.shape[1] - 2:
+            continue
+        gx, gy, value, number, late = look_up(image, a, b)
+        gx, gy = gx * per_px, gy * per_px
+        age = s[k] - late / max(number, 1e-9)
+        w = 1.0 / (number + NUMBER_FLOOR)
+        score += p[k] * value * w
+        x, y = (a - 0.5) * cell - 0.5, (b - 0.5) * cell - 0.5
+        ux, uy = displacement_at(u, spacing, x, y)
+        along = gx * ux + gy * uy
+        i = min(int(place[k]), len(clock) - 2)
+        f = place[k] - i
+        for d in range(2):
+            weight = f if d else 1 - f
+            clock[i + d, 0] -= weight * p[k] * w * along
+            clock[i + d, 1] += weight * CURVATURE * w / (number + NUMBER_FLOOR) * along * along
+        c = -p[k] * age * w
+        h = CURVATURE * age * age * w / (number + NUMBER_FLOOR)
+        others = max(number - OWN_NUMBER, 0.0)
+        i, j, fx, fy = node_cell(u, spacing, x, y)
+        for dj in range(2):
+            for di in range(2):
+                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+                a, b = min(j + dj, u.shape[0] - 1), min(i + di, u.shape[1] - 1)
+                normal[a, b, 0] += weight * c * gx
+                normal[a, b, 1] += weight * c * gy
+                normal[a, b, 2] += weight * h * gx * gx
+                normal[a, b, 3] += weight * h * gx * gy
+                normal[a, b, 4] += weight * h * gy * gy
+                normal[a, b, 5] += weight * h * others * per_px * per_px
+    return score
+
+
+@njit_noalloc
+def solve_step(u, normal, smoothness, edge, sweeps, step):
+    """Solve (2) for the step (rows, columns, 2) of the displacement, by Gauss-Seidel."""
+    rows, columns = u.shape[0], u.shape[1]
+    step[:] = 0
+    for _ in range(sweeps):
+        for j in range(rows):
+            for i in range(columns):
+                gx, gy = normal[j, i, 0], normal[j, i, 1]
+                xx, xy, yy = normal[j, i, 2], normal[j, i, 3], normal[j, i, 4]
+                for n in range(4):
+                    b, a = i + (n == 0) - (n == 1), j + (n == 2) - (n == 3)
+                    if 0 <= a < rows and 0 <= b < columns:
+                        ex, ey = u[a, b, 0] - u[j, i, 0], u[a, b, 1] - u[j, i, 1]
+                        w = smoothness / (1 + (ex * ex + ey * ey) / (edge * edge))
+                        gx += w * (ex + step[a, b, 0])
+                        gy += w * (ey + step[a, b, 1])
+                        xx += w
+                        yy += w
+                det = xx * yy - xy * xy
+                if det > 1e-12:
+                    step[j, i, 0] = (yy * gx - xy * gy) / det
+                    step[j, i, 1] = (xx * gy - xy * gx) / det
+
+
+def image_shape(shape: tuple[int, int], cell: float) -> tuple[int, int]:
+    """Return rows and columns of an image of cells, with a border of one."""
+    return int(np.ceil(shape[0] / cell)) + 2, int(np.ceil(shape[1] / cell)) + 2
+
+
+def node_shape(shape: tuple[int, int], spacing: float) -> tuple[int, int]:
+    """Return rows and columns of the nodes of a sensor (H, W)."""
+    return tuple(max(int(np.ceil(n / spacing)), 1) for n in shape)
+
+
+def fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[np.float32]:
+    """Interpolate values of nodes (rows, columns, ...) bilinearly to all pixels (H, W, ...)."""
+    for axis in (0, 1):
+        a = np.clip((np.arange(shape[axis])) / spacing - 0.5, 0, u.shape[axis] - 1)
+        i = np.minimum(a.astype(int), max(u.shape[axis] - 2, 0))
+        f = (a - i).reshape([-1 if k == axis else 1 for k in range(u.ndim)])
+        after = np.minimum(i + 1, u.shape[axis] - 1)
+        u = (1 - f) * u.take(i, axis) + f * u.take(after, axis)
+    return u.astype(np.float32)
+
+
+class Clock(NamedTuple):
+    """Relative times s of a window, linear between some times."""
+
+    t: NDArray[np.float64]  # (K,) us, rising
+    s: NDArray[np.float64]  # (K,)
+
+    @classmethod
+    def of(cls, events: Events, at: int, half: int) -> "Clock":
+        """Make the clock of a window that goes as fast as time and, in equal parts, events do.
+
+        Events come as fast as a scene moves.
+
+        Args:
+            events: The events, one or more.
+            at: Time at which s = 0, us.
+            half: Number of events around it on either side.
+        """
+        parts = max(round(CLOCK_PARTS * len(events) / half), 1)
+        rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
+        t, first = np.unique(events.t[rows], return_index=True)
+        if len(t) < 2:
+            return cls(at + np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
+        s = rows[first] / half
+        s = (s + (t - t[0]) * (s[-1] / (t[-1] - t[0]))) / 2
+        return cls(t.astype(float), s - np.interp(at, t, s))
+
+    @property
+    def mean_rate(self) -> float:
+        """How fast s goes over the window, 1/s."""
+        return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
+
+    def rate(self, t: float) -> float:
+        """Return how fast s goes at a time (us), 1/s."""
+        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
+        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
+        return float(np.interp(t, self.t, smooth)) * 1e6
+
+
+class WindowEvents(NamedTuple):
+    """Events of a window: places (px), times and polarities."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    t: NDArray[np.int64]  # us
+    p: NDArray[np.float32]  # polarity, of mean 0 and variance 1
+
+    @classmethod
+    def of(cls, events: Events) -> "WindowEvents":
+        """Make them of events."""
+        # What goes up comes down: the mean is 0. A polarity that is always the same tells nothing.
+        p = np.where(events.p, 1.0, -1.0)
+        p = (p - p.mean()) / max(float(p.std()), 1e-3)
+        x, y, p = (np.asarray(c, np.float32) for c in (events.x, events.y, p))
+        return cls(x, y, events.t, p)
+
+
+class Aligned(NamedTuple):
+    """Displacement of nodes and what events tell of it."""
+
+    u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
+    clock: Clock
+    information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
+    score: float  # per event
+
+
+def _principal(information: NDArray, reach: int) -> tuple[NDArray, NDArray]:
+    """Return eigenvalues and axes of the information of nodes within a Gaussian."""
+    pooled = gaussian_filter(information, (reach, reach, 0), mode="constant")
+    return np.linalg.eigh(4 * np.pi * reach**2 * pooled[..., [[0, 1], [1, 2]]])
+
+
+def _rotate(axes: NDArray, values: NDArray) -> NDArray:
+    """Return matrices of these axes and eigenvalues."""
+    return (axes * values[..., None, :]) @ np.swapaxes(axes, -1, -2)
+
+
+def _curvature(u: NDArray, reach: int) -> NDArray[np.float64]:
+    """Return the largest square of second differences around nodes, px^2; 0 of affine flow."""
+    far, (rows, columns) = 2 * reach, u.shape[:2]
+    near, most = np.pad(u, ((far, far), (far, far), (0, 0)), mode="edge"), np.zeros(u.shape[:2])
+    for distance in (reach, far):
+        for j, i in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            y, x = j * distance, i * distance
+            one, other = (near[far + c * y :, far + c * x :][:rows, :columns] for c in (1, -1))
+            most = np.maximum(most, (((one + other) / 2 - u) ** 2).sum(-1))
+    return most
+
+
+class Alignment:
+    """Displacements of windows of events: `align(events, start, cells)`.
+
+    Args:
+        shape: Height and width of the sensor.
+        params: `FlowParams`.
+    """
+
+    def __init__(self, shape: tuple[int, int], params: Any):
+        self.shape, self.spacing = shape, float(params.spacing)
+        self.nodes = node_shape(shape, self.spacing)
+        self.smoothness, self.edge = float(params.smoothness), float(params.edge)
+
+    def fill(self, values: NDArray) -> NDArray[np.float32]:
+        """Interpolate values of nodes to all pixels."""
+        return fill_pixels(values, self.shape, self.spacing)
+
+    def covariance(self, aligned: Aligned) -> NDArray[np.float64]:
+        """Return the covariance of the nodes' displacement.
+
+        It is the inverse of what a node and those around tell, and by how much flow bends among
+        them, which is large at borders of objects; those near or far, which give the least.
+
+        Args:
+            aligned: Displacement and information.
+
+        Returns:
+            (rows, columns, 2, 2), px^2.
+        """
+        best = np.full((*self.nodes, 2, 2), np.inf)
+        for reach in POOLING:
+            values, axes = _principal(aligned.information, reach)
+            C = _rotate(axes, 1 / np.maximum(values, MIN_INFORMATION))
+            C = C + _curvature(aligned.u, reach)[..., None, None] * np.eye(2)
+            less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
+            best = np.where(less[..., None, None], C, best)
+        length2 = (aligned.u**2).sum(-1)[..., None, None]
+        floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
+        return best + floor
+
+    def shrink(self, aligned: Aligned) -> NDArray[np.float64]:
+        """Return the displacement without components that events around do not determine.
+
+        They would double with each window.
+
+        Args:
+            aligned: Displacement and information.
+
+        Returns:
+            (rows, columns, 2), px.
+        """
+        values, axes = _principal(aligned.information, POOLING[-1])
+        values = np.maximum(values, 0)
+        known = _rotate(axes, values / (values + FIRST_INFORMATION))
+        return (known @ aligned.u[..., None])[..., 0]
+
+    def typical(self, aligned: Aligned) -> float:
+        """Return the median length of known displacements, weighted by information, px.
+
+        Args:
+            aligned: Displacement and information.
+        """
+        known = self.shrink(aligned)
+        length = np.hypot(known[..., 0], known[..., 1]).ravel()
+        weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0)
+        order = np.argsort(length, kind="stable")
+        total = np.cumsum(weight.ravel()[order])
+        return float(length[order[np.searchsorted(total, total[-1] / 2)]])
+
+    def _turn(self, clock: Clock, at: int, s: NDArray, turns: NDArray) -> NDArray[np.float64]:
+        """Return a clock's s after a step of (1), on the whole as fast as `clock`."""
+        step = (turns[:, 0] + CLOCK_INFORMATION * (clock.s - s)) / (turns[:, 1] + CLOCK_INFORMATION)
+        s = s + CLOCK_STEP * np.clip(step, -CLOCK_REACH, CLOCK_REACH)
+        s = s - np.interp(at, clock.t, s)
+        speed = (s @ clock.s) / max(clock.s @ clock.s, 1e-9)
+        return s / speed if speed > MIN_CLOCK_SPEED else clock.s
+
+    def __call__(
+        self,
+        events: WindowEvents,
+        clock: Clock,
+        at: int,
+        start: NDArray | None,
+        cells: tuple[int, ...],
+        adapt: bool,
+    ) -> Aligned:
+        """Align the events of a window.
+
+        Args:
+            events: The events.
+            clock: Clock to start from.
+            at: Time at which points are displaced by 0, us.
+            start: Displacement (rows, columns, 2) to start from, px; None: no displacement.
+            cells: Sizes of the cells, px, one after the other.
+            adapt: Whether the clock is estimated, too.
+
+        Returns:
+            The displacement.
+        """
+        u = np.zeros((*self.nodes, 2)) if start is None else start.copy()
+        normal, step = np.zeros((*self.nodes, 6)), np.zeros_like(u)
+        x, y, t, p = events
+        warped = np.empty((len(x), 2), np.float32)
+        place = np.interp(t, clock.t, np.arange(len(clock.t))).astype(np.float32)
+        turns, ahead = np.zeros((len(clock.t), 2)), clock.s.copy()
+        score = 0.0
+        for cell in cells:
+            image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)
+            scratch = np.empty_like(image[0])
+            reach, before = np.full((*self.nodes, 1), float(cell)), np.zeros_like(u)
+            for _ in range(N_STEPS):
+                s = np.interp(place, np.arange(len(ahead)), ahead).astype(np.float32)
+                warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
+                for channel, passes in zip(image, N_BLURS, strict=True):
+                    blur(channel, scratch, passes)
+                score = accumulate(warped, s, p, place, u, self.spacing, cell, image, normal, turns)
+                solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
+                # Sharp images have a smaller range than their curvature tells: steps that turn
+                # back are halved.
+                reach *= np.where((step * before).sum(-1, keepdims=True) < 0, 0.5, 1)
+                length = np.hypot(step[..., :1], step[..., 1:])
+                before = step * np.minimum(1, reach / np.maximum(length, 1e-9))
+                u += before
+                if adapt:
+                    ahead = self._turn(clock, at, ahead, turns)
+        information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
+        return Aligned(u, Clock(clock.t, ahead), information, score / max(len(x), 1))

@@ -1,0 +1,283 @@
+"""Dense optical flow of a recording's events, as a function of time."""
+
+import functools
+import threading
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
+from jaxevent.event_flow.alignment import (
+    MAX_VARIANCE,
+    Aligned,
+    Alignment,
+    Clock,
+    WindowEvents,
+)
+from jaxevent.event_flow.paths import WindowPaths
+from jaxevent.parameters import Count, Parameters, Positive
+from jaxevent.recording import Events, Recording, Times, check_times, microseconds
+
+CELLS = (4, 2, 1)  # px, for motion sought from nothing
+LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
+LEVELS = range(-4, 5)  # powers of 2 of the window's size
+CHAIN_WINDOWS = 16  # half windows of a chain of anchors
+N_CACHED_ANCHORS = 256
+UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
+MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
+
+
+class FlowParams(Parameters):
+    """Parameters of the flow from events."""
+
+    density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
+    displacement = Positive(3.0, "px", "typical displacement before and after a time; windows grow")
+    spacing = Count(8, "px", "distance between nodes of the flow")
+    smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
+    edge = Positive(0.5, "px", "difference from which neighbours are taken for different objects")
+
+
+class Anchor(NamedTuple):
+    """Flow at one time, at nodes."""
+
+    row: int  # of the event there
+    t: int  # us
+    aligned: Aligned
+
+    @property
+    def rate(self) -> float:
+        """Displacements per second."""
+        return self.aligned.clock.rate(self.t)
+
+
+class Chain(NamedTuple):
+    """Anchors that start one from the other: the first of them, and how many events apart."""
+
+    first: Anchor
+    half: int  # events on either side of an anchor
+
+
+class EventFlow:
+    """Dense optical flow of a recording, estimated where it is asked for: `flow(times)`.
+
+    Flow is estimated at anchors, one for so many events. Between them it is linear in time. What is
+    returned does not depend on what was asked for before.
+
+    Attributes:
+        recording: The recording; only its events are used.
+        params: The parameters.
+        causal: Whether flow at a time uses no later events.
+    """
+
+    def __init__(self, recording: Recording, params: FlowParams, causal: bool = False):
+        self.recording, self.params, self.causal = recording, params, causal
+        self.shape = (recording.height, recording.width)
+        pixels = self.shape[0] * self.shape[1]
+        self._base = max(round(float(params.density) * pixels), 2 ** -LEVELS[0])  # events
+        self._align = Alignment(self.shape, params)
+        self._chain = functools.lru_cache(N_CACHED_ANCHORS)(self._make_chain)
+        self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
+        self._lock = threading.RLock()
+
+    def _events(self, row: int, half: int) -> tuple[int, Events]:
+        """Return the time (us) of an event, and the events around it."""
+        events = self.recording.events[max(row - half, 0) : row + half]
+        return int(events.t[min(row, half)]), events
+
+    def _seek(self, row: int, most: int | None = None) -> Chain:
+        """Find the motion around an event from nothing, in windows that double.
+
+        They grow until points are displaced far enough, or to `most` events.
+        """
+        start, rate, half = None, 0.0, 0
+        for level in LEVELS:
+            half = int(self._base * 2.0**level)
+            found = self._refine(row, half, start, rate, grow=True)
+            start, rate = self._align.shrink(found.aligned), found.aligned.clock.mean_rate
+            whole = row + half >= len(self.recording.events) and row - half <= 0
+            if half == most or (
+                most is None
+                and (whole or self._align.typical(found.aligned) >= float(self.params.displacement))
+            ):
+                break
+        return Chain(self._refine(row, half, start, rate), half)
+
+    def _refine(
+        self, row: int, half: int, start: NDArray | None, rate: float, grow: bool = False
+    ) -> Anchor:
+        """Align the window around an event from displacements that went at a rate (1/s)."""
+        at, events = self._events(row, half)
+        clock = Clock.of(events, at, half)
+        if start is not None:
+            start = start * (rate / clock.mean_rate)
+        window, cells = WindowEvents.of(events), CELLS if grow else LAST_CELLS
+        return Anchor(row, at, self._align(window, clock, at, start, cells, not grow))
+
+    def _make_chain(self, number: int) -> Chain:
+        return self._seek(number * CHAIN_WINDOWS * self._base)
+
+    def _make_anchor(self, number: int, k: int) -> Anchor:
+        """Return an anchor of a chain; those before it are estimated first."""
+        first, half = self._chain(number)
+        if k == 0:
+            return first
+        before = self._anchor(number, k - 1)
+        row = number * CHAIN_WINDOWS * self._base + k * half
+        found = self._refine(row, half, before.aligned.u, before.aligned.clock.mean_rate)
+        if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
+            other = self._seek(row, half).first
+            if other.aligned.score > found.aligned.score:
+                return other
+        return found
+
+    def window_events(self, t: int) -> int:
+        """Return how many events on either side of a time (us) the flow there rests on."""
+        row = max(self.recording.events.index(t + 1) - 1, 0)
+        return self._chain(row // (CHAIN_WINDOWS * self._base)).half
+
+    def _rows(self, number: int) -> NDArray[np.int64]:
+        """Return the events at which the anchors of a chain are."""
+        length = CHAIN_WINDOWS * self._base
+        end = min((number + 1) * length, len(self.recording.events))
+        return np.arange(number * length, end, self._chain(number).half)
+
+    def _around(self, start: int, stop: int, until: int) -> list[Anchor]:
+        """Return the anchors that determine flow from start to stop (us), of different times.
+
+        A causal flow uses events up to the time `until`.
+        """
+        events, length = self.recording.events, CHAIN_WINDOWS * self._base
+        n = len(events)
+        if not n:
+            return []
+        seen = events.index(until + 1)  # events that a causal flow may use
+        low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), n - 1)
+        found: list[Anchor] = []
+        first = max(low // length - self.causal, 0)
+        for number in range(first, min(high // length + 2, (n - 1) // length + 1)):
+            if found and found[-1].row >= high:
+                break
+            rows = self._rows(number)
+            if self.causal:
+                rows = rows[rows + self._chain(number).half <= seen]
+            for k in range(len(rows)):
+                next_row = rows[k + 1] if k + 1 < len(rows) else n
+                if next_row <= low and not (self.causal and k + 1 == len(rows)):
+                    continue
+                anchor = self._anchor(number, k)
+                if not found or anchor.t > found[-1].t:
+                    found.append(anchor)
+                if rows[k] >= high:
+                    break
+        return found
+
+    def _fields(
+        self, anchors: list[Anchor], knots: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return velocity and covariance of all pixels at some times (us)."""
+        velocity = np.zeros((len(knots), *self.shape, 2), np.float32)
+        covariance = np.zeros((*velocity.shape, 2), np.float32)
+        if not anchors:
+            covariance[:] = UNKNOWN_VARIANCE * np.eye(2)
+            return velocity, covariance
+        fields = [self._align.fill(anchor.aligned.u) for anchor in anchors]
+        spreads = [self._align.fill(self._align.covariance(a.aligned)) for a in anchors]
+        times = [anchor.t for anchor in anchors]
+        for n, t in enumerate(knots.tolist()):
+            for k, anchor in enumerate(anchors):
+                weight = np.interp(t, times, np.eye(len(times))[k])
+                if weight > 0:
+                    velocity[n] += np.float32(weight * anchor.aligned.clock.rate(t)) * fields[k]
+                    covariance[n] += np.float32(weight * anchor.rate**2) * spreads[k]
+        return velocity, covariance
+
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
+        """Return the paths of the points that events of a window saw.
+
+        Args:
+            start: First time of the events, us.
+            stop: Last time of the events, us.
+            at: Time to which points are carried, us.
+            until: Time up to which a causal flow may use events, us; None: the latest of the three.
+
+        Returns:
+            The paths.
+        """
+        start, stop = min(start, at), max(stop, at)
+        with self._lock:
+            anchors = self._around(start, stop, stop if until is None else until)
+        times = [np.array([anchor.t for anchor in anchors] or [at])]
+        for anchor in anchors:
+            inner = anchor.aligned.clock.t[1:-1]
+            times.append(inner[(inner >= start) & (inner <= stop)])
+        knots = np.unique(np.concatenate(times).astype(np.int64))
+        return WindowPaths(int(at), knots, *self._fields(anchors, knots))
+
+    def __call__(
+        self, times: Times, extrapolate: bool = False
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        """Return the flow at some times.
+
+        Args:
+            times: (T,) integers (us) or floats (s).
+            extrapolate: Whether times outside the recording are allowed.
+
+        Returns:
+            Flow (T, H, W, 2) along x and y, px/s; its covariance (T, H, W, 2, 2), (px/s)^2; and
+            whether events determine it (T, H, W).
+
+        Raises:
+            InputError: A time is outside the recording without `extrapolate`.
+        """
+        wanted = np.atleast_1d(microseconds(times))
+        if not extrapolate:
+            check_times(wanted, self.recording.start, self.recording.stop, self.recording.name)
+        mean = np.zeros((len(wanted), *self.shape, 2), np.float32)
+        covariance = np.zeros((*mean.shape, 2), np.float32)
+        valid = np.zeros(mean.shape[:3], bool)
+        for row, t in enumerate(wanted.tolist()):
+            with self._lock:
+                anchors = self._around(t, t, t)
+            (mean[row],), (covariance[row],) = self._fields(anchors, wanted[row : row + 1])
+            if anchors:
+                rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])
+                valid[row] = np.linalg.eigvalsh(covariance[row])[..., 1] < MAX_VARIANCE * rate**2
+        return mean, covariance, valid
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.float32]:
+        """Return the flow alone, as `mc` takes it.
+
+        Args:
+            times: (T,) integers (us) or floats (s).
+            extrapolate: Whether times outside the recording are allowed.
+
+        Returns:
+            (T, H, W, 2) flow along x and y, px/s.
+
+        Raises:
+            InputError: A time is outside the recording without `extrapolate`.
+        """
+        return self(times, extrapolate)[0]
+
+
+def flow_from_events(
+    recording: Recording, params: FlowParams | None = None, *, causal: bool = False
+) -> EventFlow:
+    """Estimate dense optical flow from events alone, as a function of time.
+
+    Args:
+        recording: The recording; frames are not used.
+        params: The parameters; None: the defaults.
+        causal: Whether flow at a time uses no later events.
+
+    Returns:
+        The flow: `mean, covariance, valid = flow(times)`.
+
+    Raises:
+        InputError: The parameters are of another method.
+    """
+    params = FlowParams() if params is None else params
+    if not isinstance(params, FlowParams):
+        raise InputError(f"params are {type(params).__name__}; give FlowParams")
+    return EventFlow(recording, params, causal)

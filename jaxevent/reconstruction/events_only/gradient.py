@@ -1,0 +1,380 @@
+"""The image of a window as a function of parameters, in JAX, with its implicit derivative.
+
+The energy E(u) is that of `solve` (3). Its minimum is found from the host's solution by the same
+reweighting, and differentiated as a root of dE/du: with F(u, p) = dE/du = 0,
+
+    du/dp = -(dF/du)^-1 dF/dp,
+
+where conjugate gradients solve with the exact second derivative of E.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.sparse.linalg import cg
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
+
+from jaxevent.reconstruction.events_only.params import Params
+from jaxevent.reconstruction.events_only.rows import EVENT
+from jaxevent.reconstruction.events_only.solve import (
+    BLUR_PX,
+    SAMPLES,
+    VARIANCE_FACTOR,
+    factor_information,
+)
+from jaxevent.reconstruction.events_only.windows import SolvedWindow
+from jaxevent.reconstruction.features import Numeric
+
+REWEIGHTINGS = 100  # at most
+CG_ITERATIONS = 200  # at most
+TOLERANCES = {4: 5e-3, 8: 1e-8}  # relative residuals to stop at, by bytes of a number
+LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
+
+
+class Perturbation(NamedTuple):
+    """Normal numbers that perturb the equations of a window, for the variance; of each sample."""
+
+    rows: Float[Numeric, "*times samples rows"]
+    pixels: Float[Numeric, "*times samples 3 height width"]  # across, down, leak
+    pull: Float[Numeric, "*times samples height width 2"]  # times the root of `information`
+
+    @classmethod
+    def draw(cls, n_rows: int, shape: tuple[int, int]) -> "Perturbation":
+        """Draw the numbers that `solve` draws."""
+        random = np.random.default_rng(0)
+        drawn = [
+            [
+                random.standard_normal(size, np.float32)
+                for size in (n_rows, (3, *shape), (*shape, 2))
+            ]
+            for _ in range(SAMPLES)
+        ]
+        return cls(*(np.stack(one) for one in zip(*drawn, strict=True)))
+
+
+class WindowEquations(NamedTuple):
+    """Equations of one window, or of several, stacked; thresholds are left open."""
+
+    corner: Int[Numeric, "*times rows 2"]
+    fraction: Float[Numeric, "*times rows 2 2"]
+    on: Float[Numeric, "*times rows"]  # change, in ON thresholds
+    off: Float[Numeric, "*times rows"]  # and in OFF thresholds
+    weight: Float[Numeric, "*times rows"]  # of rows of events
+    silent: Float[Numeric, "*times rows"]  # weight of the others, in `silence`
+    pull: Float[Numeric, "*times height width 2"]  # gradient by other windows, thresholds / px
+    information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
+    start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
+    unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
+    relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
+    noise: Perturbation
+
+
+def pack_equations(
+    window: SolvedWindow, relative: NDArray, params: Params, count: int
+) -> WindowEquations:
+    """Pack a window's equations for JAX, with thresholds factored out.
+
+    Args:
+        window: Rows of the window, and the host's solution.
+        relative: (2, height, width) thresholds, relative to those of the parameters.
+        params: Parameters that the rows were made with.
+        count: Number of rows to fill up to.
+
+    Returns:
+        The equations.
+    """
+    dtype = np.dtype(jnp.result_type(float))
+    rows, prior, solution = window
+    c, n = rows.threshold, len(rows.kind)
+
+    def fill(column: NDArray, kind: Any = dtype) -> NDArray:
+        whole = np.zeros((count, *column.shape[1:]), kind)
+        whole[:n] = column
+        return whole
+
+    information = prior.information * c**2
+    xx, xy, yy = information[..., 0, 0], information[..., 0, 1], information[..., 1, 1]
+    event, noise = rows.kind == EVENT, Perturbation.draw(n, rows.shape)
+    return WindowEquations(
+        fill(rows.corner, np.int32),
+        fill(rows.fraction),
+        fill(np.maximum(rows.change, 0) * (c / float(params.c_on))),
+        fill(np.maximum(-rows.change, 0) * (c / float(params.c_off))),
+        fill(event * rows.weight),
+        fill(~event * rows.weight),
+        (prior.gradient / c).astype(dtype),
+        information.astype(dtype),
+        (solution.log_image / c).astype(dtype),
+        (solution.unseen / c**2).astype(dtype),
+        relative.mean((1, 2)).astype(dtype),
+        Perturbation(
+            np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
+            noise.pixels.astype(dtype),
+            np.einsum("hwij,nhwj->nhwi", factor_information(xx, xy, yy), noise.pull).astype(dtype),
+        ),
+    )
+
+
+def look_up(u: Array, corner: Array, fraction: Array) -> Array:
+    """Return the difference of the two bilinear look-ups of rows.
+
+    Args:
+        u: (height, width) image.
+        corner: (rows, 2) flat indices of the pixels above and left.
+        fraction: (rows, 2, 2) px from there.
+
+    Returns:
+        (rows,) differences.
+    """
+    width, flat = u.shape[1], u.reshape(-1)
+    x, y = fraction[..., 0], fraction[..., 1]
+    upper = flat[corner] * (1 - x) + flat[corner + 1] * x
+    lower = flat[corner + width] * (1 - x) + flat[corner + width + 1] * x
+    both = upper * (1 - y) + lower * y
+    return both[:, 0] - both[:, 1]
+
+
+def _gradient(u: Array) -> Array:
+    """Central differences, one-sided at the border, (height, width, 2)."""
+
+    def along(axis: int) -> Array:
+        n = u.shape[axis]
+        before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
+        span = np.maximum(after - before, 1)
+        difference = jnp.take(u, after, axis) - jnp.take(u, before, axis)
+        return difference / (span[:, None] if axis == 0 else span)
+
+    return jnp.stack([along(1), along(0)], -1)
+
+
+def _cells(u: Array) -> Array:
+    """Mean squares q of the differences of cells, (height - 1, width - 1)."""
+    across, down = jnp.diff(u, axis=1) ** 2, jnp.diff(u, axis=0) ** 2
+    return (across[:-1] + across[1:] + down[:, :-1] + down[:, 1:]) / 2
+
+
+def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
+    """Return the energy E (3) of a log image in thresholds.
+
+    Args:
+        u: (height, width) image, thresholds.
+        equations: Equations of the window.
+        params: Parameters.
+
+    Returns:
+        E.
+    """
+    numbers = params.solver()
+    weight, e = _residuals(u, equations, params)
+    total = (weight * numbers.tail**2 * jnp.log1p(e**2 / (2 * numbers.tail**2))).sum()
+    total += numbers.gradient / 2 * jnp.log1p(_cells(u) / numbers.edge**2).sum()
+    return total + _quadratic(u, equations, numbers.leak)
+
+
+def _residuals(u: Array, equations: WindowEquations, params: Params) -> tuple[Array, Array]:
+    """Return the weights of the rows and their residuals in thresholds."""
+    c = threshold(equations, params)
+    change = (params.c_on * equations.on - params.c_off * equations.off) / c
+    weight = equations.weight + params.silence * equations.silent
+    return weight, look_up(u, equations.corner, equations.fraction) - change
+
+
+def threshold(equations: WindowEquations, params: Params) -> Array:
+    """Return the mean threshold (ln I), in whose multiples the image is solved for."""
+    mean = equations.relative
+    return (params.c_on * mean[..., 0] + params.c_off * mean[..., 1]) / 2
+
+
+def _quadratic(u: Array, equations: WindowEquations, leak: Array) -> Array:
+    g = _gradient(u) - equations.pull
+    pulled = jnp.einsum("hwi,hwij,hwj->", g, equations.information, g)
+    return (pulled + leak * (u**2).sum()) / 2
+
+
+class _Weights(NamedTuple):
+    """Weights of the reweighted problem at an image: of rows, and of differences of pixels."""
+
+    rows: Array
+    across: Array  # (height, width - 1)
+    down: Array  # (height - 1, width)
+
+
+def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
+    numbers = params.solver()
+    weight, e = _residuals(u, equations, params)
+    s = numbers.gradient / (2 * (_cells(u) + numbers.edge**2))
+    across = jnp.pad(s, [(0, 1), (0, 0)]) + jnp.pad(s, [(1, 0), (0, 0)])
+    down = jnp.pad(s, [(0, 0), (0, 1)]) + jnp.pad(s, [(0, 0), (1, 0)])
+    return _Weights(weight / (1 + e**2 / (2 * numbers.tail**2)), across, down)
+
+
+def _product(
+    weights: _Weights, equations: WindowEquations, leak: Array
+) -> Callable[[Array], Array]:
+    """Return the product with the matrix A of the reweighted problem."""
+
+    def form(v: Array) -> Array:
+        total = (weights.rows * look_up(v, equations.corner, equations.fraction) ** 2).sum()
+        total += (weights.across * jnp.diff(v, axis=1) ** 2).sum()
+        total += (weights.down * jnp.diff(v, axis=0) ** 2).sum()
+        g = _gradient(v)
+        total += jnp.einsum("hwi,hwij,hwj->", g, equations.information, g)
+        return (total + leak * (v**2).sum()) / 2
+
+    return jax.linearize(jax.grad(form), jnp.zeros_like(equations.start))[1]
+
+
+def _diagonal(weights: _Weights, equations: WindowEquations, leak: Array) -> Array:
+    """Return about the diagonal of A, which preconditions."""
+    x, y = equations.fraction[..., 0], equations.fraction[..., 1]
+    height, width = equations.start.shape
+    flat = jnp.full(height * width, leak, x.dtype)
+    for shift, share in (
+        (0, (1 - x) * (1 - y)),
+        (1, x * (1 - y)),
+        (width, (1 - x) * y),
+        (width + 1, x * y),
+    ):
+        flat = flat.at[equations.corner + shift].add(weights.rows[:, None] * share**2)
+    across = jnp.pad(weights.across, [(0, 0), (1, 0)]) + jnp.pad(weights.across, [(0, 0), (0, 1)])
+    down = jnp.pad(weights.down, [(1, 0), (0, 0)]) + jnp.pad(weights.down, [(0, 1), (0, 0)])
+    pulled = jnp.trace(equations.information, axis1=-2, axis2=-1) / 2
+    return flat.reshape(height, width) + across + down + pulled
+
+
+def _solve_linear(product: Callable[[Array], Array], right: Array, diagonal: Array) -> Array:
+    def divide(v: Array) -> Array:
+        return v / diagonal
+
+    tolerance = TOLERANCES[right.dtype.itemsize]
+    return cg(product, right, tol=tolerance, maxiter=CG_ITERATIONS, M=divide)[0]
+
+
+def solve_equations(equations: WindowEquations, params: Params) -> Array:
+    """Find the image of least energy; differentiable by parameters.
+
+    Args:
+        equations: Equations of one window.
+        params: Parameters.
+
+    Returns:
+        (height, width) log image, thresholds.
+    """
+    found = jax.lax.stop_gradient(_minimise(*jax.lax.stop_gradient((equations, params))))
+    return _implicit_solution(found, equations, params)
+
+
+def _minimise(equations: WindowEquations, params: Params) -> Array:
+    start = equations.start
+    scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
+    least = TOLERANCES[start.dtype.itemsize] * scale
+
+    def should_continue(state: tuple[Array, Array, int]) -> Array:
+        _, slope, n = state
+        return (n < REWEIGHTINGS) & (jnp.linalg.norm(slope) > least)
+
+    def reweight(state: tuple[Array, Array, int]) -> tuple[Array, Array, int]:
+        u, slope, n = state
+        weights = _weights(u, equations, params)
+        product = _product(weights, equations, params.leak)
+        u = u - _solve_linear(product, slope, _diagonal(weights, equations, params.leak))
+        return u, _slope(u, equations, params), n + 1
+
+    first = (start, _slope(start, equations, params), 0)
+    return jax.lax.while_loop(should_continue, reweight, first)[0]
+
+
+def _slope(u: Array, equations: WindowEquations, params: Params) -> Array:
+    return jax.grad(energy)(u, equations, params)
+
+
+@jax.custom_jvp
+def _implicit_solution(u: Array, equations: WindowEquations, params: Params) -> Array:
+    return u
+
+
+@_implicit_solution.defjvp
+def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
+    u, equations, params = values
+
+    def times(du: Array) -> Array:
+        return jax.jvp(lambda v: _slope(v, equations, params), (u,), (du,))[1]
+
+    weights = _weights(u, equations, params)
+    diagonal = _diagonal(weights, equations, params.leak)
+
+    def solve(product: Callable[[Array], Array], right: Array) -> Array:
+        return _solve_linear(product, right, diagonal)
+
+    _, right = jax.jvp(lambda numbers: _slope(u, equations, numbers), (params,), (changes[2],))
+    return u, -jax.lax.custom_linear_solve(times, right, solve, symmetric=True)
+
+
+def held_out_likelihood(equations: WindowEquations, held: Array, params: Params) -> Array:
+    """Return the log likelihood of events that the image was not solved for.
+
+    A residual e, in thresholds, has Student's t distribution of the energy's robust loss,
+
+        p(e) = Gamma(a) / (sqrt(2 pi) tail Gamma(a - 1/2)) (1 + e^2 / (2 tail^2))^-a,  a = tail^2.
+
+    Args:
+        equations: Equations of a window.
+        held: (rows,) 1 for the rows of events to predict, else 0.
+        params: Parameters; a `tail` whose distribution has no integral counts as the least.
+
+    Returns:
+        (), a sum over these rows.
+    """
+    others = equations._replace(weight=equations.weight * (1 - held))
+    u = solve_equations(others, params)
+    e = _residuals(u, equations, params)[1]
+    a = jnp.maximum(params.tail**2, LEAST_STUDENT_SHAPE)
+    norm = jax.scipy.special.gammaln(a) - jax.scipy.special.gammaln(a - 0.5)
+    each = norm - 0.5 * jnp.log(2 * jnp.pi * a) - a * jnp.log1p(e**2 / (2 * a))
+    return (held * each).sum()
+
+
+def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Array:
+    """Return the variance of a solution as `solve` does: perturb the equations and solve again.
+
+    Args:
+        u: (height, width) solution, thresholds.
+        equations: Equations of the window, with the perturbations.
+        params: Parameters.
+
+    Returns:
+        (height, width) variance, squared thresholds.
+    """
+    weights = _weights(u, equations, params)
+    product = _product(weights, equations, params.leak)
+    diagonal = jax.lax.stop_gradient(_diagonal(weights, equations, params.leak))
+
+    def sample(noise: Perturbation) -> Array:
+        def spread(v: Array) -> Array:
+            rows = noise.rows * jnp.sqrt(weights.rows)
+            n = noise.pixels
+            total = (rows * look_up(v, equations.corner, equations.fraction)).sum()
+            total += (n[0, :, :-1] * jnp.sqrt(weights.across) * jnp.diff(v, axis=1)).sum()
+            total += (n[1, :-1] * jnp.sqrt(weights.down) * jnp.diff(v, axis=0)).sum()
+            total += (_gradient(v) * noise.pull).sum()
+            return total + jnp.sqrt(params.leak) * (n[2] * v).sum()
+
+        z = _solve_linear(product, jax.grad(spread)(jnp.zeros_like(u)), diagonal)
+        return (z - z.mean()) ** 2
+
+    squares = jax.lax.map(sample, equations.noise).mean(0)
+    down, across = (jnp.asarray(_blur_matrix(n), u.dtype) for n in u.shape)
+    return VARIANCE_FACTOR * (down @ squares @ across.T) + equations.unseen
+
+
+@functools.cache
+def _blur_matrix(n: int) -> NDArray[np.float64]:
+    """Return the Gaussian blur of n pixels as a matrix."""
+    from scipy.ndimage import gaussian_filter1d
+
+    return gaussian_filter1d(np.eye(n), BLUR_PX, axis=0)

@@ -1,0 +1,167 @@
+"""Rows: linear equations that the events of a window give for one log image.
+
+Brightness is constant along paths: the pixel x sees at time t the point that is at X(x, t) in the
+image M at the target time, so L(x, t) = M(X(x, t)). Each row looks twice at M, bilinearly:
+
+    M(X(x, t_b)) - M(X(x, t_a)) = change + noise                                             (1)
+
+| kind | from t_a | to t_b | change |
+|---|---|---|---|
+| event | event before of the same pixel | event | p c_p |
+| first | begin of the window | first event | p c_p 0.55 |
+| last | last event | end of the window | p c_p 0.3 |
+| silent | begin of the window | end of the window | 0 |
+
+An edge that passes makes events only when its level reaches a threshold, so a part of the change
+comes before the first event and after the last one. Without that part the edge would be too low,
+and would lag behind. The shares are means over simulated scenes (`experiments/studies`).
+A path whose velocity has the covariance C is uncertain by C (t_b - t_a)^2, so that the image there
+is another. With the mean square `ROUGHNESS` of a gradient of log images, the row has the variance
+
+    1 + ROUGHNESS trace C (t_b - t_a)^2                                                      (1b)
+
+against that of a row with a known path. Where no event shows the motion, silence says nothing.
+The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is new.
+"""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int32, UInt32
+from numpy.typing import NDArray
+
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.recording import Events
+
+EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
+NONE, MUTED = -1, -2  # in place of the number of a pixel's last event
+FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
+ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^2
+
+
+@runtime_checkable
+class Paths(Protocol):
+    """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
+
+    covariance: NDArray | None  # (K, height, width, 2, 2) of the velocity, (px/s)^2; None: known
+
+    def carry(self, x: NDArray, y: NDArray, t: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the positions at the target time of what pixels (x, y) see at times t."""
+        ...
+
+
+class Rows(NamedTuple):
+    """Equations (1) of one window; positions are those of the look-ups at t_b and t_a."""
+
+    shape: tuple[int, int]  # (height, width)
+    threshold: float  # ln I, mean of both polarities
+    corner: UInt32[np.ndarray, "rows 2"]  # flat index of the look-up's pixel above and left
+    fraction: Float[np.ndarray, "rows 2 2"]  # px from there, x before y
+    change: Float[np.ndarray, " rows"]  # in thresholds
+    weight: Float[np.ndarray, " rows"]  # reciprocal variance, against that of a common row
+    kind: NDArray[np.uint8]
+    pixel: Int32[np.ndarray, " rows"]  # flat index of the pixel x
+
+
+def make_rows(
+    events: Events,
+    paths: Paths,
+    thresholds: NDArray,
+    shape: tuple[int, int],
+    span: tuple[int, int],
+    muted: NDArray[np.bool_] | None = None,
+) -> Rows:
+    """Make the equations of a window's events and of its silence.
+
+    Args:
+        events: Events of the window, in order of time.
+        paths: Paths towards the target time.
+        thresholds: (2,) or (2, height, width) ln I, of ON and OFF events.
+        shape: (height, width) of the sensor.
+        span: Begin and end of the window, us.
+        muted: (height, width), true for pixels without events whose silence tells nothing; None:
+            there are none.
+
+    Returns:
+        The rows whose look-ups are both inside the image.
+    """
+    height, width = shape
+    c = np.broadcast_to(
+        np.asarray(thresholds, np.float32).reshape(2, *np.shape(thresholds)[1:] or (1, 1)),
+        (2, height, width),
+    )
+    threshold = float(c.mean())
+    y, x = np.indices(shape, np.float32).reshape(2, -1)
+    begin = np.stack(paths.carry(x, y, np.full(x.size, span[0])), -1)
+    end = np.stack(paths.carry(x, y, np.full(x.size, span[1])), -1)
+    at_event = np.stack(
+        paths.carry(events.x.astype(np.float32), events.y.astype(np.float32), events.t), -1
+    )
+    pixel = events.y.astype(np.int32) * width + events.x
+    change = np.where(events.p, c[0].reshape(-1)[pixel], -c[1].reshape(-1)[pixel]) / threshold
+    doubt = np.zeros(height * width, np.float32)  # (c / s)^2
+    if paths.covariance is not None:
+        doubt[:] = (
+            ROUGHNESS * np.einsum("khwii->hw", paths.covariance).ravel() / len(paths.covariance)
+        )
+    n = len(pixel) + height * width
+    rows = Rows(
+        shape,
+        threshold,
+        np.empty((n, 2), np.uint32),
+        np.empty((n, 2, 2), np.float32),
+        np.empty(n, np.float32),
+        np.ones(n + 1, np.float32),
+        np.empty(n, np.uint8),
+        np.empty(n, np.int32),
+    )
+    last = np.full(height * width, NONE, np.int32)
+    if muted is not None:
+        last[muted.ravel()] = MUTED
+    ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
+    times = (1e-6 * (events.t - span[0]), 1e-6 * (span[1] - span[0]), doubt)
+    n = _lay_rows(pixel, change.astype(np.float32), ends, times, last, rows)
+    return Rows(shape, threshold, *(column[:n] for column in rows[2:]))
+
+
+@njit_noalloc
+def _lay_rows(pixel, change, positions, times, last, rows):
+    begin, at_event, end = positions
+    t, stop, doubt = times
+    n = 0
+    for k in range(len(pixel)):
+        x, before = pixel[k], last[pixel[k]]
+        if before < 0:
+            rows.weight[n] = 1 / (1 + doubt[x] * t[k] ** 2)
+            n += _lay_row(n, at_event[k], begin[x], FIRST_SHARE * change[k], FIRST, x, rows)
+        else:
+            rows.weight[n] = 1 / (1 + doubt[x] * (t[k] - t[before]) ** 2)
+            n += _lay_row(n, at_event[k], at_event[before], change[k], EVENT, x, rows)
+        last[x] = k
+    for x in range(len(last)):
+        before = last[x]
+        if before == NONE:
+            rows.weight[n] = 1 / (1 + doubt[x] * stop**2)
+            n += _lay_row(n, end[x], begin[x], 0.0, SILENT, x, rows)
+        elif before != MUTED:
+            rows.weight[n] = 1 / (1 + doubt[x] * (stop - t[before]) ** 2)
+            n += _lay_row(n, end[x], at_event[before], LAST_SHARE * change[before], LAST, x, rows)
+    return n
+
+
+@njit_noalloc_inlined
+def _lay_row(n, after, before, change, kind, pixel, rows):
+    """Write row n, and return 1, or 0 if a look-up is outside the image."""
+    height, width = rows.shape
+    for side in range(2):
+        x, y = (after[0], after[1]) if side == 0 else (before[0], before[1])
+        if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
+            return 0
+        i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+        rows.corner[n, side] = j * width + i
+        rows.fraction[n, side, 0] = x - i
+        rows.fraction[n, side, 1] = y - j
+    rows.change[n] = change
+    rows.kind[n] = kind
+    rows.pixel[n] = pixel
+    return 1

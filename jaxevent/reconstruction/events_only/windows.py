@@ -1,0 +1,140 @@
+"""The windows of a recording's events: equations, and their solutions on the host."""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.calibration.event_calibration import calibrate_events
+from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
+from jaxevent.reconstruction.events_only.memory import KeyMemories
+from jaxevent.reconstruction.events_only.params import Params
+from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
+from jaxevent.reconstruction.events_only.rows import Rows, make_rows
+from jaxevent.reconstruction.events_only.solve import Solution, solve
+from jaxevent.recording import Events, Recording, Times
+
+ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
+N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
+
+
+@runtime_checkable
+class FlowSource(Protocol):
+    """A source of optical flow: a `RigidFlow` of egomotion, or a video with flow."""
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
+        """Return the optical flow at some times.
+
+        Args:
+            times: (T,) times, us or seconds as of images.
+            extrapolate: Whether times may lie outside the data.
+
+        Returns:
+            (T, H, W, 2) flow along x and y, px/s; not finite where it is not known.
+        """
+        ...
+
+
+class SolvedWindow(NamedTuple):
+    """The equations of a window, and their solution."""
+
+    rows: Rows
+    prior: GradientPrior
+    solution: Solution
+
+
+class WindowSolver:
+    """Solves for the image at a time: `solved = windows(t)`, t in us.
+
+    Args:
+        recording: Events.
+        params: Parameters.
+        causal: Whether images rest on earlier events alone.
+        motion: Optical flow that is known beforehand; None: that of the events.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params,
+        *,
+        causal: bool = False,
+        motion: FlowSource | None = None,
+    ):
+        self.recording, self.params, self.causal = recording, params, causal
+        self.shape = (recording.height, recording.width)
+        self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
+        self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
+        self.relative = np.ones((2, *self.shape), np.float32)
+        self.muted = np.zeros(self.shape, bool)
+        if params.learn:
+            found = calibrate_events(recording)
+            self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
+        c = np.float32([params.c_on, params.c_off])
+        self.thresholds = self.relative * c[:, None, None]
+        self.numbers = SolverParams(*(float(value) for value in params.solver()))
+        self.memory = KeyMemories(
+            self,
+            recording,
+            self.n_side,
+            silence=self.numbers.silence,
+            threshold=float(self.thresholds.mean()),
+        )
+
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
+        """Return the paths of points through a window, see `EventFlow.paths`."""
+        if isinstance(self.flow, EventFlow):
+            return self.flow.paths(start, stop, at, until=until)
+        low, high = min(start, at), max(stop, at)
+        knots = np.unique(np.linspace(low, high, N_MOTION_KNOTS).astype(np.int64))
+        velocity = np.nan_to_num(np.asarray(self.flow.flow(knots, extrapolate=True), np.float32))
+        return WindowPaths(at, knots, velocity)
+
+    def events(self, first: int, last: int) -> Events:
+        """Return the events of some rows of the recording, without those of unused pixels.
+
+        Args:
+            first: First row.
+            last: Row after the last one.
+
+        Returns:
+            The events.
+        """
+        events = self.recording.events[first:last]
+        return events[~self.muted[events.y, events.x]]
+
+    def __call__(
+        self, t: int, *, variance: bool = True, held_out: Callable[[Rows], NDArray] | None = None
+    ) -> SolvedWindow:
+        """Solve for the image at a time.
+
+        A window begins at a key of the memory, and ends at one or, where images are causal, at t.
+
+        Args:
+            t: Time, us.
+            variance: Whether the variance is wanted.
+            held_out: Chooses rows (booleans) that the solution does not see.
+
+        Returns:
+            The window's equations and solution.
+        """
+        memory, place = self.memory, self.recording.events.index(t)
+        ahead = 0 if self.causal else min(self.n_side, len(self.recording.events) - place)
+        first = max(place + ahead - 2 * self.n_side, 0) // memory.step
+        if self.causal:
+            last, end, stop = None, place, t
+        else:
+            last = memory.key_after(max(place + ahead, 2 * self.n_side))
+            end, stop = memory.row(last), memory.time(last)
+        start = memory.time(first)
+        span = min(start, t), max(stop, t)
+        events = self.events(memory.row(first), end)
+        paths = self.paths(*span, t)
+        rows = make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
+        prior = memory.prior(rows, t, first, last)
+        seen = rows
+        if held_out is not None:
+            kept = ~held_out(rows)
+            seen = rows._replace(**{name: getattr(rows, name)[kept] for name in ROW_COLUMNS})
+        return SolvedWindow(rows, prior, solve(seen, prior, self.numbers, variance=variance))

@@ -1,0 +1,109 @@
+"""`jaxevent flow`: its files, and what it refuses."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from commands import decoded, described, fails
+
+import jaxevent
+from jaxevent import cli
+from jaxevent.event_flow import FlowParams, flow_from_events
+from jaxevent.show.flow import encode_flow, flow_colours
+from jaxevent.simulate import motion_scene
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("flow") / "planar.h5"
+    recording, _ = motion_scene("planar", size=(64, 48), focal=50.0, duration=0.12)
+    jaxevent.save(recording, path)
+    return path
+
+
+def decode_png(data: bytes) -> np.ndarray:
+    """Samples of a PNG image of 16 bits in three colours, whose rows have the filter 2."""
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    place, parts = 8, {}
+    while place < len(data):
+        (size,) = struct.unpack(">I", data[place : place + 4])
+        kind, body = data[place + 4 : place + 8], data[place + 8 : place + 8 + size]
+        assert struct.unpack(">I", data[place + 8 + size : place + 12 + size])[0] == zlib.crc32(
+            kind + body
+        )
+        parts[kind] = body
+        place += 12 + size
+    width, height, *rest = struct.unpack(">IIBBBBB", parts[b"IHDR"])
+    assert rest == [16, 2, 0, 0, 0]
+    rows = np.frombuffer(zlib.decompress(parts[b"IDAT"]), np.uint8).reshape(height, -1)
+    assert (rows[:, 0] == 2).all()
+    plain = np.cumsum(rows[:, 1:], 0, dtype=np.uint8)
+    return plain.view(">u2").reshape(height, width, 3).astype(int)
+
+
+def test_png_has_displacements_as_dsec_does(tmp_path):
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(7, 9, 2)) * 40
+    d[0, 0] = 300
+    valid = rng.random((7, 9)) < 0.7
+    valid[0, 0] = True
+    code = decode_png(encode_flow(d, valid))
+    known = valid.copy()
+    known[0, 0] = False
+    assert np.array_equal(code[..., 2], known)
+    assert np.abs((code[..., :2] - 2**15) / 128 - d)[known].max() <= 1 / 256
+    cv2 = pytest.importorskip("cv2")
+    (tmp_path / "one.png").write_bytes(encode_flow(d, valid))
+    assert np.array_equal(cv2.imread(str(tmp_path / "one.png"), -1)[..., ::-1], code)
+
+
+def test_files_hold_the_flow(stored, tmp_path, capsys):
+    out = tmp_path / "flow.h5"
+    argv = ["flow", str(stored), "--rate", "50", "--start", "0.02", "--stop", "0.1"]
+    assert cli.main([*argv, "--out", str(out)]) == 0
+    assert "4 times" in capsys.readouterr().out
+    flow = flow_from_events(jaxevent.load(stored))
+    with h5py.File(out) as file:
+        times = file["t"][:]
+        found = [file[name][:] for name in ("flow", "covariance", "valid")]
+    for a, b in zip(found, flow(times), strict=True):
+        assert np.array_equal(a, b)
+    told = described(out)
+    assert FlowParams(**told["params"]).values() == FlowParams().values()
+    folder = tmp_path / "images"
+    assert cli.main([*argv, "--out", str(folder)]) == 0
+    listed = np.loadtxt(folder / "forward_timestamps.txt", delimiter=",", dtype=np.int64)
+    assert np.array_equal(listed, np.stack([times[:-1], times[1:]], 1))
+    code = decode_png((folder / "000000.png").read_bytes())
+    d = (code[..., :2] - 2**15) / 128
+    known = code[..., 2] == 1
+    assert np.array_equal(known, found[2][0])
+    expected = found[0][0][known] * (times[1] - times[0]) * 1e-6
+    assert np.median(np.linalg.norm(d[known] - expected, axis=-1)) < 0.2
+
+
+def test_video_has_the_colours_of_directions(stored, tmp_path):
+    out = tmp_path / "flow.mp4"
+    assert cli.main(["flow", str(stored), "--rate", "40", "--out", str(out)]) == 0
+    frames, _ = decoded(out, 48, 64, "rgb24")
+    assert len(frames) == 5
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    colours = flow_colours(np.stack([np.cos(turn), np.sin(turn)], -1) * 3, 3.0)
+    assert len(np.unique(colours, axis=0)) == 12 and tuple(colours[0]) == (255, 0, 0)
+    assert (flow_colours(np.zeros((2, 2)), 3.0) == 255).all()
+
+
+def test_what_cannot_be_is_refused(stored, tmp_path, capsys):
+    fails(capsys, ["flow", stored, "--out", tmp_path / "flow.avi"], "flow.avi")
+    fails(capsys, ["flow", stored, "--rate", "0", "--out", tmp_path / "a.h5"], "--rate")
+    fails(capsys, ["flow", stored, "--start", "9", "--out", tmp_path / "a.h5"], "--start")
+    one = tmp_path / "times.csv"
+    one.write_text("0.05\n")
+    fails(capsys, ["flow", stored, "--times", one, "--out", tmp_path / "b"], "two or more")
+    (tmp_path / "mine.toml").write_text("speed = 3\n")
+    wrong = ["flow", stored, "--params", tmp_path / "mine.toml", "--out", tmp_path / "c.h5"]
+    fails(capsys, wrong, "speed")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.toml", "times.csv"]
