@@ -442,7 +442,7 @@ class TrajectoryEstimator:
         known = self._known_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
         size, noise = L.shape[1:], self._noise(t)
-        if known is not None and not self.start.refine:
+        if known is not None and self.start is not None and not self.start.refine:
             p = NodeTrajectories(known, 1).at_level(0, size).p
             return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         variance = self._cautious(V, clear)

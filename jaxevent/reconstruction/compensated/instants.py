@@ -65,7 +65,7 @@ class MissedEvents:
         rows = slice(events.index(begin - self._block), events.index(end + self._block))
         found = find_gaps(events[rows].t)
         chosen = (found.begin >= begin) & (found.begin < end)
-        return Gaps(*(part[chosen] for part in found))
+        return Gaps._make(part[chosen] for part in found)
 
 
 @dataclasses.dataclass(frozen=True)
