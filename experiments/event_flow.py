@@ -42,8 +42,10 @@ def make(scene: str, seed: int):
         "large": ("texture", "varying"),
     }[scene]
     duration = 0.22 if scene == "large" else 0.3
-    settings = {"size": size, "focal": 200 * size[0] / 240, "sensor": SENSORS["davis"]}
-    recording, camera = motion_scene(name, motion, seed, duration=duration, **settings)
+    focal, sensor = 200 * size[0] / 240, SENSORS["davis"]
+    recording, camera = motion_scene(
+        name, motion, seed, size=size, focal=focal, duration=duration, sensor=sensor
+    )
     return recording, lambda t: camera_flow(camera, t)
 
 
@@ -163,7 +165,9 @@ def measure_slider():
     path = Path(os.environ.get("JAXEVENT_DATA", ".")) / "data" / "slider_depth.zip"
     recording = jaxevent.load(path)
     shape = (recording.height, recording.width)
+    assert recording.poses is not None
     twists = from_poses(recording.poses, 0.05)
+    assert twists.T is not None
     xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     jacobian = np.linalg.inv(np.stack([np.gradient(xi, axis=1), np.gradient(xi, axis=0)], -1))
     flow, rows = jaxevent.flow_from_events(recording), []
