@@ -21,9 +21,7 @@ class Params(FrameParams):
     silence = Positive(_SOLVER.silence, "1", "weight of silence, against that of an event")
     tail = Positive(_SOLVER.tail, "c", "residual from which an equation counts less", least=1e-6)
     gradient = Positive(_SOLVER.gradient, "1", "weight of the prior of gradients")
-    edge = Positive(
-        _SOLVER.edge, "c / px", "scale of the prior of gradients", least=1e-6
-    )
+    edge = Positive(_SOLVER.edge, "c / px", "scale of the prior of gradients", least=1e-6)
     leak = Positive(_SOLVER.leak, "1 / c^2", "weight of the squared log intensity", least=1e-9)
     vague = Positive(
         1.0, "ln I", "standard deviation from which an image is not valid", gradient=False
