@@ -46,7 +46,7 @@ RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
 
 @njit_noalloc_inlined
-def node_cell(u, spacing, x, y):
+def _node_cell(u, spacing, x, y):
     """Return the node before a place and the distance from it, in nodes."""
     rows, columns = u.shape[0], u.shape[1]
     a = min(max(x / spacing - 0.5, 0.0), columns - 1.0)
@@ -56,9 +56,9 @@ def node_cell(u, spacing, x, y):
 
 
 @njit_noalloc_inlined
-def displacement_at(u, spacing, x, y):
+def _displacement_at(u, spacing, x, y):
     """Return the displacement at a place, bilinear between nodes at (k + 1/2) spacing."""
-    i, j, fx, fy = node_cell(u, spacing, x, y)
+    i, j, fx, fy = _node_cell(u, spacing, x, y)
     i2, j2 = min(i + 1, u.shape[1] - 1), min(j + 1, u.shape[0] - 1)
     a, b, c, d = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
     return (
@@ -68,7 +68,7 @@ def displacement_at(u, spacing, x, y):
 
 
 @njit_noalloc
-def warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
+def _warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
     """Move events along the displacement and add each to sum, number and mean time of cells.
 
     `image` (3, rows, columns) has a border of one cell; `warped` (n, 2) gets the places in cells.
@@ -76,9 +76,9 @@ def warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
     rows, columns = image.shape[1], image.shape[2]
     image[:] = 0
     for k in range(len(x)):
-        dx, dy = displacement_at(u, spacing, x[k], y[k])
+        dx, dy = _displacement_at(u, spacing, x[k], y[k])
         for _ in range(2):
-            dx, dy = displacement_at(u, spacing, x[k] - s[k] * dx, y[k] - s[k] * dy)
+            dx, dy = _displacement_at(u, spacing, x[k] - s[k] * dx, y[k] - s[k] * dy)
         a, b = (x[k] - s[k] * dx + 0.5) / cell + 0.5, (y[k] - s[k] * dy + 0.5) / cell + 0.5
         warped[k, 0], warped[k, 1] = a, b
         if not (0 <= a < columns - 1 and 0 <= b < rows - 1):
@@ -95,7 +95,7 @@ def warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
 
 
 @njit_noalloc
-def blur(image, scratch, passes):
+def _blur(image, scratch, passes):
     """Convolve an image with (1, 2, 1) / 4 along both axes, some times; edges repeat."""
     rows, columns = image.shape
     for _ in range(passes):
@@ -110,7 +110,7 @@ def blur(image, scratch, passes):
 
 
 @njit_noalloc_inlined
-def look_up(image, a, b):
+def _look_up(image, a, b):
     """Return gradient, sum, number and mean time of an image's cells at a place; bilinear."""
     i, j = int(a), int(b)
     fx, fy = a - i, b - j
@@ -128,7 +128,7 @@ def look_up(image, a, b):
 
 
 @njit_noalloc
-def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
+def _accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
     """Add the derivatives (1) of each event to the nodes and clock's times around it.
 
     Args:
@@ -139,7 +139,7 @@ def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
         u: (rows, columns, 2) displacement of nodes, px.
         spacing: Distance of nodes, px.
         cell: Size of cells, px.
-        image: (3, ...) blurred images of `warp_and_vote`.
+        image: (3, ...) blurred images of `_warp_and_vote`.
         normal: (rows, columns, 6) gets g, xx, xy, yy of H, and what noise adds to xx and yy per
             variance of the gradient, px.
         clock: (K, 2) gets derivative and curvature by the clock's s.
@@ -155,13 +155,13 @@ def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
         a, b = warped[k, 0], warped[k, 1]
         if a < 1 or b < 1 or a >= image.shape[2] - 2 or b >= image.shape[1] - 2:
             continue
-        gx, gy, value, number, late = look_up(image, a, b)
+        gx, gy, value, number, late = _look_up(image, a, b)
         gx, gy = gx * per_px, gy * per_px
         age = s[k] - late / max(number, 1e-9)
         w = 1.0 / (number + NUMBER_FLOOR)
         score += p[k] * value * w
         x, y = (a - 0.5) * cell - 0.5, (b - 0.5) * cell - 0.5
-        ux, uy = displacement_at(u, spacing, x, y)
+        ux, uy = _displacement_at(u, spacing, x, y)
         along = gx * ux + gy * uy
         i = min(int(place[k]), len(clock) - 2)
         f = place[k] - i
@@ -172,7 +172,7 @@ def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
         c = -p[k] * age * w
         h = CURVATURE * age * age * w / (number + NUMBER_FLOOR)
         others = max(number - OWN_NUMBER, 0.0)
-        i, j, fx, fy = node_cell(u, spacing, x, y)
+        i, j, fx, fy = _node_cell(u, spacing, x, y)
         for dj in range(2):
             for di in range(2):
                 weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
@@ -187,7 +187,7 @@ def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
 
 
 @njit_noalloc
-def solve_step(u, normal, smoothness, edge, sweeps, step):
+def _solve_step(u, normal, smoothness, edge, sweeps, step):
     """Solve (2) for the step (rows, columns, 2) of the displacement, by Gauss-Seidel."""
     rows, columns = u.shape[0], u.shape[1]
     step[:] = 0
@@ -211,17 +211,17 @@ def solve_step(u, normal, smoothness, edge, sweeps, step):
                     step[j, i, 1] = (xx * gy - xy * gx) / det
 
 
-def image_shape(shape: tuple[int, int], cell: float) -> tuple[int, int]:
+def _image_shape(shape: tuple[int, int], cell: float) -> tuple[int, int]:
     """Return rows and columns of an image of cells, with a border of one."""
     return int(np.ceil(shape[0] / cell)) + 2, int(np.ceil(shape[1] / cell)) + 2
 
 
-def node_shape(shape: tuple[int, int], spacing: float) -> tuple[int, int]:
+def _node_shape(shape: tuple[int, int], spacing: float) -> tuple[int, int]:
     """Return rows and columns of the nodes of a sensor (H, W)."""
-    return tuple(max(int(np.ceil(n / spacing)), 1) for n in shape)
+    return max(int(np.ceil(shape[0] / spacing)), 1), max(int(np.ceil(shape[1] / spacing)), 1)
 
 
-def fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[np.float32]:
+def _fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[np.float32]:
     """Interpolate values of nodes (rows, columns, ...) bilinearly to all pixels (H, W, ...)."""
     for axis in (0, 1):
         a = np.clip((np.arange(shape[axis])) / spacing - 0.5, 0, u.shape[axis] - 1)
@@ -248,6 +248,9 @@ class Clock(NamedTuple):
             events: The events, one or more.
             at: Time at which s = 0, us.
             half: Number of events around it on either side.
+
+        Returns:
+            The clock.
         """
         parts = max(round(CLOCK_PARTS * len(events) / half), 1)
         rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
@@ -260,7 +263,7 @@ class Clock(NamedTuple):
 
     @property
     def mean_rate(self) -> float:
-        """How fast s goes over the window, 1/s."""
+        """Mean rate of s over the window, 1/s."""
         return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
 
     def rate(self, t: float) -> float:
@@ -288,7 +291,7 @@ class WindowEvents(NamedTuple):
         return cls(x, y, events.t, p)
 
 
-class Aligned(NamedTuple):
+class Displacement(NamedTuple):
     """Displacement of nodes and what events tell of it."""
 
     u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
@@ -330,14 +333,14 @@ class Alignment:
 
     def __init__(self, shape: tuple[int, int], params: Any):
         self.shape, self.spacing = shape, float(params.spacing)
-        self.nodes = node_shape(shape, self.spacing)
+        self.nodes = _node_shape(shape, self.spacing)
         self.smoothness, self.edge = float(params.smoothness), float(params.edge)
 
     def fill(self, values: NDArray) -> NDArray[np.float32]:
         """Interpolate values of nodes to all pixels."""
-        return fill_pixels(values, self.shape, self.spacing)
+        return _fill_pixels(values, self.shape, self.spacing)
 
-    def covariance(self, aligned: Aligned) -> NDArray[np.float64]:
+    def covariance(self, aligned: Displacement) -> NDArray[np.float64]:
         """Return the covariance of the nodes' displacement.
 
         It is the inverse of what a node and those around tell, and by how much flow bends among
@@ -360,7 +363,7 @@ class Alignment:
         floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
         return best + floor
 
-    def shrink(self, aligned: Aligned) -> NDArray[np.float64]:
+    def shrink(self, aligned: Displacement) -> NDArray[np.float64]:
         """Return the displacement without components that events around do not determine.
 
         They would double with each window.
@@ -376,7 +379,7 @@ class Alignment:
         known = _rotate(axes, values / (values + FIRST_INFORMATION))
         return (known @ aligned.u[..., None])[..., 0]
 
-    def typical(self, aligned: Aligned) -> float:
+    def typical(self, aligned: Displacement) -> float:
         """Return the median length of known displacements, weighted by information, px.
 
         Args:
@@ -405,7 +408,7 @@ class Alignment:
         start: NDArray | None,
         cells: tuple[int, ...],
         adapt: bool,
-    ) -> Aligned:
+    ) -> Displacement:
         """Align the events of a window.
 
         Args:
@@ -427,16 +430,18 @@ class Alignment:
         turns, ahead = np.zeros((len(clock.t), 2)), clock.s.copy()
         score = 0.0
         for cell in cells:
-            image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)
+            image = np.zeros((3, *_image_shape(self.shape, cell)), np.float32)
             scratch = np.empty_like(image[0])
             reach, before = np.full((*self.nodes, 1), float(cell)), np.zeros_like(u)
             for _ in range(N_STEPS):
                 s = np.interp(place, np.arange(len(ahead)), ahead).astype(np.float32)
-                warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
+                _warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
                 for channel, passes in zip(image, N_BLURS, strict=True):
-                    blur(channel, scratch, passes)
-                score = accumulate(warped, s, p, place, u, self.spacing, cell, image, normal, turns)
-                solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
+                    _blur(channel, scratch, passes)
+                score = _accumulate(
+                    warped, s, p, place, u, self.spacing, cell, image, normal, turns
+                )
+                _solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
                 # Sharp images have a smaller range than their curvature tells: steps that turn
                 # back are halved.
                 reach *= np.where((step * before).sum(-1, keepdims=True) < 0, 0.5, 1)
@@ -446,4 +451,4 @@ class Alignment:
                 if adapt:
                     ahead = self._turn(clock, at, ahead, turns)
         information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
-        return Aligned(u, Clock(clock.t, ahead), information, score / max(len(x), 1))
+        return Displacement(u, Clock(clock.t, ahead), information, score / max(len(x), 1))

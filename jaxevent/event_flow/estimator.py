@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError
 from jaxevent.event_flow.alignment import (
     MAX_VARIANCE,
-    Aligned,
     Alignment,
     Clock,
+    Displacement,
     WindowEvents,
 )
 from jaxevent.event_flow.paths import WindowPaths
@@ -43,7 +43,7 @@ class Anchor(NamedTuple):
 
     row: int  # of the event there
     t: int  # us
-    aligned: Aligned
+    aligned: Displacement
 
     @property
     def rate(self) -> float:

@@ -9,7 +9,7 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
 
 @njit_noalloc_inlined
-def velocity_at(velocity, k, weight, x, y):
+def _velocity_at(velocity, k, weight, x, y):
     """Return the velocity (px/s) at a place, bilinear, between the knots k and k + 1."""
     h, w = velocity.shape[1], velocity.shape[2]
     x, y = min(max(x, 0.0), w - 1.0), min(max(y, 0.0), h - 1.0)
@@ -31,7 +31,7 @@ def velocity_at(velocity, k, weight, x, y):
 
 
 @njit_noalloc
-def integrate_paths(x, y, t, knots, velocity, at, out_x, out_y):
+def _integrate_paths(x, y, t, knots, velocity, at, out_x, out_y):
     """Integrate dx/dt = v(x, t) from t to `at`, by the midpoint rule between times of knots."""
     n_knots = len(knots)
     for n in range(len(x)):
@@ -53,9 +53,9 @@ def integrate_paths(x, y, t, knots, velocity, at, out_x, out_y):
                 scale = 1.0 / (knots[k + 1] - knots[k])
                 shift = now - knots[k]
             step = end - now
-            u, v = velocity_at(velocity, low, shift * scale, px, py)
+            u, v = _velocity_at(velocity, low, shift * scale, px, py)
             half = 0.5e-6 * step
-            u, v = velocity_at(
+            u, v = _velocity_at(
                 velocity, low, (shift + 0.5 * step) * scale, px + half * u, py + half * v
             )
             px, py, now = px + 2 * half * u, py + 2 * half * v, end
@@ -94,5 +94,5 @@ class WindowPaths(NamedTuple):
         out_x, out_y = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
         places = (np.ascontiguousarray(c, np.float32) for c in (x, y))
         stamps = np.ascontiguousarray(t, np.int64)
-        integrate_paths(*places, stamps, self.knots, self.velocity, self.at, out_x, out_y)
+        _integrate_paths(*places, stamps, self.knots, self.velocity, self.at, out_x, out_y)
         return out_x, out_y
