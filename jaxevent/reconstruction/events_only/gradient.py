@@ -32,6 +32,7 @@ from jaxevent.reconstruction.features import Numeric
 
 REWEIGHTINGS = 100  # at most
 CG_ITERATIONS = 200  # at most
+TOLERANCES = {4: 5e-3, 8: 1e-8}  # relative residuals to stop at, by bytes of a number
 LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 
 
@@ -250,13 +251,8 @@ def _solve_linear(product: Callable[[Array], Array], right: Array, diagonal: Arr
     def divide(v: Array) -> Array:
         return v / diagonal
 
-    tolerance = _tolerance(right.dtype)
+    tolerance = TOLERANCES[right.dtype.itemsize]
     return cg(product, right, tol=tolerance, maxiter=CG_ITERATIONS, M=divide)[0]
-
-
-def _tolerance(dtype: Any) -> float:
-    """Return the relative size of a residual to stop at: the third root of the precision."""
-    return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
 def solve_equations(equations: WindowEquations, params: Params) -> Array:
@@ -276,7 +272,7 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
 def _minimise(equations: WindowEquations, params: Params) -> Array:
     start = equations.start
     scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
-    least = _tolerance(start.dtype) * scale
+    least = TOLERANCES[start.dtype.itemsize] * scale
 
     def should_continue(state: tuple[Array, Array, int]) -> Array:
         _, slope, n = state
