@@ -30,7 +30,7 @@ from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 
-REWEIGHTINGS = 8
+REWEIGHTINGS = 20
 CG_LIMITS = (1e-3, 25)  # relative residual, and iterations
 BLOCK_BITS = 1  # sides of blocks are powers of 2 to this
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
@@ -150,9 +150,9 @@ def solve(
         preconditioner.update(system)
         iterations += _conjugate_gradients(system, b, u, preconditioner.arrays, CG_LIMITS)
     _reweight(system, u, (rows.change, base), numbers, residual)
-    V, unseen = np.full((2, *rows.shape), np.inf, np.float32)
+    V = np.full(rows.shape, np.inf, np.float32)
+    unseen = _unseen_variance(system, preconditioner.of_rows[0]) * c**2
     if variance:
-        unseen = _unseen_variance(system, preconditioner.of_rows[0]) * c**2
         samples = _sample_variance(system, preconditioner, np.random.default_rng(seed))
         V = VARIANCE_FACTOR * c**2 * samples + unseen
     return Solution(u * c, V, unseen, residual, system.weight, iterations)
