@@ -84,7 +84,7 @@ def pack_equations(
         The equations.
     """
     dtype = np.dtype(jnp.result_type(float))
-    rows, prior, solution = window
+    rows, prior, solution, _ = window
     c, n = rows.threshold, len(rows.kind)
 
     def fill(column: NDArray, kind: Any = dtype) -> NDArray:
