@@ -52,7 +52,7 @@ class Windows(Protocol):
 
 
 class FrameMeasurements:
-    """What the nearest frame says of the image at a time.
+    """Measurements of the image at a time by the nearest frame.
 
     Args:
         windows: Source of paths and equations.
