@@ -26,6 +26,9 @@ from jaxevent.recording import Events
 
 N_STEPS = 5  # Gauss-Newton steps at each size of cells
 CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
+CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
+CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
+MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
 N_SWEEPS = 30  # of Gauss-Seidel
 N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
@@ -34,9 +37,10 @@ CURVATURE = 3.0
 OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
 NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
-POOLING = 1.5  # nodes, of the Gaussian whose nodes tell of one
+POOLING = (1, 2, 4)  # nodes, of the Gaussian whose nodes tell of one
 MIN_INFORMATION = 0.1  # 1/px^2
 MIN_VARIANCE = 0.001  # px^2
+FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
@@ -105,43 +109,70 @@ def blur(image, scratch, passes):
                 image[j, i] = 0.25 * (scratch[up, i] + scratch[down, i]) + 0.5 * scratch[j, i]
 
 
-@njit_noalloc
-def accumulate(warped, s, p, x, y, u, spacing, cell, image, normal):
-    """Add the derivatives (1) of each event to the nodes around it; return the score.
+@njit_noalloc_inlined
+def look_up(image, a, b):
+    """Return gradient, sum, number and mean time of an image's cells at a place; bilinear."""
+    i, j = int(a), int(b)
+    fx, fy = a - i, b - j
+    gx = gy = value = number = late = 0.0
+    for dj in range(2):
+        for di in range(2):
+            weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+            y, x = j + dj, i + di
+            gx += weight * 0.5 * (image[0, y, x + 1] - image[0, y, x - 1])
+            gy += weight * 0.5 * (image[0, y + 1, x] - image[0, y - 1, x])
+            value += weight * image[0, y, x]
+            number += weight * image[1, y, x]
+            late += weight * image[2, y, x]
+    return gx, gy, value, number, late
 
-    `normal` (rows, columns, 6) gets g, xx, xy, yy of H, and what noise adds to xx and to yy
-    per variance of the gradient, px.
+
+@njit_noalloc
+def accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
+    """Add the derivatives (1) of each event to the nodes and clock's times around it.
+
+    Args:
+        warped: (n, 2) places in cells.
+        s: (n,) relative times.
+        p: (n,) polarities.
+        place: (n,) place among the clock's times, from 0.
+        u: (rows, columns, 2) displacement of nodes, px.
+        spacing: Distance of nodes, px.
+        cell: Size of cells, px.
+        image: (3, ...) blurred images of `warp_and_vote`.
+        normal: (rows, columns, 6) gets g, xx, xy, yy of H, and what noise adds to xx and yy per
+            variance of the gradient, px.
+        clock: (K, 2) gets derivative and curvature by the clock's s.
+
+    Returns:
+        The score.
     """
     normal[:] = 0
+    clock[:] = 0
     score = 0.0
     per_px = 1.0 / cell
     for k in range(len(s)):
-        if warped[k, 0] < 1:
+        a, b = warped[k, 0], warped[k, 1]
+        if a < 1 or b < 1 or a >= image.shape[2] - 2 or b >= image.shape[1] - 2:
             continue
-        i, j = int(warped[k, 0]), int(warped[k, 1])
-        if i < 1 or j < 1 or i > image.shape[2] - 3 or j > image.shape[1] - 3:
-            continue
-        fx, fy = warped[k, 0] - i, warped[k, 1] - j
-        gx = gy = number = late = value = 0.0
-        for dj in range(2):
-            for di in range(2):
-                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
-                a, b = j + dj, i + di
-                gx += weight * 0.5 * (image[0, a, b + 1] - image[0, a, b - 1])
-                gy += weight * 0.5 * (image[0, a + 1, b] - image[0, a - 1, b])
-                number += weight * image[1, a, b]
-                late += weight * image[2, a, b]
-                value += weight * image[0, a, b]
+        gx, gy, value, number, late = look_up(image, a, b)
         gx, gy = gx * per_px, gy * per_px
         age = s[k] - late / max(number, 1e-9)
         w = 1.0 / (number + NUMBER_FLOOR)
         score += p[k] * value * w
+        x, y = (a - 0.5) * cell - 0.5, (b - 0.5) * cell - 0.5
+        ux, uy = displacement_at(u, spacing, x, y)
+        along = gx * ux + gy * uy
+        i = min(int(place[k]), len(clock) - 2)
+        f = place[k] - i
+        for d in range(2):
+            weight = f if d else 1 - f
+            clock[i + d, 0] -= weight * p[k] * w * along
+            clock[i + d, 1] += weight * CURVATURE * w / (number + NUMBER_FLOOR) * along * along
         c = -p[k] * age * w
         h = CURVATURE * age * age * w / (number + NUMBER_FLOOR)
         others = max(number - OWN_NUMBER, 0.0)
-        i, j, fx, fy = node_cell(
-            u, spacing, (warped[k, 0] - 0.5) * cell - 0.5, (warped[k, 1] - 0.5) * cell - 0.5
-        )
+        i, j, fx, fy = node_cell(u, spacing, x, y)
         for dj in range(2):
             for di in range(2):
                 weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
@@ -202,69 +233,91 @@ def fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[n
 
 
 class Clock(NamedTuple):
-    """Relative times s of a window, linear between some times; s = 1 is its end."""
+    """Relative times s of a window, linear between some times."""
 
-    t: NDArray[np.float64]  # (K,) us
+    t: NDArray[np.float64]  # (K,) us, rising
     s: NDArray[np.float64]  # (K,)
+
+    @classmethod
+    def of(cls, events: Events, at: int, half: int) -> "Clock":
+        """Make the clock of a window that goes as fast as time and, in equal parts, events do.
+
+        Events come as fast as a scene moves.
+
+        Args:
+            events: The events, one or more.
+            at: Time at which s = 0, us.
+            half: Number of events around it on either side.
+        """
+        parts = max(round(CLOCK_PARTS * len(events) / half), 1)
+        rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
+        t, first = np.unique(events.t[rows], return_index=True)
+        if len(t) < 2:
+            return cls(at + np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
+        s = rows[first] / half
+        s = (s + (t - t[0]) * (s[-1] / (t[-1] - t[0]))) / 2
+        return cls(t.astype(float), s - np.interp(at, t, s))
+
+    @property
+    def mean_rate(self) -> float:
+        """How fast s goes over the window, 1/s."""
+        return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
 
     def rate(self, t: float) -> float:
         """Return how fast s goes at a time (us), 1/s."""
-        return float(np.interp(t, self.t, np.gradient(self.s, self.t))) * 1e6
-
-
-def time_clock(events: Events, at: int) -> Clock:
-    """Make the clock of a window that goes as fast as time, with s = 0 at a time (us)."""
-    unit = max(float(np.abs(events.t - at).max(initial=0)), 1.0)
-    return Clock(at + np.array([-unit, unit]), np.array([-1.0, 1.0]))
-
-
-def event_clock(events: Events, at: int, half: int) -> Clock:
-    """Make the clock of a window that goes as fast as events come.
-
-    Events come as fast as a scene moves, so that a camera that brakes has a constant velocity.
-
-    Args:
-        events: The events.
-        at: Time at which s = 0, us.
-        half: Number of events after which s = 1.
-
-    Returns:
-        The clock.
-    """
-    rows = np.unique(
-        np.append(np.arange(0, len(events), max(half // CLOCK_PARTS, 1)), len(events) - 1)
-    )
-    t, first = np.unique(events.t[rows], return_index=True)
-    s = rows[first] / half
-    if len(t) < 2:
-        return time_clock(events, at)
-    return Clock(t.astype(float), s - np.interp(at, t, s))
+        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
+        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
+        return float(np.interp(t, self.t, smooth)) * 1e6
 
 
 class WindowEvents(NamedTuple):
-    """Events of a window: places (px) and relative times."""
+    """Events of a window: places (px), times and polarities."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
-    s: NDArray[np.float32]
+    t: NDArray[np.int64]  # us
     p: NDArray[np.float32]  # polarity, of mean 0 and variance 1
 
     @classmethod
-    def of(cls, events: Events, clock: Clock) -> "WindowEvents":
-        """Make them of events, with relative times of a clock."""
+    def of(cls, events: Events) -> "WindowEvents":
+        """Make them of events."""
         # What goes up comes down: the mean is 0. A polarity that is always the same tells nothing.
         p = np.where(events.p, 1.0, -1.0)
-        p = (p - p.mean()) / max(float(p.std()), 1e-3) if len(p) else p
-        columns = (events.x, events.y, np.interp(events.t, clock.t, clock.s), p)
-        return cls(*(np.asarray(c, np.float32) for c in columns))
+        p = (p - p.mean()) / max(float(p.std()), 1e-3)
+        x, y, p = (np.asarray(c, np.float32) for c in (events.x, events.y, p))
+        return cls(x, y, events.t, p)
 
 
 class Aligned(NamedTuple):
     """Displacement of nodes and what events tell of it."""
 
     u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
+    clock: Clock
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
     score: float  # per event
+
+
+def _principal(information: NDArray, reach: int) -> tuple[NDArray, NDArray]:
+    """Return eigenvalues and axes of the information of nodes within a Gaussian."""
+    pooled = gaussian_filter(information, (reach, reach, 0), mode="constant")
+    return np.linalg.eigh(4 * np.pi * reach**2 * pooled[..., [[0, 1], [1, 2]]])
+
+
+def _rotate(axes: NDArray, values: NDArray) -> NDArray:
+    """Return matrices of these axes and eigenvalues."""
+    return (axes * values[..., None, :]) @ np.swapaxes(axes, -1, -2)
+
+
+def _curvature(u: NDArray, reach: int) -> NDArray[np.float64]:
+    """Return the largest square of second differences around nodes, px^2; 0 of affine flow."""
+    far, (rows, columns) = 2 * reach, u.shape[:2]
+    near, most = np.pad(u, ((far, far), (far, far), (0, 0)), mode="edge"), np.zeros(u.shape[:2])
+    for distance in (reach, far):
+        for j, i in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            y, x = j * distance, i * distance
+            one, other = (near[far + c * y :, far + c * x :][:rows, :columns] for c in (1, -1))
+            most = np.maximum(most, (((one + other) / 2 - u) ** 2).sum(-1))
+    return most
 
 
 class Alignment:
@@ -287,8 +340,8 @@ class Alignment:
     def covariance(self, aligned: Aligned) -> NDArray[np.float64]:
         """Return the covariance of the nodes' displacement.
 
-        It is the inverse of what a node and those around tell, and what they differ by, which is
-        large at borders of objects.
+        It is the inverse of what a node and those around tell, and by how much flow bends among
+        them, which is large at borders of objects; those near or far, which give the least.
 
         Args:
             aligned: Displacement and information.
@@ -296,64 +349,93 @@ class Alignment:
         Returns:
             (rows, columns, 2, 2), px^2.
         """
-        pooled = gaussian_filter(aligned.information, (POOLING, POOLING, 0), mode="constant")
-        pooled *= 4 * np.pi * POOLING**2
-        values, axes = np.linalg.eigh(pooled[..., [[0, 1], [1, 2]]])
-        variances = 1 / np.maximum(values, MIN_INFORMATION)
-        C = (axes * variances[..., None, :]) @ np.swapaxes(axes, -1, -2)
-        # Differences of second order around a node: 0 where flow is affine, large at borders.
-        near = np.pad(aligned.u, ((2, 2), (2, 2), (0, 0)), mode="edge")
-        rows, columns = self.nodes
-        around = [near[j : j + rows, i : i + columns] for j in range(5) for i in range(5)]
-        off = np.stack([(around[k] + around[24 - k]) / 2 - aligned.u for k in range(12)])
-        spread = (off**2).sum(-1).max(0)[..., None, None] * np.eye(2)
+        best = np.full((*self.nodes, 2, 2), np.inf)
+        for reach in POOLING:
+            values, axes = _principal(aligned.information, reach)
+            C = _rotate(axes, 1 / np.maximum(values, MIN_INFORMATION))
+            C = C + _curvature(aligned.u, reach)[..., None, None] * np.eye(2)
+            less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
+            best = np.where(less[..., None, None], C, best)
         length2 = (aligned.u**2).sum(-1)[..., None, None]
         floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
-        return C + spread + floor
+        return best + floor
+
+    def shrink(self, aligned: Aligned) -> NDArray[np.float64]:
+        """Return the displacement without components that events around do not determine.
+
+        They would double with each window.
+
+        Args:
+            aligned: Displacement and information.
+
+        Returns:
+            (rows, columns, 2), px.
+        """
+        values, axes = _principal(aligned.information, POOLING[-1])
+        values = np.maximum(values, 0)
+        known = _rotate(axes, values / (values + FIRST_INFORMATION))
+        return (known @ aligned.u[..., None])[..., 0]
 
     def typical(self, aligned: Aligned) -> float:
-        """Return the median length of displacements, weighted by information, px.
-
-        It is 0 where events determine none of them.
+        """Return the median length of known displacements, weighted by information, px.
 
         Args:
             aligned: Displacement and information.
         """
-        if not (np.linalg.eigvalsh(self.covariance(aligned)) < MAX_VARIANCE).all(-1).any():
-            return 0.0
+        known = self.shrink(aligned)
+        length = np.hypot(known[..., 0], known[..., 1]).ravel()
         weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0)
-        length = np.hypot(aligned.u[..., 0], aligned.u[..., 1]).ravel()
         order = np.argsort(length, kind="stable")
         total = np.cumsum(weight.ravel()[order])
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])
 
+    def _turn(self, clock: Clock, at: int, s: NDArray, turns: NDArray) -> NDArray[np.float64]:
+        """Return a clock's s after a step of (1), on the whole as fast as `clock`."""
+        step = (turns[:, 0] + CLOCK_INFORMATION * (clock.s - s)) / (turns[:, 1] + CLOCK_INFORMATION)
+        s = s + CLOCK_STEP * np.clip(step, -CLOCK_REACH, CLOCK_REACH)
+        s = s - np.interp(at, clock.t, s)
+        speed = (s @ clock.s) / max(clock.s @ clock.s, 1e-9)
+        return s / speed if speed > MIN_CLOCK_SPEED else clock.s
+
     def __call__(
-        self, events: WindowEvents, start: NDArray | None, cells: tuple[int, ...]
+        self,
+        events: WindowEvents,
+        clock: Clock,
+        at: int,
+        start: NDArray | None,
+        cells: tuple[int, ...],
+        adapt: bool,
     ) -> Aligned:
         """Align the events of a window.
 
         Args:
             events: The events.
+            clock: Clock to start from.
+            at: Time at which points are displaced by 0, us.
             start: Displacement (rows, columns, 2) to start from, px; None: no displacement.
             cells: Sizes of the cells, px, one after the other.
+            adapt: Whether the clock is estimated, too.
 
         Returns:
             The displacement.
         """
         u = np.zeros((*self.nodes, 2)) if start is None else start.copy()
         normal, step = np.zeros((*self.nodes, 6)), np.zeros_like(u)
-        warped = np.empty((len(events.x), 2), np.float32)
-        x, y, s, p = events
+        x, y, t, p = events
+        warped = np.empty((len(x), 2), np.float32)
+        place = np.interp(t, clock.t, np.arange(len(clock.t))).astype(np.float32)
+        turns, ahead = np.zeros((len(clock.t), 2)), clock.s.copy()
         score = 0.0
         for cell in cells:
             image = np.zeros((3, *image_shape(self.shape, cell)), np.float32)
             scratch = np.empty_like(image[0])
             reach, before = np.full((*self.nodes, 1), float(cell)), np.zeros_like(u)
             for _ in range(N_STEPS):
+                s = np.interp(place, np.arange(len(ahead)), ahead).astype(np.float32)
                 warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
                 for channel, passes in zip(image, N_BLURS, strict=True):
                     blur(channel, scratch, passes)
-                score = accumulate(warped, s, p, x, y, u, self.spacing, cell, image, normal)
+                score = accumulate(warped, s, p, place, u, self.spacing, cell, image, normal, turns)
                 solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
                 # Sharp images have a smaller range than their curvature tells: steps that turn
                 # back are halved.
@@ -361,5 +443,7 @@ class Alignment:
                 length = np.hypot(step[..., :1], step[..., 1:])
                 before = step * np.minimum(1, reach / np.maximum(length, 1e-9))
                 u += before
+                if adapt:
+                    ahead = self._turn(clock, at, ahead, turns)
         information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
-        return Aligned(u, information, score / max(len(x), 1))
+        return Aligned(u, Clock(clock.t, ahead), information, score / max(len(x), 1))

@@ -2,7 +2,7 @@
 
 import functools
 import threading
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,6 @@ from jaxevent.event_flow.alignment import (
     Alignment,
     Clock,
     WindowEvents,
-    event_clock,
-    time_clock,
 )
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
@@ -27,8 +25,6 @@ LEVELS = range(-4, 5)  # powers of 2 of the window's size
 CHAIN_WINDOWS = 16  # half windows of a chain of anchors
 N_CACHED_ANCHORS = 256
 UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
-MIN_CLOCK_CHANGE = 0.1  # of s, from which the clock of events is tried beside time
-MIN_CLOCK_GAIN = 1.01  # of the score, with which it is taken
 MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
 
 
@@ -47,13 +43,12 @@ class Anchor(NamedTuple):
 
     row: int  # of the event there
     t: int  # us
-    clock: Clock  # of displacements
     aligned: Aligned
 
     @property
     def rate(self) -> float:
         """Displacements per second."""
-        return self.clock.rate(self.t)
+        return self.aligned.clock.rate(self.t)
 
 
 class Chain(NamedTuple):
@@ -98,31 +93,26 @@ class EventFlow:
         start, rate, half = None, 0.0, 0
         for level in LEVELS:
             half = int(self._base * 2.0**level)
-            at, events = self._events(row, half)
-            clock = time_clock(events, at)
-            start = None if start is None else start * (rate / clock.rate(at))
-            found = self._align(WindowEvents.of(events, clock), start, CELLS)
-            start, rate = found.u, clock.rate(at)
+            found = self._refine(row, half, start, rate, grow=True)
+            start, rate = self._align.shrink(found.aligned), found.aligned.clock.mean_rate
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
-                and (whole or self._align.typical(found) >= float(self.params.displacement))
+                and (whole or self._align.typical(found.aligned) >= float(self.params.displacement))
             ):
                 break
-        return Chain(self._choose_clock(row, half, start, start), half)
+        return Chain(self._refine(row, half, start, rate), half)
 
-    def _choose_clock(self, row: int, half: int, by_time: Any, by_events: Any) -> Anchor:
-        """Refine displacements by time and by the clock of events, and choose by their scores."""
+    def _refine(
+        self, row: int, half: int, start: NDArray | None, rate: float, grow: bool = False
+    ) -> Anchor:
+        """Align the window around an event from displacements that went at a rate (1/s)."""
         at, events = self._events(row, half)
-        clock, other = time_clock(events, at), event_clock(events, at, half)
-        window = WindowEvents.of(events, clock)
-        found = Anchor(row, at, clock, self._align(window, by_time, LAST_CELLS))
-        moved = WindowEvents.of(events, other)
-        if np.abs(moved.s - window.s).max() < MIN_CLOCK_CHANGE:
-            return found
-        second = Anchor(row, at, other, self._align(moved, by_events, LAST_CELLS))
-        better = second.aligned.score > MIN_CLOCK_GAIN * found.aligned.score
-        return second if better else found
+        clock = Clock.of(events, at, half)
+        if start is not None:
+            start = start * (rate / clock.mean_rate)
+        window, cells = WindowEvents.of(events), CELLS if grow else LAST_CELLS
+        return Anchor(row, at, self._align(window, clock, at, start, cells, not grow))
 
     def _make_chain(self, number: int) -> Chain:
         return self._seek(number * CHAIN_WINDOWS * self._base)
@@ -134,10 +124,7 @@ class EventFlow:
             return first
         before = self._anchor(number, k - 1)
         row = number * CHAIN_WINDOWS * self._base + k * half
-        at, events = self._events(row, half)
-        velocity = before.aligned.u * before.clock.rate(at)
-        start = velocity / time_clock(events, at).rate(at)
-        found = self._choose_clock(row, half, start, before.aligned.u)
+        found = self._refine(row, half, before.aligned.u, before.aligned.clock.mean_rate)
         if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
             other = self._seek(row, half).first
             if other.aligned.score > found.aligned.score:
@@ -155,13 +142,16 @@ class EventFlow:
         end = min((number + 1) * length, len(self.recording.events))
         return np.arange(number * length, end, self._chain(number).half)
 
-    def _around(self, start: int, stop: int) -> list[Anchor]:
-        """Return the anchors that determine flow from start to stop (us), of different times."""
+    def _around(self, start: int, stop: int, until: int) -> list[Anchor]:
+        """Return the anchors that determine flow from start to stop (us), of different times.
+
+        A causal flow uses events up to the time `until`.
+        """
         events, length = self.recording.events, CHAIN_WINDOWS * self._base
         n = len(events)
         if not n:
             return []
-        seen = events.index(stop + 1)  # events that a causal flow may use
+        seen = events.index(until + 1)  # events that a causal flow may use
         low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), n - 1)
         found: list[Anchor] = []
         first = max(low // length - self.causal, 0)
@@ -198,27 +188,28 @@ class EventFlow:
             for k, anchor in enumerate(anchors):
                 weight = np.interp(t, times, np.eye(len(times))[k])
                 if weight > 0:
-                    velocity[n] += np.float32(weight * anchor.clock.rate(t)) * fields[k]
+                    velocity[n] += np.float32(weight * anchor.aligned.clock.rate(t)) * fields[k]
                     covariance[n] += np.float32(weight * anchor.rate**2) * spreads[k]
         return velocity, covariance
 
-    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
 
         Args:
             start: First time of the events, us.
             stop: Last time of the events, us.
             at: Time to which points are carried, us.
+            until: Time up to which a causal flow may use events, us; None: the latest of the three.
 
         Returns:
             The paths.
         """
         start, stop = min(start, at), max(stop, at)
         with self._lock:
-            anchors = self._around(start, stop)
+            anchors = self._around(start, stop, stop if until is None else until)
         times = [np.array([anchor.t for anchor in anchors] or [at])]
         for anchor in anchors:
-            inner = anchor.clock.t[1:-1]
+            inner = anchor.aligned.clock.t[1:-1]
             times.append(inner[(inner >= start) & (inner <= stop)])
         knots = np.unique(np.concatenate(times).astype(np.int64))
         return WindowPaths(int(at), knots, *self._fields(anchors, knots))
@@ -247,7 +238,7 @@ class EventFlow:
         valid = np.zeros(mean.shape[:3], bool)
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
-                anchors = self._around(t, t)
+                anchors = self._around(t, t, t)
             (mean[row],), (covariance[row],) = self._fields(anchors, wanted[row : row + 1])
             if anchors:
                 rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])

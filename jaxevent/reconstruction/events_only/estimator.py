@@ -15,6 +15,7 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.events_only.gradient import (
     WindowEquations,
     held_out_likelihood,
+    measure_slope,
     pack_equations,
     sample_variance,
     solve_equations,
@@ -122,7 +123,7 @@ class EventsOnly(ImageEstimator[Params]):
             InputError: The recording has no events, or times lie outside it.
         """
         windows, wanted, params = self._open(recording, times, params, extrapolate)
-        solved = [windows(t, variance=False) for t in wanted.tolist()]
+        solved = [windows(t) for t in wanted.tolist()]
         equations, _ = self._stack(windows, solved, params)
         scale = IntensityScale.of(solved, float(params.I0))
         return WindowFeatures(equations), PreparedTimes(np.arange(len(wanted)), scale)
@@ -157,7 +158,8 @@ class EventsOnly(ImageEstimator[Params]):
         for row, one in zip(held, solved, strict=True):
             if held_out is not None:
                 row[: len(one.rows.kind)] = held_out(one.rows)
-        return jax.device_put((jax.tree.map(lambda *leaves: np.stack(leaves), *packed), held))
+        equations = jax.tree.map(lambda *leaves: np.stack(leaves), *packed)
+        return measure_slope(equations, params), jax.device_put(held)
 
     def prepare_likelihood(
         self, recording: Recording, times: Times, params: Params | None = None

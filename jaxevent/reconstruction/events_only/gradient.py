@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.rows import EVENT
-from jaxevent.reconstruction.events_only.solve import SAMPLES, factor_information
+from jaxevent.reconstruction.events_only.solve import (
+    BLUR_PX,
+    SAMPLES,
+    VARIANCE_FACTOR,
+    factor_information,
+)
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
@@ -29,7 +34,6 @@ REWEIGHTINGS = 100  # at most
 CG_ITERATIONS = 200  # at most
 TOLERANCES = {4: 5e-3, 8: 1e-8}  # relative residuals to stop at, by bytes of a number
 LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
-BLUR_PX = 1.5  # of the variance, as that of `solve`
 
 
 class Perturbation(NamedTuple):
@@ -65,6 +69,8 @@ class WindowEquations(NamedTuple):
     pull: Float[Numeric, "*times height width 2"]  # gradient by other windows, thresholds / px
     information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
     start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
+    unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
+    slope: Float[Numeric, "*times"]  # norm of dE/du there, at which JAX stops, too
     relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
     noise: Perturbation
 
@@ -105,6 +111,8 @@ def pack_equations(
         (prior.gradient / c).astype(dtype),
         information.astype(dtype),
         (solution.log_image / c).astype(dtype),
+        (solution.unseen / c**2).astype(dtype),
+        np.zeros((), dtype),
         relative.mean((1, 2)).astype(dtype),
         Perturbation(
             np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
@@ -266,7 +274,7 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
 def _minimise(equations: WindowEquations, params: Params) -> Array:
     start = equations.start
     scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
-    least = TOLERANCES[start.dtype.itemsize] * scale
+    least = jnp.maximum(TOLERANCES[start.dtype.itemsize] * scale, equations.slope)
 
     def should_continue(state: tuple[Array, Array, int]) -> Array:
         _, slope, n = state
@@ -281,6 +289,21 @@ def _minimise(equations: WindowEquations, params: Params) -> Array:
 
     first = (start, _slope(start, equations, params), 0)
     return jax.lax.while_loop(should_continue, reweight, first)[0]
+
+
+@jax.jit
+def measure_slope(equations: WindowEquations, params: Params) -> WindowEquations:
+    """Measure how far the host's solutions are from the minimum of the energy.
+
+    Args:
+        equations: Equations of windows, stacked.
+        params: Parameters that they were solved with.
+
+    Returns:
+        The equations with `slope`.
+    """
+    size = jax.lax.map(lambda one: jnp.linalg.norm(_slope(one.start, one, params)), equations)
+    return equations._replace(slope=1.001 * size)
 
 
 def _slope(u: Array, equations: WindowEquations, params: Params) -> Array:
@@ -363,7 +386,7 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
 
     squares = jax.lax.map(sample, equations.noise).mean(0)
     down, across = (jnp.asarray(_blur_matrix(n), u.dtype) for n in u.shape)
-    return down @ squares @ across.T
+    return VARIANCE_FACTOR * (down @ squares @ across.T) + equations.unseen
 
 
 @functools.cache

@@ -27,13 +27,14 @@ The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, UInt32
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events
 
 EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
+NONE, MUTED = -1, -2  # in place of the number of a pixel's last event
 FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
 ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^2
 
@@ -54,7 +55,7 @@ class Rows(NamedTuple):
 
     shape: tuple[int, int]  # (height, width)
     threshold: float  # ln I, mean of both polarities
-    corner: Int32[np.ndarray, "rows 2"]  # flat index of the look-up's pixel above and left
+    corner: UInt32[np.ndarray, "rows 2"]  # flat index of the look-up's pixel above and left
     fraction: Float[np.ndarray, "rows 2 2"]  # px from there, x before y
     change: Float[np.ndarray, " rows"]  # in thresholds
     weight: Float[np.ndarray, " rows"]  # reciprocal variance, against that of a common row
@@ -68,6 +69,7 @@ def make_rows(
     thresholds: NDArray,
     shape: tuple[int, int],
     span: tuple[int, int],
+    muted: NDArray[np.bool_] | None = None,
 ) -> Rows:
     """Make the equations of a window's events and of its silence.
 
@@ -77,6 +79,8 @@ def make_rows(
         thresholds: (2,) or (2, height, width) ln I, of ON and OFF events.
         shape: (height, width) of the sensor.
         span: Begin and end of the window, us.
+        muted: (height, width), true for pixels without events whose silence tells nothing; None:
+            there are none.
 
     Returns:
         The rows whose look-ups are both inside the image.
@@ -104,14 +108,16 @@ def make_rows(
     rows = Rows(
         shape,
         threshold,
-        np.empty((n, 2), np.int32),
+        np.empty((n, 2), np.uint32),
         np.empty((n, 2, 2), np.float32),
         np.empty(n, np.float32),
         np.ones(n + 1, np.float32),
         np.empty(n, np.uint8),
         np.empty(n, np.int32),
     )
-    last = np.full(height * width, -1, np.int32)
+    last = np.full(height * width, NONE, np.int32)
+    if muted is not None:
+        last[muted.ravel()] = MUTED
     ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
     times = (1e-6 * (events.t - span[0]), 1e-6 * (span[1] - span[0]), doubt)
     n = _lay_rows(pixel, change.astype(np.float32), ends, times, last, rows)
@@ -134,10 +140,10 @@ def _lay_rows(pixel, change, positions, times, last, rows):
         last[x] = k
     for x in range(len(last)):
         before = last[x]
-        if before < 0:
+        if before == NONE:
             rows.weight[n] = 1 / (1 + doubt[x] * stop**2)
             n += _lay_row(n, end[x], begin[x], 0.0, SILENT, x, rows)
-        else:
+        elif before != MUTED:
             rows.weight[n] = 1 / (1 + doubt[x] * (stop - t[before]) ** 2)
             n += _lay_row(n, end[x], at_event[before], LAST_SHARE * change[before], LAST, x, rows)
     return n
@@ -151,7 +157,7 @@ def _lay_row(n, after, before, change, kind, pixel, rows):
         x, y = (after[0], after[1]) if side == 0 else (before[0], before[1])
         if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
             return 0
-        i, j = min(int(x), width - 2), min(int(y), height - 2)
+        i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
         rows.corner[n, side] = j * width + i
         rows.fraction[n, side, 0] = x - i
         rows.fraction[n, side, 1] = y - j
