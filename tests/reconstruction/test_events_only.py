@@ -97,7 +97,7 @@ def test_jax_makes_the_images_of_the_host():
     with jax.enable_x64(False):
         images = events_only.prepare_images(translated(), [0.15])
         made = jax.jit(lambda params, images: images(params))(events_only.Params(), images)
-    np.testing.assert_allclose(made.mean.reshape(SIZE), host.mean[0], rtol=1e-4)
+    np.testing.assert_allclose(made.mean.reshape(SIZE), host.mean[0], rtol=2e-3)
     assert 0.5 < np.median(made.covariance.reshape(SIZE) / host.covariance[0]) < 2
 
 
