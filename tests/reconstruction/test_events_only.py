@@ -97,7 +97,7 @@ def test_jax_makes_the_images_of_the_host():
     with jax.enable_x64(False):
         images = events_only.prepare_images(translated(), [0.15])
         made = jax.jit(lambda params, images: images(params))(events_only.Params(), images)
-    np.testing.assert_allclose(made.mean.reshape(SIZE), host.mean[0], rtol=0.1)
+    np.testing.assert_allclose(made.mean.reshape(SIZE), host.mean[0], rtol=2e-3)
     assert 0.5 < np.median(made.covariance.reshape(SIZE) / host.covariance[0]) < 2
 
 
@@ -105,9 +105,9 @@ def test_derivatives_are_differences():
     """Of image and variance by all numbers at once, through the solution."""
     weights = np.random.default_rng(0).normal(size=SIZE)
     params = PLAIN.replace(leak=1e-2)
-    window = jax.tree.map(
-        lambda leaf: leaf[0], events_only.prepare(translated(), [0.15], params)[0]
-    )
+    features, _ = events_only.prepare(translated(), [0.15], params)
+    # To the minimum itself, nearer than the host goes.
+    window = jax.tree.map(lambda leaf: leaf[0], features.equations)._replace(slope=0.0)
     random = np.random.default_rng(1)
     direction = {name: float(random.normal()) for name in NAMES}
 
@@ -117,8 +117,8 @@ def test_derivatives_are_differences():
             name: getattr(params, name) * jnp.exp(step * direction[name])
             for name in NAMES
         })  # fmt: skip
-        u = solve_equations(window.equations, moved)
-        V = sample_variance(u, window.equations, moved)
+        u = solve_equations(window, moved)
+        V = sample_variance(u, window, moved)
         return (weights * (u - u.mean() + 0.1 * jnp.log(V))).sum()
 
     slope, step = jax.jit(jax.grad(loss))(0.0, window), 1e-3

@@ -1,7 +1,7 @@
 """The method `events-only`: video from events alone."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.events_only.gradient import (
     WindowEquations,
     held_out_likelihood,
+    measure_slope,
     pack_equations,
     sample_variance,
     solve_equations,
@@ -22,8 +23,12 @@ from jaxevent.reconstruction.events_only.gradient import (
 )
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.rows import EVENT, Rows
-from jaxevent.reconstruction.events_only.video import EventsOnlyVideo, read_intensity
-from jaxevent.reconstruction.events_only.windows import WindowSolver
+from jaxevent.reconstruction.events_only.video import (
+    EventsOnlyVideo,
+    IntensityScale,
+    read_intensity,
+)
+from jaxevent.reconstruction.events_only.windows import SolvedWindow, WindowSolver
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -73,10 +78,11 @@ class PreparedTimes(ShortRepr):
     """Times to read images at, as rows of the windows."""
 
     rows: Any
+    scale: IntensityScale
 
     def take(self, rows: Any) -> "PreparedTimes":
         """Choose some of the images, in the order of `rows`."""
-        return PreparedTimes(self.rows[rows])
+        return PreparedTimes(self.rows[rows], IntensityScale(*(v[rows] for v in self.scale)))
 
     def over(self, devices: Any) -> "PreparedTimes":
         """Return the times as they are: pixels depend on each other and are not shared out."""
@@ -117,8 +123,10 @@ class EventsOnly(ImageEstimator[Params]):
             InputError: The recording has no events, or times lie outside it.
         """
         windows, wanted, params = self._open(recording, times, params, extrapolate)
-        equations, _ = self._stack(windows, wanted, params)
-        return WindowFeatures(equations), PreparedTimes(np.arange(len(wanted)))
+        solved = [windows(t) for t in wanted.tolist()]
+        equations, _ = self._stack(windows, solved, params)
+        scale = IntensityScale.of(solved, float(params.I0))
+        return WindowFeatures(equations), PreparedTimes(np.arange(len(wanted)), scale)
 
     def _open(
         self,
@@ -139,19 +147,19 @@ class EventsOnly(ImageEstimator[Params]):
     def _stack(
         self,
         windows: WindowSolver,
-        times: NDArray[np.int64],
+        solved: Sequence[SolvedWindow],
         params: Params,
         held_out: Callable[[Rows], NDArray[np.bool_]] | None = None,
     ) -> tuple[WindowEquations, Array]:
-        """Solve windows on the host; return their equations, and 1 for rows that are held out."""
-        solved = [windows(t, variance=False, held_out=held_out) for t in times.tolist()]
+        """Return the equations of solved windows, and 1 for rows that are held out."""
         count = max(len(one.rows.kind) for one in solved)
         packed = [pack_equations(one, windows.relative, params, count) for one in solved]
         held = np.zeros((len(solved), count), packed[0].fraction.dtype)
         for row, one in zip(held, solved, strict=True):
             if held_out is not None:
                 row[: len(one.rows.kind)] = held_out(one.rows)
-        return jax.device_put((jax.tree.map(lambda *leaves: np.stack(leaves), *packed), held))
+        equations = jax.tree.map(lambda *leaves: np.stack(leaves), *packed)
+        return measure_slope(equations, params), jax.device_put(held)
 
     def prepare_likelihood(
         self, recording: Recording, times: Times, params: Params | None = None
@@ -170,7 +178,8 @@ class EventsOnly(ImageEstimator[Params]):
             InputError: As `prepare`.
         """
         windows, wanted, params = self._open(recording, times, params)
-        return HeldOutEvents(*self._stack(windows, wanted, params, _choose_held_out))
+        solved = [windows(t, variance=False, held_out=_choose_held_out) for t in wanted.tolist()]
+        return HeldOutEvents(*self._stack(windows, solved, params, _choose_held_out))
 
     def log_likelihood(self, params: Params, features: HeldOutEvents) -> Float[Array, ""]:
         """Return the log likelihood of events that the others of their window predict.
@@ -223,7 +232,7 @@ class EventsOnly(ImageEstimator[Params]):
             Images (T, pixels), their variance (ln I)^2, and which pixels are valid.
         """
         L, P = (leaf[out.rows] for leaf in trajectory)
-        return Estimate(*read_intensity(params, L, P))
+        return Estimate(*read_intensity(params, L, P, out.scale))
 
     def estimate(
         self, recording: Recording, params: Params | None = None, **options: Any

@@ -70,6 +70,7 @@ class WindowEquations(NamedTuple):
     information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
     start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
     unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
+    slope: Float[Numeric, "*times"]  # norm of dE/du there, at which JAX stops, too
     relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
     noise: Perturbation
 
@@ -89,7 +90,7 @@ def pack_equations(
         The equations.
     """
     dtype = np.dtype(jnp.result_type(float))
-    rows, prior, solution = window
+    rows, prior, solution, _ = window
     c, n = rows.threshold, len(rows.kind)
 
     def fill(column: NDArray, kind: Any = dtype) -> NDArray:
@@ -111,6 +112,7 @@ def pack_equations(
         information.astype(dtype),
         (solution.log_image / c).astype(dtype),
         (solution.unseen / c**2).astype(dtype),
+        np.zeros((), dtype),
         relative.mean((1, 2)).astype(dtype),
         Perturbation(
             np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
@@ -272,7 +274,7 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
 def _minimise(equations: WindowEquations, params: Params) -> Array:
     start = equations.start
     scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
-    least = TOLERANCES[start.dtype.itemsize] * scale
+    least = jnp.maximum(TOLERANCES[start.dtype.itemsize] * scale, equations.slope)
 
     def should_continue(state: tuple[Array, Array, int]) -> Array:
         _, slope, n = state
@@ -287,6 +289,21 @@ def _minimise(equations: WindowEquations, params: Params) -> Array:
 
     first = (start, _slope(start, equations, params), 0)
     return jax.lax.while_loop(should_continue, reweight, first)[0]
+
+
+@jax.jit
+def measure_slope(equations: WindowEquations, params: Params) -> WindowEquations:
+    """Measure how far the host's solutions are from the minimum of the energy.
+
+    Args:
+        equations: Equations of windows, stacked.
+        params: Parameters that they were solved with.
+
+    Returns:
+        The equations with `slope`.
+    """
+    size = jax.lax.map(lambda one: jnp.linalg.norm(_slope(one.start, one, params)), equations)
+    return equations._replace(slope=1.001 * size)
 
 
 def _slope(u: Array, equations: WindowEquations, params: Params) -> Array:

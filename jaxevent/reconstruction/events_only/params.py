@@ -29,6 +29,9 @@ class Params(FrameParams):
     learn = Choice(
         (True, False), "whether the thresholds are scaled by the ratios that the events show"
     )
+    use_frames = Choice(
+        (False, True), "whether a frame at hand shows gradients, too, and the scale of intensity"
+    )
     calibrated = ()
 
     def solver(self) -> SolverParams:

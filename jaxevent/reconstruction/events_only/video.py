@@ -1,37 +1,60 @@
 """Images from events alone as a function of time."""
 
-from collections.abc import Iterator
-from typing import Any
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.locks import synchronized
 from jaxevent.reconstruction.events_only.params import Params
-from jaxevent.reconstruction.events_only.windows import FlowSource, WindowSolver
+from jaxevent.reconstruction.events_only.windows import FlowSource, SolvedWindow, WindowSolver
+from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 
 GREY = 0.5  # intensity where the log image is at its mean: events alone tell it up to a factor
 
 
-def read_intensity(params: Params, L: Array, P: Array) -> tuple[Array, Array, Array]:
+class IntensityScale(NamedTuple):
+    """Scales of images: ln(I + I0) = factor (L - mean L) + level."""
+
+    factor: Float[Numeric, " images"]
+    level: Float[Numeric, " images"]
+
+    @classmethod
+    def of(cls, windows: Sequence[SolvedWindow], I0: float) -> "IntensityScale":
+        """Return the scales by frames, or those that are agreed where there are none."""
+        agreed = math.log(GREY + I0)
+        pairs = [(1.0, agreed)] * len(windows)
+        for k, (_, _, solution, scale) in enumerate(windows):
+            level = math.nan if scale is None else scale.level(solution.log_image)
+            if scale is not None and math.isfinite(level):
+                pairs[k] = scale.factor, level + scale.factor * float(solution.log_image.mean())
+        return cls(*np.array(pairs, np.dtype(jnp.result_type(float))).T)
+
+
+def read_intensity(
+    params: Params, L: Array, P: Array, scale: IntensityScale
+) -> tuple[Array, Array, Array]:
     """Return mean, variance and validity of an estimate; pure.
 
     Args:
         params: Parameters.
         L: (images, ...) log images, ln I.
         P: Their variance, (ln I)^2.
+        scale: Scales of the images.
 
     Returns:
-        Intensity, of which the geometric mean (of I + I0) of an image is 0.5; P; and whether the
-        standard deviation is below `vague`.
+        Intensity; the variance of ln(I + I0); and whether its root is below `vague`.
     """
-    level = L.mean(tuple(range(1, L.ndim)), keepdims=True)
-    image = (GREY + params.I0) * jnp.exp(L - level) - params.I0
+    factor, level = (v.reshape(-1, *[1] * (L.ndim - 1)) for v in scale)
+    mean = L.mean(tuple(range(1, L.ndim)), keepdims=True)
+    image, P = jnp.exp(factor * (L - mean) + level) - params.I0, factor**2 * P
     return image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague)
 
 
@@ -71,9 +94,10 @@ class EventsOnlyVideo(ImageSequence[Params]):
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         for n, t in enumerate(times.tolist()):
-            solution = self._windows(t).solution
-            images = (v[None].astype(self.dtype) for v in (solution.log_image, solution.variance))
-            yield times[n : n + 1], _read_compiled(self.params, *images)
+            window = self._windows(t)
+            scale = IntensityScale.of([window], float(self.params.I0))
+            L, P = (v[None].astype(self.dtype) for v in window.solution[:2])
+            yield times[n : n + 1], _read_compiled(self.params, L, P, scale)
 
     @synchronized
     def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:

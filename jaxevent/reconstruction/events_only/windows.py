@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration.event_calibration import calibrate_events
 from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
-from jaxevent.reconstruction.events_only.memory import KeyMemories
+from jaxevent.reconstruction.events_only.frames import FrameMeasurements, FrameScale
+from jaxevent.reconstruction.events_only.memory import KeyMemories, fuse
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import Rows, make_rows
@@ -42,6 +43,7 @@ class SolvedWindow(NamedTuple):
     rows: Rows
     prior: GradientPrior
     solution: Solution
+    scale: FrameScale | None  # None: intensity has no scale
 
 
 class WindowSolver:
@@ -81,6 +83,20 @@ class WindowSolver:
             silence=self.numbers.silence,
             threshold=float(self.thresholds.mean()),
         )
+
+        self.frames: FrameMeasurements | None = None
+        if params.use_frames and recording.frames is not None:
+            numbers = (float(params.I0), float(params.clock_offset))
+            self.frames = FrameMeasurements(self, recording, *numbers, causal)
+
+    def rows_around(self, t: int) -> Rows:
+        """Return the equations of the events around a time (us) for the image there."""
+        place = self.recording.events.index(t)
+        events = self.events(max(place - self.n_side, 0), place + self.n_side)
+        span = (int(events.t[0]), int(events.t[-1])) if len(events) else (t, t)
+        span = min(span[0], t), max(span[1], t)
+        paths = self.paths(*span, t)
+        return make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of points through a window, see `EventFlow.paths`."""
@@ -132,9 +148,13 @@ class WindowSolver:
         events = self.events(memory.row(first), end)
         paths = self.paths(*span, t)
         rows = make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
-        prior = memory.prior(rows, t, first, last)
+        prior, scale = memory.prior(rows, t, first, last), None
+        measured = None if self.frames is None else self.frames(t, memory.threshold)
+        if measured is not None:
+            prior, scale = fuse(prior, measured[0], memory.threshold), measured[1]
         seen = rows
         if held_out is not None:
             kept = ~held_out(rows)
             seen = rows._replace(**{name: getattr(rows, name)[kept] for name in ROW_COLUMNS})
-        return SolvedWindow(rows, prior, solve(seen, prior, self.numbers, variance=variance))
+        solution = solve(seen, prior, self.numbers, variance=variance)
+        return SolvedWindow(rows, prior, solution, scale)
