@@ -89,7 +89,7 @@ def motion_errors(
     true = truth(times)
     smoothed = smooth(motion, params)
     told = {
-        "at once": motion(times, extrapolate=True),
+        "at once": motion(times, centred=False, extrapolate=True),
         "fixed lag": motion(times, centred=True, extrapolate=True),
         "smoothed": smoothed(times, extrapolate=True),
     }
@@ -141,7 +141,7 @@ def score_both(
             continue
         params, runs = Params.of(settings), []
         for k, (recording, (truth, duration)) in enumerate(sequences):
-            motion = voting.estimate(recording, params, model=model, seed=first + k)
+            motion = voting.estimate(recording, params, model=model, seed=first + k, smooth=False)
             times = np.arange(SETTLE, duration - 1e-6, 0.005)
             runs.append(motion_errors(motion, params, truth, times))
         row |= summarise_runs(runs, chosen, prefix)
@@ -179,7 +179,7 @@ def in_frames(
     params, runs, fill = Params.of(settings), [], []
     for seed in seeds:
         recording, velocity = simulate_frame_events(flow, seed=seed, **made)
-        motion = voting.estimate(recording, params, seed=seed)
+        motion = voting.estimate(recording, params, seed=seed, smooth=False)
         frame = np.arange(SETTLE_FRAMES, len(flow) - 1)
         frame = frame[(frame + 1) * STEP <= motion.t[-1] * 1e-6]
         scores = motion_errors(
@@ -210,7 +210,7 @@ def part_rotation(seeds: range) -> Table:
         times = np.arange(SETTLE, source.duration - 1e-6, 0.005)
         for name, settings in ways.items():
             params = Params.of(settings)
-            motion = voting.estimate(recording, params, model="rotation", seed=seed)
+            motion = voting.estimate(recording, params, model="rotation", seed=seed, smooth=False)
             runs[name].append(
                 motion_errors(motion, params, lambda t, s=source: s.twist(t)[1], times)
             )
@@ -253,7 +253,9 @@ def part_penalty(seeds: range) -> Table:
                         **more,
                     )  # fmt: skip
                     params = Params(preset=preset, r_t=float(r_t))
-                    motion = voting.estimate(recording, params, model=model, seed=seed)
+                    motion = voting.estimate(
+                        recording, params, model=model, seed=seed, smooth=False
+                    )
                     times = np.arange(SETTLE, duration - 1e-6, 0.005)
                     truth = source.velocity if model == "planar" else _turn(source)
                     errors.append(motion_errors(motion, params, truth, times)["at once"])

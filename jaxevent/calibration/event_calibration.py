@@ -4,10 +4,14 @@ Between two times the log intensity of a pixel with U ON and D OFF events change
 
     c_on U - c_off D = change + (less than a threshold).                                  (1)
 
-The change is mostly common to neighbours, where scenes and lamps grow brighter on the whole. So (1)
-is taken between pixels a few pixels apart, whose differences of U and of D scatter about a line of
-slope c_off / c_on. Both have errors. The line that treats ON and OFF alike is that of the geometric
-mean of both regressions, which bound the slope (Frisch 1934).
+Two estimates of c_on / c_off follow, which are weighted by their precision:
+
+- What rises falls again: the sum of (1) over all pixels is small. A scene that grows brighter on
+  the whole biases it, by about half of the standard deviation of (1) among pixels.
+- Neighbours grow brighter together. The differences of U and of D between pixels a few pixels apart
+  scatter about a line of slope c_off / c_on. Both have errors: `QUANTISATION` of whole events, and
+  differences of the change, which are treated alike in ON and OFF by the geometric mean of both
+  regressions. These bound the slope (Frisch 1934).
 """
 
 from typing import NamedTuple
@@ -25,10 +29,14 @@ MAX_PART_EVENTS = 2_000_000
 BLOCK_EVENTS = 1_000_000
 DISTANCES_PX = (1, 2, 4)  # between pixels that are compared
 CAUCHY_SCALE = 2.0  # thresholds, of the errors of (1)
-RATIO_SPREAD = 0.5  # standard deviation of ln(c_on / c_off) among sensors
+QUANTISATION = 1 / 3  # variance of a difference of counts, whose four ends are uniform in an event
+MIN_PART_KEPT = 0.25  # of a second moment, after the quantisation is subtracted
+COUNTS_ERROR = 0.5  # standard deviation of the image's mean change, of that of its pixels
+RATIO_SPREAD = 0.7  # standard deviation of ln(c_on / c_off) among sensors
 N_STEPS = 50  # of reweighted least squares
 MIN_EVENTS = 200  # of either polarity
 MIN_RHO = 1e-3
+MIN_ERROR = 0.03  # of ln(c_on / c_off)
 
 
 class EventCalibration(NamedTuple):
@@ -91,7 +99,7 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     root = np.sqrt(ratio.value if ratio.is_identifiable else 1.0)
     change = root * parts[:, 0] - parts[:, 1] / root
     gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
-    s, spread = _estimate_deviations(change, gain, ~hot)
+    s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
     return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(parts.sum((0, 1))))
 
@@ -126,24 +134,40 @@ def _differences(
 
 def _estimate_ratio(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> CalibrationValue:
     """Estimate c_on / c_off from ON and OFF counts (2, height, width)."""
-    if counts[:, ~hot].sum(1).min() < MIN_EVENTS:
+    on, off = counts[:, ~hot]
+    if min(on.sum(), off.sum()) < MIN_EVENTS:
         return not_identifiable("1", "too few events of one polarity")
+    whole = np.log(off.sum() / on.sum())
+    root, active = np.exp(whole / 2), on + off > 0
+    change, gain = (root * on - off / root)[active], (root * on + off / root)[active] / 2
+    error = COUNTS_ERROR * float(change.std() / gain.mean()) + MIN_ERROR
+    estimates = [(whole, error), _compare_neighbours(counts, hot)]
+    value = precision = 0.0
+    for log_ratio, error in estimates:
+        value += log_ratio / error**2
+        precision += error**-2
+    # Sensors' ratios have the mean 1.
+    precision += RATIO_SPREAD**-2
+    ratio, wide = np.exp([value / precision, CONFIDENCE_Z / np.sqrt(precision)]).tolist()
+    return CalibrationValue(ratio, ratio / wide, ratio * wide, "1", "from events alone")
+
+
+def _compare_neighbours(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return ln(c_on / c_off) from differences between pixels, and its standard deviation."""
     U, D = _differences(counts, hot)
-    UU = UD = DD = 1.0
+    root, rho = 1.0, 0.0
     for _ in range(N_STEPS):
-        root = (DD / UU) ** 0.25
         w = 1 / (1 + (root * U - D / root) ** 2 / (2 * CAUCHY_SCALE**2))
         UU, UD, DD = (w * U * U).sum(), (w * U * D).sum(), (w * D * D).sum()
         if not UU * DD > 0:
-            return not_identifiable("1", "neighbouring pixels have equal numbers of events")
-    log_ratio = 0.5 * np.log(DD / UU)
-    rho = max(UD / np.sqrt(UU * DD), MIN_RHO)
+            return 0.0, np.inf
+        rho = UD / np.sqrt(UU * DD)
+        UU, DD = (max(v - QUANTISATION * w.sum(), MIN_PART_KEPT * v) for v in (UU, DD))
+        root = (DD / UU) ** 0.25
+    rho = max(rho, MIN_RHO)
     # The regressions of U on D and of D on U have slopes rho times smaller and larger.
-    error = -np.log(rho) / CONFIDENCE_Z + np.sqrt((1 - rho**2) / len(U)) / rho
-    shrinkage = RATIO_SPREAD**2 / (RATIO_SPREAD**2 + error**2)
-    value = float(np.exp(shrinkage * log_ratio))
-    wide = float(np.exp(CONFIDENCE_Z * np.sqrt(shrinkage) * error))
-    return CalibrationValue(value, value / wide, value * wide, "1", "from events alone")
+    error = -np.log(rho) / CONFIDENCE_Z + np.sqrt((1 - rho**2) / len(U)) / rho + MIN_ERROR
+    return 2 * float(np.log(root)), error
 
 
 def _estimate_deviations(
@@ -167,11 +191,13 @@ def _estimate_deviations(
 
     own = change - median_filter(change, (1, 5, 5), mode="reflect")
     own, gain = own[:, is_used], gain[:, is_used]
-    products = moments = 0.0
+    products, moments = np.zeros((2, own.shape[1]))
     for k in range(2, len(own)):
-        products += (own[k] * own[: k - 1].sum(0)).sum()
-        moments += (gain[k] * gain[: k - 1].sum(0)).sum()
-    variance = max(products / max(moments, 1e-9), 0.0)
+        products += own[k] * own[: k - 1].sum(0)
+        moments += gain[k] * gain[: k - 1].sum(0)
+    chance = CONFIDENCE_Z * float(np.sqrt((products**2).sum()))
+    found = float(products.sum())
+    variance = found / max(float(moments.sum()), 1e-9) if found > chance else 0.0
     own, gain = own.sum(0), gain.sum(0)
     noise = max(float((own**2 - variance * gain**2).mean()), 1.0) if len(own) else 1.0
     s = np.zeros(is_used.shape)

@@ -263,8 +263,10 @@ def tell_from_later(
     searching: NDArray[np.bool_],
     told: NDArray[np.bool_],
     diffusion: Callable[[NDArray], Any],
-) -> NDArray[np.bool_]:
+) -> tuple[NDArray[np.bool_], NDArray[np.floating]]:
     """Tell the estimates before a motion settled, too, as far as they agree with it.
+
+    A cloud that has just collapsed is too narrow, so how far they differ from it is added.
 
     Args:
         t: (n,) times, us.
@@ -275,9 +277,9 @@ def tell_from_later(
         diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
 
     Returns:
-        (n,) booleans.
+        (n,) booleans, and the covariances (n, d, d).
     """
-    told = told.copy()
+    told, covariance = told.copy(), covariance.copy()
     eye = np.eye(mean.shape[1])
     for first in np.flatnonzero(told & ~np.r_[False, told[:-1]]):
         rate = eye * np.asarray(diffusion(mean[first]), np.float64) ** 2
@@ -289,7 +291,8 @@ def tell_from_later(
             if float(far @ np.linalg.solve(C, far)) > MAX_DRIFT_SIGMAS**2 * len(far):
                 break
             told[k] = True
-    return told
+            covariance[k] += np.outer(far, far)
+    return told, covariance
 
 
 @njit_noalloc

@@ -1,6 +1,6 @@
 """Motion of a live stream of events: from a camera, a socket, any iterator.
 
-    live = jaxevent.voting.live((240, 180), model="rotation", camera=camera)
+    live = jaxevent.egomotion.voting.live((240, 180), model="rotation", camera=camera)
     for events in camera:  # `jaxevent.Events`, one chunk after another
         live.add(events)
         mean, covariance, valid = live(live.stop)
@@ -11,14 +11,13 @@ are divided into chunks. Only the latest estimates are held, and the events that
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 
-from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.egomotion.particle_filter.estimator import VotingEstimator, join_reports
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.tail import Tail
@@ -29,40 +28,37 @@ HELD_ESTIMATES = 4096  # the latest ones, which are read
 DROPPED_EVENTS = 1 << 15  # from so many on they are dropped
 
 
+class ChunkRunner(Protocol):
+    """The filter over the chunks of a recording, see `particle_filter.estimator`."""
+
+    params: Any
+    sampler: Any
+
+    def has_chunk(self) -> bool: ...
+    def run(self) -> Any: ...
+    def causal_motion(self, parts: list[Any]) -> MotionEstimate: ...
+
+
 class LiveMotion:
     """The motion of all events added so far: `mean, covariance, valid = live(times)`.
 
     One thread may add what another reads.
 
     Args:
-        estimator: The method.
-        size: Width and height of the sensor, px.
-        params: Its parameters.
-        model: Motion model, or its name.
-        camera: The calibration.
-        seed: Seed of the random numbers.
-        compiler: "numba", "xla" or None.
+        recording: A recording without events, whose events are a `Tail`.
+        model: Motion model.
+        make_runner: Function that makes the runner of the filter, once the first event is there.
     """
 
     def __init__(
-        self,
-        estimator: VotingEstimator,
-        size: tuple[int, int],
-        params: Any,
-        model: str | type[Model],
-        camera: PinholeCamera | None,
-        *,
-        seed: int = 0,
-        compiler: str | None = None,
+        self, recording: Recording, model: type[Model], make_runner: Callable[[], ChunkRunner]
     ):
         self._turns = TurnLock("live motion")
-        self._tail = Tail(*size)
-        self._recording = Recording("live", *size, self._tail, camera=camera)
-        self._estimator, self._settings = estimator, (params, model, camera)
-        self._options = {"seed": seed, "compiler": compiler}
-        self._runner: Any = None
-        kind, _ = estimator.find_model_and_camera(self._recording, model, camera)
-        self._motion = dataclasses.replace(MotionEstimate.empty(kind), causal=True)
+        assert isinstance(recording.events, Tail)
+        self._recording, self._tail = recording, recording.events
+        self._make_runner = make_runner
+        self._runner: ChunkRunner | None = None
+        self._motion = dataclasses.replace(MotionEstimate.empty(model), causal=True)
         self._is_finished = False
 
     def __repr__(self) -> str:
@@ -120,22 +116,16 @@ class LiveMotion:
 
     def _run(self, until_end: bool) -> MotionEstimate:
         """Run the chunks that no event to come can change."""
-        parts: list[Any] = []
         if len(self._tail) and self._runner is None:
-            self._runner = self._estimator.make_runner(
-                self._recording, *self._settings, **self._options
-            )
-        runner = self._runner
+            self._runner = self._make_runner()
+        runner, parts = self._runner, []
         while runner is not None and (runner.has_chunk() or until_end):
             if runner.sampler.is_exhausted:
                 break
             parts.append(runner.run())
-        kind = self._motion.model
-        new = dataclasses.replace(MotionEstimate.empty(kind), causal=True)
-        if not parts:
-            return new
-        new = dataclasses.replace(join_reports(runner.model, parts, False), causal=True)
-        new = self._estimator.calibrate(new, self._settings[2])
+        if runner is None or not parts:
+            return _rows(self._motion, slice(0, 0))
+        new = runner.causal_motion(parts)
         last = _rows(self._motion, slice(-1, None))
         joined = _join(last, new)._with_gaps(float(runner.params.tau_max))
         new = _rows(joined, slice(len(last), None))

@@ -185,7 +185,9 @@ class _WindowFits(NamedTuple):
         rows = self.basis.reshape(-1, 3)
         flow = np.tile(self.planar, len(self.basis))
         turn = {"rotation": self.turn, "general": self.general[3:]}.get(name)
-        return np.linalg.lstsq(rows, flow, rcond=None)[0] if turn is None else turn
+        if turn is None:
+            turn = np.asarray(np.linalg.lstsq(rows, flow, rcond=None)[0], np.float64)
+        return turn
 
 
 def _model_doubt(

@@ -247,9 +247,14 @@ class MotionEstimate(HtmlRepr):
             The estimate with the larger covariance, and a warning; "" if nothing was added.
         """
         from jaxevent.egomotion.patches import flow_consistency
-        from jaxevent.egomotion.still import find_undecided
+        from jaxevent.egomotion.still import Turns, find_undecided
 
-        undecided, still = find_undecided(recording, self)
+        turns = None
+        for part in self.model.parts:
+            if part.figure == "Omega":
+                at = self.t - np.rint(1e6 * self.lag).astype(np.int64)
+                turns = Turns(at, self.mean[:, part.rows], self.covariance[:, part.rows, part.rows])
+        undecided, still = find_undecided(recording, self.valid, turns)
         if undecided.any():
             unsure = self._with_full_uncertainty().covariance
             covariance = np.where(undecided[:, None, None], unsure, self.covariance)

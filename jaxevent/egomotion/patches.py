@@ -166,7 +166,8 @@ def window_durations(recording: Recording) -> NDArray[np.float64]:
     Of a recording longer than all of them, they are `WINDOW_DURATIONS_S`.
     """
     whole = 1e-6 * (recording.stop - recording.start)
-    fitting = WINDOW_DURATIONS_S[[_fits(recording, float(one)) for one in WINDOW_DURATIONS_S]]
+    every = np.asarray(WINDOW_DURATIONS_S, np.float64)
+    fitting: NDArray[np.float64] = every[[_fits(recording, float(one)) for one in every]]
     if whole >= WINDOW_DURATIONS_S[-1] or not len(fitting):
         return fitting
     return np.append(fitting, whole)

@@ -6,11 +6,12 @@ moves (`patches`). Without either, one object covers a part of the image only, i
 are.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.egomotion.evidence import MIN_BLOCKS, N_BLOCKS
-from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
     FIT_WINDOW_DISPLACEMENT_PX,
     ImageSpeed,
@@ -28,34 +29,44 @@ GYRO_SIGMAS = 3.0
 N_TESTED_WINDOWS = 12  # of events, for the part of the image that moves
 
 
-def find_undecided(recording: Recording, motion: MotionEstimate) -> tuple[NDArray[np.bool_], str]:
+class Turns(NamedTuple):
+    """Estimates of an angular velocity."""
+
+    t: NDArray[np.int64]  # (n,) us, at which they were observed
+    Omega: NDArray[np.floating]  # (n, 3) rad/s
+    covariance: NDArray[np.floating]  # (n, 3, 3)
+
+
+def find_undecided(
+    recording: Recording, told: NDArray[np.bool_], turns: Turns | None
+) -> tuple[NDArray[np.bool_], str]:
     """Find the estimates that a camera at rest, before which things move, explains as well.
 
     Args:
         recording: The recording.
-        motion: Its estimated motion.
+        told: (n,) whether an estimate of its motion is told.
+        turns: The angular velocities of the estimates, or None.
 
     Returns:
         (n,) booleans, and a warning; "" if there are none.
     """
-    none = np.zeros(len(motion), bool)
-    if not motion.valid.any():
+    none = np.zeros(len(told), bool)
+    if not told.any():
         return none, ""
-    turns = [part.rows for part in motion.model.parts if part.figure == "Omega"]
-    if recording.imu is not None and turns:
-        undecided = motion.valid & _contradicts(recording.imu, motion, turns[0])
+    if recording.imu is not None and turns is not None:
+        undecided = told & _contradicts(recording.imu, turns)
         if not undecided.any():
             return none, ""
-        if undecided.sum() > motion.valid.sum() / 2:
-            undecided = motion.valid
+        if undecided.sum() > told.sum() / 2:
+            undecided = told
         return undecided, (
-            f"the gyro contradicts {100 * undecided.sum() / motion.valid.sum():.0f} % of the "
+            f"the gyro contradicts {100 * undecided.sum() / told.sum():.0f} % of the "
             "estimates: things move, or the camera does otherwise; those rows are empty"
         )
     speed = measure_image_speed(recording)
     if recording.frames and edge_event_fraction(recording, speed) is not None:
         if is_camera_static(recording, speed):
-            return motion.valid, (
+            return told, (
                 "the camera seems to stand still while objects move: edges in the frames make no "
                 "events; rows are empty, and jaxevent track follows objects"
             )
@@ -63,28 +74,26 @@ def find_undecided(recording: Recording, motion: MotionEstimate) -> tuple[NDArra
     blocks = N_BLOCKS**2 if speed is None else _active_blocks(recording, speed)
     if blocks >= MIN_BLOCKS:
         return none, ""
-    return motion.valid, (
+    return told, (
         f"the camera may stand still while objects move: only about {blocks:.1f} of "
         f"{N_BLOCKS**2} parts of the image make events; rows are empty, and jaxevent track "
         "follows objects"
     )
 
 
-def _contradicts(imu: Imu, motion: MotionEstimate, rows: slice) -> NDArray[np.bool_]:
+def _contradicts(imu: Imu, turns: Turns) -> NDArray[np.bool_]:
     """Return where an angular velocity is of another size than the gyro's rates, in any axes."""
     rates = np.asarray(imu.gyro, np.float64)
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(rates, 0)])
-    at = motion.t - np.rint(1e6 * motion.lag).astype(np.int64)
-    first = np.searchsorted(imu.t, at - GYRO_SPAN_US // 2)
-    last = np.searchsorted(imu.t, at + GYRO_SPAN_US // 2)
+    first = np.searchsorted(imu.t, turns.t - GYRO_SPAN_US // 2)
+    last = np.searchsorted(imu.t, turns.t + GYRO_SPAN_US // 2)
     count = np.maximum(last - first, 1)[:, None]
     measured = np.linalg.norm((total[last] - total[first]) / count, axis=1)
-    told = np.linalg.norm(np.nan_to_num(motion.mean[:, rows]), axis=1)
-    covariance = motion.covariance[:, rows, rows]
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0))
+    size = np.linalg.norm(np.nan_to_num(turns.Omega), axis=1)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(turns.covariance)[:, -1], 0))
     allowed = GYRO_SIGMAS * sigma + np.sqrt(3) * MAX_GYRO_BIAS_RAD_S
-    allowed = allowed + GYRO_RELATIVE_ERROR * np.maximum(told, measured)
-    return (last > first) & (np.abs(told - measured) > allowed)
+    allowed = allowed + GYRO_RELATIVE_ERROR * np.maximum(size, measured)
+    return (last > first) & (np.abs(size - measured) > allowed)
 
 
 def _active_blocks(recording: Recording, speed: ImageSpeed) -> float:

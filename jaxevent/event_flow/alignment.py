@@ -40,6 +40,7 @@ NOISE = 0.055  # variance of the gradient of an image of events without order, p
 POOLING = (1, 2, 4)  # nodes, of the Gaussian whose nodes tell of one
 MIN_INFORMATION = 0.1  # 1/px^2
 MIN_VARIANCE = 0.001  # px^2
+FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
@@ -248,11 +249,12 @@ class Clock(NamedTuple):
             at: Time at which s = 0, us.
             half: Number of events around it on either side.
         """
-        rows = np.arange(0, len(events), max(half // CLOCK_PARTS, 1))
-        t, first = np.unique(events.t[np.append(rows, len(events) - 1)], return_index=True)
+        parts = max(round(CLOCK_PARTS * len(events) / half), 1)
+        rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
+        t, first = np.unique(events.t[rows], return_index=True)
         if len(t) < 2:
             return cls(at + np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
-        s = np.append(rows, len(events) - 1)[first] / half
+        s = rows[first] / half
         s = (s + (t - t[0]) * (s[-1] / (t[-1] - t[0]))) / 2
         return cls(t.astype(float), s - np.interp(at, t, s))
 
@@ -263,8 +265,8 @@ class Clock(NamedTuple):
 
     def rate(self, t: float) -> float:
         """Return how fast s goes at a time (us), 1/s."""
-        rates = np.pad(np.gradient(self.s, self.t), 1, mode="edge")
-        smooth = (rates[:-2] + 2 * rates[1:-1] + rates[2:]) / 4
+        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
+        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
         return float(np.interp(t, self.t, smooth)) * 1e6
 
 
@@ -293,6 +295,17 @@ class Aligned(NamedTuple):
     clock: Clock
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
     score: float  # per event
+
+
+def _principal(information: NDArray, reach: int) -> tuple[NDArray, NDArray]:
+    """Return eigenvalues and axes of the information of nodes within a Gaussian."""
+    pooled = gaussian_filter(information, (reach, reach, 0), mode="constant")
+    return np.linalg.eigh(4 * np.pi * reach**2 * pooled[..., [[0, 1], [1, 2]]])
+
+
+def _rotate(axes: NDArray, values: NDArray) -> NDArray:
+    """Return matrices of these axes and eigenvalues."""
+    return (axes * values[..., None, :]) @ np.swapaxes(axes, -1, -2)
 
 
 def _curvature(u: NDArray, reach: int) -> NDArray[np.float64]:
@@ -338,11 +351,8 @@ class Alignment:
         """
         best = np.full((*self.nodes, 2, 2), np.inf)
         for reach in POOLING:
-            pooled = gaussian_filter(aligned.information, (reach, reach, 0), mode="constant")
-            pooled *= 4 * np.pi * reach**2
-            values, axes = np.linalg.eigh(pooled[..., [[0, 1], [1, 2]]])
-            variances = 1 / np.maximum(values, MIN_INFORMATION)
-            C = (axes * variances[..., None, :]) @ np.swapaxes(axes, -1, -2)
+            values, axes = _principal(aligned.information, reach)
+            C = _rotate(axes, 1 / np.maximum(values, MIN_INFORMATION))
             C = C + _curvature(aligned.u, reach)[..., None, None] * np.eye(2)
             less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
             best = np.where(less[..., None, None], C, best)
@@ -350,18 +360,31 @@ class Alignment:
         floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
         return best + floor
 
-    def typical(self, aligned: Aligned) -> float:
-        """Return the median length of displacements, weighted by information, px.
+    def shrink(self, aligned: Aligned) -> NDArray[np.float64]:
+        """Return the displacement without components that events around do not determine.
 
-        It is 0 where events determine none of them.
+        They would double with each window.
+
+        Args:
+            aligned: Displacement and information.
+
+        Returns:
+            (rows, columns, 2), px.
+        """
+        values, axes = _principal(aligned.information, POOLING[-1])
+        values = np.maximum(values, 0)
+        known = _rotate(axes, values / (values + FIRST_INFORMATION))
+        return (known @ aligned.u[..., None])[..., 0]
+
+    def typical(self, aligned: Aligned) -> float:
+        """Return the median length of known displacements, weighted by information, px.
 
         Args:
             aligned: Displacement and information.
         """
-        if not (np.linalg.eigvalsh(self.covariance(aligned)) < MAX_VARIANCE).all(-1).any():
-            return 0.0
+        known = self.shrink(aligned)
+        length = np.hypot(known[..., 0], known[..., 1]).ravel()
         weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0)
-        length = np.hypot(aligned.u[..., 0], aligned.u[..., 1]).ravel()
         order = np.argsort(length, kind="stable")
         total = np.cumsum(weight.ravel()[order])
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])

@@ -94,7 +94,7 @@ class EventFlow:
         for level in LEVELS:
             half = int(self._base * 2.0**level)
             found = self._refine(row, half, start, rate, grow=True)
-            start, rate = found.aligned.u, found.aligned.clock.mean_rate
+            start, rate = self._align.shrink(found.aligned), found.aligned.clock.mean_rate
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None

@@ -120,11 +120,12 @@ def test_a_search_and_a_pause_begin_anew():
 
 def test_earlier_estimates_are_told_where_they_agree():
     mean = np.array([[0.0], [9.0], [1.0], [1.1], [1.0]])
-    told = tell_from_later(
+    told, covariance = tell_from_later(
         np.arange(5) * 1000, mean, np.full((5, 1, 1), 0.1), np.zeros(5, bool),
         np.array([False, False, False, False, True]), lambda m: np.zeros(1),
     )  # fmt: skip
     assert told.tolist() == [False, False, True, True, True]
+    np.testing.assert_allclose(covariance[:, 0, 0], [0.1, 0.1, 0.1, 0.11, 0.1])
 
 
 def estimate(model, mean, t):

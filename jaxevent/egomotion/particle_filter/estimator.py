@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from jaxevent.egomotion.estimator import (
 )
 from jaxevent.egomotion.evidence import EvidenceTest, Lock, tell_from_later
 from jaxevent.egomotion.geometry import length
+from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
@@ -35,11 +36,9 @@ from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.patches import ImageSpeed, is_camera_known_to_move
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.events.tail import Tail
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
-
-if TYPE_CHECKING:
-    from jaxevent.egomotion.live import LiveMotion
 
 EVENTS_PER_CHUNK = 1024  # scored events after which the range of candidates is updated
 MAX_CHUNK_TAUS = 0.1  # tau_max, time after which it is updated at the latest
@@ -254,16 +253,16 @@ class VotingEstimator(MotionEstimator[Params]):
             return motion
         if lock is not None and not causal:
             searching = np.concatenate([info.searching for _, info, _ in parts])
-            valid = tell_from_later(
+            valid, covariance = tell_from_later(
                 motion.t, motion.mean, motion.covariance, searching, motion.valid, lock.diffusion
             )
-            motion = dataclasses.replace(motion, valid=valid)
+            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
         motion = dataclasses.replace(motion, causal=causal)._with_gaps(float(params.tau_max))
         camera = camera or recording.camera
         if causal:
-            return self.calibrate(motion, camera)
+            return calibrate(motion, camera)
         smoothed = motion if smooth is False else filtering.smooth(motion, params)
-        return self.calibrate(smoothed, camera, 2 * motion.lag)
+        return calibrate(smoothed, camera, 2 * motion.lag)
 
     def live(
         self,
@@ -274,7 +273,7 @@ class VotingEstimator(MotionEstimator[Params]):
         camera: PinholeCamera | None = None,
         seed: int = 0,
         compiler: str | None = None,
-    ) -> "LiveMotion":
+    ) -> LiveMotion:
         """Begin to estimate the motion of a live stream of events, see `egomotion.live`.
 
         Args:
@@ -291,62 +290,18 @@ class VotingEstimator(MotionEstimator[Params]):
         Raises:
             InputError: The model is unknown, or it needs a camera and there is none.
         """
-        from jaxevent.egomotion.live import LiveMotion
-
         self.check_options(seed=seed)
-        return LiveMotion(self, size, params, model, camera, seed=seed, compiler=compiler)
+        recording = Recording("live", *size, Tail(*size), camera=camera)
+        found, _ = self.find_model_and_camera(recording, model, camera)
+        used = self.initial_params(found) if params is None else params
 
-    def make_runner(
-        self,
-        recording: Recording,
-        params: Params | None,
-        model: str | type[Model],
-        camera: PinholeCamera | None,
-        *,
-        seed: int,
-        compiler: str | None,
-    ) -> "ChunkRunner":
-        """Make the runner of a recording that is still coming.
+        def make_runner() -> ChunkRunner:
+            kind, sampler = self.sampler(recording, used, found, camera)
+            lock = self._make_lock(recording, used, kind, sampler, camera)
+            kernel = self._kernel(used, kind, compiler, MIN_KERNEL_EVENTS)
+            return ChunkRunner(used, kind, sampler, kernel, lock, seed)
 
-        Args:
-            recording: The recording.
-            params: The parameters; by default those of the model.
-            model: Motion model, or its name.
-            camera: The calibration.
-            seed: Seed of the random numbers.
-            compiler: "numba" or "xla".
-
-        Returns:
-            The runner.
-        """
-        params = self.initial_params(self.find_model(model)) if params is None else params
-        kind, sampler = self.sampler(recording, params, model, camera)
-        lock = self._make_lock(recording, params, kind, sampler, camera)
-        kernel = self._kernel(params, kind, compiler, MIN_KERNEL_EVENTS)
-        return ChunkRunner(params, kind, sampler, kernel, lock, seed)
-
-    def calibrate(
-        self,
-        motion: MotionEstimate,
-        camera: PinholeCamera | None,
-        length: NDArray[np.floating] | None = None,
-    ) -> MotionEstimate:
-        """Return the motion with the covariance of its errors.
-
-        Args:
-            motion: Estimates of the filter or the smoother.
-            camera: The calibration.
-            length: (n,) time span of an estimate's events, s, in which changes between the
-                neighbours, before and after, count; None: they do not.
-
-        Returns:
-            The motion with the calibrated covariance.
-        """
-        calibration = PLANAR_CALIBRATION if motion.model.uniform else CAMERA_MOTION_CALIBRATION
-        calibration = calibration.with_lens(camera)
-        if length is None:
-            return motion.with_calibrated_covariance(calibration._replace(change=0.0))
-        return motion.with_calibrated_covariance(calibration, length)
+        return LiveMotion(recording, found, make_runner)
 
     def _make_lock(
         self,
@@ -467,6 +422,13 @@ class ChunkRunner:
         self._state: ParticleState | None = None
         self._number = 0
 
+    def causal_motion(
+        self, parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]]
+    ) -> MotionEstimate:
+        """Join what `run` returned for some chunks to a causal estimate."""
+        motion = dataclasses.replace(join_reports(self.model, parts, False), causal=True)
+        return calibrate(motion, self.sampler.recording.camera)
+
     def has_chunk(self) -> bool:
         """Return whether the next chunk is complete, whatever events are still to come."""
         every, row = self.params.every, self.sampler.next_row
@@ -559,6 +521,29 @@ class WarmStartedRuns(TrainingRuns):
             shard(chosen, self),
             placed,
         )
+
+
+def calibrate(
+    motion: MotionEstimate,
+    camera: PinholeCamera | None,
+    length: NDArray[np.floating] | None = None,
+) -> MotionEstimate:
+    """Return the motion with the covariance of its errors.
+
+    Args:
+        motion: Estimates of the filter or the smoother.
+        camera: The calibration.
+        length: (n,) time span of an estimate's events, s, in which changes between the neighbours,
+            before and after, count; None: they do not.
+
+    Returns:
+        The motion with the calibrated covariance.
+    """
+    calibration = PLANAR_CALIBRATION if motion.model.uniform else CAMERA_MOTION_CALIBRATION
+    calibration = calibration.with_lens(camera)
+    if length is None:
+        return motion.with_calibrated_covariance(calibration._replace(change=0.0))
+    return motion.with_calibrated_covariance(calibration, length)
 
 
 def join_reports(

@@ -117,7 +117,6 @@ ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
 MIN_DOUBT = 0.1
 N_CACHED_ANCHORS = 4
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
-MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
@@ -398,7 +397,7 @@ class TrajectoryEstimator:
         if other is None:
             return p
         images, several = PackedImages.of(pixels, instants.s), (p, self._carry(other, instants))
-        return choose_trajectories(images, several, self._cost, (1, doubt))
+        return choose_trajectories(images, several, self._cost, (1.0, doubt))
 
     def _carry(self, anchor: Anchor, instants: TargetInstants) -> NDArray[np.float32]:
         """Carry the motion of an anchor to another target, on the clock of that one."""
@@ -433,7 +432,7 @@ class TrajectoryEstimator:
             return instants, found
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
-        if cost(instants, found) < MAX_CLOCK_COST_RATIO * cost(timed, other):
+        if cost(instants, found) < cost(timed, other):
             return instants, found
         return timed, other
 

@@ -251,6 +251,6 @@ events_only = EventsOnly(
     Params,
     fuses=False,
     about="Video from events alone. It estimates motion and image of a window of events together. "
-    "The log intensity is known up to an offset and a factor: where nothing is known it is 0 and "
-    "the intensity 0.5.",
+    "The log intensity is known up to an offset and a factor: the geometric mean of each image is "
+    "0.5.",
 )

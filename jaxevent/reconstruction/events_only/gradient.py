@@ -21,14 +21,19 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.rows import EVENT
-from jaxevent.reconstruction.events_only.solve import SAMPLES, factor_information
+from jaxevent.reconstruction.events_only.solve import (
+    BLUR_PX,
+    SAMPLES,
+    VARIANCE_FACTOR,
+    factor_information,
+)
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
 REWEIGHTINGS = 100  # at most
 CG_ITERATIONS = 200  # at most
+TOLERANCES = {4: 5e-3, 8: 1e-8}  # relative residuals to stop at, by bytes of a number
 LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
-BLUR_PX = 1.5  # of the variance, as that of `solve`
 
 
 class Perturbation(NamedTuple):
@@ -64,6 +69,7 @@ class WindowEquations(NamedTuple):
     pull: Float[Numeric, "*times height width 2"]  # gradient by other windows, thresholds / px
     information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
     start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
+    unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
     relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
     noise: Perturbation
 
@@ -104,6 +110,7 @@ def pack_equations(
         (prior.gradient / c).astype(dtype),
         information.astype(dtype),
         (solution.log_image / c).astype(dtype),
+        (solution.unseen / c**2).astype(dtype),
         relative.mean((1, 2)).astype(dtype),
         Perturbation(
             np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
@@ -244,13 +251,8 @@ def _solve_linear(product: Callable[[Array], Array], right: Array, diagonal: Arr
     def divide(v: Array) -> Array:
         return v / diagonal
 
-    tolerance = _tolerance(right.dtype)
+    tolerance = TOLERANCES[right.dtype.itemsize]
     return cg(product, right, tol=tolerance, maxiter=CG_ITERATIONS, M=divide)[0]
-
-
-def _tolerance(dtype: Any) -> float:
-    """Return the relative size of a residual to stop at: the third root of the precision."""
-    return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
 def solve_equations(equations: WindowEquations, params: Params) -> Array:
@@ -270,7 +272,7 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
 def _minimise(equations: WindowEquations, params: Params) -> Array:
     start = equations.start
     scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
-    least = _tolerance(start.dtype) * scale
+    least = TOLERANCES[start.dtype.itemsize] * scale
 
     def should_continue(state: tuple[Array, Array, int]) -> Array:
         _, slope, n = state
@@ -367,7 +369,7 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
 
     squares = jax.lax.map(sample, equations.noise).mean(0)
     down, across = (jnp.asarray(_blur_matrix(n), u.dtype) for n in u.shape)
-    return down @ squares @ across.T
+    return VARIANCE_FACTOR * (down @ squares @ across.T) + equations.unseen
 
 
 @functools.cache

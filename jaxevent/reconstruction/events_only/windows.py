@@ -92,7 +92,7 @@ class WindowSolver:
         return WindowPaths(at, knots, velocity)
 
     def events(self, first: int, last: int) -> Events:
-        """Return the events of some rows of the recording, without those of pixels that are not used.
+        """Return the events of some rows of the recording, without those of unused pixels.
 
         Args:
             first: First row.
