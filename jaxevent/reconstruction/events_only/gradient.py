@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.rows import EVENT
-from jaxevent.reconstruction.events_only.solve import SAMPLES, factor_information
+from jaxevent.reconstruction.events_only.solve import SAMPLES, factor_information, scene_conductance
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
@@ -296,7 +296,9 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
     Returns:
         (height, width) variance, squared thresholds.
     """
-    weights = _weights(u, equations, params)
+    g, weights = scene_conductance(u), _weights(u, equations, params)
+    across, down = (jnp.full_like(one, g) for one in weights[1:])
+    weights = weights._replace(across=across, down=down)
     product = _product(weights, equations, params.leak)
     diagonal = jax.lax.stop_gradient(_diagonal(weights, equations, params.leak))
 

@@ -20,7 +20,7 @@ regions, which only their edges tie together, move as a whole.
 At the solution dE/du = A u - b = 0 with the weights of u itself.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +33,7 @@ from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 REWEIGHTINGS = 8
 CG_LIMITS = (1e-3, 25)  # relative residual, and iterations
 BLOCK_BITS = 1  # sides of blocks are powers of 2 to this
+SCENE_VARIANCE = 4.0  # of log images, squared thresholds
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
 
 
@@ -145,6 +146,7 @@ def solve(
     _reweight(system, u, (rows.change, base), numbers, residual)
     V = np.full(rows.shape, np.inf, np.float32)
     if variance:
+        _relax_prior(system, scene_conductance(u))
         V = _sample_variance(system, preconditioner, np.random.default_rng(seed)) * c**2
     return Solution(u * c, V, residual, system.weight, iterations)
 
@@ -165,6 +167,29 @@ def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
     factor[..., 1, 0] = xy / np.sqrt(np.maximum(xx, np.finfo(np.float32).tiny))
     factor[..., 1, 1] = np.sqrt(np.maximum(yy - factor[..., 1, 0] ** 2, 0))
     return factor
+
+
+def scene_conductance(u: Any) -> Any:
+    """Return the weight g of squared differences under which an image is as variable as scenes.
+
+    At the image of least energy the heavy-tailed prior (2) is stiff where the image is flat, even
+    where nothing is known. So variances rest on a Gaussian prior in its place, with the spectrum
+    1 / (g k^2): n pixels have the variance ln(n) / (4 pi g), which is that of the image, or of
+    common scenes where this is less.
+
+    Args:
+        u: (height, width) log image, thresholds; NumPy or JAX.
+
+    Returns:
+        g, 1 / threshold^2.
+    """
+    more = u.var() - SCENE_VARIANCE
+    return np.log(max(u.size, 4)) / (4 * np.pi) / (SCENE_VARIANCE + more * (more > 0))
+
+
+def _relax_prior(system, conductance):
+    system.across[:], system.down[:] = conductance, conductance
+    system.across[:, -1], system.down[-1] = 0, 0
 
 
 def _sample_variance(system, preconditioner, rng):
