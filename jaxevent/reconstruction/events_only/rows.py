@@ -44,9 +44,10 @@ ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^
 
 @runtime_checkable
 class Paths(Protocol):
-    """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them."""
+    """Paths of the scene's points towards one time, as `event_flow.WindowPaths` has them.
 
-    covariance: NDArray | None  # (K, height, width, 2, 2) of the velocity, (px/s)^2; None: known
+    An attribute `covariance` (K, height, width, 2, 2) of the velocity, (px/s)^2, is used if given.
+    """
 
     def carry(self, x: NDArray, y: NDArray, t: NDArray) -> tuple[NDArray, NDArray]:
         """Return the positions at the target time of what pixels (x, y) see at times t."""
