@@ -4,7 +4,8 @@
 
 Parts: images (the complete path from a file to images, losses, gradients), xla (the scan, where
 there is no kernel), calibration, smoother, tracker (bench_blob.py), voting and motion
-(bench_motion.py), memory (streaming.py). Without any, all but motion, which takes minutes.
+(bench_motion.py), events-only (events_only.py), memory (streaming.py). Without any, all but
+motion, which takes minutes.
 CPU seconds of this process are compared, so other programs on the machine change little: `--gate`
 compares the ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance;
 `--bless` writes those of the parts that ran. Two parts have no gate: `gpu` times a GPU against the
@@ -46,6 +47,8 @@ GATED = {
     "planar voting, N = 200 / numba loop": ("higher", 0.4),
     "rotation voting, N = 200 / numba loop": ("higher", 0.4),
     "general voting, N = 500 / numba loop": ("higher", 0.4),
+    "events-only / images of tiles": ("higher", 0.4),
+    "events-only: pixel of 640x480 / of 240x180": ("lower", 0.4),
     "peak memory of 10 M events, GB": ("lower", 0.25),
 }
 
@@ -59,6 +62,7 @@ PARTS = {
     "tracker": "bench_blob.tracker_bench",
     "voting": "bench_motion.voting_bench",
     "motion": "bench_motion.motion_bench",
+    "events-only": "events_only.events_only_bench",
     "memory": "streaming.memory_bench",
 }
 TABLES = {"gpu": "bench_images.gpu_bench", "start": "bench_images.start_bench"}  # no gate

@@ -62,12 +62,12 @@ def disk_rows(data: Path) -> Rows:
     for name, motion in (
         ("voting", voting.estimate(recording, model="rotation", camera=camera)),
         (
-            "voting, smoothed",
-            voting.estimate(recording, model="rotation", camera=camera, smooth=True),
+            "voting, causal",
+            voting.estimate(recording, model="rotation", camera=camera, causal=True),
         ),
         ("contrast", contrast.estimate(recording, model="rotation", camera=camera)),
     ):
-        mean, _, valid = motion(times, centred="smooth" not in name, extrapolate=True)
+        mean, _, valid = motion(times, extrapolate=True)
         lost = ~valid
         error = 100 * np.abs(mean[:, 2] - gyro) / np.abs(gyro)
         failed = lost | (error > 20)
@@ -197,9 +197,9 @@ def _numbers(values: np.ndarray) -> str:
 def slider_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
     rows: Rows = []
-    motion = voting.estimate(recording, model="planar", smooth=True)
+    motion = voting.estimate(recording, model="planar")
     times = np.arange(recording.start + 400_000, 3_200_000, 20_000)
-    mean, _, valid = motion(times, centred=True, extrapolate=True)
+    mean, _, valid = motion(times, extrapolate=True)
     lost = ~valid
     direction = np.degrees(np.arctan2(mean[:, 1], -mean[:, 0]))
     rows.append(

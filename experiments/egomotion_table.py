@@ -135,7 +135,8 @@ METHODS: dict[str, tuple[MotionEstimator[Any], dict[str, Any] | None]] = {
 def estimate_motion(label: str, model: str, recording: Recording) -> MotionEstimate:
     method, given = METHODS[label]
     params = None if given is None else method.Params.of(given[model])
-    return method.estimate(recording, params, model=model)
+    more = {"smooth": False} if "smooth" in method.options else {}
+    return method.estimate(recording, params, model=model, **more)
 
 
 def cpu() -> float:

@@ -1,7 +1,7 @@
 """Motion by voting on simulated sequences with known motion, the thesis' literal likelihood beside.
 
     python experiments/egomotion_voting.py --out egomotion_voting [--seeds 10] [--first 100]
-        [--only planar frames rotation penalty]
+        [--only planar frames rotation penalty situations]
 
 An ideal event camera of 160 x 120 pixels, f = 200 px, and the thesis' generator of frames 50 us
 apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.Params`, which were
@@ -10,9 +10,16 @@ in three readings: "at once", as the filter tells it; "fixed lag", when what is 
 time that the candidates show; "smoothed", after a backward pass over the whole sequence
 (`smoothed`). A run is lost if the filter says so at any time after the start-up, or if its
 mean error is 50 % or more. Start-up is until the filter first says that it has found the motion.
-Writes a table of every part.
+
+"situations" are estimates as the command makes them by default, smoothed, and `causal` ones, where
+motion varies, at 300 deg/s, with noise, uneven thresholds, a lens or a focal length that is wrong,
+a pause, and a camera at rest. A row is beyond 3 sigma if a component is. A false lock is a stretch
+of told rows that are off by more than half of the motion (by 0.5 rad/s where it is less than 1).
+Beside them stand contrast maximisation in 30 lines, in windows of 30 ms from an exhaustive start,
+and points tracked in frames. Writes a table of every part.
 """
 
+import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -20,15 +27,21 @@ from typing import Any
 import numpy as np
 from common import command_line, machine, table_of_rows, write_text
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.optimize import minimize
 
-from jaxevent.egomotion import voting
+from jaxevent.camera import PinholeCamera
+from jaxevent.egomotion import frames, voting
+from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.model_selection import select_model
+from jaxevent.egomotion.models import find_model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter.filtering import smooth
 from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.scores import axis_error, relative_error, relative_magnitude_error
-from jaxevent.recording import Recording
-from jaxevent.simulate import motion_scene
-from jaxevent.simulate.motion import simulate_frame_events
+from jaxevent.recording import Events, Recording
+from jaxevent.simulate import SENSORS, motion_scene, simulate
+from jaxevent.simulate.motion import simulate_frame_events, simulate_motion
 
 Row = dict[str, Any]
 Table = tuple[str, list[Row]]
@@ -76,7 +89,7 @@ def motion_errors(
     true = truth(times)
     smoothed = smooth(motion, params)
     told = {
-        "at once": motion(times, extrapolate=True),
+        "at once": motion(times, centred=False, extrapolate=True),
         "fixed lag": motion(times, centred=True, extrapolate=True),
         "smoothed": smoothed(times, extrapolate=True),
     }
@@ -128,7 +141,7 @@ def score_both(
             continue
         params, runs = Params.of(settings), []
         for k, (recording, (truth, duration)) in enumerate(sequences):
-            motion = voting.estimate(recording, params, model=model, seed=first + k)
+            motion = voting.estimate(recording, params, model=model, seed=first + k, smooth=False)
             times = np.arange(SETTLE, duration - 1e-6, 0.005)
             runs.append(motion_errors(motion, params, truth, times))
         row |= summarise_runs(runs, chosen, prefix)
@@ -166,7 +179,7 @@ def in_frames(
     params, runs, fill = Params.of(settings), [], []
     for seed in seeds:
         recording, velocity = simulate_frame_events(flow, seed=seed, **made)
-        motion = voting.estimate(recording, params, seed=seed)
+        motion = voting.estimate(recording, params, seed=seed, smooth=False)
         frame = np.arange(SETTLE_FRAMES, len(flow) - 1)
         frame = frame[(frame + 1) * STEP <= motion.t[-1] * 1e-6]
         scores = motion_errors(
@@ -197,7 +210,7 @@ def part_rotation(seeds: range) -> Table:
         times = np.arange(SETTLE, source.duration - 1e-6, 0.005)
         for name, settings in ways.items():
             params = Params.of(settings)
-            motion = voting.estimate(recording, params, model="rotation", seed=seed)
+            motion = voting.estimate(recording, params, model="rotation", seed=seed, smooth=False)
             runs[name].append(
                 motion_errors(motion, params, lambda t, s=source: s.twist(t)[1], times)
             )
@@ -240,7 +253,9 @@ def part_penalty(seeds: range) -> Table:
                         **more,
                     )  # fmt: skip
                     params = Params(preset=preset, r_t=float(r_t))
-                    motion = voting.estimate(recording, params, model=model, seed=seed)
+                    motion = voting.estimate(
+                        recording, params, model=model, seed=seed, smooth=False
+                    )
                     times = np.arange(SETTLE, duration - 1e-6, 0.005)
                     truth = source.velocity if model == "planar" else _turn(source)
                     errors.append(motion_errors(motion, params, truth, times)["at once"])
@@ -250,11 +265,223 @@ def part_penalty(seeds: range) -> Table:
     return "literal likelihood over r_t (px/s): relative error at once (%)", rows
 
 
+IDEAL = dataclasses.replace(
+    SENSORS["ideal"], frame_rate=25.0, exposure=1e-3, exposure_samples=1, truth_rate=1e-3
+)
+UNEVEN = dataclasses.replace(IDEAL, c_on=0.16, c_off=0.26, mismatch=0.15, jitter=5e-4)
+MIDDLE = (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2
+PAUSE_US, PAUSE_AT_US = 2_000_000, 300_000
+
+
+def merge(recording: Recording, events: Events, keep_frames: bool) -> Recording:
+    """Return the recording with further events."""
+    columns = [np.concatenate([getattr(e, n) for e in (recording.events, events)]) for n in "txyp"]
+    order = np.argsort(columns[0], kind="stable")
+    kept = {} if keep_frames else {"frames": None, "poses": None}
+    return dataclasses.replace(recording, events=Events(*(c[order] for c in columns)), **kept)
+
+
+def noise_events(span: tuple[int, int], number: int, seed: int) -> Events:
+    """Return events without order; one in ten is of five hot pixels."""
+    rng = np.random.default_rng([seed, 1])
+    x, y = (rng.integers(0, n, number).astype(np.uint16) for n in SIZE)
+    hot = rng.random(number) < 0.1
+    x[hot], y[hot] = x[rng.integers(0, 5, hot.sum())], y[rng.integers(0, 5, hot.sum())]
+    x[:5], y[:5] = np.arange(5) * 20 + 7, np.arange(5) * 15 + 4
+    return Events(rng.integers(*span, number), x, y, rng.random(number) < 0.5)
+
+
+class Things:
+    """Two textured discs that fly before a textured background: a source of intensity."""
+
+    def __init__(self, seed: int):
+        rng = np.random.default_rng([seed, 2])
+        self.size, self.duration = SIZE, DURATION
+        self.textures = [
+            0.3 * np.exp(2 * gaussian_filter(rng.normal(size=(SIZE[1], SIZE[1])), 1.5))
+            for _ in range(2)
+        ]
+        self.back = 0.3 * np.exp(2 * gaussian_filter(rng.normal(size=SIZE[::-1]), 2))
+        self.radius, self.place = rng.uniform(8, 20, 2), rng.uniform(30, 90, (2, 2))
+        self.velocity = rng.uniform(60, 250, (2, 1)) * np.stack(
+            [[np.cos(a), np.sin(a)] for a in rng.uniform(0, 2 * np.pi, 2)]
+        )
+
+    def intensity(self, t: float | int) -> NDArray[np.float64]:
+        y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+        image = self.back
+        for k in range(2):
+            u, v = self.place[k] + self.velocity[k] * t
+            u, v = u % SIZE[0], v % SIZE[1]
+            cover = np.clip(self.radius[k] - np.hypot(x - u, y - v) + 0.5, 0, 1)
+            own = map_coordinates(self.textures[k], [y - v + 50, x - u + 50], order=1, mode="wrap")
+            image = image * (1 - cover) + cover * own
+        return image
+
+
+def situation(name: str, seed: int) -> tuple[Recording, str, Callable[[NDArray], NDArray]]:
+    """Return the recording, its model ("auto" if it is chosen), and the truth at times (us)."""
+    model = "planar" if name in ("planar", "low texture") else "rotation"
+    made: Row = {"size": SIZE, "duration": DURATION}
+    if name == "low texture":
+        made["texture"] = "shapes"
+    elif name == "300 deg/s":
+        made |= {"speed": np.radians(300), "duration": 0.3}
+    elif name == "uneven thresholds":
+        made["sensor"] = UNEVEN
+    elif name == "lens k1 = -0.35":
+        made["lens"] = PinholeCamera(100.0, 100.0, *MIDDLE, (-0.35, 0.1, 0.0, 0.0, 0.0))
+    if name == "camera at rest":
+        recording = dataclasses.replace(
+            simulate(Things(seed), IDEAL, seed), camera=PinholeCamera(200.0, 200.0, *MIDDLE)
+        )
+        recording = merge(recording, noise_events((0, 600_000), 7000, seed), False)
+        return recording, "rotation", lambda t: np.zeros((len(t), 3))
+    change = "constant" if name in ("300 deg/s", "slow translation") else "varying"
+    scene = "texture" if name == "slow translation" else model
+    if name == "slow translation":
+        made["speed"] = 0.15
+    recording, source = motion_scene(scene, change, seed, **made)
+    if name == "slow translation":
+        T = source.motion.mean[:3]
+        source = dataclasses.replace(
+            source, motion=dataclasses.replace(source.motion, mean=(*T, 0, 0, 0))
+        )
+        recording = simulate_motion(source, None, seed)
+    last = round(1e6 * source.duration) - 1
+
+    def truth(t: NDArray) -> NDArray:
+        if name == "pause of 2 s":
+            paused = (t >= PAUSE_AT_US) & (t < PAUSE_AT_US + PAUSE_US)
+            t = np.where(t >= PAUSE_AT_US + PAUSE_US, t - PAUSE_US, np.minimum(t, PAUSE_AT_US))
+            return np.where(paused[:, None], 0, source.twist(np.clip(t, 0, last))[1])
+        t = np.clip(t, 0, last)
+        return source.velocity(t) if model == "planar" else source.twist(t)[1]
+
+    if name == "30 % noise":
+        number = int(0.3 * len(recording.events))
+        recording = merge(recording, noise_events((0, last), number, seed), True)
+    elif name == "pause of 2 s":
+        e = recording.events[:]
+        moved = Events(e.t + PAUSE_US * (e.t >= PAUSE_AT_US), e.x, e.y, e.p)
+        noise = noise_events((0, last + PAUSE_US), 30_000, seed)
+        recording = merge(dataclasses.replace(recording, events=moved), noise, False)
+    elif name == "lens k1 = -0.35":
+        recording = dataclasses.replace(recording, camera=PinholeCamera(100.0, 100.0, *MIDDLE))
+    elif name == "focal 10 % wrong":
+        recording = dataclasses.replace(recording, camera=PinholeCamera(220.0, 220.0, *MIDDLE))
+    return recording, "auto" if name[:4] in ("lens", "slow") else model, truth
+
+
+SITUATIONS = (
+    "planar", "rotation", "300 deg/s", "low texture", "30 % noise", "uneven thresholds",
+    "lens k1 = -0.35", "focal 10 % wrong", "pause of 2 s", "camera at rest", "slow translation",
+)  # fmt: skip
+
+
+def maximise_contrast(recording: Recording, model: str, times: NDArray) -> NDArray[np.float64]:
+    """Return the motions (times, d) that make 30 ms of events sharpest, plainly."""
+    xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
+    kind = find_model(model)(f)
+    basis, found = np.asarray(kind.basis(xi), float), []
+    unit = 1 / kind.pixel_scale(xi)
+    low = xi.min((0, 1)) - 20
+    shape = (np.ceil(xi.max((0, 1))) + 21 - low).astype(int)[::-1]
+    grid = np.stack(np.meshgrid(*[np.linspace(-400, 400, 17)] * 2), -1).reshape(-1, 2)
+    if model == "rotation":
+        grid = np.stack([grid[:, 1], -grid[:, 0], 0 * grid[:, 0]], 1)
+    for t in times:
+        part = recording.events[
+            recording.events.index(int(t) - 15_000) : recording.events.index(int(t) + 15_000)
+        ]
+        step = max(1, len(part) // 10_000)
+        x, y, at = (c[::step] for c in (part.x, part.y, (part.t - t) * 1e-6))
+        where, columns, sign = xi[y, x] - low, basis[y, x], np.where(part.p[::step], 1, -1)
+
+        def loss(z: NDArray) -> float:
+            i, j = np.rint(where - columns @ (z * unit) * at[:, None]).astype(int).T  # noqa: B023
+            i, j = np.clip(i, 0, shape[1] - 1), np.clip(j, 0, shape[0] - 1)
+            image = np.bincount(j * shape[1] + i, sign, shape.prod()).reshape(shape)  # noqa: B023
+            return -float(gaussian_filter(image, 1.0).var())
+
+        starts = grid if not found else [found[-1] / unit]
+        start = min(starts, key=loss)
+        simplex = np.concatenate([start[None], start + 20 * np.eye(len(start))])
+        options = {"initial_simplex": simplex, "maxiter": 120}
+        found.append(minimize(loss, start, method="Nelder-Mead", options=options).x * unit)
+    return np.array(found)
+
+
+def score_rows(told: Any, true: NDArray) -> tuple[dict[str, float], NDArray[np.bool_]]:
+    """Return figures of an estimate at some times, and which rows are false."""
+    off = np.linalg.norm(np.nan_to_num(told.mean) - true, axis=1)
+    size = np.linalg.norm(true, axis=1)
+    least = 1.0 if true.shape[1] == 3 else 50.0
+    false = told.valid & (off > 0.5 * np.maximum(size, least))
+    sigma = np.sqrt(np.diagonal(told.covariance, axis1=1, axis2=2))
+    beyond = (np.abs(np.nan_to_num(told.mean) - true) > 3 * sigma).any(1)[told.valid]
+    row = {"lost %": 100 * float((~told.valid).mean())}
+    if told.valid.any():
+        share = off[told.valid] / np.maximum(size[told.valid], 1e-3 * least)
+        row |= {"beyond 3 sigma %": 100 * float(beyond.mean())}
+        if size.min() > 0 or (size > 0).mean() > 0.1:
+            row |= {"error %": 100 * float(np.median(share))}
+    return row, false
+
+
+def part_situations(seeds: range) -> Table:
+    rows = []
+    for name in SITUATIONS:
+        runs: dict[str, list[dict[str, float]]] = {"": [], "causal ": [], "other ": []}
+        chosen = []
+        for seed in seeds:
+            recording, model, truth = situation(name, seed)
+            doubt = None
+            if model == "auto":
+                doubt = select_model(recording)
+                model = doubt.model.name
+                chosen.append(model + (" + k1" if doubt.camera else ""))
+                if doubt.camera:
+                    recording = dataclasses.replace(recording, camera=doubt.camera)
+            if model == "general" or (model == "planar" and truth(np.zeros(1)).shape[1] == 3):
+                continue
+            times = np.arange(recording.start, recording.stop, 1000)
+            true = truth(times)
+            for prefix, causal in (("", False), ("causal ", True)):
+                motion = voting.estimate(recording, model=model, seed=seed, causal=causal)
+                motion = doubt.include_doubt(motion) if doubt else motion
+                motion, _ = motion.with_flow_consistency(recording)
+                row, false = score_rows(motion(times), true)
+                row["false locks"] = float((np.diff(np.r_[0, false]) == 1).sum())
+                runs[prefix].append(row)
+            some = np.arange(recording.start + 100_000, recording.stop - 15_000, 50_000)
+            some = some[np.linalg.norm(truth(some), axis=1) > 0]
+            if len(some):
+                plain = relative_error(maximise_contrast(recording, model, some), truth(some))
+                runs["other "].append({"30 lines, error %": 100 * float(np.median(plain))})
+            if recording.frames and len(some):
+                points = frames.estimate(recording, model=model)(some)
+                off = relative_error(points.mean[points.valid], truth(some)[points.valid])
+                runs["other "].append({"points, error %": 100 * float(np.median(off))})
+        row: Row = {"situation": name}
+        if chosen:
+            row["chosen"] = ", ".join(chosen)
+        for prefix, scored in runs.items():
+            for key in dict.fromkeys(key for one in scored for key in one):
+                values = [one[key] for one in scored if key in one]
+                total = np.sum if key == "false locks" else np.mean
+                row[prefix.replace("other ", "") + key] = float(total(values))
+        rows.append(row)
+        print(f"situations {row}", file=sys.stderr, flush=True)
+    return "situations: as the command estimates by default, and causal", rows
+
+
 PARTS: dict[str, Callable[[range], Table]] = {
     "planar": part_planar,
     "frames": part_frames,
     "rotation": part_rotation,
     "penalty": part_penalty,
+    "situations": part_situations,
 }
 
 

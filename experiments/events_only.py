@@ -20,7 +20,7 @@ from tile_images import tile_images
 
 import jaxevent
 from jaxevent.metrics import mse, ssim
-from jaxevent.show.images import write_png
+from jaxevent.show.images import new_figure, save_figure, tone_map, write_png
 
 TEXELS = 2  # per pixel at the depth of the farthest plane
 SCENES = ("rotation", "slider", "objects", "hdr", "large", "turn")
@@ -318,6 +318,8 @@ def score(image, truth):
     from skimage.exposure import match_histograms
 
     image, truth = np.asarray(image, np.float64), np.asarray(truth, np.float64)
+    if not np.isfinite(image).all():
+        return np.full(4, np.nan)
     columns = np.stack([image.ravel(), np.ones(image.size)], 1)
     fit = columns @ np.linalg.lstsq(columns, truth.ravel(), rcond=None)[0]
     fitted = fit.reshape(truth.shape).clip(0, 1)
@@ -422,6 +424,7 @@ METHODS = {
     "events-only, causal": functools.partial(events_only, causal=True),
     "events-only": events_only,
 }
+STRIP = ("high-pass", "FireNet", "events-only", "frame, given to none")  # of the picture
 EXPONENTIAL = ("tiles", "events-only, causal", "events-only")  # methods whose images are ln I
 
 
@@ -459,6 +462,7 @@ def format_scores(scores):
 
 def match_tone(image, truth):
     """Return the affine fit of an image to the truth in 8 bit, for a picture."""
+    image = np.nan_to_num(image)
     slope, offset = np.polyfit(image.ravel(), truth.ravel(), 1)
     return np.rint(255 * np.clip(slope * image + offset, 0, 1)).astype(np.uint8)
 
@@ -469,6 +473,16 @@ def write_sheet(path, images, truth):
     columns = [*images, truth]
     rows = [np.hstack([match_tone(one[k], truth[k]) for one in columns]) for k in chosen]
     write_png(path, np.vstack(rows))
+
+
+def write_strip(path, panels):
+    """Write labelled images (height, width) side by side, each from its 0.5 to 99.5 percentile."""
+    figure = new_figure(3 * len(panels), 2.5)
+    for axis, (label, image) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        axis.imshow(tone_map(image, "percentile"), cmap="gray", vmin=0, vmax=255)
+        axis.set_title(label, fontsize=11)
+        axis.set_axis_off()
+    save_figure(figure, path, dpi=110)
 
 
 def run_part(name, options):
@@ -485,6 +499,9 @@ def run_part(name, options):
             print(f"{case.recording.name}, {label}: {format_scores(row['scores'])}{quality}; "
                   f"{row['seconds']:.2f} s", flush=True)  # fmt: skip
         write_sheet(options.out / f"{name}{seed or ''}.png", images.values(), case.truth)
+        panels = {**images, "frame, given to none": case.truth}
+        if name == "slider_depth" and all(label in panels for label in STRIP):
+            write_strip(options.out / "events_only.png", {k: panels[k][2] for k in STRIP})
     return {
         label: {
             "scores": np.concatenate([row["scores"] for row in rows]).tolist(),
@@ -518,6 +535,44 @@ def make_tables(results):
         ]
         parts.append(f"{title}\n\n{markdown_table(['', *results], rows)}\n")
     return "\n".join([*parts, machine(), ""])
+
+
+def image_seconds(estimate, recording, events, count):
+    """Return CPU seconds of an image, of `count` images with `events` between, after one more."""
+    times = recording.events.t[events * 4 :: events][: count + 1]
+    video = estimate(recording)
+    video(times[:1])
+    start = time.process_time()
+    video(times[1:])
+    return (time.process_time() - start) / (len(times) - 1)
+
+
+def events_only_bench():
+    """Return M events per CPU second of videos of a scene, and ratios, for `bench.py`."""
+    small, large = make_scene("slider", 0).recording, make_scene("large", 0).recording
+    shorter = jaxevent.events_only.Params(window=jaxevent.events_only.Params().window / 2)
+    taken = {
+        name: (events, image_seconds(estimate, recording, events, count))
+        for name, estimate, recording, events, count in (
+            ("240x180", jaxevent.events_only.estimate, small, 20_000, 8),
+            ("240x180, causal", lambda one: jaxevent.events_only.estimate(one, causal=True),
+             small, 20_000, 8),
+            ("240x180, half of the events",
+             lambda one: jaxevent.events_only.estimate(one, shorter), small, 20_000, 8),
+            ("640x480", jaxevent.events_only.estimate, large, 167_000, 4),
+            ("240x180, high-pass", jaxevent.high_pass.estimate, small, 20_000, 8),
+            ("240x180, tiles", lambda one: functools.partial(tile_images, one), small, 20_000, 2),
+        )
+    }  # fmt: skip
+    for name, (_, seconds) in taken.items():
+        print(f"events-only, {name}: {seconds:.3f} CPU s an image")
+    speed = {f"events-only, {k}": events / 1e6 / seconds for k, (events, seconds) in taken.items()}
+    cost = {k: seconds for k, (_, seconds) in taken.items()}
+    pixels = 640 * 480 / (240 * 180)
+    return speed, {
+        "events-only / images of tiles": cost["240x180, tiles"] / cost["240x180"],
+        "events-only: pixel of 640x480 / of 240x180": cost["640x480"] / cost["240x180"] / pixels,
+    }
 
 
 def main():

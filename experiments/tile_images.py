@@ -37,12 +37,10 @@ def _scores(x, y, t, p, vx, vy, image):
     return scores
 
 
-def tile_flow(x, y, t, p, shape, fastest=(240, 60)):
+def tile_flow(x, y, t, p, shape, fastest=(240, 240)):
     """Return the flow (height, width, 2), px/s, of events at t seconds about the time 0."""
     span = t[-1] - t[0]
-    vx, vy = (
-        np.arange(-v, v + 1, max(1.4 / span, v / n)) for v, n in zip(fastest, (24, 12), strict=True)
-    )
+    vx, vy = (np.arange(-v, v + 1, max(1.4 / span, v / 24)) for v in fastest)
     rows, columns = (np.arange(TILE_PX // 2, n, TILE_PX) for n in shape)
     scores = np.zeros((len(rows), len(columns), len(vy), len(vx)))
     for i, row in enumerate(rows):
@@ -131,7 +129,7 @@ def solve(x, y, t, p, flow, thresholds):
     return image.reshape(height, width)
 
 
-def tile_images(recording, times, events=None, fastest=(240, 60)):
+def tile_images(recording, times, events=None, fastest=(240, 240)):
     """Return log intensities (T, height, width) at times (us)."""
     e, shape = recording.events[:], (recording.height, recording.width)
     x, y, p = e.x.astype(int), e.y.astype(int), np.where(e.p, 1, -1)

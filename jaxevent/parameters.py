@@ -273,7 +273,7 @@ class Parameters(_Module):
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     calibrated: ClassVar[tuple[str, ...]] = ()  # names that calibrations of recordings determine
-    calibrated_if_clipped: ClassVar[tuple[str, ...]] = ()  # further names, where frames are clipped
+    calibrated_if_needed: ClassVar[tuple[str, ...]] = ()  # where frames are clipped or blurred
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
@@ -332,10 +332,10 @@ class Parameters(_Module):
             explicit: Values by name, and perhaps "preset".
 
         Returns:
-            The names, those in `calibrated_if_clipped` among them.
+            The names, those in `calibrated_if_needed` among them.
         """
         stated = {*explicit, *cls.presets.get(explicit.get("preset") or "", {})}
-        names = (*cls.calibrated, *cls.calibrated_if_clipped)
+        names = (*cls.calibrated, *cls.calibrated_if_needed)
         return tuple(name for name in names if name not in stated)
 
     @property
@@ -547,7 +547,7 @@ class Parameters(_Module):
                 "holds the calibration of a recording, and this method has no clock or thresholds; "
                 "leave it out"
             )
-        names = set(cls.names_left_open(table)) - set(cls.calibrated_if_clipped)
+        names = set(cls.names_left_open(table)) - set(cls.calibrated_if_needed)
         found = {n: calibration[n] for n in cls.settings() if n in names and n in calibration}
         if not found.keys() & THRESHOLDS:
             return found

@@ -51,12 +51,14 @@ class EventCalibration(NamedTuple):
     | ratio | ratio of the ON threshold to the OFF threshold; 1 is used where it is unknown |
     | spread | standard deviation of the logarithm of this ratio among pixels |
     | hot | (height, width), true for pixels that fire without cause |
+    | read_out | (height, width), true within the rows and columns that the sensor reads out |
     """
 
     thresholds: NDArray[np.float32]
     ratio: CalibrationValue
     spread: float
     hot: NDArray[np.bool_]
+    read_out: NDArray[np.bool_]
 
 
 def count_parts(recording: Recording) -> NDArray[np.int32]:
@@ -99,7 +101,19 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
     s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
-    return EventCalibration(thresholds, ratio, spread, hot)
+    return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(parts.sum((0, 1))))
+
+
+def _find_read_out(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Find the region of interest: rows and columns between the first and the last with events."""
+    inside = np.ones(counts.shape, bool)
+    for axis in (0, 1):
+        (used,) = np.nonzero(counts.any(axis))
+        along = np.arange(counts.shape[1 - axis])
+        if len(used):
+            within = (used[0] <= along) & (along <= used[-1])
+            inside &= within[:, None] if axis else within
+    return inside
 
 
 def _differences(

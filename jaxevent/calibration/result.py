@@ -132,6 +132,8 @@ class Calibration:
     def select(self, names: Iterable[str]) -> CalibratedValues:
         """Return the values of some names, and those that the data do not determine.
 
+        An exposure that may be none is left out.
+
         Args:
             names: Names, as of `Parameters.calibrated`; those of other things are left out.
 
@@ -140,6 +142,8 @@ class Calibration:
         """
         values = self.values()
         chosen = {name: values[name] for name in names if name in values}
+        if "exposure" in chosen and not chosen["exposure"].low > 0:
+            del chosen["exposure"]
         return CalibratedValues(
             {name: one.value for name, one in chosen.items() if one.is_identifiable},
             {name: one.note for name, one in chosen.items() if not one.is_identifiable},
@@ -156,6 +160,6 @@ class Calibration:
             The parameters.
         """
         left_open = kind.names_left_open(explicit)
-        names = [name for name in left_open if name not in kind.calibrated_if_clipped]
+        names = [name for name in left_open if name not in kind.calibrated_if_needed]
         found: dict[str, Any] = {**self.select(names).found}
         return kind(**found, **explicit)

@@ -124,11 +124,50 @@ def _read_stretch(
             return rows, (span[0], int(source[first + most :][:1].t[0])), first, first + most
 
 
-def _linear(recording: Recording, grey: NDArray[np.float32], row: int) -> NDArray[np.float32]:
-    """Return the intensity of a frame's grey values."""
-    table = np.asarray(recording.response.intensity(np.linspace(0, 1, 1025)), np.float64)
-    values = np.interp(grey, np.linspace(0, 1, 1025), table) / recording.gain[row]
-    return values.astype(np.float32)
+def _choose_stretches(recording: Recording) -> list[NDArray[np.intp]]:
+    """Choose the frames of each stretch, of which there may be none."""
+    frames = recording.frames
+    if frames is not None and len(frames) > 1:
+        return _choose_rows(recording)
+    rows = np.arange(len(frames) if frames is not None else 0)
+    return [rows] * (N_STRETCHES if len(recording.events) > MAX_EVENTS else 1)
+
+
+def _spread_events(
+    recording: Recording, number: int, count: int, most: int
+) -> tuple[tuple[int, int], int, int]:
+    """Return the span (us) and rows of the events of one of several stretches without frames."""
+    source = recording.events
+    first = max((len(source) - most) * number // max(count - 1, 1), 0)
+    last = min(first + most, len(source))
+    ends = source[first:last].t[[0, -1]] if last > first else (0, 0)
+    return (int(ends[0]), int(ends[1])), first, last
+
+
+def _read_frames(
+    recording: Recording, rows: NDArray[np.intp], places: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return grey values and intensities (rows, pixels) of frames."""
+    grey = np.empty((len(rows), len(places)), np.float32)
+    intensity, frames = np.empty_like(grey), recording.frames
+    if frames is None:
+        return grey, intensity
+    levels, gain = np.linspace(0, 1, 1025), recording.gain
+    table = np.asarray(recording.response.intensity(levels), np.float64)
+    for i, row in enumerate(rows.tolist()):
+        grey[i] = frames[row : row + 1].intensity[0].ravel()[places]
+        intensity[i] = np.interp(grey[i], levels, table) / gain[row]
+    return grey, intensity
+
+
+def _count_by_part(
+    t: NDArray[np.int64], place: NDArray[np.int64], parts: int, pixels: int
+) -> list[NDArray[np.int32]]:
+    """Count the events of each pixel in parts of equal length."""
+    cuts = np.empty(0, np.intp)
+    if parts > 1 and len(t):
+        cuts = np.searchsorted(t, np.linspace(t[0], t[-1] + 1, parts + 1)[1:-1])
+    return [np.bincount(part, minlength=pixels).astype(np.int32) for part in np.split(place, cuts)]
 
 
 def take_sample(recording: Recording) -> Sample:
@@ -145,12 +184,7 @@ def take_sample(recording: Recording) -> Sample:
     places, tile = choose_pixels(width, height)
     index = np.full(width * height, -1, np.int32)
     index[places] = np.arange(len(places))
-    if frames is not None and len(frames) > 1:
-        chosen = _choose_rows(recording)
-    else:
-        chosen = [np.arange(len(frames) if frames is not None else 0)]
-        if len(source) > MAX_EVENTS:
-            chosen = chosen * N_STRETCHES
+    chosen = _choose_stretches(recording)
     most = MAX_EVENTS // len(chosen)
     counts = np.zeros((2, width * height), np.int64)
     by_part, found, events_read = [], [], 0
@@ -158,31 +192,17 @@ def take_sample(recording: Recording) -> Sample:
         if len(rows) > 1:
             rows, span, first, last = _read_stretch(recording, (0, 0), most, rows)
         else:
-            first = (len(source) - most) * number // max(len(chosen) - 1, 1)
-            first, last = max(first, 0), min(max(first, 0) + most, len(source))
-            ends = source[first:last].t[[0, -1]] if last > first else (0, 0)
-            span = int(ends[0]), int(ends[1])
+            span, first, last = _spread_events(recording, number, len(chosen), most)
         events = source[first:last]
         events_read += len(events)
         place = events.y.astype(np.int64) * width + events.x
         for row, of in enumerate((events.p, ~events.p)):
             counts[row] += np.bincount(place[of], minlength=width * height)
-        cuts = np.empty(0, np.intp)
-        if len(chosen) == 1 and len(events):
-            times = np.linspace(events.t[0], events.t[-1] + 1, N_STRETCHES + 1)
-            cuts = np.searchsorted(events.t, times[1:-1])
-        by_part += [
-            np.bincount(part, minlength=width * height).astype(np.int32)
-            for part in np.split(place, cuts)
-        ]
+        parts = N_STRETCHES if len(chosen) == 1 else 1
+        by_part += _count_by_part(events.t, place, parts, width * height)
         pixel = index[place]
         keep = pixel >= 0
-        grey = np.empty((len(rows), len(places)), np.float32)
-        intensity = np.empty_like(grey)
-        for i, row in enumerate(rows.tolist()):
-            assert frames is not None
-            grey[i] = frames[row : row + 1].intensity[0].ravel()[places]
-            intensity[i] = _linear(recording, grey[i], row)
+        grey, intensity = _read_frames(recording, rows, places)
         stamps = frames.t[rows] if frames is not None else np.empty(0, np.int64)
         exposure = frames.exposure[rows] if frames is not None else np.empty(0, np.int64)
         # Before the first and after the last event nothing is known to be missing.

@@ -52,13 +52,18 @@ def add(commands: Any) -> None:
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
     )
     one.add_argument(
-        "--centred",
+        "--causal",
         action="store_true",
-        help="assign each estimate to the middle of the events that it rests on, some ms earlier",
+        help="estimate each row from the events before it alone, as on a live stream; it lags; "
+        "with --method voting; by default later events are used too",
     )
     one.add_argument(
-        "--smooth", action="store_true", help="use later events too, with --method voting"
+        "--centred",
+        action="store_true",
+        help="with --method voting, do not smooth, but assign each estimate to the middle of the "
+        "events that it rests on, some ms earlier",
     )
+    one.add_argument("--smooth", action="store_true", help="smooth by later events: the default")
     one.add_argument(
         "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
     )
@@ -131,6 +136,7 @@ def run(
     imu_rotation: str | None,
     still: tuple[float, float] | None,
     rate: float | int,
+    causal: bool,
     centred: bool,
     smooth: bool,
     start: float | int | None,
@@ -149,11 +155,13 @@ def run(
 
     kind = None if model == "auto" else find_model(model)
     if kind is not None:
-        _check(find_estimator(method or kind.best_method), kind, imu, smooth)
+        _check(find_estimator(method or kind.best_method), kind, imu, causal, smooth)
+    if causal and (centred or smooth):
+        raise InputError("--causal uses no later events; leave out --centred and --smooth")
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
     turned = None if imu_rotation is None else rotation_of(imu_rotation)
-    output = Output(out, rate, truth, centred, flow)
+    output = Output(out, rate, truth, flow=flow)
     recording = arguments.open_recording(path, reading)
     recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
     if not len(recording.events):
@@ -167,25 +175,33 @@ def run(
     if recording.imu is not None and still is not None:
         bias = gyro_bias(recording.imu, *still)
     whole, recording = recording, _stretch(recording, start, stop)
+    choice = None
     if kind is None:
         choice = select_model(recording)
         print("\n".join(choice.lines))
         kind = choice.model
+        if choice.camera is not None:
+            recording = dataclasses.replace(recording, camera=choice.camera)
     estimator = find_estimator(method or kind.best_method)
-    _check(estimator, kind, imu, smooth)
+    _check(estimator, kind, imu, causal, smooth)
     _need_camera(recording, kind)
     true = output.known(whole, kind, bias, turned, depth)
     clock = time.perf_counter()
     settings: dict[str, Any] = {"model": kind, "seed": seed, "progress": show_progress()}
-    if smooth:
-        settings["smooth"] = True
-    gyro, other = (imu, bias, turned), not (method or params or smooth)
+    if causal:
+        settings["causal"] = True
+    elif "smooth" in estimator.options:
+        settings["smooth"] = smooth or not centred
+    gyro, other = (imu, bias, turned), not (method or params or causal or smooth)
     estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
+    if choice is not None:
+        told = choice.include_doubt(told)
     told, warning = told.with_flow_consistency(recording)
     if warning:
         print(warning)
     seconds = time.perf_counter() - clock
-    about = {"seed": seed, "smooth": smooth, "gyro": imu, "centred": centred}
+    smoothed = settings.get("smooth", False)
+    about = {"seed": seed, "smooth": smoothed, "gyro": imu, "causal": causal}
     made = {"method": estimator.name, "params": values}
     written = output.write(recording, told, about, true, progress=show_progress(), **made)
     hint = _truth_there(whole, kind) if truth is None else []
@@ -197,13 +213,14 @@ def run(
     )
 
 
-def _check(estimator: Any, kind: Any, imu: bool, smooth: bool) -> None:
+def _check(estimator: Any, kind: Any, imu: bool, causal: bool, smooth: bool) -> None:
     """Raise `InputError` for a model or an option that the method does not know."""
     from jaxevent.methods import names
     from jaxevent.runs.egomotion import find_estimator
 
     estimator.find_model(kind)
-    for option, name, used in (("gyro", "imu", imu), ("smooth", "smooth", smooth)):
+    wanted = (("gyro", "imu", imu), ("causal", "causal", causal), ("smooth", "smooth", smooth))
+    for option, name, used in wanted:
         if used and option not in estimator.options:
             others = [one for one in names("egomotion") if option in find_estimator(one).options]
             raise InputError(
@@ -301,6 +318,7 @@ def estimated(
     suited = estimator.adapt_params(recording, estimator.initial_params(kind), speed=suited.speed)
     if suited.params_message:
         print(f"{estimator.name}: {suited.params_message}")
+    settings = {k: v for k, v in settings.items() if k not in ("causal", "smooth")}
     told = _told(estimator, recording, suited.params, settings, gyro)
     if len(first) and not told.valid.any():
         return usual

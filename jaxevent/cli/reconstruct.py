@@ -67,12 +67,13 @@ def add(commands: Any) -> None:
     arguments.add_no_calibrate(one)
     one.add_argument(
         "--tone",
-        choices=["linear", "log", "percentile", "clahe", "changes"],
+        choices=["linear", "log", "percentile", "clahe", "changes", "relative"],
         help="how intensity becomes grey in PNG and MP4: linear (default), from the frames' black "
         "to their white, so that images are as bright as frames and what is brighter is cut off; "
         "log, the logarithm of 99 %% of the intensities, for high dynamic range; percentile, their "
-        "intensity; clahe, log with contrast evened out; changes (default where there are no "
-        "frames), grey where nothing changed. All images have the same limits",
+        "intensity; clahe, log with contrast evened out; relative (default where there are no "
+        "frames), log that fades to grey where nothing is known; changes (default of high-pass "
+        "then), grey where nothing changed. All images have the same limits",
     )
     one.add_argument(
         "--colour",
@@ -163,7 +164,7 @@ def run(
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.reconstruction.augment import calibrated_values
-    from jaxevent.show.export import within, write_hdf5, writer
+    from jaxevent.show.export import default_tone, within, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
@@ -209,8 +210,7 @@ def run(
         from jaxevent.reconstruction.colour import colour_video
 
         colours = colour_video(video, recording)
-    tone = tone or ("changes" if recording.frames is None else "linear")
-    how = write(video, chosen, out, tone, name, colours)
+    how = write(video, chosen, out, tone or default_tone(estimator, recording), name, colours)
     seconds = time.perf_counter() - clock
     print(
         f"{out}: {len(chosen):,} images{how}, {seconds:.2f} s, "

@@ -14,7 +14,9 @@ Modules that they are built on:
 - `geometry`: the flow of a rigid scene, rotations and twists, images of warped events;
 - `truth`: the known motion of a recording, from poses, a gyro or a table;
 - `scores`: errors of an estimate;
-- `patches` and `model_selection`: the speed of the image, and the model that explains it.
+- `patches` and `model_selection`: the speed of the image, and the model that explains it;
+- `evidence` and `still`: whether votes support a motion, and whether the camera moves at all;
+- `live`: the motion of a stream of events.
 
 Motion is the camera's own twist (T, Omega) in its axes, x to the right, y down, z forward.
 

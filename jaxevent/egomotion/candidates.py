@@ -142,14 +142,19 @@ class CandidateSampler:
             np.zeros((2, *shape), np.int16),
             np.zeros((3, (2 * radius + 1) ** 2 * per_pixel)),
         )
-        self._row, self._end = 0, len(recording.events)
-        self._last = int(recording.events[:1].t[0]) if self._end else 0
+        self._row = 0
+        self._last = int(recording.events[:1].t[0]) if len(recording.events) else 0
         self._clock = np.array([self._last, self._last])  # start of the history, last event
 
     @property
     def is_exhausted(self) -> bool:
         """Return whether all events have been sampled."""
-        return self._row >= self._end
+        return self._row >= len(self.recording.events)
+
+    @property
+    def next_row(self) -> int:
+        """Row of the first event that has not been sampled."""
+        return self._row
 
     def sample(
         self,

@@ -170,9 +170,9 @@ def iterate_flow(
                 break
             t = recording.events[int(rows[0]) : int(rows[-1]) + 1].t
             estimate = motion(t, centred=True, extrapolate=True)
-            known = estimate.valid & np.isfinite(estimate.mean).all(1)
+            known = estimate.valid
             mean = np.zeros((*used.shape, estimate.mean.shape[1]), real)
-            mean[used] = np.where(known[:, None], estimate.mean, 0)
+            mean[used] = np.nan_to_num(estimate.mean)  # without a heading it is a rotation
             U, residual = _estimate_flow(params, model, batches.candidates, mean)
             U, residual = np.asarray(U)[used], np.asarray(residual)[used]
             valid = known & (residual <= float(params.limit)) if model.half_line else known
@@ -340,7 +340,7 @@ class RigidFlow:
         distortion = np.linalg.inv(undistortion)
         for row, t in enumerate(times.tolist()):
             if estimate.valid[row]:
-                mean = np.asarray(estimate.mean[row], float)
+                mean = np.nan_to_num(np.asarray(estimate.mean[row], float))
                 U = _map_pixels(model.flow, xi, mean)
                 if model.half_line:
                     U = U + self._parallax(t, xi, model, mean)

@@ -14,6 +14,7 @@ a translation (`bundle.hypotheses`).
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,10 @@ from jaxevent.egomotion.bundle.hypotheses import MotionGuess, translation_z
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import rotation_basis
 from jaxevent.egomotion.models import MODELS, General, Model, Planar, Rotation
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
     FIT_WINDOW_DISPLACEMENT_PX,
+    PatchSharpness,
     describe_windows,
     fit_general,
     fit_planar,
@@ -34,6 +37,7 @@ from jaxevent.egomotion.patches import (
     log_sharpness,
     measure_image_speed,
     measure_windows,
+    refine_rotation,
     z_score,
 )
 from jaxevent.errors import InputError
@@ -47,6 +51,9 @@ MIN_DEPTH_SELECTION_Z = 4.0
 # parameters that general motion adds fit noise too, and general motion 2.8 and more.
 MAX_EXCLUSION_Z = 0.0
 N_LONG_WINDOWS = 2  # in which a translation is tested
+MIN_REPORTED_WEIGHT = 0.01  # of a model that was not chosen
+TRIED_K1 = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2)  # of a lens of which none is known
+MIN_LENS_Z = 3.0  # from which a distortion explains more than none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,11 +65,35 @@ class ModelSelection:
         lines: What was found, lines to print.
         z: Test statistic by names (general model, simpler model); positive if the first one
             explains held-out events better.
+        doubt: (d, d) covariance of what the other models tell, relative to the motion's size; None
+            where they are excluded.
+        camera: The camera with a distortion that was found, or None.
     """
 
     model: type[Model]
     lines: tuple[str, ...]
     z: dict[tuple[str, str], float]
+    doubt: NDArray[np.float64] | None = None
+    camera: PinholeCamera | None = None
+
+    def include_doubt(self, motion: MotionEstimate) -> MotionEstimate:
+        """Add what the models that are not excluded tell otherwise to the covariance.
+
+        Args:
+            motion: A motion of the selected model.
+
+        Returns:
+            The motion with the larger covariance.
+        """
+        if self.doubt is None:
+            return motion
+        mean = np.nan_to_num(motion.mean)
+        scale = np.ones_like(mean)  # of directions; others are relative to their size
+        for part in motion.model.parts:
+            if not part.direction:
+                scale[:, part.rows] = np.linalg.norm(mean[:, part.rows], axis=1)[:, None]
+        added = self.doubt * scale[:, :, None] * scale[:, None, :]
+        return dataclasses.replace(motion, covariance=motion.covariance + added)
 
 
 def select_model(recording: Recording, camera: PinholeCamera | None = None) -> ModelSelection:
@@ -94,7 +125,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
         return ModelSelection(Planar, (line,), {})
     _, f = pixel_coordinates(recording.width, recording.height, camera)
     sharpness: dict[str, list[NDArray]] = {"planar": [], "rotation": [], "general": []}
-    guesses = []
+    guesses, fits = [], []
     for window in windows:
         rows = np.arange(len(window.xi))
         d = fit_planar(window)
@@ -106,6 +137,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
         sharpness["planar"].append(log_sharpness(window, 1, np.tile(d, (len(rows), 1))))
         sharpness["rotation"].append(log_sharpness(window, 1, turned))
         sharpness["general"].append(log_sharpness(window, 1, along[best, rows]))
+        fits.append(_WindowFits(np.asarray(rotation_basis(window.xi, f)), d, turn, six))
         duration = window.duration
         guesses.append(
             MotionGuess(
@@ -113,13 +145,117 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
                 six[3:] / duration,
             )
         )  # fmt: skip
+    lines: tuple[str, ...] = ()
+    lens = None if camera.is_distorted else _fit_lens(windows, f, [one.turn for one in fits])
     every = {name: np.concatenate(parts) for name, parts in sharpness.items()}
+    if lens is not None:
+        gain = z_score(lens.sharpness - every["rotation"])
+        if gain > MIN_LENS_Z and z_score(lens.sharpness - every["planar"]) > 0:
+            every["rotation"] = lens.sharpness
+            camera = dataclasses.replace(camera, distortion=(lens.k1, 0.0, 0.0, 0.0, 0.0))
+            lines = (
+                f"a lens that distorts, k1 about {lens.k1:g}, explains a rotation better than one "
+                f"that does not (z = {gain:.1f}); it is used, and a calibration is better",
+            )
     z = {
         pair: z_score(every[pair[0]] - every[pair[1]])
         for pair in (("rotation", "planar"), ("general", "planar"), ("general", "rotation"))
     }
     step = -(-len(guesses) // N_LONG_WINDOWS)
-    return select_by_z(z, lambda: translation_z(recording, camera, guesses[::step]))
+    found = select_by_z(z, lambda: translation_z(recording, camera, guesses[::step]))
+    doubt, doubts = _model_doubt(found, fits)
+    return dataclasses.replace(
+        found, lines=(*lines, *doubts, *found.lines), doubt=doubt, camera=camera if lines else None
+    )
+
+
+class _WindowFits(NamedTuple):
+    """The motions that models find in a window."""
+
+    basis: NDArray[np.float64]  # (patches, 2, 3) of rotations
+    planar: NDArray[np.float64]  # (2,) px
+    turn: NDArray[np.float64]  # (3,) rad
+    general: NDArray[np.float64]  # (6,) heading and rad
+
+    def motion(self, name: str, model: type[Model]) -> NDArray[np.float64]:
+        """Return what the fit of a model tells of the components of another, in the window."""
+        if model is Planar:
+            turn = self.turn if name == Rotation.name else self.general[3:]
+            return self.planar if name == Planar.name else self.basis.mean(0) @ turn
+        rows = self.basis.reshape(-1, 3)
+        flow = np.tile(self.planar, len(self.basis))
+        turn = {"rotation": self.turn, "general": self.general[3:]}.get(name)
+        if turn is None:
+            turn = np.asarray(np.linalg.lstsq(rows, flow, rcond=None)[0], np.float64)
+        return turn
+
+
+def _model_doubt(
+    found: ModelSelection, fits: list[_WindowFits]
+) -> tuple[NDArray[np.float64] | None, list[str]]:
+    """Average what other models tell, by their weights exp(-z^2 / 2) relative to the chosen one.
+
+    z is the evidence against them, at least 0.
+    """
+    model, lines = found.model, []
+    d = len(model.components)
+    total = np.zeros((d, d))
+    rows = slice(3, 6) if model is General else slice(0, d)
+    for other in (name for name in MODELS if name != model.name):
+        pair = (model.name, other)
+        against = found.z[pair] if pair in found.z else -found.z[pair[::-1]]
+        odds = np.exp(-(max(against, 0.0) ** 2) / 2)
+        weight = float(odds / (1 + odds))
+        if weight < MIN_REPORTED_WEIGHT:
+            continue
+        size, away = 0.0, np.zeros((rows.stop - rows.start,) * 2)
+        for one in fits:
+            own = one.motion(model.name, model)
+            far = one.motion(other, model) - own
+            away += np.outer(far, far)
+            size += float(own @ own)
+        total[rows, rows] += weight * away / max(size, 1e-12)
+        if model is General:
+            total[:3, :3] += weight * np.eye(3)
+        share = 100 * np.sqrt(np.trace(away) / max(size, 1e-12))
+        lines.append(
+            f"{MODELS[other].title} is not excluded: its weight is {weight:.2f}, and it differs by "
+            f"{share:.0f} %; sigmas include that"
+        )
+    return (total if lines else None), lines
+
+
+class _LensFit(NamedTuple):
+    """Rotations before a lens that distorts."""
+
+    k1: float
+    sharpness: NDArray[np.float64]  # of held-out pixels
+
+
+def _fit_lens(
+    windows: list[PatchSharpness], f: float, turns: list[NDArray[np.float64]]
+) -> _LensFit:
+    """Fit rotations and one k1 to patches' own half of the pixels.
+
+    A pixel x = u (1 + k1 |u|^2 / f^2) moves with J B(u) Omega, u being where it is without the
+    distortion, and J = dx / du.
+    """
+    best = (-np.inf, 0.0, np.zeros(0))
+    for k1 in TRIED_K1:
+        trained, held = 0.0, []
+        for window, turn in zip(windows, turns, strict=True):
+            u = window.xi
+            for _ in range(10):
+                u = window.xi / (1 + k1 * (u**2).sum(1, keepdims=True) / f**2)
+            r2 = (u**2).sum(1)[:, None, None] / f**2
+            J = (1 + k1 * r2) * np.eye(2) + 2 * k1 * u[:, :, None] * u[:, None, :] / f**2
+            basis = J @ np.asarray(rotation_basis(u, f))
+            turned = basis @ refine_rotation(window, basis, turn)
+            trained += float(log_sharpness(window, 0, turned).sum())
+            held.append(log_sharpness(window, 1, turned))
+        if trained > best[0]:
+            best = trained, k1, np.concatenate(held)
+    return _LensFit(best[1], best[2])
 
 
 def select_by_z(

@@ -22,6 +22,7 @@ TANGENTIAL_SIGMA_RATIO = 0.1
 # Relative error of a motion that a calibrated lens leaves: of a rotation, if f is off by 0.5 %, the
 # centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_model_selection.py).
 RELATIVE_LENS_ERROR = 0.01
+CHANGE_OVER_LAG = 1.0  # error of estimates that lag, relative to the change over twice the lag
 MAX_DIRECTION_SIGMA_RAD = 1.0  # rad, standard deviation of a direction that the data determine
 
 
@@ -63,10 +64,11 @@ def table_columns(
 
     Returns:
         Arrays (T,) by name: t (s), each component, its standard deviation sigma_<component>, and
-        lost, 0 or 1. Where the motion is lost the components and their sigmas are NaN.
+        lost, 0 or 1. Where the motion is lost the components and their sigmas are NaN, and those of
+        a direction where it is not observable.
     """
     names = find_model(model).components
-    lost = ~estimate.valid[:, None]
+    lost = ~(estimate.valid[:, None] & is_observable(model, estimate.covariance))
     variance = np.diagonal(estimate.covariance, axis1=1, axis2=2)
     columns: dict[str, NDArray] = {"t": times / 1e6}
     columns |= dict(zip(names, np.where(lost, np.nan, estimate.mean).T, strict=True))
@@ -132,6 +134,7 @@ class MotionEstimate(HtmlRepr):
         recording: Name of the recording.
         span: First and last time of the recording, us; None allows all times.
         n_extended: Number of estimates that `extended_to` has added at the ends.
+        causal: Whether the motion is read as it is known at a time, without later events.
     """
 
     model: type[Model]
@@ -147,6 +150,7 @@ class MotionEstimate(HtmlRepr):
     recording: str = "the recording"
     span: tuple[int, int] | None = None
     n_extended: int = 0
+    causal: bool = False
 
     @classmethod
     def from_arrays(
@@ -193,8 +197,8 @@ class MotionEstimate(HtmlRepr):
         Args:
             calibration: The coefficients.
             length: Time span of the data of an estimate, s; one number or (n,).
-            lone_change: (d,) change of the motion within the time span, if there is one estimate;
-                of several it is measured between neighbours.
+            lone_change: (d,) or (n, d) change of the motion within the time span, measured there;
+                it counts where it is more than that between neighbours.
 
         Returns:
             The estimate with the calibrated covariance.
@@ -218,8 +222,9 @@ class MotionEstimate(HtmlRepr):
                 change[:, i], bend[:, i] = late - early, late + early - 2 * now
                 if inner.any():
                     bend[:, i] = np.interp(self.t, self.t[inner], bend[inner, i])
-        elif lone_change is not None:
-            change[:] = lone_change
+        if lone_change is not None:
+            larger = (lone_change**2).sum(-1) > (change**2).sum(1)
+            change = np.where(larger[:, None], lone_change, change)
         covariance = calibration.factor * self.covariance
         for d in (change, bend):
             covariance = covariance + calibration.change**2 * d[:, :, None] * d[:, None, :]
@@ -232,8 +237,8 @@ class MotionEstimate(HtmlRepr):
         """Add the spread of the motions of parts of the image to the covariance.
 
         One velocity of the whole image is at most as certain as its parts are alike. Where they
-        differ from a rotation, translation may have caused all of the motion. Where the camera is
-        static and objects move, the objects alone determine the estimate.
+        differ from a rotation, translation may have caused all of the motion. Where the camera may
+        be static while objects move (`still`), the estimate is lost.
 
         Args:
             recording: The recording of the estimate.
@@ -241,19 +246,21 @@ class MotionEstimate(HtmlRepr):
         Returns:
             The estimate with the larger covariance, and a warning; "" if nothing was added.
         """
-        from jaxevent.egomotion.patches import (
-            flow_consistency,
-            is_camera_static,
-            measure_image_speed,
-        )
+        from jaxevent.egomotion.patches import flow_consistency
+        from jaxevent.egomotion.still import Turns, find_undecided
 
-        speed = measure_image_speed(recording) if recording.frames else None
-        if self.valid.any() and is_camera_static(recording, speed):
-            return self._with_full_uncertainty(), (
-                "the camera seems to stand still while objects move: edges in the frames make no "
-                "events; sigmas include that, and jaxevent track follows objects"
-            )
-        found = flow_consistency(recording, self.model, speed=speed)
+        turns = None
+        for part in self.model.parts:
+            if part.figure == "Omega":
+                at = self.t - np.rint(1e6 * self.lag).astype(np.int64)
+                turns = Turns(at, self.mean[:, part.rows], self.covariance[:, part.rows, part.rows])
+        undecided, still = find_undecided(recording, self.valid, turns)
+        if undecided.any():
+            unsure = self._with_full_uncertainty().covariance
+            covariance = np.where(undecided[:, None, None], unsure, self.covariance)
+            told = dataclasses.replace(self, valid=self.valid & ~undecided, covariance=covariance)
+            return told, still
+        found = flow_consistency(recording, self.model)
         if found is None or not found.is_inconsistent:
             return self, ""
         mean = np.nan_to_num(self.mean)
@@ -332,13 +339,13 @@ class MotionEstimate(HtmlRepr):
         return rates.T @ rates / max(len(rates), 1)
 
     def to_dataframe(
-        self, times: Times | None = None, *, centred: bool = False
+        self, times: Times | None = None, *, centred: bool | None = None
     ) -> "pandas.DataFrame":
         """Make a pandas table of the motion, with the columns that `jaxevent motion` writes as CSV.
 
         Args:
             times: Integers (us) or floats (s); by default the table holds the estimates themselves.
-            centred: Whether to use fixed-lag estimates, see the call.
+            centred: See the call.
 
         Returns:
             A row for each time. The columns are t (s), the model's components, their standard
@@ -351,7 +358,7 @@ class MotionEstimate(HtmlRepr):
         import pandas
 
         if times is None:
-            us, estimate = self.t, Estimate(self.mean, self.covariance, self.valid)
+            us, estimate = self.t, self._without_undecided(self.mean, self.covariance, self.valid)
         else:
             us, estimate = np.atleast_1d(microseconds(times)), self(times, centred=centred)
         table = pandas.DataFrame(table_columns(self.model, us, estimate))
@@ -368,7 +375,7 @@ class MotionEstimate(HtmlRepr):
         return f"MotionEstimate({self.model.name}, {len(self)} estimates, {lost} lost)"
 
     def __call__(
-        self, times: Times, *, centred: bool = False, extrapolate: bool = False
+        self, times: Times, *, centred: bool | None = None, extrapolate: bool = False
     ) -> Estimate:
         """Return the motion at some times.
 
@@ -379,12 +386,15 @@ class MotionEstimate(HtmlRepr):
         Args:
             times: Integers (us) or floats (s).
             centred: Whether an estimate holds for the time `lag` before its own, when the motion
-                was observed. This is a fixed-lag estimate, of events up to `lag` later.
+                was observed. This is a fixed-lag estimate, of events up to `lag` later. By default
+                it does unless the estimate is causal. Without, the covariance includes the change
+                of the motion meanwhile.
             extrapolate: Whether times outside the recording are allowed.
 
         Returns:
             An `Estimate` of mean (times, d), covariance (times, d, d) and valid (times,). Invalid
             are times next to a lost estimate, before the first one, and outside the recording.
+            There the mean is NaN, and so are the components of an unobservable direction.
 
         Raises:
             InputError: A time is not finite, or outside the recording without `extrapolate`.
@@ -399,6 +409,8 @@ class MotionEstimate(HtmlRepr):
         if n == 0:
             missing = np.full((len(times), d), np.nan), np.full((len(times), d, d), np.nan)
             return Estimate(*missing, np.zeros(len(times), bool))
+        if centred is None:
+            centred = not self.causal
         at = self.t - (1e6 * self.lag if centred else 0)
         at = np.maximum.accumulate(at)
         row = np.searchsorted(at, times, "right")
@@ -412,9 +424,55 @@ class MotionEstimate(HtmlRepr):
         beyond = np.maximum(at[0] - times, 0) + np.maximum(times - at[-1], 0)
         if beyond.any():
             covariance = covariance + beyond[:, None, None] ** 2 * self._change_rate()
+        if not centred and self.lag.any():
+            covariance = covariance + self._change_over_lag(times, mean, before)
         valid = self.valid[before] & self.valid[after] & (times >= at[0]) & inside
         valid &= np.isfinite(mean).all(1) & np.isfinite(covariance).all((1, 2))
-        return Estimate(mean, covariance, valid)
+        return self._without_undecided(mean, covariance, valid)
+
+    def _change_over_lag(
+        self, times: NDArray[np.int64], mean: NDArray[np.floating], row: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the covariance (times, d, d) of the change while estimates lag.
+
+        The filter follows what its candidates show as late as these precede it, so the change is
+        that over twice the lag, as it was before.
+        """
+        past = times - 2e6 * self.lag[row]
+        found = self.valid & np.isfinite(self.mean).all(1)
+        if not found.any():
+            return np.zeros((*mean.shape, mean.shape[1]))
+        change = mean - np.stack([np.interp(past, self.t[found], c) for c in self.mean[found].T], 1)
+        return CHANGE_OVER_LAG**2 * change[:, :, None] * change[:, None, :]
+
+    def _without_undecided(
+        self,
+        mean: NDArray[np.floating],
+        covariance: NDArray[np.floating],
+        valid: NDArray[np.bool_],
+    ) -> Estimate:
+        """Make an estimate whose mean is NaN where it is lost or not observable."""
+        told = valid[:, None] & is_observable(self.model, covariance)
+        return Estimate(np.where(told, mean, np.nan), covariance, valid)
+
+    def _with_gaps(self, longest: float) -> "MotionEstimate":
+        """Add a lost estimate in each pause between estimates that is longer (s).
+
+        Nothing is known of the motion while no event comes.
+        """
+        at = np.flatnonzero(np.diff(self.t) > 1e6 * longest)
+        if not len(at):
+            return self
+        rows = np.insert(np.arange(len(self)), at + 1, at)
+        added = at + 1 + np.arange(len(at))
+        arrays = {
+            field.name: value[rows]
+            for field in dataclasses.fields(self)
+            if isinstance(value := getattr(self, field.name), np.ndarray)
+        }
+        arrays["t"][added] += round(1e6 * longest)
+        arrays["valid"][added] = False
+        return dataclasses.replace(self, **arrays)
 
 
 __getattr__ = renamed_names(__name__)

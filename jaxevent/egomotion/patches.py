@@ -36,7 +36,7 @@ from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
-from jaxevent.recording import Recording
+from jaxevent.recording import Imu, Recording
 
 PATCH_PX = 24
 MAX_GRID_DISPLACEMENT_PX = 7  # of the grid, in x and y
@@ -55,6 +55,7 @@ IMAGE_PIXEL_PX = 2
 FRAME_WINDOW_DISPLACEMENT_PX = 5.0  # of the image around a frame whose edges are counted
 EDGE_PIXEL_FRACTION = 0.1  # of the pixels, those of the steepest log intensity
 DARK_GREY_OFFSET = 0.05  # of full scale, added before the logarithm: darker greys are noise
+MIN_GYRO_SPEED_RAD_S = 0.3  # of a camera that turns; biases are up to 0.2
 MAX_STATIC_EDGE_FRACTION = 0.3  # fraction of edges with events, below which the camera is static
 
 N_FIT_TIMES = 4  # at which patches are evaluated for fits
@@ -151,12 +152,25 @@ def describe_windows(recording: Recording) -> str:
     """Describe the durations of the windows that are evaluated, those that fit, in words."""
     if len(recording.events) < MIN_PATCH_EVENTS:
         return "in so few events"
-    fitting = [float(duration) for duration in WINDOW_DURATIONS_S if _fits(recording, duration)]
+    fitting = window_durations(recording).tolist()
     if not fitting:
         return "in so short a recording"
     ends = sorted({fitting[0], fitting[-1]})
     words = [f"{1e3 * one:.2g} ms" if one < 0.1 else f"{one:.2g} s" for one in ends]
     return f"in windows of {' to '.join(words)}"
+
+
+def window_durations(recording: Recording) -> NDArray[np.float64]:
+    """Return the durations (s) of windows that fit in a recording, the last one its whole length.
+
+    Of a recording longer than all of them, they are `WINDOW_DURATIONS_S`.
+    """
+    whole = 1e-6 * (recording.stop - recording.start)
+    every = np.asarray(WINDOW_DURATIONS_S, np.float64)
+    fitting: NDArray[np.float64] = every[[_fits(recording, float(one)) for one in every]]
+    if whole >= WINDOW_DURATIONS_S[-1] or not len(fitting):
+        return fitting
+    return np.append(fitting, whole)
 
 
 def _fits(recording: Recording, duration: float) -> bool:
@@ -171,7 +185,7 @@ def _measure_speed(recording: Recording, camera: PinholeCamera | None) -> ImageS
     speeds, by_time, n_patches = [], [], 0
     for middle in spread_times(recording, N_EVALUATED_TIMES):
         best: dict[tuple[float, ...], tuple[float, float]] = {}  # sharpness and speed by position
-        for duration in WINDOW_DURATIONS_S:
+        for duration in window_durations(recording):
             window = measure_sharpness(
                 recording, middle, float(duration), MAX_GRID_DISPLACEMENT_PX, xi
             )
@@ -324,6 +338,29 @@ def is_camera_static(recording: Recording, speed: ImageSpeed | None) -> bool:
     return fraction is not None and fraction < MAX_STATIC_EDGE_FRACTION
 
 
+def is_camera_known_to_move(recording: Recording, camera: PinholeCamera | None = None) -> bool:
+    """Return whether frames or a gyro show that the camera moves.
+
+    Args:
+        recording: The recording.
+        camera: The camera; by default the recording's.
+
+    Returns:
+        A boolean; false where nothing tells.
+    """
+    if recording.imu is not None and gyro_speed(recording.imu) > MIN_GYRO_SPEED_RAD_S:
+        return True
+    if not recording.frames:
+        return False
+    fraction = edge_event_fraction(recording, measure_image_speed(recording, camera))
+    return fraction is not None and fraction >= MAX_STATIC_EDGE_FRACTION
+
+
+def gyro_speed(imu: Imu) -> float:
+    """Return the root mean square of a gyro's rates, rad/s, of which the least is its bias."""
+    return float(np.sqrt((np.asarray(imu.gyro, np.float64) ** 2).sum(1).mean()))
+
+
 def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -> float | None:
     """Measure the fraction of the strongest edges in frames that have events beside them.
 
@@ -467,9 +504,11 @@ def measure_windows(
     for middle in spread_times(recording, N_FIT_TIMES):
         near = [(abs(t - middle), v) for t, v in speed.by_time if np.isfinite(v)]
         here = min(near)[1] if near else speed.median
-        duration = WINDOW_DURATIONS_S[
-            np.abs(np.log(WINDOW_DURATIONS_S * here / FIT_WINDOW_DISPLACEMENT_PX)).argmin()
-        ]
+        durations = window_durations(recording)
+        if not len(durations):
+            return windows
+        ratio = durations * here / FIT_WINDOW_DISPLACEMENT_PX
+        duration = durations[np.abs(np.log(ratio)).argmin()]
         window = measure_sharpness(recording, middle, float(duration), MAX_FIT_DISPLACEMENT_PX, xi)
         if window is not None:
             windows.append(window)
@@ -545,6 +584,27 @@ def fit_rotation(
         return -float(log_sharpness(window, 0, basis @ (v * unit)).sum())
 
     return _minimise(loss, [one / unit for one in starts], 1.0) * unit
+
+
+def refine_rotation(
+    window: PatchSharpness, basis: NDArray[np.float64], turn: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Refine a rotation whose displacements are linear.
+
+    Args:
+        window: The patches.
+        basis: (patches, 2, 3) displacements per rad, px.
+        turn: (3,) rotation vector over the window at the start, rad.
+
+    Returns:
+        (3,) rotation vector, rad.
+    """
+    unit = 1 / np.sqrt(np.maximum((basis**2).sum(1).mean(0), 1e-12))
+
+    def loss(v: NDArray) -> float:
+        return -float(log_sharpness(window, 0, basis @ (v * unit)).sum())
+
+    return _minimise(loss, [turn / unit], 1.0) * unit
 
 
 def half_line_displacements(

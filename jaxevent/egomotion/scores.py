@@ -226,7 +226,7 @@ def score_motion(
     times: NDArray[np.int64],
     *,
     start: int | None = None,
-    centred: bool = False,
+    centred: bool | None = None,
     description: str = "the truth",
 ) -> MotionScores:
     """Compare a motion with a known one.
@@ -251,7 +251,11 @@ def score_motion(
         return MotionScores({}, max(span, 0.0), 1.0, 0, description)
     lost, first = ~estimate.valid[found[0] :], int(times[found[0]])
     mean, true = estimate.mean[found], truth(times[found])
-    pairs = {part.figure: (mean[:, part.rows], true[:, part.rows]) for part in motion.model.parts}
+    pairs = {}
+    for part in motion.model.parts:
+        rows = np.isfinite(mean[:, part.rows]).all(1)
+        if rows.any():
+            pairs[part.figure] = mean[rows, part.rows], true[rows, part.rows]
     startup = max(first - start, 0) * 1e-6
     return MotionScores(
         motion_errors(**pairs), startup, float(lost.mean()), len(found), description
@@ -272,7 +276,11 @@ def errors_by_part(
         Arrays (n,) by the name of a direction, degrees, and "error" of the rest, %.
     """
     errors = {
-        part.name: axis_error(mean[:, part.rows], true[:, part.rows])
+        part.name: np.where(
+            np.isfinite(mean[:, part.rows]).all(1),
+            axis_error(np.nan_to_num(mean[:, part.rows]), true[:, part.rows]),
+            np.nan,
+        )
         for part in model.parts
         if part.direction
     }

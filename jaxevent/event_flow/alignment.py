@@ -26,7 +26,7 @@ from jaxevent.recording import Events
 
 N_STEPS = 5  # Gauss-Newton steps at each size of cells
 CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
-CLOCK_INFORMATION = 10.0  # of a clock's time before alignment
+CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
 CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
 MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
 N_SWEEPS = 30  # of Gauss-Seidel
@@ -37,9 +37,10 @@ CURVATURE = 3.0
 OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
 NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
-POOLING = 1.5  # nodes, of the Gaussian whose nodes tell of one
+POOLING = (1, 2, 4)  # nodes, of the Gaussian whose nodes tell of one
 MIN_INFORMATION = 0.1  # 1/px^2
 MIN_VARIANCE = 0.001  # px^2
+FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
@@ -248,11 +249,12 @@ class Clock(NamedTuple):
             at: Time at which s = 0, us.
             half: Number of events around it on either side.
         """
-        rows = np.arange(0, len(events), max(half // CLOCK_PARTS, 1))
-        t, first = np.unique(events.t[np.append(rows, len(events) - 1)], return_index=True)
+        parts = max(round(CLOCK_PARTS * len(events) / half), 1)
+        rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
+        t, first = np.unique(events.t[rows], return_index=True)
         if len(t) < 2:
             return cls(at + np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
-        s = np.append(rows, len(events) - 1)[first] / half
+        s = rows[first] / half
         s = (s + (t - t[0]) * (s[-1] / (t[-1] - t[0]))) / 2
         return cls(t.astype(float), s - np.interp(at, t, s))
 
@@ -263,7 +265,9 @@ class Clock(NamedTuple):
 
     def rate(self, t: float) -> float:
         """Return how fast s goes at a time (us), 1/s."""
-        return float(np.interp(t, self.t, np.gradient(self.s, self.t))) * 1e6
+        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
+        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
+        return float(np.interp(t, self.t, smooth)) * 1e6
 
 
 class WindowEvents(NamedTuple):
@@ -293,6 +297,29 @@ class Aligned(NamedTuple):
     score: float  # per event
 
 
+def _principal(information: NDArray, reach: int) -> tuple[NDArray, NDArray]:
+    """Return eigenvalues and axes of the information of nodes within a Gaussian."""
+    pooled = gaussian_filter(information, (reach, reach, 0), mode="constant")
+    return np.linalg.eigh(4 * np.pi * reach**2 * pooled[..., [[0, 1], [1, 2]]])
+
+
+def _rotate(axes: NDArray, values: NDArray) -> NDArray:
+    """Return matrices of these axes and eigenvalues."""
+    return (axes * values[..., None, :]) @ np.swapaxes(axes, -1, -2)
+
+
+def _curvature(u: NDArray, reach: int) -> NDArray[np.float64]:
+    """Return the largest square of second differences around nodes, px^2; 0 of affine flow."""
+    far, (rows, columns) = 2 * reach, u.shape[:2]
+    near, most = np.pad(u, ((far, far), (far, far), (0, 0)), mode="edge"), np.zeros(u.shape[:2])
+    for distance in (reach, far):
+        for j, i in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            y, x = j * distance, i * distance
+            one, other = (near[far + c * y :, far + c * x :][:rows, :columns] for c in (1, -1))
+            most = np.maximum(most, (((one + other) / 2 - u) ** 2).sum(-1))
+    return most
+
+
 class Alignment:
     """Displacements of windows of events: `align(events, start, cells)`.
 
@@ -313,8 +340,8 @@ class Alignment:
     def covariance(self, aligned: Aligned) -> NDArray[np.float64]:
         """Return the covariance of the nodes' displacement.
 
-        It is the inverse of what a node and those around tell, and what they differ by, which is
-        large at borders of objects.
+        It is the inverse of what a node and those around tell, and by how much flow bends among
+        them, which is large at borders of objects; those near or far, which give the least.
 
         Args:
             aligned: Displacement and information.
@@ -322,33 +349,42 @@ class Alignment:
         Returns:
             (rows, columns, 2, 2), px^2.
         """
-        pooled = gaussian_filter(aligned.information, (POOLING, POOLING, 0), mode="constant")
-        pooled *= 4 * np.pi * POOLING**2
-        values, axes = np.linalg.eigh(pooled[..., [[0, 1], [1, 2]]])
-        variances = 1 / np.maximum(values, MIN_INFORMATION)
-        C = (axes * variances[..., None, :]) @ np.swapaxes(axes, -1, -2)
-        # Differences of second order around a node: 0 where flow is affine, large at borders.
-        near = np.pad(aligned.u, ((2, 2), (2, 2), (0, 0)), mode="edge")
-        rows, columns = self.nodes
-        around = [near[j : j + rows, i : i + columns] for j in range(5) for i in range(5)]
-        off = np.stack([(around[k] + around[24 - k]) / 2 - aligned.u for k in range(12)])
-        spread = (off**2).sum(-1).max(0)[..., None, None] * np.eye(2)
+        best = np.full((*self.nodes, 2, 2), np.inf)
+        for reach in POOLING:
+            values, axes = _principal(aligned.information, reach)
+            C = _rotate(axes, 1 / np.maximum(values, MIN_INFORMATION))
+            C = C + _curvature(aligned.u, reach)[..., None, None] * np.eye(2)
+            less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
+            best = np.where(less[..., None, None], C, best)
         length2 = (aligned.u**2).sum(-1)[..., None, None]
         floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
-        return C + spread + floor
+        return best + floor
+
+    def shrink(self, aligned: Aligned) -> NDArray[np.float64]:
+        """Return the displacement without components that events around do not determine.
+
+        They would double with each window.
+
+        Args:
+            aligned: Displacement and information.
+
+        Returns:
+            (rows, columns, 2), px.
+        """
+        values, axes = _principal(aligned.information, POOLING[-1])
+        values = np.maximum(values, 0)
+        known = _rotate(axes, values / (values + FIRST_INFORMATION))
+        return (known @ aligned.u[..., None])[..., 0]
 
     def typical(self, aligned: Aligned) -> float:
-        """Return the median length of displacements, weighted by information, px.
-
-        It is 0 where events determine none of them.
+        """Return the median length of known displacements, weighted by information, px.
 
         Args:
             aligned: Displacement and information.
         """
-        if not (np.linalg.eigvalsh(self.covariance(aligned)) < MAX_VARIANCE).all(-1).any():
-            return 0.0
+        known = self.shrink(aligned)
+        length = np.hypot(known[..., 0], known[..., 1]).ravel()
         weight = np.maximum(aligned.information[..., 0] + aligned.information[..., 2], 0)
-        length = np.hypot(aligned.u[..., 0], aligned.u[..., 1]).ravel()
         order = np.argsort(length, kind="stable")
         total = np.cumsum(weight.ravel()[order])
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])

@@ -94,7 +94,7 @@ class EventFlow:
         for level in LEVELS:
             half = int(self._base * 2.0**level)
             found = self._refine(row, half, start, rate, grow=True)
-            start, rate = found.aligned.u, found.aligned.clock.mean_rate
+            start, rate = self._align.shrink(found.aligned), found.aligned.clock.mean_rate
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
@@ -142,13 +142,16 @@ class EventFlow:
         end = min((number + 1) * length, len(self.recording.events))
         return np.arange(number * length, end, self._chain(number).half)
 
-    def _around(self, start: int, stop: int) -> list[Anchor]:
-        """Return the anchors that determine flow from start to stop (us), of different times."""
+    def _around(self, start: int, stop: int, until: int) -> list[Anchor]:
+        """Return the anchors that determine flow from start to stop (us), of different times.
+
+        A causal flow uses events up to the time `until`.
+        """
         events, length = self.recording.events, CHAIN_WINDOWS * self._base
         n = len(events)
         if not n:
             return []
-        seen = events.index(stop + 1)  # events that a causal flow may use
+        seen = events.index(until + 1)  # events that a causal flow may use
         low, high = max(events.index(start + 1) - 1, 0), min(events.index(stop), n - 1)
         found: list[Anchor] = []
         first = max(low // length - self.causal, 0)
@@ -189,20 +192,21 @@ class EventFlow:
                     covariance[n] += np.float32(weight * anchor.rate**2) * spreads[k]
         return velocity, covariance
 
-    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of the points that events of a window saw.
 
         Args:
             start: First time of the events, us.
             stop: Last time of the events, us.
             at: Time to which points are carried, us.
+            until: Time up to which a causal flow may use events, us; None: the latest of the three.
 
         Returns:
             The paths.
         """
         start, stop = min(start, at), max(stop, at)
         with self._lock:
-            anchors = self._around(start, stop)
+            anchors = self._around(start, stop, stop if until is None else until)
         times = [np.array([anchor.t for anchor in anchors] or [at])]
         for anchor in anchors:
             inner = anchor.aligned.clock.t[1:-1]
@@ -234,7 +238,7 @@ class EventFlow:
         valid = np.zeros(mean.shape[:3], bool)
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
-                anchors = self._around(t, t)
+                anchors = self._around(t, t, t)
             (mean[row],), (covariance[row],) = self._fields(anchors, wanted[row : row + 1])
             if anchors:
                 rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])

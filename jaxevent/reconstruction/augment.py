@@ -96,7 +96,7 @@ def calibrated_values(
     Returns:
         The values.
     """
-    further = set(names).intersection(params.calibrated_if_clipped)
+    further = THRESHOLDS.intersection(names).intersection(params.calibrated_if_needed)
     if further and find_clipping(recording).white.level is None:
         names = [name for name in names if name not in further]
     if not names or recording.frames is None or len(recording.frames) < 2:
@@ -109,7 +109,7 @@ def calibrated_values(
     if method.Params is not type(params):
         of_method = calibrated_values(recording, method.Params(), method.Params.calibrated).found
         return CalibratedValues(
-            {name: of_method.get(name, values.found[name]) for name in names}, {}
+            {name: of_method.get(name, value) for name, value in values.found.items()}, {}
         )
     start = params.replace(**values.found)
     others = [start.replace(**{n: v for n, v in params.values().items() if n in THRESHOLDS})]

@@ -77,7 +77,9 @@ class ImageEstimator(Estimator[P]):
 
     family: ClassVar[str] = "reconstruction"
     fuses: bool = dataclasses.field(default=True, kw_only=True)
-    has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood` of the frames given
+    has_likelihood: ClassVar[bool] = False  # whether it has `log_likelihood`
+    measures_events: ClassVar[bool] = False  # whether that is of events, else of the frames given
+    is_absolute: ClassVar[bool] = True  # whether intensity has the frames' black and white
 
     @property
     def by_parameters(self) -> str:

@@ -5,7 +5,8 @@ Settings of a method of egomotion in a configuration of `jaxevent.runs.fit`:
     model = "planar"                    # or "rotation", "general", "package.module:Class"
     truth = "*.csv"                     # beside each recording, * being its name without suffix;
                                         # or "poses", "gyro" of the recording itself
-    centred = false                     # compare with the motion that candidates show, `lag` ago
+    centred = true                      # compare with the motion that candidates show, `lag` ago;
+                                        # false: with that at the time of an estimate
     runs = 4                            # of every window, with different random numbers
     settle = 0.05                       # s of every window before errors count
     gyro_bias = [0.0, 0.0, 0.0]         # rad/s, taken off the gyro first
@@ -68,7 +69,7 @@ from jaxevent.tuning import Batches
 class MotionLoss:
     """The mean relative squared error of estimates, over runs: `loss(params, batch)`."""
 
-    centred: bool = False
+    centred: bool = True
 
     def __call__(self, params: Any, batch: TrainingRuns) -> Float[Array, ""]:
         means, lags = batch.estimates(params)
@@ -157,7 +158,7 @@ class MotionGoal(Goal):
             motion = self.method.estimate(recording, params, model=self.kind, progress=progress)
             t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / SCORE_RATE_HZ))
             t = t[known.covers(t)]
-            told = motion(t, centred=self.loss.centred) if self.loss.centred else motion(t)
+            told = motion(t, centred=self.loss.centred)
             mean, _, valid = told
             truth = known(t)
             for k, name in enumerate(SPLIT_NAMES):
@@ -171,7 +172,9 @@ class MotionGoal(Goal):
                 row: dict[str, Any] = {"recording": given, "split": name, "error": None}
                 if usable.any():
                     each = errors_by_part(self.kind, mean[usable], truth[usable])
-                    row |= {name: finite(float(values.mean())) for name, values in each.items()}
+                    row |= {
+                        name: finite(float(np.nanmean(values))) for name, values in each.items()
+                    }
                 row["lost"] = float((~valid[inside]).mean())
                 row["windows"] = len(chosen)
                 yield {**row, "params": values_of(params)}
@@ -243,7 +246,7 @@ class Egomotion(Family):
         method.find_model(scores.model_of(settings))
         return MotionGoal(
             method,
-            MotionLoss(settings.get("centred", False)),
+            MotionLoss(settings.get("centred", True)),
             settings.get("model", "planar"),
             settings["truth"],
             settings.get("runs", 4),

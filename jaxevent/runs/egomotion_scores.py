@@ -9,8 +9,8 @@ Settings beside `protocol = "motion"`:
     imu_rotation = "y-up"               # its axes, as --imu-rotation of `jaxevent motion`
     depth = 2.0                         # m, of the scene: poses then tell a planar motion too
     settle = 0.0                        # s after the first event before errors count
-    centred = false                     # compare with the motion that candidates show, `lag` ago
-    smooth = false                      # a backward pass, of methods that have one
+    centred = true                      # compare with the motion that candidates show, `lag` ago
+    smooth = true                       # a backward pass, of methods that have one
     gyro = false                        # tell the gyro to methods that take it
     seed = 0
     metrics = ["mypackage.mymodule:function"]  # of one's own: `jaxevent.runs.own`
@@ -192,7 +192,7 @@ class MotionProtocol(Protocol):
                 **_settings(recording, method, options, bias),
             )
         seconds = time.perf_counter() - clock
-        centred = options.get("centred", False)
+        centred = options.get("centred")
         found = score_motion(motion, truth, times, start=first, centred=centred)
         mean, _, valid = motion(times, centred=centred)
 
@@ -228,8 +228,8 @@ def _settings(
 ) -> dict[str, Any]:
     """Return the settings of the protocol that the method's `estimate` takes."""
     settings: dict[str, Any] = {}
-    if options.get("smooth", False) and "smooth" in method.options:
-        settings["smooth"] = True
+    if "smooth" in options and "smooth" in method.options:
+        settings["smooth"] = options["smooth"]
     if options.get("gyro", False) and "gyro" in method.options:
         if recording.imu is None:
             raise InputError(f"{recording.name}: holds no IMU; leave out gyro = true")
@@ -241,7 +241,7 @@ class SampledMotion(MotionEstimate):
     """A motion that is known at the times of its estimates alone, without interpolation."""
 
     def __call__(
-        self, times: Times, *, centred: bool = False, extrapolate: bool = False
+        self, times: Times, *, centred: bool | None = None, extrapolate: bool = False
     ) -> Estimate:
         rows = np.searchsorted(self.t, np.asarray(times))
         return Estimate(self.mean[rows], self.covariance[rows], self.valid[rows])

@@ -9,8 +9,8 @@ loss.
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -45,7 +45,7 @@ from jaxevent.runs.protocols import (
     is_gap,
 )
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
-from jaxevent.show.tables import markdown_table
+from jaxevent.show.tables import legend, markdown_table, results_table
 from jaxevent.splits import SPLIT_NAMES, interleave
 from jaxevent.tuning import Batches
 
@@ -104,7 +104,7 @@ class Objective:
             if not self.method.has_likelihood:
                 raise InputError(
                     f"the method {self.method.name!r} has no likelihood; choose another loss or "
-                    "the method 'aks'"
+                    "the method 'aks' or 'events-only'"
                 )
         elif self.error == "nll" and not self.method.has_covariance:
             raise InputError(
@@ -144,12 +144,28 @@ class Objective:
         """Weighted errors (times, pixels), and how many pixels share a weight."""
         surprising = self.error == "nll"
         image, variance, _ = batch.prepared(params, variance=surprising)
+        if not self.method.is_absolute:
+            image, variance = self._scale(params, image, variance, batch)
         if surprising:
             errors = self._surprise(params, image, variance, batch.truth)
         else:
             errors = self._difference(image, batch) ** 2
         counted = jnp.where(batch.weights > 0, batch.weights * errors, 0)
         return counted, batch.truth.shape[1] // batch.weights.shape[1]
+
+    def _scale(
+        self, params: FrameParams, image: Array, variance: Array, batch: ImageBatch
+    ) -> tuple[Array, Array]:
+        """Fit offset and factor of each log image to the truth, by least squares."""
+        L, truth = jnp.log(image + params.I0), jnp.log(batch.truth + params.I0)
+        weights = jnp.broadcast_to(batch.weights, L.shape)
+        total = jnp.maximum(weights.sum(1, keepdims=True), 1)
+        mean, level = ((weights * v).sum(1, keepdims=True) / total for v in (L, truth))
+        spread = (weights * (L - mean) ** 2).sum(1, keepdims=True)
+        factor = (weights * (L - mean) * (truth - level)).sum(1, keepdims=True)
+        factor = factor / jnp.where(spread > 0, spread, 1)
+        image = jnp.exp(level + factor * (L - mean)) - params.I0
+        return image, factor**2 * variance
 
     def _difference(self, image: Array, batch: ImageBatch) -> Array:
         """Image minus truth, linear or logarithmic.
@@ -410,6 +426,78 @@ class ImageGoal(Goal):
         return markdown_table(rows)
 
 
+@dataclasses.dataclass(frozen=True)
+class EventGoal(Goal):
+    """The goal of a method of reconstruction that predicts events by others; no truth is needed."""
+
+    method: ImageEstimator
+    loss: Objective
+    measure: ClassVar[str] = "nll"
+
+    def problem(
+        self, sources: Sources, split: Shares, window: float | int | None
+    ) -> Callable[[FrameParams], Batches]:
+        def prepare(params: FrameParams) -> Batches:
+            batches: tuple[list[Any], list[Any]] = ([], [])
+            for name, shares in (("fit", split), ("validation", (0, 1, 0))):
+                for _, recording in sources[name]:
+                    for s, times in _window_times(recording, shares or (1, 0, 0), window):
+                        if s < len(batches):
+                            batches[s].append(self._batch(recording, times, params))
+            return batches
+
+        return LastBatches(EventTiming.of, prepare)
+
+    def _batch(
+        self, recording: Recording, times: NDArray[np.int64], params: FrameParams
+    ) -> LikelihoodBatch:
+        features = self.method.prepare_likelihood(recording, times, params)  # ty: ignore[missing-attribute]
+        count = np.asarray(features.count, np.dtype(jnp.result_type(float)))
+        return jax.device_put(LikelihoodBatch(features, count))
+
+    def score(
+        self,
+        sources: Sources,
+        split: Shares,
+        window: float | int | None,
+        params: FrameParams,
+        progress: bool | None,
+    ) -> Iterator[dict[str, Any]]:
+        for whole, name in enumerate(SPLIT_NAMES):
+            shares = tuple(int(s == whole) for s in range(len(SPLIT_NAMES)))
+            for given, recording in sources[name]:
+                for s, times in _window_times(recording, split or shares, window):
+                    batch = self._batch(recording, times, params)
+                    nll = float(jax.jit(self.loss)(params, batch))
+                    yield {
+                        "recording": given,
+                        "split": SPLIT_NAMES[s],
+                        "windows": len(times),
+                        "events": int(batch.weight),
+                        "nll": nll,
+                    }
+
+    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        columns = [("NLL", "nll", 1, 4), ("windows", "windows", 1, 0), ("events", "events", 1, 0)]
+        return results_table(rows, columns) + legend(columns)
+
+
+N_LIKELIHOOD_WINDOWS = 8  # of a recording, where their distance is not given
+
+
+def _window_times(
+    recording: Recording, split: Sequence[int], window: float | int | None
+) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield the times (us) of windows, spread evenly over a recording, of each split that has."""
+    span = recording.stop - recording.start
+    count = N_LIKELIHOOD_WINDOWS if window is None else max(round(span / (window * 1e6)), 1)
+    times = recording.start + (np.arange(count) + 0.5) * (span / count)
+    shared = interleave(split, count)
+    for s in range(len(SPLIT_NAMES)):
+        if (shared == s).any():
+            yield s, times[shared == s].astype(np.int64)
+
+
 class Reconstruction(Family):
     """The methods that make images."""
 
@@ -433,9 +521,7 @@ class Reconstruction(Family):
     }
     own = ("loss", "error")
 
-    def goal(
-        self, method: ImageEstimator, params: Parameters, settings: Mapping[str, Any]
-    ) -> ImageGoal:
+    def goal(self, method: ImageEstimator, params: Parameters, settings: Mapping[str, Any]) -> Goal:
         if not method.differentiable:
             raise InputError(
                 f"the method {method.name!r} has no gradients and cannot be fitted; fit another, "
@@ -443,6 +529,10 @@ class Reconstruction(Family):
             )
         loss = check_choice(settings.get("loss", "held-out"), "loss", [*PROTOCOLS, "likelihood"])
         protocol = loss
+        if loss == "likelihood" and method.measures_events:
+            if "protocol" in settings:
+                raise InputError("the likelihood of events compares with no images; omit protocol")
+            return EventGoal(method, Objective(method, None))
         if loss == "likelihood":
             protocol = check_choice(
                 settings.get("protocol", "held-out"), "protocol", list(PROTOCOLS)

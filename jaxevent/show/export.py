@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import N_THREADS
 from jaxevent.errors import InputError
+from jaxevent.estimator import Estimator
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
@@ -218,6 +219,21 @@ class RangeCounter:
         return ""
 
 
+def default_tone(estimator: Estimator, recording: Recording) -> str:
+    """Return the tone that shows a method's images of a recording best.
+
+    Args:
+        estimator: The method.
+        recording: The recording.
+
+    Returns:
+        A tone of `tone_map`.
+    """
+    if recording.frames is not None:
+        return "linear"
+    return "relative" if estimator.has_covariance else "changes"
+
+
 def display_images(
     video: ImageSequence, times: NDArray, tone: str, colours: Colours = None
 ) -> Iterator[tuple[int, NDArray]]:
@@ -234,11 +250,12 @@ def display_images(
     sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
     if tone == "linear":  # the limits are those of any image
         sample = sample[:1]
-    limits = display_limits(video(sample).mean, tone)
+    seen = video(sample)
+    limits = display_limits(seen.mean, tone, seen.covariance)
     for batch, values in _batches(video, times, colours):
         images = values["image"]
         if colours is None:
-            shown = tone_map(images, tone, limits)
+            shown = tone_map(images, tone, limits, variance=values["variance"])
         else:
             # Infinite intensity (`tone_map`) times a chrominance of 0 is NaN.
             images = np.nan_to_num(images, nan=1e30, posinf=1e30)

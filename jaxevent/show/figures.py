@@ -172,7 +172,7 @@ def plot_motion(
     times: Times | None = None,
     truth: KnownMotion | None = None,
     *,
-    centred: bool = False,
+    centred: bool | None = None,
 ) -> Any:
     """Draw a motion's components over time, with bands of two standard deviations.
 

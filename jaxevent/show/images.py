@@ -21,26 +21,32 @@ from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete
 from jaxevent.metrics import checked
 
-Tone = Literal["linear", "log", "percentile", "clahe", "changes"]
+Tone = Literal["linear", "log", "percentile", "clahe", "changes", "relative"]
 Kind = Literal["image", "error", "uncertainty"]
 
 # The logarithm shows at most this many halvings below the brightest value (96 dB): pixels that are
 # dark up to rounding, say 1e-9, would otherwise take most of the grey scale.
 MAX_OCTAVES = 16
+FADE_SPAN = 4.0  # standard deviations that the grey scale of "relative" has, or more
 MIN_LOG_CHANGE = 0.01  # of ln(1 + I), a tenth of a threshold; smaller ones do not count for limits
 
 
-def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float]:
+def display_limits(
+    images: ArrayLike, how: str = "linear", variance: ArrayLike | None = None
+) -> tuple[float, float]:
     """Compute the intensities shown as black and as white.
 
     "linear" has the limits 0 and 1, whatever the images. The other tones leave out the darkest and
     the brightest 0.5 % of the values as outliers; "log" and "clahe" use positive values only.
     "changes" leaves out the largest 5 % of the values that differ from 0, and is symmetric about 0.
-    With the same limits for all frames of a video its brightness does not pump.
+    "relative" leaves out 1 %, and has limits that are at least four standard deviations of most
+    pixels apart, so that noise is not stretched to black and white. With the same limits for all
+    frames of a video its brightness does not pump.
 
     Args:
         images: A sample (..., height, width) of the images, floats.
         how: The tone.
+        variance: Variances of the logarithms, of the images' shape; used by "relative" alone.
 
     Returns:
         Intensities of black and white, for `tone_map`.
@@ -59,27 +65,39 @@ def display_limits(images: ArrayLike, how: str = "linear") -> tuple[float, float
     values = images[images > 0] if logarithmic else images.ravel()
     if not len(values):
         return (2.0**-MAX_OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
-    low, high = (float(limit) for limit in np.percentile(values.astype(np.float64), [0.5, 99.5]))
+    rare = 1.0 if how == "relative" else 0.5
+    low, high = np.percentile(values.astype(np.float64), [rare, 100 - rare]).tolist()
     if logarithmic:
         low = max(low, high * 2.0**-MAX_OCTAVES)
+        if how == "relative" and np.isfinite(variance := _fill_unknown(variance, images)).any():
+            apart = FADE_SPAN * math.sqrt(np.median(variance[np.isfinite(variance)]))
+            more = math.exp(max(apart - math.log(high / low), 0.0) / 2)
+            low, high = low / more, high * more
         return (low, high) if low < high else (low / 2, high * 2)
     return (low, high) if low < high else (low - 0.5, high + 0.5)
 
 
 def tone_map(
-    images: ArrayLike, how: str = "linear", limits: tuple[float | int, float | int] | None = None
+    images: ArrayLike,
+    how: str = "linear",
+    limits: tuple[float | int, float | int] | None = None,
+    variance: ArrayLike | None = None,
 ) -> NDArray[np.uint8]:
     """Convert images for the display.
 
     "linear" and "percentile" scale intensity, "log" its base-2 logarithm, from the limits to 0..255
     and clip values outside. "changes" scales ln(1 + I), for images from events alone, whose
-    intensity 0 is no change: grey. "clahe" equalises the histogram of the result of "log" in tiles
-    of 1/8 of the image with limited contrast, each image by itself.
+    intensity 0 is no change: grey. "relative" is "log" for images whose scale is not known, and
+    fades what is uncertain towards middle grey: the distance of the logarithm from grey is divided
+    by 1 + P / d^2, with P its variance and d a quarter of the grey scale. "clahe" equalises the
+    histogram of the result of "log" in tiles of 1/8 of the image with limited contrast, each image
+    by itself.
 
     Args:
         images: (..., height, width) linear intensity, floats.
         how: The tone.
         limits: Intensities of black and white; by default `display_limits` of these images.
+        variance: Variances of the logarithms, of the images' shape; used by "relative" alone.
 
     Returns:
         (..., height, width) uint8.
@@ -89,7 +107,7 @@ def tone_map(
             out of order or, with a logarithm, not positive.
     """
     images, logarithmic = _clip_infinite(images), _is_logarithmic(how)
-    low, high = limits or display_limits(images, how)
+    low, high = limits or display_limits(images, how, variance)
     if not (-math.inf < low < high < math.inf) or (logarithmic and low <= 0):
         raise InputError(
             f"the display limits {low} and {high} do not suit the tone {how!r}; give two finite"
@@ -98,6 +116,9 @@ def tone_map(
     shown = _to_tone_scale(np.clip(images, low, high), how)
     low, high = _to_tone_scale(np.array([low, high]), how).tolist()
     shown = np.clip((shown - low) / (high - low), 0, 1)
+    if how == "relative":
+        quarter = math.log(2) * (high - low) / FADE_SPAN
+        shown = 0.5 + (shown - 0.5) / (1 + _fill_unknown(variance, images) / quarter**2)
     if how == "clahe":
         shown = _equalise(shown)
     return np.rint(shown * 255).astype(np.uint8)
@@ -118,11 +139,17 @@ def _to_tone_scale(intensity: NDArray[np.floating], how: str) -> NDArray[np.floa
     return np.log2(intensity) if _is_logarithmic(how) else intensity
 
 
+def _fill_unknown(variance: ArrayLike | None, images: NDArray) -> NDArray[np.floating]:
+    """Return variances with 0 for those that are not estimated, None or NaN."""
+    given = np.asarray(np.nan if variance is None else variance, np.float64)
+    return np.where(np.isnan(given), 0.0, np.broadcast_to(given, images.shape))
+
+
 def _is_logarithmic(how: str) -> bool:
     """Return whether a tone scales logarithms; raise `InputError` if it is unknown."""
     if how not in get_args(Tone):
         raise InputError(f"there is no tone {how!r}; choose one of {', '.join(get_args(Tone))}")
-    return how in ("log", "clahe")
+    return how in ("log", "clahe", "relative")
 
 
 def _equalise(images: NDArray[np.floating]) -> NDArray[np.floating]:

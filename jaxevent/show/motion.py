@@ -246,7 +246,7 @@ class Output:
     path: Path
     rate: float | int = 1000.0
     truth: str | Path | None = None
-    centred: bool = False
+    centred: bool | None = None
     flow: bool = False
 
     def __post_init__(self) -> None:

@@ -39,7 +39,7 @@ def motion_figure(
     times: NDArray[np.int64],
     truth: KnownMotion | None = None,
     *,
-    centred: bool = False,
+    centred: bool | None = None,
 ) -> Any:
     """Draw the components over times, against the truth and with errors where it is known.
 
@@ -170,7 +170,7 @@ def _contrasts(
     return []
 
 
-def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> None:
+def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool | None) -> None:
     """Draw some of the particles of a component."""
     cloud = motion.cloud
     if cloud is None or not len(cloud):
@@ -179,6 +179,8 @@ def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool) -> 
         np.linspace(0, len(cloud) - 1, max(1, min(len(cloud), _MAX_PARTICLES // cloud.shape[1])))
         .round().astype(int)
     )  # fmt: skip
+    if centred is None:
+        centred = not motion.causal
     t = (motion.t * 1e-6 - (motion.lag if centred else 0))[keep]
     values = cloud[keep][..., component]
     axis.plot(
@@ -339,7 +341,7 @@ def plot_warped(
         keep = flows.valid
         events = Events(events.t[keep], events.x[keep], events.y[keep], events.p[keep])
         xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
-        mean = motion(events.t, centred=True, extrapolate=True).mean
+        mean = np.nan_to_num(motion(events.t, centred=True, extrapolate=True).mean)
         moved = flows.flow[keep] - _linear_flow(motion.model(f), xi[events.y, events.x], mean)
     xi, _ = pixel_coordinates(recording.width, recording.height, recording.camera)
     shape = recording.height, recording.width

@@ -2,7 +2,7 @@
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,12 @@ from jaxevent.io.images import is_series, read_series
 from jaxevent.io.output import complete
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, microseconds
+from jaxevent.show.export import default_tone, display_images, evenly_spaced_times
 from jaxevent.show.track_tables import STATE_COLUMNS
 
 ON_COLOUR, OFF_COLOUR = (200, 64, 30), (58, 120, 181)
 BLOCK_EVENTS = 1 << 20  # events sent at a time
+VIDEO_RATE_HZ = 30.0  # of images where there are no frames
 STATE_STEP_US = 5_000  # us between states of tracks and of motion
 TABLE_FILES = "tracks.csv", "motion.csv"  # of the folders that the commands write
 CIRCLE_ANGLES_RAD = np.linspace(0, 2 * np.pi, 25)
@@ -41,9 +43,9 @@ def view(
 
     Args:
         recording: Events and frames.
-        results: Reconstructions (shown at the frames' times), tracks, motions, or paths: images
-            with times, as `jaxevent reconstruct` writes in HDF5, or the folder or table (CSV) of
-            `jaxevent track` and `jaxevent motion`.
+        results: Reconstructions (shown at the frames' times, or 30 per second), tracks, motions,
+            or paths: images with times, as `jaxevent reconstruct` writes in HDF5, or the folder or
+            table (CSV) of `jaxevent track` and `jaxevent motion`.
         out: File .rrd that is written; None to open a viewer.
         window: Length of the windows in which events are shown, s.
 
@@ -148,9 +150,17 @@ class _Sender:
             bright = np.nanpercentile(values, 99.5) if np.isfinite(values).any() else 0.0
             self._white = max(self._white, float(bright))
             grey = np.clip(np.nan_to_num(values) / (self._white or 1.0), 0, 1)
-            self._stream.set_time("time", duration=(time - self._start) * 1e-6)
-            shown = self._rerun.Image(np.rint(255 * grey).astype(np.uint8))
-            self._stream.log(name, shown)
+            self._image(name, time, np.rint(255 * grey).astype(np.uint8))
+
+    def toned_images(self, name: str, images: Iterable[tuple[int, NDArray[np.uint8]]]) -> None:
+        """Send times (us) and images for the display."""
+        self._pictures.append(f"/{name}")
+        for time, image in images:
+            self._image(name, time, image)
+
+    def _image(self, name: str, time: int, image: NDArray[np.uint8]) -> None:
+        self._stream.set_time("time", duration=(time - self._start) * 1e-6)
+        self._stream.log(name, self._rerun.Image(image))
 
     def tracks(self, table: pd.DataFrame) -> None:
         """Send ellipses of two standard deviations, until the track ends, and paths."""
@@ -229,12 +239,12 @@ def _layer_of_table(path: Path) -> _Layer:
 
 
 def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name: str) -> None:
-    """Send a reconstruction at the frames' times."""
+    """Send a reconstruction at the frames' times, or at even times where there are no frames."""
     if recording.frames is None:
-        raise InputError(
-            f"{recording.name}: has no frames, at whose times images are shown"
-            f"{recording.describe_left_out('frames')}; store images"
-        )
+        times = evenly_spaced_times(recording, VIDEO_RATE_HZ)
+        tone = default_tone(video.estimator, recording)
+        send.toned_images(f"image/{name}", display_images(video, times, tone))
+        return
     t = recording.frames.t
     send.images(f"image/{name}", t, lambda row: video(t[row]).mean[0])
 

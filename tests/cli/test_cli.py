@@ -25,7 +25,7 @@ from jaxevent.cli import reconstruct
 from jaxevent.methods import names
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show import describe, export
-from jaxevent.show.images import tone_map
+from jaxevent.show.images import display_limits, tone_map
 from jaxevent.simulate import SCENES, SENSORS, Pan, from_video, scene, simulate
 
 pytestmark = pytest.mark.slow
@@ -628,15 +628,20 @@ def test_reconstruct_to_video(rate, fps, factor, folder, capsys):
     assert np.abs(images - shown).mean() < 3
 
 
-def test_without_frames_images_show_changes(folder, capsys):
+@pytest.mark.parametrize(
+    ("method", "tone"), [("high-pass", "changes"), ("events-only", "relative")]
+)
+def test_without_frames_images_have_a_tone_of_their_own(folder, capsys, method, tone):
     recording = small(frames=None)
     jaxevent.save(recording, folder / "bare.h5")
-    assert cli.main(f"reconstruct {folder}/bare.h5 --rate 300 --out {folder}/a".split()) == 0
+    argv = f"reconstruct {folder}/bare.h5 --method {method} --rate 300 --out {folder}/{tone}"
+    assert cli.main(argv.split()) == 0
     assert "frames," not in capsys.readouterr().out.partition("\n")[2]
     times = export.evenly_spaced_times(recording, 300)
-    images = jaxevent.high_pass.estimate(recording)(times).mean
-    shown = [np.asarray(Image.open(p)) for p in sorted((folder / "a").glob("*.png"))]
-    np.testing.assert_array_equal(np.stack(shown), tone_map(images, "changes"))
+    images, variance, _ = jaxevent.METHODS[method].estimate(recording)(times)
+    shown = [np.asarray(Image.open(p)) for p in sorted((folder / tone).glob("*.png"))]
+    limits = display_limits(images, tone, variance)
+    np.testing.assert_array_equal(np.stack(shown), tone_map(images, tone, limits, variance))
 
 
 def test_reconstruct_in_colour(folder):

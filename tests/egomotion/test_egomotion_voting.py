@@ -447,8 +447,9 @@ def test_odd_streams(model, likelihood):
         motion = voting.estimate(recording, params, model=model, smooth=True)
         assert len(motion) > 0
         states = motion(recording.start + np.arange(5) * 300_000, extrapolate=True)
-        for value in (motion.mean, motion.covariance, motion.contrast, motion.evidence, *states):
+        for value in (motion.mean, motion.covariance, motion.contrast, motion.evidence):
             assert np.isfinite(value).all()
+        assert (np.isfinite(states.mean).all(1) == states.valid).all()
         if model == "general":
             np.testing.assert_allclose(np.linalg.norm(motion.mean[:, :3], axis=1), 1)
     assert not motion.valid.any() or likelihood == "literal"
@@ -477,11 +478,17 @@ def test_states_between_batches():
         np.stack([np.eye(2), 3 * np.eye(2)]), np.array([False, True]),
         np.full(2, 5e-4), np.ones(2), np.zeros(2),
     )  # fmt: skip
-    mean, covariance, valid = motion(np.array([500, 1500, 3000, 9000]))
-    np.testing.assert_allclose(mean, [[1, 0], [1.5, 1], [3, 4], [3, 4]])
+    at_once = dataclasses.replace(motion, lag=np.zeros(2))
+    mean, covariance, valid = at_once(np.array([500, 1500, 3000, 9000]))
+    np.testing.assert_allclose(mean, [[np.nan] * 2, [np.nan] * 2, [3, 4], [3, 4]])
     np.testing.assert_allclose(covariance[1], 1.5 * np.eye(2))
     assert valid.tolist() == [False, False, True, True]
-    np.testing.assert_allclose(motion(np.array([1500]), centred=True).mean, [[2, 2]])
+    found = dataclasses.replace(motion, valid=np.array([True, True]))
+    np.testing.assert_allclose(found(np.array([1500])).mean, [[2, 2]])
+    # As it was known at the time, the error has what the motion changes while it lags.
+    late = dataclasses.replace(found, causal=True)(np.array([2000]))
+    np.testing.assert_allclose(late.mean, [[2, 2]])
+    np.testing.assert_allclose(late.covariance[0], 2 * np.eye(2) + [[1, 2], [2, 4]])
 
 
 def test_smoothing_equals_the_dense_posterior():

@@ -47,7 +47,7 @@ def test_flow_of_constant_velocity(velocity):
     mean, covariance, valid = flow([0.06, 0.1])
     speed = np.hypot(*velocity)
     error = np.linalg.norm(mean - velocity, axis=-1)
-    assert np.median(error) < 0.03 * speed
+    assert np.median(error) < 0.05 * speed
     assert valid.mean() > 0.8
     e = (mean - velocity)[valid]
     z2 = np.einsum("ni,nij,nj->n", e, np.linalg.inv(covariance[valid]), e) / 2
@@ -154,19 +154,21 @@ def test_what_shows_no_motion_is_finite_and_not_valid(kind):
 
 
 def test_the_component_along_an_edge_is_uncertain():
-    rng = np.random.default_rng(2)
-    columns = np.arange(4, WIDTH, 7)
-    t = np.sort(rng.integers(0, 100_000, 20_000))
-    edge = rng.integers(0, len(columns) * 3, len(t))
-    x = columns[edge % len(columns)] + t * 150e-6 - 20
-    inside = (x >= 0) & (x < WIDTH - 0.5)
-    recording = record(
-        t, np.floor(x).clip(0), rng.integers(0, HEIGHT, len(t)), edge % len(columns) % 2
-    )
-    recording = dataclasses.replace(recording, events=recording.events[:][inside])
-    mean, covariance, _ = flow_from_events(recording)([0.05])
-    assert np.median(np.abs(mean[..., 0] - 150)) < 10
-    assert np.median(covariance[..., 1, 1]) > 5 * np.median(covariance[..., 0, 0])
+    # Every row of a vertical edge makes an event where the edge enters a column, but for one in
+    # ten, within a millisecond.
+    rng, speed = np.random.default_rng(2), 150.0
+    edges = np.sort(rng.uniform(-20, WIDTH, 14))
+    y, x, k = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), np.arange(len(edges)))
+    t = (x - edges[k]) / speed + rng.uniform(0, 1e-3, x.shape)
+    keep = (t >= 0) & (t < 0.12) & (rng.random(x.shape) < 0.9)
+    order = np.argsort(t[keep], kind="stable")
+    rows = [np.rint(t[keep] * 1e6), x[keep], y[keep], (k % 2)[keep]]
+    recording = record(*(column[order] for column in rows))
+    mean, covariance, _ = flow_from_events(recording)([0.06])
+    assert np.median(np.abs(mean[..., 0] - speed)) < 0.15 * speed
+    across, along = (np.median(np.sqrt(covariance[..., i, i])) for i in (0, 1))
+    assert along > 3 * across
+    assert np.median(np.abs(mean[..., 1])) < 3 * along
 
 
 def test_other_parameters_are_refused():

@@ -31,7 +31,7 @@ from jaxevent.reconstruction.compensated.normal_equations import (
     solve_normal_equations,
 )
 from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
-from jaxevent.recording import Frames
+from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
 
 mc = find("mc", "reconstruction")
@@ -362,6 +362,24 @@ def test_instants():
     first = choose(0)  # nothing before
     assert first.target == first.before - 0 or first.t[first.before] > 0
     assert (first.t >= 0).all()
+
+
+def test_the_clock_counts_events_that_are_missing():
+    # Ten events per ms, of which those of two stretches are missing, about one of two blocks.
+    t = np.arange(0, 400_000, 100)
+    kept = t[~(((t > 90_000) & (t < 130_000)) | ((t > 210_000) & (t < 240_000)))]
+    none = np.zeros(len(kept), np.uint16)
+    lossy = Recording("lossy", 4, 4, Events(kept, none, none, none > 0))
+    missed = instants.MissedEvents(lossy, 80_000)
+    times = np.array([50_000, 90_000, 110_000, 130_000, 200_000, 225_000, 300_000])
+    found = missed(times)
+    np.testing.assert_allclose(found - found[0], [0, 0, 200, 400, 400, 550, 700], atol=2)
+    np.testing.assert_allclose(missed(times[5:]) - missed(times[5:])[0], [0, 150], atol=2)
+    clock = instants.MotionClock(lossy.events.index, 0, 100.0, 0.8, missed)
+    np.testing.assert_allclose(np.diff(clock(times)), np.diff(times), rtol=2e-2)
+    # Between two times of which events are missing the clock is nearer to time.
+    assert clock.between(80_000, 140_000).event_share == pytest.approx(0.8 / 3, rel=0.02)
+    assert clock.between(140_000, 200_000) is clock
 
 
 def test_a_clock_that_stops_with_the_scene():

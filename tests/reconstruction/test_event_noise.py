@@ -116,9 +116,10 @@ def test_trajectories_are_chosen_by_region():
     resting = np.zeros((HEIGHT // 2, WIDTH // 2, 4), np.float32)
     going = resting.copy()
     going[..., 0] = 4
-    chosen = choose_trajectories(images, (resting, going), cost)[..., 0]
+    chosen = choose_trajectories(images, (resting, going), cost, (1.0, 0.5))[..., 0]
     assert (chosen[3:-3, 3 : WIDTH // 4 - 5] == 0).all()
     assert (chosen[3:-3, WIDTH // 4 + 5 : -5] == 4).all()
+    assert (choose_trajectories(images, (resting, going), cost, (1.0, 1e-9)) == 0).all()
 
 
 class Slide:

@@ -14,6 +14,8 @@ C = np.float32([0.2, 0.2])
 class Translation:
     """Paths of points that move with one velocity, px/s, towards the time 0."""
 
+    covariance = None
+
     def __init__(self, velocity):
         self.velocity = velocity
 
@@ -209,3 +211,23 @@ def test_warm_start_costs_fewer_iterations(window):
     first = solve(window, variance=False)
     again = solve(window, start=first.log_image, variance=False)
     assert again.iterations < first.iterations / 2
+
+
+def test_variance_is_large_where_nothing_was_seen(window):
+    seen = solve(window).variance
+    events = Events(np.arange(4), [2, 3, 2, 3], [2, 2, 2, 2], [True, False, True, True])
+    still = make_rows(events, Translation((0.0, 0.0)), C, window.shape, (-9, 9))
+    unseen = solve(still).variance
+    assert np.sqrt(unseen).min() > 1 > 2 * np.sqrt(np.median(seen))
+
+
+def test_errors_have_the_size_of_the_variance():
+    def level(x, y):
+        return 0.6 * np.sin(0.7 * x + 0.4 * y) - 0.5 * x
+
+    events, shape, span = record(level, (60.0, 20.0))
+    solution = solve(make_rows(events, Translation((60.0, 20.0)), C, shape, span))
+    y, x = np.indices(shape)
+    error = solution.log_image - level(x, y)
+    error -= error.mean()
+    assert 0.1 < (error**2 / solution.variance).mean() < 2

@@ -26,6 +26,8 @@ TURN_US = 200_000  # the motion is horizontal before, vertical from then on
 class Turning:
     """Motion of the whole image: a `Paths` towards the time `at` and a `FlowSource`."""
 
+    covariance = None
+
     def __init__(self, at=0):
         self.at = at
 
@@ -81,10 +83,10 @@ INNER = np.s_[8:16, 10:20]
 
 def test_a_window_measures_the_gradient_along_its_motion_alone():
     horizontal = measured(ramp_recording(), 0, TURN_US, TURN_US)
-    assert np.allclose(horizontal.gradient[INNER][..., 0], SLOPE[0], rtol=0.1)
+    assert np.allclose(horizontal.gradient[INNER][..., 0], SLOPE[0], rtol=0.2)
     assert np.allclose(horizontal.gradient[INNER][..., 1], 0, atol=1e-6)
     information = horizontal.information[INNER]
-    assert (information[..., 0, 0] > 100 / THRESHOLD**2).all()
+    assert (information[..., 0, 0] > 10 / THRESHOLD**2).all()
     assert np.abs(information[..., 1, :]).max() < 1e-6 * information[..., 0, 0].min()
 
 
@@ -99,11 +101,11 @@ def test_after_a_turn_both_components_of_the_gradient_are_known():
 
 def test_an_image_after_a_turn_has_the_edges_seen_before_it():
     recording = ramp_recording()
-    params = Params().replace(c_on=THRESHOLD, c_off=THRESHOLD, learn=False, window=2.0)
+    params = Params().replace(c_on=THRESHOLD, c_off=THRESHOLD, learn=False, window=1.0)
     windows = WindowSolver(recording, params, motion=Turning(), causal=True)
     image = windows(TURN_US + 150_000).solution.log_image
     slopes = [np.diff(image, axis=axis)[17:20, 10:20].mean() for axis in (1, 0)]
-    assert np.allclose(slopes, SLOPE, rtol=0.15)
+    assert np.allclose(slopes, SLOPE, rtol=0.25)
     windows.memory.params = MemoryParams(forgetting=1e12)
     blind = windows.memory.__class__(
         windows, recording, windows.n_side, silence=0.5, threshold=THRESHOLD
@@ -168,3 +170,16 @@ def test_images_do_not_depend_on_earlier_requests_and_few_memories_are_kept():
     assert max(kept) <= KEYS_PER_BLOCK
     for t, image in zip(times[::-1], first[::-1], strict=True):
         assert (windows_of(recording)(t, variance=False).solution.log_image == image).all()
+
+
+def test_causal_images_do_not_depend_on_later_events():
+    recording = ramp_recording()
+    params = Params().replace(c_on=THRESHOLD, c_off=THRESHOLD, learn=False, window=1.0)
+    at = 310_000
+    early = recording[: at * 1e-6]
+    images = [
+        WindowSolver(part, params, motion=Turning(), causal=True)(at, variance=False)
+        for part in (recording, early)
+    ]
+    assert images[0].prior.information.any()
+    assert (images[0].solution.log_image == images[1].solution.log_image).all()

@@ -66,7 +66,24 @@ def test_changes_are_even_about_grey():
     np.testing.assert_allclose(display_limits(sparse, "changes"), [low, high])  # not of what rests
 
 
-@pytest.mark.parametrize("how", ["linear", "log", "percentile", "changes"])
+def test_relative_fades_what_is_uncertain_and_does_not_stretch_noise():
+    """At a deviation of a quarter of the grey scale half of the contrast is left."""
+    L = np.linspace(-1, 1, 1001)[None].repeat(2, 0)
+    image, limits = 0.5 * np.exp(L), (0.5 * np.exp(-1), 0.5 * np.exp(1))
+    variance = np.array([[0.0], [0.25]]).repeat(1001, 1)
+    shown = tone_map(image, "relative", limits, variance).astype(float)
+    np.testing.assert_allclose(shown[0], tone_map(image, "log", limits)[0])
+    np.testing.assert_allclose(shown[1] - 127.5, (shown[0] - 127.5) / 2, atol=1)
+    unknown = tone_map(image, "relative", limits, np.full(L.shape, np.inf))
+    assert set(np.unique(unknown)) <= {127, 128}
+    low, high = display_limits(image, "relative", np.full(L.shape, 1.0))
+    np.testing.assert_allclose(np.log(2 * np.array([low, high])), [-2, 2], atol=0.02)
+    for known in (None, 0 * variance, np.nan * variance):
+        limits = display_limits(image, "relative", known)
+        np.testing.assert_allclose(np.log(2 * np.array(limits)), [-0.98, 0.98], atol=1e-3)
+
+
+@pytest.mark.parametrize("how", ["linear", "log", "percentile", "changes", "relative"])
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e3))
 def test_brighter_is_never_shown_darker(how, seed, scale):
     values = scale * np.random.default_rng(seed).normal(size=(8, 9)) ** 3

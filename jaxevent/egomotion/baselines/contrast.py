@@ -64,6 +64,8 @@ BEST_WINDOW_DISPLACEMENT_PX = 10.0  # of the image in a window, at best
 WINDOW_DISPLACEMENT_RANGE_PX = (5.0, 60.0)  # within which the default is kept
 WINDOW_DURATION_RANGE_S = (0.002, 2.0)
 COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.09)
+SYSTEMATIC_ERROR_PX = 0.25  # of the displacement in a window, from events at pixels' middles
+N_NEIGHBOURS = 3  # estimates, up to which halves of windows show how the motion changes
 INITIAL_VARIANCE_PX2 = 2.0  # px^2, inverse curvature relative to the objective, at the start
 
 Numeric = Array | np.ndarray
@@ -598,7 +600,11 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         found = refine(params, windows.crop(part), motion)
         is_sharp = found.contrast >= float(params.contrast)
         is_found = is_sharp and found.covariance is not None
-        fit = Fit(found.motion, found.covariance) if is_found else None
+        fit = None
+        if is_found and found.covariance is not None:
+            fit = Fit(found.motion, found.covariance).with_systematic_error(
+                SYSTEMATIC_ERROR_PX, windows.length(part), windows.pixel_scale
+            )
         motion = None if fit is None else fit.mean
         fits.append(fit)
         contrasts.append(found.contrast)
@@ -606,10 +612,18 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     spans = np.array([windows.length(part) for part in parts])
     estimate = motion_of_fits(inputs.model, t, fits, np.array(contrasts))
     change = rate = None
-    if estimate.valid.sum() == 1:
-        k = int(estimate.valid.argmax())
-        change = windows.measure_change(parts[k], estimate.mean[k])
-        rate = np.outer(change, change) / max(1e6 * spans[k], 1) ** 2
+    valid = np.flatnonzero(estimate.valid)
+    if 0 < len(valid) <= N_NEIGHBOURS:
+        change = np.zeros_like(estimate.mean)
+        for k in valid:
+            change[k] = windows.measure_change(parts[k], estimate.mean[k])
+    if change is not None and len(valid) == 1:
+        k = int(valid[0])
+        rate = np.outer(change[k], change[k]) / max(1e6 * spans[k], 1) ** 2
+    if change is not None:
+        # Halves tell how far the motion of a window may be from that at its middle.
+        half = change[:, :, None] * change[:, None, :] / 4
+        estimate = dataclasses.replace(estimate, covariance=estimate.covariance + half)
     calibration = COVARIANCE_CALIBRATION.with_lens(inputs.camera)
     estimate = estimate.with_calibrated_covariance(calibration, spans, change)
     before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))

@@ -22,6 +22,22 @@ class Fit(NamedTuple):
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
+    def with_systematic_error(
+        self, displacement: float, duration: float, pixel_scale: NDArray[np.floating]
+    ) -> "Fit":
+        """Add an error of the whole image's displacement, which no fit shows.
+
+        Args:
+            displacement: Standard deviation of the error, px.
+            duration: Time in which the image moves, s.
+            pixel_scale: (d,) flow per unit of each component, px/s, see `Model.pixel_scale`.
+
+        Returns:
+            The fit with the larger covariance.
+        """
+        sigma = displacement / (max(duration, 1e-6) * np.maximum(pixel_scale, 1e-12))
+        return self._replace(covariance=self.covariance + np.diag(sigma**2))
+
 
 def robust_fit(
     rows: NDArray[np.floating],

@@ -38,7 +38,7 @@ from jaxevent.egomotion.baselines.fits import (
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.estimator import HostEstimator, HostInputs
 from jaxevent.egomotion.models import General, Model
-from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.errors import InputError, require
 from jaxevent.parameters import Count, Parameters, Positive, UnitInterval
@@ -51,6 +51,9 @@ MIN_TRACKED_POINTS = 8  # of a general motion: 5 of a sample, and others that te
 MAX_EPIPOLAR_DISTANCE_PX = 1.0  # from the epipolar line
 RANSAC_CONFIDENCE = 0.999  # of having drawn five inliers
 MIN_POINT_NOISE_PX = 0.1  # of tracked points
+# Of ideal frames, which all points share: interpolation errs alike everywhere.
+SYSTEMATIC_ERROR_PX = 0.008
+COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.02)
 
 
 class Params(Parameters):
@@ -71,7 +74,8 @@ class Params(Parameters):
 def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     """Estimate the motion between pairs of frames, at the middle of their times.
 
-    The covariance is that of the fit. With too few points the motion is lost, and its mean that of
+    The covariance is that of the fit, with an error that all points share and that of a motion
+    which changes between the frames. With too few points the motion is lost, and its mean that of
     the pair before. The samples of five points are drawn with a fixed seed.
 
     Args:
@@ -104,9 +108,15 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
             basis = np.asarray(model.basis((before + after) / 2), np.float64)
             values = ((after - before) / dt).reshape(-1)
             rows = basis.reshape(-1, len(size))
-            fits.append(robust_fit(rows, values, np.repeat(cells, 2), size))
+            fit = robust_fit(rows, values, np.repeat(cells, 2), size)
+            fits.append(fit and fit.with_systematic_error(SYSTEMATIC_ERROR_PX, dt, size))
     one, two = np.array(pairs).T
-    return motion_of_fits(inputs.model, (frames.t[one] + frames.t[two]) // 2, fits)
+    motion = motion_of_fits(inputs.model, (frames.t[one] + frames.t[two]) // 2, fits)
+    if model.half_line:
+        return motion
+    lengths = (frames.t[two] - frames.t[one]) * 1e-6
+    calibration = COVARIANCE_CALIBRATION.with_lens(inputs.camera)
+    return motion.with_calibrated_covariance(calibration, lengths)
 
 
 def pair_frames(frames: Frames, span: float) -> list[tuple[int, int]]:

@@ -24,16 +24,19 @@ from jaxevent.egomotion.estimator import (
     TrainingRuns,
     TrainingSegment,
 )
+from jaxevent.egomotion.evidence import EvidenceTest, Lock, tell_from_later
 from jaxevent.egomotion.geometry import length
+from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter
 from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
-from jaxevent.egomotion.patches import ImageSpeed
+from jaxevent.egomotion.patches import ImageSpeed, is_camera_known_to_move
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.events.tail import Tail
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
@@ -188,7 +191,8 @@ class VotingEstimator(MotionEstimator[Params]):
         camera: PinholeCamera | None = None,
         seed: int = 0,
         progress: bool | None = None,
-        smooth: bool = False,
+        causal: bool = False,
+        smooth: bool | None = None,
         cloud: int = 0,
         compiler: str | None = None,
     ) -> MotionEstimate:
@@ -202,7 +206,10 @@ class VotingEstimator(MotionEstimator[Params]):
             camera: The calibration; by default the recording's.
             seed: Seed of the random numbers; it makes the estimate reproducible.
             progress: Whether to show a progress bar; by default in a terminal.
-            smooth: Whether to smooth by later events, for use after the recording.
+            causal: Whether estimates use events before their times alone, as live ones do. They
+                lag, and their covariance has the change of the motion meanwhile.
+            smooth: Whether to smooth by later events; by default unless `causal`. Without,
+                estimates hold for the time `lag` before their own.
             cloud: Number of particles of each batch, drawn by weight, in the result's `cloud`.
             compiler: "numba" runs a kernel made of the filter's own functions, "xla" the `run` that
                 is differentiated. Their log-likelihoods are equal to rounding, and weights to
@@ -217,42 +224,100 @@ class VotingEstimator(MotionEstimator[Params]):
             InputError: The model is unknown, it needs a camera and there is none, or the compiler
                 is "numba" and there is no kernel.
         """
-        self.check_options(seed=seed, progress=progress, smooth=smooth, cloud=cloud)
+        self.check_options(seed=seed, progress=progress, causal=causal, smooth=smooth, cloud=cloud)
+        if causal and smooth:
+            raise InputError("a causal estimate cannot be smoothed; leave out causal or smooth")
         dispatch.check_not_forked()
         if params is None:
             found, _ = self.find_model_and_camera(recording, model, camera)
             start = self.initial_params(found)
             params = self.adapt_params(recording, start, camera=camera).params
         kind, sampler = self.sampler(recording, params, model, camera)
-        batches = -(-EVENTS_PER_CHUNK // params.batch)
         events = len(recording.events) // params.every
-        run = self._kernel(params, kind, compiler, events) or functools.partial(_run, params, kind)
-        key, corners = jax.random.key(seed), _basis_at_corners(kind, sampler)
-        state, parts, number, span = None, [], 0, MAX_CHUNK_TAUS * float(params.tau_max)
+        runner = ChunkRunner(
+            params, kind, sampler,
+            self._kernel(params, kind, compiler, events),
+            self._make_lock(recording, params, kind, sampler, camera), seed,
+        )  # fmt: skip
+        lock, parts = runner.lock, []
         with bar(
             total=len(recording.events), desc="find motion", unit="event", unit_scale=True,
             progress=progress,
         ) as shown:  # fmt: skip
             while not sampler.is_exhausted:
-                noise = _draw(jax.random.fold_in(key, number), batches, params, kind)
-                if state is None:
-                    state = _init(params, kind, noise)
-                ages = candidate_range(params, kind, corners, state)
-                sample = sampler.sample(batches, ages.youngest, ages.oldest, span, ages.expected)
-                state, info = run(sample.candidates, noise, state, cloud)
-                used = int((sample.row >= 0).any(1).sum())
-                info = jax.tree.map(lambda a, n=used: np.asarray(a)[:n], info)
-                parts.append((sample.t[:used], info))
-                shown.update(int(sample.row.max(initial=0)) + 1 - shown.n)
-                number += 1
+                parts.append(runner.run(cloud))
+                shown.update(runner.row - shown.n)
 
-        motion = _join_reports(kind, parts, cloud > 0).with_recording(recording)
+        motion = join_reports(kind, parts, cloud > 0).with_recording(recording)
         if not parts:
             return motion
-        calibration = PLANAR_CALIBRATION if kind.uniform else CAMERA_MOTION_CALIBRATION
-        calibration = calibration.with_lens(camera or recording.camera)
-        smoothed = filtering.smooth(motion, params) if smooth else motion
-        return smoothed.with_calibrated_covariance(calibration, 2 * motion.lag)
+        if lock is not None and not causal:
+            searching = np.concatenate([info.searching for _, info, _ in parts])
+            valid, covariance = tell_from_later(
+                motion.t, motion.mean, motion.covariance, searching, motion.valid, lock.diffusion
+            )
+            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
+        motion = dataclasses.replace(motion, causal=causal)._with_gaps(float(params.tau_max))
+        camera = camera or recording.camera
+        if causal:
+            return calibrate(motion, camera)
+        smoothed = motion if smooth is False else filtering.smooth(motion, params)
+        return calibrate(smoothed, camera, 2 * motion.lag)
+
+    def live(
+        self,
+        size: tuple[int, int],
+        params: Params | None = None,
+        *,
+        model: str | type[Model] = "planar",
+        camera: PinholeCamera | None = None,
+        seed: int = 0,
+        compiler: str | None = None,
+    ) -> LiveMotion:
+        """Begin to estimate the motion of a live stream of events, see `egomotion.live`.
+
+        Args:
+            size: Width and height of the sensor, px.
+            params: The parameters; by default those of the model. They are not adapted.
+            model: Motion model, or its name.
+            camera: The calibration.
+            seed: Seed of the random numbers.
+            compiler: "numba" or "xla", see `estimate`; by default a kernel if there is one.
+
+        Returns:
+            The live motion.
+
+        Raises:
+            InputError: The model is unknown, or it needs a camera and there is none.
+        """
+        self.check_options(seed=seed)
+        recording = Recording("live", *size, Tail(*size), camera=camera)
+        found, _ = self.find_model_and_camera(recording, model, camera)
+        used = self.initial_params(found) if params is None else params
+
+        def make_runner() -> ChunkRunner:
+            kind, sampler = self.sampler(recording, used, found, camera)
+            lock = self._make_lock(recording, used, kind, sampler, camera)
+            kernel = self._kernel(used, kind, compiler, MIN_KERNEL_EVENTS)
+            return ChunkRunner(used, kind, sampler, kernel, lock, seed)
+
+        return LiveMotion(recording, found, make_runner)
+
+    def _make_lock(
+        self,
+        recording: Recording,
+        params: Params,
+        model: Model,
+        sampler: CandidateSampler,
+        camera: PinholeCamera | None,
+    ) -> Lock | None:
+        """Return the test of what the filter finds; None for likelihoods and models without one."""
+        if params.likelihood == "literal" or model.half_line:
+            return None
+        diffusion = jax.jit(functools.partial(model.diffusion, params))
+        moves = is_camera_known_to_move(recording, camera)
+        test = EvidenceTest(model, sampler.xi)
+        return Lock(test, float(params.baseline), float(params.tau_max), diffusion, moves)
 
     def _kernel(
         self, params: Params, model: Model, compiler: str | None, events: int
@@ -327,6 +392,85 @@ class VotingEstimator(MotionEstimator[Params]):
         return kind, whole.candidates, whole.t
 
 
+class ChunkRunner:
+    """The filter over the chunks of a recording, one after another.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        sampler: Sampler of the recording's candidates.
+        kernel: The filter as a kernel, or None.
+        lock: The test of what it finds, or None.
+        seed: Seed of the random numbers.
+    """
+
+    def __init__(
+        self,
+        params: Params,
+        model: Model,
+        sampler: CandidateSampler,
+        kernel: CompiledFilter | None,
+        lock: Lock | None,
+        seed: int,
+    ):
+        self.params, self.model, self.sampler, self.lock = params, model, sampler, lock
+        self.batches = -(-EVENTS_PER_CHUNK // params.batch)
+        self.span = MAX_CHUNK_TAUS * float(params.tau_max)  # s
+        self.row = 0  # after the last event that was scored
+        self._run = kernel or functools.partial(_run, params, model)
+        self._key, self._corners = jax.random.key(seed), _basis_at_corners(model, sampler)
+        self._state: ParticleState | None = None
+        self._number = 0
+
+    def causal_motion(
+        self, parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]]
+    ) -> MotionEstimate:
+        """Join what `run` returned for some chunks to a causal estimate."""
+        motion = dataclasses.replace(join_reports(self.model, parts, False), causal=True)
+        return calibrate(motion, self.sampler.recording.camera)
+
+    def has_chunk(self) -> bool:
+        """Return whether the next chunk is complete, whatever events are still to come."""
+        every, row = self.params.every, self.sampler.next_row
+        events = self.sampler.recording.events
+        first, count = -(-row // every) * every, len(events)
+        if (count - first) // every > self.batches * self.params.batch:
+            return True
+        last = (count - 1) // every * every
+        if last <= first:
+            return False
+        begin, end = (int(events[at : at + 1].t[0]) for at in (first, last))
+        return end - begin > round(1e6 * self.span)
+
+    def run(self, cloud: int = 0) -> tuple[NDArray[np.int64], Any, NDArray[np.bool_]]:
+        """Run the next chunk.
+
+        Args:
+            cloud: Number of particles to report.
+
+        Returns:
+            Times (n,) of its batches, us, their stacked reports, and whether the motion is told.
+        """
+        key = jax.random.fold_in(self._key, self._number)
+        noise = _draw(key, self.batches, self.params, self.model)
+        if self._state is None:
+            self._state = _init(self.params, self.model, noise)
+        ages = candidate_range(self.params, self.model, self._corners, self._state)
+        sample = self.sampler.sample(
+            self.batches, ages.youngest, ages.oldest, self.span, ages.expected
+        )
+        self._state, info = self._run(sample.candidates, noise, self._state, cloud)
+        used = int((sample.row >= 0).any(1).sum())
+        info = jax.tree.map(lambda a: np.asarray(a)[:used], info)
+        t, told = sample.t[:used], ~info.searching
+        if self.lock is not None:
+            events = self.sampler.recording.events
+            told = self.lock.update(events, t, info.mean, info.covariance, info.searching)
+        self._number += 1
+        self.row = int(sample.row.max(initial=self.row - 1)) + 1
+        return t, info, told
+
+
 class WarmStartedRuns(TrainingRuns):
     """Runs of the filter over a segment, with particles that start around the true motion."""
 
@@ -379,20 +523,45 @@ class WarmStartedRuns(TrainingRuns):
         )
 
 
-def _join_reports(model: Model, parts: list[tuple[NDArray, Any]], cloud: bool) -> MotionEstimate:
+def calibrate(
+    motion: MotionEstimate,
+    camera: PinholeCamera | None,
+    length: NDArray[np.floating] | None = None,
+) -> MotionEstimate:
+    """Return the motion with the covariance of its errors.
+
+    Args:
+        motion: Estimates of the filter or the smoother.
+        camera: The calibration.
+        length: (n,) time span of an estimate's events, s, in which changes between the neighbours,
+            before and after, count; None: they do not.
+
+    Returns:
+        The motion with the calibrated covariance.
+    """
+    calibration = PLANAR_CALIBRATION if motion.model.uniform else CAMERA_MOTION_CALIBRATION
+    calibration = calibration.with_lens(camera)
+    if length is None:
+        return motion.with_calibrated_covariance(calibration._replace(change=0.0))
+    return motion.with_calibrated_covariance(calibration, length)
+
+
+def join_reports(
+    model: Model, parts: list[tuple[NDArray, Any, NDArray]], cloud: bool
+) -> MotionEstimate:
     """Join the times and reports of chunks to an estimate."""
     if not parts:
         return MotionEstimate.empty(type(model))
 
     def join(name: str) -> NDArray:
-        return np.concatenate([getattr(info, name) for _, info in parts])
+        return np.concatenate([getattr(info, name) for _, info, _ in parts])
 
     return MotionEstimate(
         type(model),
-        np.concatenate([t for t, _ in parts]),
+        np.concatenate([t for t, *_ in parts]),
         join("mean"),
         join("covariance"),
-        ~join("searching"),
+        np.concatenate([told for *_, told in parts]),
         join("lag"),
         join("contrast"),
         join("evidence"),
@@ -497,7 +666,7 @@ voting = VotingEstimator(
     "voting",
     Params,
     lengths=lengths,
-    options=COMMON_OPTIONS | {"smooth", "cloud", "compiler"},
+    options=COMMON_OPTIONS | {"causal", "smooth", "cloud", "compiler"},
     about="Motion by voting: a particle filter whose likelihood is the vote of the earlier "
     "neighbours of events (Egomotion thesis, chapters 5 and 6, with soft votes of all neighbours).",
 )

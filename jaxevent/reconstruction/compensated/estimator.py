@@ -9,7 +9,7 @@ target (`trajectories`). Along these paths the images are fused (`fusion`).
 import collections
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -113,10 +113,10 @@ from jaxevent.recording import Recording, Times, microseconds
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
 ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
-MIN_TRUST = 0.8  # in an interval's events, from which motion is not sought in frames alone
-N_CACHED_ANCHORS = 2
+# 1 - (trust in events)^4, up to which frames alone are not asked: images would seldom choose them.
+MIN_DOUBT = 0.1
+N_CACHED_ANCHORS = 4
 N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
-MAX_CLOCK_COST_RATIO = 0.97  # of the cost by the motion clock to that by time, to take the clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
@@ -309,7 +309,7 @@ class TrajectoryEstimator:
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
         self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
-        # By their times, and whether events there are doubted.
+        # By their times, and whether they are of frames alone.
         self._anchors: collections.OrderedDict[tuple[int, bool], Anchor] = collections.OrderedDict()
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
@@ -332,43 +332,45 @@ class TrajectoryEstimator:
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
     def _anchor(self, t: int) -> Anchor:
-        """Return the anchor next to a time (us), and its motion at half resolution.
-
-        Where the events are doubted that is halfway between the frames around the time.
-        """
+        """Return the anchor next to a time (us), and its motion at half resolution."""
         first, last = self.schedule.span
         interval = ANCHOR_STEPS * self.schedule.step
         at = min(max(first + round((t - first) / interval) * interval, first), last)
-        doubted = min(self.event_noise.trust(t), self.event_noise.trust(at)) < MIN_TRUST
+        return self._remember((at, False), self._make_anchor)
+
+    def _frame_anchor(self, t: int) -> Anchor | None:
+        """Return the anchor halfway between two frames, and its motion by frames alone."""
         frames = self.schedule.frames
         after = int(np.searchsorted(frames, t, "right"))
-        if doubted and 0 < after < len(frames):
-            at = int(frames[after - 1] + frames[after]) // 2
-        if (at, doubted) in self._anchors:
-            self._anchors.move_to_end((at, doubted))
+        if not 0 < after < len(frames):
+            return None
+        at = int(frames[after - 1] + frames[after]) // 2
+        return self._remember((at, True), self._make_frame_anchor)
+
+    def _remember(self, key: tuple[int, bool], make: Callable[[int], Anchor]) -> Anchor:
+        if key in self._anchors:
+            self._anchors.move_to_end(key)
         else:
-            self._anchors[at, doubted] = self._make_anchor(at, doubted)
+            self._anchors[key] = make(key[0])
             if len(self._anchors) > N_CACHED_ANCHORS:
                 self._anchors.popitem(last=False)
-        return self._anchors[at, doubted]
+        return self._anchors[key]
 
-    def _make_anchor(self, at: int, doubted: bool) -> Anchor:
-        """Seek the motion of the target at a time (us) from nothing.
-
-        Where events are doubted it is also sought from the frames alone.
-        """
+    def _make_anchor(self, at: int) -> Anchor:
+        """Seek the motion of the target at a time (us) from nothing."""
         instants = self.schedule(at)
         L, V, clear, _ = self._images(instants)
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-        p = self._seek(pyramid, instants.s, instants.first_horizon)
+        return instants, self._seek(pyramid, instants.s, instants.first_horizon)
+
+    def _make_frame_anchor(self, at: int) -> Anchor:
+        """Seek the motion of the target at a time (us) from nothing, by frames alone."""
+        instants = self.schedule(at)
+        L, V, _, _ = self._images(instants)
         framed = np.isin(instants.t, self.schedule.frames)
-        if not doubted or framed.sum() < 2:
-            return instants, p
         frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
         nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        other = self._seek(frames, instants.s[framed], nearest)
-        images = PackedImages.of(pyramid[1], instants.s)
-        return instants, choose_trajectories(images, (p, other), self._cost)
+        return instants, self._seek(frames, instants.s[framed], nearest)
 
     def _seek(
         self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float
@@ -377,15 +379,34 @@ class TrajectoryEstimator:
         motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
         return motion.at_level(1, self.images.image_shape).p
 
-    def _initial_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32]:
-        """Return the motion that a target starts from, at half resolution."""
-        if self.start is not None:
-            known = self.start(t, self.schedule.step, instants.unit)
-            if known is not None:
-                return NodeTrajectories(known, 0).at_level(1, self.images.image_shape).p
-        anchor, p = self._anchor(t)
-        s = float(anchor.to_relative_times(np.array([t]))[0])
-        return advect_nodes(p, s, instants.unit / anchor.unit)
+    def _known_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32] | None:
+        """Return the motion that is known beforehand, at half resolution, or None."""
+        known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
+        if known is None:
+            return None
+        return NodeTrajectories(known, 0).at_level(1, self.images.image_shape).p
+
+    def _sought_motion(
+        self, pixels: NDArray[np.float32], instants: TargetInstants
+    ) -> NDArray[np.float32]:
+        """Return the motion of the anchors that images agree with, at half resolution."""
+        t = int(instants.t[instants.target])
+        doubt = 1 - self.event_noise.trust(t) ** 4
+        other = self._frame_anchor(t) if doubt > MIN_DOUBT else None
+        p = self._carry(self._anchor(t), instants)
+        if other is None:
+            return p
+        images, several = PackedImages.of(pixels, instants.s), (p, self._carry(other, instants))
+        return choose_trajectories(images, several, self._cost, (1.0, doubt))
+
+    def _carry(self, anchor: Anchor, instants: TargetInstants) -> NDArray[np.float32]:
+        """Carry the motion of an anchor to another target, on the clock of that one."""
+        there, p = anchor
+        now = there.with_clock(instants.clock)
+        if there.clock.event_share != instants.clock.event_share:
+            p = change_clock(p, there.s, now.s)
+        s = float(now.to_relative_times(instants.t[[instants.target]])[0])
+        return advect_nodes(p, s, instants.unit / now.unit)
 
     def _improve(
         self, pixels: NDArray[np.float32], instants: TargetInstants, p: NDArray[np.float32]
@@ -411,23 +432,22 @@ class TrajectoryEstimator:
             return instants, found
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
-        if cost(instants, found) < MAX_CLOCK_COST_RATIO * cost(timed, other):
+        if cost(instants, found) < cost(timed, other):
             return instants, found
         return timed, other
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
         instants = self.schedule(t)
-        if instants.clock.event_share:
-            instants = instants.with_clock(self._anchor(t)[0].clock)
-        p = self._initial_motion(t, instants)
+        known = self._known_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
         size, noise = L.shape[1:], self._noise(t)
-        if self.start is not None and not self.start.refine:
-            p = NodeTrajectories(p, 1).at_level(0, size).p
+        if known is not None and not self.start.refine:
+            p = NodeTrajectories(known, 1).at_level(0, size).p
             return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         variance = self._cautious(V, clear)
         pyramid = ImagePyramid(L, variance, PYRAMID_VARIANCE_FACTOR)
+        p = self._sought_motion(pyramid[1], instants) if known is None else known
         instants, p = self._improve(pyramid[1], instants, p)
         p = NodeTrajectories(p, 1).at_level(0, size).p
         # The target's own image is the smoother's. The image fused so far is a better one to refine

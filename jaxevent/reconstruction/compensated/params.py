@@ -117,9 +117,10 @@ class Params(smoother.Params):
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )
     # Thresholds are learned (`learn`) along trajectories, from more than events between frames. But
-    # they are relative to the common ones, which alone tell how far beyond white points are.
+    # they are relative to the common ones, which alone tell how far beyond white points are. The
+    # exposure is needed of frames that are blurred and do not state theirs.
     calibrated = ("clock_offset",)
-    calibrated_if_clipped = ("c_on", "c_off")
+    calibrated_if_needed = ("c_on", "c_off", "exposure")
 
     @classmethod
     def predictor(cls) -> smoother.Smoother:

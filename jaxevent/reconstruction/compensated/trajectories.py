@@ -237,7 +237,10 @@ def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) 
 
 
 def choose_trajectories(
-    images: PackedImages, several: Sequence[NDArray[np.float32]], cost: CostParams
+    images: PackedImages,
+    several: Sequence[NDArray[np.float32]],
+    cost: CostParams,
+    shares: Sequence[float],
 ) -> NDArray[np.float32]:
     """Choose for every node the trajectories along which images agree best around it.
 
@@ -245,19 +248,20 @@ def choose_trajectories(
         images: Packed images.
         several: Trajectories of nodes, each (rows, columns, 4), px.
         cost: Parameters of the cost, float32.
+        shares: By which the cost of each is divided, above 0.
 
     Returns:
         (rows, columns, 4) the trajectories chosen, px.
     """
     costs = []
-    for p in several:
+    for p, share in zip(several, shares, strict=True):
         points, M, _ = sample_trajectories(images, p, cost)
         squares = ((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).sum(1)
         rows, columns = p.shape[:2]
         unpaired = [(0, 2 * rows - len(squares)), (0, 2 * columns - squares.shape[1])]
         padded = np.pad(squares, unpaired, mode="edge")
         nodes = padded.reshape(rows, 2, columns, 2).mean((1, 3))
-        costs.append(blur_image(nodes, CHOICE_SIGMA))
+        costs.append(blur_image(nodes, CHOICE_SIGMA) / np.float32(share))
     best = np.argmin(costs, 0)
     return np.take_along_axis(np.stack(several), best[None, ..., None], 0)[0]
 

@@ -1,26 +1,39 @@
 """The method `events-only`: video from events alone."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.events_only.gradient import (
     WindowEquations,
+    held_out_likelihood,
     pack_equations,
     sample_variance,
     solve_equations,
     threshold,
 )
 from jaxevent.reconstruction.events_only.params import Params
+from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 from jaxevent.reconstruction.events_only.video import EventsOnlyVideo, read_intensity
 from jaxevent.reconstruction.events_only.windows import WindowSolver
+from jaxevent.reconstruction.features import Numeric
 from jaxevent.recording import Recording, Times, microseconds
+
+HELD_OUT_STEP = 5  # one of so many events is predicted by the others
+
+
+def _choose_held_out(rows: Rows) -> NDArray[np.bool_]:
+    """Choose rows of events evenly, in the order of their times."""
+    event = rows.kind == EVENT
+    return event & (np.cumsum(event) % HELD_OUT_STEP == 0)
 
 
 class WindowFeatures(ShortRepr):
@@ -31,6 +44,22 @@ class WindowFeatures(ShortRepr):
     def over(self, devices: Any) -> "WindowFeatures":
         """Return the windows as they are: pixels depend on each other and are not shared out."""
         return self
+
+
+class HeldOutEvents(ShortRepr):
+    """Windows of events, of which some events are to be predicted by the others."""
+
+    equations: WindowEquations  # stacked
+    held: Float[Numeric, "times rows"]  # 1 for an event to predict, else 0
+
+    def over(self, devices: Any) -> "HeldOutEvents":
+        """Return the windows as they are, see `WindowFeatures`."""
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of the events to predict."""
+        return int(self.held.sum())
 
 
 class WindowImages(NamedTuple):
@@ -58,6 +87,9 @@ class PreparedTimes(ShortRepr):
 class EventsOnly(ImageEstimator[Params]):
     """Video from events alone."""
 
+    has_likelihood: ClassVar[bool] = True
+    measures_events: ClassVar[bool] = True
+    is_absolute: ClassVar[bool] = False
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"causal", "motion"}), kw_only=True
     )
@@ -84,6 +116,17 @@ class EventsOnly(ImageEstimator[Params]):
         Raises:
             InputError: The recording has no events, or times lie outside it.
         """
+        windows, wanted, params = self._open(recording, times, params, extrapolate)
+        equations, _ = self._stack(windows, wanted, params)
+        return WindowFeatures(equations), PreparedTimes(np.arange(len(wanted)))
+
+    def _open(
+        self,
+        recording: Recording,
+        times: Times,
+        params: Params | None,
+        extrapolate: bool = False,
+    ) -> tuple[WindowSolver, NDArray[np.int64], Params]:
         self.check(recording)
         params = self.Params() if params is None else params
         wanted = np.atleast_1d(microseconds(times))
@@ -91,13 +134,60 @@ class EventsOnly(ImageEstimator[Params]):
             self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
-        windows = WindowSolver(recording, params)
-        solved = [windows(t, variance=False) for t in wanted.tolist()]
+        return WindowSolver(recording, params), wanted, params
+
+    def _stack(
+        self,
+        windows: WindowSolver,
+        times: NDArray[np.int64],
+        params: Params,
+        held_out: Callable[[Rows], NDArray[np.bool_]] | None = None,
+    ) -> tuple[WindowEquations, Array]:
+        """Solve windows on the host; return their equations, and 1 for rows that are held out."""
+        solved = [windows(t, variance=False, held_out=held_out) for t in times.tolist()]
         count = max(len(one.rows.kind) for one in solved)
         packed = [pack_equations(one, windows.relative, params, count) for one in solved]
-        equations = jax.tree.map(lambda *leaves: np.stack(leaves), *packed)
-        features = WindowFeatures(jax.device_put(equations))
-        return features, PreparedTimes(np.arange(len(wanted)))
+        held = np.zeros((len(solved), count), packed[0].fraction.dtype)
+        for row, one in zip(held, solved, strict=True):
+            if held_out is not None:
+                row[: len(one.rows.kind)] = held_out(one.rows)
+        return jax.device_put((jax.tree.map(lambda *leaves: np.stack(leaves), *packed), held))
+
+    def prepare_likelihood(
+        self, recording: Recording, times: Times, params: Params | None = None
+    ) -> HeldOutEvents:
+        """Prepare the windows at some times for `log_likelihood`.
+
+        Args:
+            recording: Events.
+            times: (T,) times at the middle of windows, us or s.
+            params: Parameters with which motion is estimated; None: the defaults.
+
+        Returns:
+            The windows, one of `HELD_OUT_STEP` events of which is to be predicted.
+
+        Raises:
+            InputError: As `prepare`.
+        """
+        windows, wanted, params = self._open(recording, times, params)
+        return HeldOutEvents(*self._stack(windows, wanted, params, _choose_held_out))
+
+    def log_likelihood(self, params: Params, features: HeldOutEvents) -> Float[Array, ""]:
+        """Return the log likelihood of events that the others of their window predict.
+
+        Args:
+            params: Parameters.
+            features: Windows of `prepare_likelihood`.
+
+        Returns:
+            (), a sum over the events to be predicted.
+        """
+
+        @jax.checkpoint
+        def one(window: tuple[WindowEquations, Array]) -> Array:
+            return held_out_likelihood(*window, params)
+
+        return jax.lax.map(one, (features.equations, features.held)).sum()
 
     def run(
         self, params: Params, features: WindowFeatures, state: Any = None
@@ -161,6 +251,6 @@ events_only = EventsOnly(
     Params,
     fuses=False,
     about="Video from events alone. It estimates motion and image of a window of events together. "
-    "The log intensity is known up to an offset and a factor: where nothing is known it is 0 and "
-    "the intensity 0.5.",
+    "The log intensity is known up to an offset and a factor: the geometric mean of each image is "
+    "0.5.",
 )

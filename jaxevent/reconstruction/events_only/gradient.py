@@ -21,15 +21,19 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.rows import EVENT
-from jaxevent.reconstruction.events_only.solve import SAMPLES, factor_information, scene_conductance
+from jaxevent.reconstruction.events_only.solve import (
+    BLUR_PX,
+    SAMPLES,
+    VARIANCE_FACTOR,
+    factor_information,
+)
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
-REWEIGHTINGS = 20
-REWEIGHTING_TOLERANCE = 1e-4  # of the gradient of E, against that of the data, to stop at
-CG_ITERATIONS = 200
-CG_TOLERANCE = 1e-4
-BLUR_PX = 1.5  # of the variance, as that of `solve`
+REWEIGHTINGS = 100  # at most
+CG_ITERATIONS = 200  # at most
+TOLERANCES = {4: 5e-3, 8: 1e-8}  # relative residuals to stop at, by bytes of a number
+LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 
 
 class Perturbation(NamedTuple):
@@ -65,6 +69,7 @@ class WindowEquations(NamedTuple):
     pull: Float[Numeric, "*times height width 2"]  # gradient by other windows, thresholds / px
     information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
     start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
+    unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
     relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
     noise: Perturbation
 
@@ -100,11 +105,12 @@ def pack_equations(
         fill(rows.fraction),
         fill(np.maximum(rows.change, 0) * (c / float(params.c_on))),
         fill(np.maximum(-rows.change, 0) * (c / float(params.c_off))),
-        fill(event.astype(dtype)),
-        fill((~event).astype(dtype)),
+        fill(event * rows.weight),
+        fill(~event * rows.weight),
         (prior.gradient / c).astype(dtype),
         information.astype(dtype),
         (solution.log_image / c).astype(dtype),
+        (solution.unseen / c**2).astype(dtype),
         relative.mean((1, 2)).astype(dtype),
         Perturbation(
             np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
@@ -245,7 +251,8 @@ def _solve_linear(product: Callable[[Array], Array], right: Array, diagonal: Arr
     def divide(v: Array) -> Array:
         return v / diagonal
 
-    return cg(product, right, tol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=divide)[0]
+    tolerance = TOLERANCES[right.dtype.itemsize]
+    return cg(product, right, tol=tolerance, maxiter=CG_ITERATIONS, M=divide)[0]
 
 
 def solve_equations(equations: WindowEquations, params: Params) -> Array:
@@ -258,31 +265,78 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
     Returns:
         (height, width) log image, thresholds.
     """
+    found = jax.lax.stop_gradient(_minimise(*jax.lax.stop_gradient((equations, params))))
+    return _implicit_solution(found, equations, params)
 
-    def residual(u: Array) -> Array:
-        return jax.grad(energy)(u, equations, params)
 
-    scale = jnp.linalg.norm(residual(jnp.zeros_like(equations.start)))
+def _minimise(equations: WindowEquations, params: Params) -> Array:
+    start = equations.start
+    scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
+    least = TOLERANCES[start.dtype.itemsize] * scale
 
-    def find(f: Callable[[Array], Array], start: Array) -> Array:
-        def should_continue(state: tuple[Array, Array, Array]) -> Array:
-            _, slope, n = state
-            return (n < REWEIGHTINGS) & (jnp.linalg.norm(slope) > REWEIGHTING_TOLERANCE * scale)
+    def should_continue(state: tuple[Array, Array, int]) -> Array:
+        _, slope, n = state
+        return (n < REWEIGHTINGS) & (jnp.linalg.norm(slope) > least)
 
-        def reweight(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            u, slope, n = state
-            weights = _weights(u, equations, params)
-            product = _product(weights, equations, params.leak)
-            u = u - _solve_linear(product, slope, _diagonal(weights, equations, params.leak))
-            return u, f(u), n + 1
+    def reweight(state: tuple[Array, Array, int]) -> tuple[Array, Array, int]:
+        u, slope, n = state
+        weights = _weights(u, equations, params)
+        product = _product(weights, equations, params.leak)
+        u = u - _solve_linear(product, slope, _diagonal(weights, equations, params.leak))
+        return u, _slope(u, equations, params), n + 1
 
-        return jax.lax.while_loop(should_continue, reweight, (start, f(start), 0))[0]
+    first = (start, _slope(start, equations, params), 0)
+    return jax.lax.while_loop(should_continue, reweight, first)[0]
 
-    def solve_tangent(product: Callable[[Array], Array], right: Array) -> Array:
-        weights = _weights(equations.start, equations, params)
-        return _solve_linear(product, right, _diagonal(weights, equations, params.leak))
 
-    return jax.lax.custom_root(residual, equations.start, find, solve_tangent)
+def _slope(u: Array, equations: WindowEquations, params: Params) -> Array:
+    return jax.grad(energy)(u, equations, params)
+
+
+@jax.custom_jvp
+def _implicit_solution(u: Array, equations: WindowEquations, params: Params) -> Array:
+    return u
+
+
+@_implicit_solution.defjvp
+def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
+    u, equations, params = values
+
+    def times(du: Array) -> Array:
+        return jax.jvp(lambda v: _slope(v, equations, params), (u,), (du,))[1]
+
+    weights = _weights(u, equations, params)
+    diagonal = _diagonal(weights, equations, params.leak)
+
+    def solve(product: Callable[[Array], Array], right: Array) -> Array:
+        return _solve_linear(product, right, diagonal)
+
+    _, right = jax.jvp(lambda numbers: _slope(u, equations, numbers), (params,), (changes[2],))
+    return u, -jax.lax.custom_linear_solve(times, right, solve, symmetric=True)
+
+
+def held_out_likelihood(equations: WindowEquations, held: Array, params: Params) -> Array:
+    """Return the log likelihood of events that the image was not solved for.
+
+    A residual e, in thresholds, has Student's t distribution of the energy's robust loss,
+
+        p(e) = Gamma(a) / (sqrt(2 pi) tail Gamma(a - 1/2)) (1 + e^2 / (2 tail^2))^-a,  a = tail^2.
+
+    Args:
+        equations: Equations of a window.
+        held: (rows,) 1 for the rows of events to predict, else 0.
+        params: Parameters; a `tail` whose distribution has no integral counts as the least.
+
+    Returns:
+        (), a sum over these rows.
+    """
+    others = equations._replace(weight=equations.weight * (1 - held))
+    u = solve_equations(others, params)
+    e = _residuals(u, equations, params)[1]
+    a = jnp.maximum(params.tail**2, LEAST_STUDENT_SHAPE)
+    norm = jax.scipy.special.gammaln(a) - jax.scipy.special.gammaln(a - 0.5)
+    each = norm - 0.5 * jnp.log(2 * jnp.pi * a) - a * jnp.log1p(e**2 / (2 * a))
+    return (held * each).sum()
 
 
 def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Array:
@@ -296,9 +350,7 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
     Returns:
         (height, width) variance, squared thresholds.
     """
-    g, weights = scene_conductance(u), _weights(u, equations, params)
-    across, down = (jnp.full_like(one, g) for one in weights[1:])
-    weights = weights._replace(across=across, down=down)
+    weights = _weights(u, equations, params)
     product = _product(weights, equations, params.leak)
     diagonal = jax.lax.stop_gradient(_diagonal(weights, equations, params.leak))
 
@@ -317,7 +369,7 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
 
     squares = jax.lax.map(sample, equations.noise).mean(0)
     down, across = (jnp.asarray(_blur_matrix(n), u.dtype) for n in u.shape)
-    return down @ squares @ across.T
+    return VARIANCE_FACTOR * (down @ squares @ across.T) + equations.unseen
 
 
 @functools.cache

@@ -19,11 +19,12 @@ added. No image is solved for: memory costs little more than the rows themselves
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior
 from jaxevent.reconstruction.events_only.rows import EVENT, Paths, Rows
-from jaxevent.recording import Recording
+from jaxevent.recording import Events, Recording
 
 KEYS_PER_BLOCK = 16  # whose memories are kept at a time, for each direction
 KEYS_BEYOND_BLOCK = 8  # from which a block's memories begin with nothing
@@ -36,7 +37,8 @@ class MemoryParams(NamedTuple):
     forgetting: float = 0.6  # variance that a gradient gains in time, (c / px)^2 / s
     drift: float = 1.0  # variance that a path gains in time, px^2 / s
     blur: float = 0.3  # variance of a path when the memory enters an image, px^2
-    tail: float = 2.0  # difference, in standard deviations, beyond which memory counts less
+    detail: float = 0.5  # mean square of gradients, that errors of paths act by, (c / px)^2
+    tail: float = 1.5  # difference, in standard deviations, beyond which memory counts less
 
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
@@ -59,28 +61,67 @@ def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
     return GradientPrior(gradient, information)
 
 
+@njit_noalloc_inlined
+def _add_row(a, b, change, weight, information, eta):
+    """Share out M(b) - M(a) = change among the pixels between, if both ends are in the image."""
+    height, width = eta.shape[:2]
+    for x, y in (a, b):
+        if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
+            return
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    n = int(np.sqrt(dx * dx + dy * dy)) + 1
+    w = weight / n
+    for step in range(n):
+        part = (step + np.float32(0.5)) / n
+        x, y = int(a[0] + part * dx + 0.5), int(a[1] + part * dy + 0.5)
+        information[y, x, 0, 0] += w * dx * dx
+        information[y, x, 0, 1] += w * dx * dy
+        information[y, x, 1, 0] += w * dx * dy
+        information[y, x, 1, 1] += w * dy * dy
+        eta[y, x, 0] += w * dx * change
+        eta[y, x, 1] += w * dy * change
+
+
 @njit_noalloc
 def _add_rows(rows, weight, c, information, eta):
-    height, width = rows.shape
+    width = rows.shape[1]
     for k in range(len(weight)):
-        bx = rows.corner[k, 0] % width + rows.fraction[k, 0, 0]
-        by = rows.corner[k, 0] // width + rows.fraction[k, 0, 1]
-        dx = bx - (rows.corner[k, 1] % width + rows.fraction[k, 1, 0])
-        dy = by - (rows.corner[k, 1] // width + rows.fraction[k, 1, 1])
-        n = int(np.sqrt(dx * dx + dy * dy)) + 1
-        w = weight[k] / n
-        change = c * rows.change[k]
-        for step in range(n):
-            part = (step + np.float32(0.5)) / n
-            x, y = int(bx - part * dx + 0.5), int(by - part * dy + 0.5)
-            information[y, x, 0, 0] += w * dx * dx
-            information[y, x, 0, 1] += w * dx * dy
-            information[y, x, 1, 1] += w * dy * dy
-            eta[y, x, 0] += w * dx * change
-            eta[y, x, 1] += w * dy * change
-    for y in range(height):
-        for x in range(width):
-            information[y, x, 1, 0] = information[y, x, 0, 1]
+        i, j = rows.corner[k, 0], rows.corner[k, 1]
+        b = i % width + rows.fraction[k, 0, 0], i // width + rows.fraction[k, 0, 1]
+        a = j % width + rows.fraction[k, 1, 0], j // width + rows.fraction[k, 1, 1]
+        _add_row(a, b, c * rows.change[k], weight[k], information, eta)
+
+
+@njit_noalloc
+def _add_span(events, positions, errors, numbers, information, eta):
+    """Add the rows of a span; events are in order of time, or in reverse order for the side -1."""
+    pixel, change, last = events
+    begin, middle, at_event = positions
+    variance, time, ends = errors
+    n_before, side, weight, silence = numbers
+    width = eta.shape[1]
+    for k in range(len(pixel)):
+        x = pixel[k]
+        previous = last[x]
+        last[x] = k
+        if k < n_before:
+            continue
+        here = at_event[k, 0], at_event[k, 1]
+        if previous < 0:
+            # In reverse order nothing happens between the event and the span's end.
+            half = 0.5 * change[k] if side > 0 else np.float32(0)
+            w = silence / (1 + variance[x] * (ends[0] - time[k]) ** 2)
+            _add_row((begin[x, 0], begin[x, 1]), here, half, w, information, eta)
+        else:
+            step = change[k] if side > 0 else change[previous]
+            there = at_event[previous, 0], at_event[previous, 1]
+            w = weight / (1 + variance[x] * (time[previous] - time[k]) ** 2)
+            _add_row(there, here, step, w, information, eta)
+    for x in range(len(last)):
+        if last[x] < n_before:
+            here = np.float32(x % width), np.float32(x // width)
+            w = silence / (1 + variance[x] * ends[1] ** 2)
+            _add_row((middle[x, 0], middle[x, 1]), here, np.float32(0), w, information, eta)
 
 
 @njit_noalloc
@@ -255,14 +296,17 @@ def _carry(px, py, memory, noise, out):
 
 @runtime_checkable
 class Windows(Protocol):
-    """A source of a recording's paths and equations."""
+    """A source of a recording's events, their thresholds and their paths."""
 
-    def paths(self, start: int, stop: int, at: int) -> Paths:
-        """Return the paths between two times (us) towards the time `at`."""
+    shape: tuple[int, int]  # (height, width)
+    thresholds: NDArray[np.float32]  # (2, height, width) ln I, of ON and OFF events
+
+    def events(self, first: int, last: int) -> Events:
+        """Return the events of some rows, without those of hot pixels."""
         ...
 
-    def rows(self, first: int, last: int, at: int, span: tuple[int, int]) -> Rows:
-        """Return the equations of some rows of events for the image at a time."""
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> Paths:
+        """Return the paths between two times (us) towards `at`, by events up to `until`."""
         ...
 
 
@@ -306,6 +350,9 @@ class KeyMemories:
     def prior(self, rows: Rows, at: int, first: int, last: int | None) -> GradientPrior:
         """Return what the windows before and after one say of its image.
 
+        Where images are causal, a window begins at least two steps before its image: flow for the
+        memory rests on so many events after the key.
+
         Args:
             rows: Equations of the window for the image.
             at: Time of the image, us.
@@ -316,7 +363,7 @@ class KeyMemories:
             The memories together; where no window saw anything the information is 0.
         """
         ends = [(first, 1)] + ([] if last is None else [(last, -1)])
-        found = [self._carried(self._at_key(k, s), k, at, self.params.blur) for k, s in ends]
+        found = [self._carried(self._at_key(k, s), k, at, at, self.params.blur) for k, s in ends]
         known = [memory for memory in found if memory is not None]
         if not known:
             zeros = np.zeros((*rows.shape, 2), np.float32)
@@ -326,14 +373,14 @@ class KeyMemories:
         return discount(joint, new, self.threshold, self.params.tail)
 
     def _carried(
-        self, memory: GradientPrior | None, key: int, at: int, blur: float = 0.0
+        self, memory: GradientPrior | None, key: int, at: int, until: int, blur: float = 0.0
     ) -> GradientPrior | None:
         if memory is None:
             return None
         start = self.time(key)
         seconds = 1e-6 * abs(at - start)
         gain = self.params.forgetting * self.threshold**2 * seconds
-        paths = self.windows.paths(min(start, at), max(start, at), start)
+        paths = self.windows.paths(min(start, at), max(start, at), start, until=until)
         return carry(memory, paths, at, (gain, self.params.drift * seconds + blur))
 
     def _at_key(self, key: int, side: int) -> GradientPrior | None:
@@ -363,12 +410,51 @@ class KeyMemories:
 
     def _extend(self, memory: GradientPrior | None, key: int, side: int) -> GradientPrior:
         """Return the memory at the next key on the way."""
-        other = key + side
-        first, last = min(key, other), max(key, other)
-        start, stop, at = self.time(first), self.time(last), self.time(other)
-        rows = self.windows.rows(self.row(first), self.row(last), at, (start, stop))
-        new = measure_gradient(rows, self.silence)
-        carried = self._carried(memory, key, at)
+        new = self._measure(key, side)
+        carried = self._carried(memory, key, self.time(key + side), self.time(key + side + 2))
         if carried is None:
             return new
         return fuse(discount(carried, new, self.threshold, self.params.tail), new, self.threshold)
+
+    def _measure(self, key: int, side: int) -> GradientPrior:
+        """Return what the events from a key to the next one on the way say of the gradient there.
+
+        A pixel's first row begins at its last event before the key, if it has one since the key
+        before: otherwise windows of few events would find gradients too small. Silence after a
+        pixel's last event is left to the next window.
+        """
+        keys = min(max(key - side, 0), self.last), key, key + side
+        rows, times = [self.row(k) for k in keys], [self.time(k) for k in keys]
+        before = self.windows.events(*sorted(rows[:2]))
+        within = self.windows.events(*sorted(rows[1:]))
+        x, y, t, p = (
+            np.concatenate([getattr(before, name)[::side], getattr(within, name)[::side]])
+            for name in "xytp"
+        )
+        height, width = shape = self.windows.shape
+        until = self.time(key + side + 2)
+        paths = self.windows.paths(min(times), max(times), times[2], until=until)
+        pixels = [v.ravel().astype(np.float32) for v in np.indices(shape)[::-1]]
+        begin, middle = (
+            np.stack(paths.carry(*pixels, np.full(height * width, time)), -1) for time in times[:2]
+        )
+        at_event = np.stack(paths.carry(x.astype(np.float32), y.astype(np.float32), t), -1)
+        pixel = y.astype(np.int32) * width + x
+        on, off = self.windows.thresholds.reshape(2, -1)
+        change = side * np.where(p, on[pixel], -off[pixel])
+        variance = np.zeros(height * width, np.float32)
+        if paths.covariance is not None:
+            variance = np.trace(paths.covariance.mean(0), axis1=-2, axis2=-1).ravel()
+        information = np.zeros((*shape, 2, 2), np.float32)
+        eta, gradient = np.zeros((2, *shape, 2), np.float32)
+        seconds = 1e-6 * np.abs(t - times[2]), 1e-6 * np.abs(np.subtract(times[:2], times[2]))
+        _add_span(
+            (pixel, change, np.full(height * width, -1, np.int32)),
+            (begin, middle, at_event),
+            (self.params.detail * variance, *seconds),
+            (len(before), side, 1 / self.threshold**2, self.silence / self.threshold**2),
+            information,
+            eta,
+        )
+        _solve_gradient(information, eta, LEAST_INFORMATION / self.threshold**2, gradient)
+        return GradientPrior(gradient, information)

@@ -14,12 +14,14 @@ class Params(FrameParams):
     of the log intensity.
     """
 
+    c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
+    c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
     I0 = Positive(0.02, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
     window = Positive(0.23, "events / px", "events of the window on each side", gradient=False)
     silence = Positive(_SOLVER.silence, "1", "weight of silence, against that of an event")
     tail = Positive(_SOLVER.tail, "c", "residual from which an equation counts less", least=1e-6)
-    gradient = Positive(_SOLVER.gradient, "1 / c", "weight of gradients of the image")
-    edge = Positive(_SOLVER.edge, "c / px", "gradient below which its cost is square", least=1e-6)
+    gradient = Positive(_SOLVER.gradient, "1", "weight of the prior of gradients")
+    edge = Positive(_SOLVER.edge, "c / px", "scale of the prior of gradients", least=1e-6)
     leak = Positive(_SOLVER.leak, "1 / c^2", "weight of the squared log intensity", least=1e-9)
     vague = Positive(
         1.0, "ln I", "standard deviation from which an image is not valid", gradient=False

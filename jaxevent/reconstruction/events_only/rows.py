@@ -37,6 +37,7 @@ from jaxevent.reconstruction.events_only.silence import explained_share
 from jaxevent.recording import Events
 
 EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
+NONE, MUTED = -1, -2  # in place of the number of a pixel's last event
 FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
 SHARED_ROWS = 10
 ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^2
@@ -73,6 +74,7 @@ def make_rows(
     thresholds: NDArray,
     shape: tuple[int, int],
     span: tuple[int, int],
+    muted: NDArray[np.bool_] | None = None,
 ) -> Rows:
     """Make the equations of a window's events and of its silence.
 
@@ -82,6 +84,8 @@ def make_rows(
         thresholds: (2,) or (2, height, width) ln I, of ON and OFF events.
         shape: (height, width) of the sensor.
         span: Begin and end of the window, us.
+        muted: (height, width), true for pixels without events whose silence tells nothing; None:
+            there are none.
 
     Returns:
         The rows whose look-ups are both inside the image.
@@ -120,7 +124,9 @@ def make_rows(
         np.empty(n, np.uint8),
         np.empty(n, np.int32),
     )
-    last = np.full(height * width, -1, np.int32)
+    last = np.full(height * width, NONE, np.int32)
+    if muted is not None:
+        last[muted.ravel()] = MUTED
     ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
     times = (1e-6 * (events.t - span[0]), 1e-6 * (span[1] - span[0]), doubt)
     n = _lay_rows(pixel, change.astype(np.float32), ends, times, last, rows)
@@ -145,10 +151,10 @@ def _lay_rows(pixel, change, positions, times, last, rows):
         last[x] = k
     for x in range(len(last)):
         before = last[x]
-        if before < 0:
+        if before == NONE:
             rows.weight[n] = 1 / (1 + doubt[x] * stop**2)
             n += _lay_row(n, end[x], begin[x], 0.0, SILENT, x, rows)
-        else:
+        elif before != MUTED:
             rows.weight[n] = 1 / (1 + doubt[x] * (stop - t[before]) ** 2)
             n += _lay_row(n, end[x], at_event[before], LAST_SHARE * change[before], LAST, x, rows)
     return n

@@ -20,7 +20,7 @@ regions, which only their edges tie together, move as a whole.
 At the solution dE/du = A u - b = 0 with the weights of u itself.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,8 +33,13 @@ from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 REWEIGHTINGS = 8
 CG_LIMITS = (1e-3, 25)  # relative residual, and iterations
 BLOCK_BITS = 1  # sides of blocks are powers of 2 to this
-SCENE_VARIANCE = 4.0  # of log images, squared thresholds
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
+# Chosen on simulated scenes (experiments/studies/events_only.md): how much larger errors are than
+# independent rows and the curvature at the solution say, and what is not known without any row.
+VARIANCE_FACTOR = 3.0
+UNSEEN_VARIANCE = 25.0  # squared thresholds
+UNSEEN_INFORMATION = 0.13  # of rows about a pixel, in squared thresholds, from which it is seen
+BLUR_PX = 1.5  # of variance and information
 
 
 class Solution(NamedTuple):
@@ -42,6 +47,7 @@ class Solution(NamedTuple):
 
     log_image: Float[np.ndarray, "height width"]  # ln I
     variance: Float[np.ndarray, "height width"]  # (ln I)^2, of the difference from the mean
+    unseen: Float[np.ndarray, "height width"]  # part of the variance, where rows say little
     residual: Float[np.ndarray, " rows"]  # thresholds
     weight: Float[np.ndarray, " rows"]  # r_k
     iterations: int  # of conjugate gradients, all together
@@ -144,11 +150,22 @@ def solve(
         preconditioner.update(system)
         iterations += _conjugate_gradients(system, b, u, preconditioner.arrays, CG_LIMITS)
     _reweight(system, u, (rows.change, base), numbers, residual)
-    V = np.full(rows.shape, np.inf, np.float32)
+    V, unseen = np.full((2, *rows.shape), np.inf, np.float32)
     if variance:
-        _relax_prior(system, scene_conductance(u))
-        V = _sample_variance(system, preconditioner, np.random.default_rng(seed)) * c**2
-    return Solution(u * c, V, residual, system.weight, iterations)
+        unseen = _unseen_variance(system, preconditioner.of_rows[0]) * c**2
+        samples = _sample_variance(system, preconditioner, np.random.default_rng(seed))
+        V = VARIANCE_FACTOR * c**2 * samples + unseen
+    return Solution(u * c, V, unseen, residual, system.weight, iterations)
+
+
+def _unseen_variance(system, of_rows):
+    """Return the variance of pixels that neither rows nor the prior of gradients describe."""
+    from scipy.ndimage import gaussian_filter
+
+    seen, nothing = of_rows.copy(), np.zeros_like(system.across)
+    _add_image_diagonal(system._replace(across=nothing, down=nothing, leak=np.float32(0)), 0, seen)
+    seen = gaussian_filter(seen.reshape(system.across.shape), BLUR_PX)
+    return UNSEEN_VARIANCE * np.exp(-seen / UNSEEN_INFORMATION)
 
 
 def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
@@ -167,29 +184,6 @@ def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
     factor[..., 1, 0] = xy / np.sqrt(np.maximum(xx, np.finfo(np.float32).tiny))
     factor[..., 1, 1] = np.sqrt(np.maximum(yy - factor[..., 1, 0] ** 2, 0))
     return factor
-
-
-def scene_conductance(u: Any) -> Any:
-    """Return the weight g of squared differences under which an image is as variable as scenes.
-
-    At the image of least energy the heavy-tailed prior (2) is stiff where the image is flat, even
-    where nothing is known. So variances rest on a Gaussian prior in its place, with the spectrum
-    1 / (g k^2): n pixels have the variance ln(n) / (4 pi g), which is that of the image, or of
-    common scenes where this is less.
-
-    Args:
-        u: (height, width) log image, thresholds; NumPy or JAX.
-
-    Returns:
-        g, 1 / threshold^2.
-    """
-    more = u.var() - SCENE_VARIANCE
-    return np.log(max(u.size, 4)) / (4 * np.pi) / (SCENE_VARIANCE + more * (more > 0))
-
-
-def _relax_prior(system, conductance):
-    system.across[:], system.down[:] = conductance, conductance
-    system.across[:, -1], system.down[-1] = 0, 0
 
 
 def _sample_variance(system, preconditioner, rng):
@@ -215,7 +209,7 @@ def _sample_variance(system, preconditioner, rng):
         z = np.zeros_like(b)
         _conjugate_gradients(system, b, z, preconditioner.arrays, CG_LIMITS)
         total += (z - z.mean()) ** 2
-    return gaussian_filter(total / SAMPLES, 1.5).astype(np.float32)
+    return gaussian_filter(total / SAMPLES, BLUR_PX).astype(np.float32)
 
 
 @njit_fastmath_inlined

@@ -15,7 +15,7 @@ from jaxevent.reconstruction.events_only.windows import FlowSource, WindowSolver
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 
-GREY = 0.5  # intensity where the log image is 0: events alone tell it up to a factor
+GREY = 0.5  # intensity where the log image is at its mean: events alone tell it up to a factor
 
 
 def read_intensity(params: Params, L: Array, P: Array) -> tuple[Array, Array, Array]:
@@ -23,13 +23,15 @@ def read_intensity(params: Params, L: Array, P: Array) -> tuple[Array, Array, Ar
 
     Args:
         params: Parameters.
-        L: Log images, ln I.
+        L: (images, ...) log images, ln I.
         P: Their variance, (ln I)^2.
 
     Returns:
-        Intensity, 0.5 where L is 0; P; and whether the standard deviation is below `vague`.
+        Intensity, of which the geometric mean (of I + I0) of an image is 0.5; P; and whether the
+        standard deviation is below `vague`.
     """
-    image = (GREY + params.I0) * jnp.exp(L) - params.I0
+    level = L.mean(tuple(range(1, L.ndim)), keepdims=True)
+    image = (GREY + params.I0) * jnp.exp(L - level) - params.I0
     return image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague)
 
 

@@ -1,5 +1,6 @@
 """The windows of a recording's events: equations, and their solutions on the host."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,8 +13,9 @@ from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import Rows, make_rows
 from jaxevent.reconstruction.events_only.solve import Solution, solve
-from jaxevent.recording import Recording, Times
+from jaxevent.recording import Events, Recording, Times
 
+ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
 
 
@@ -65,10 +67,10 @@ class WindowSolver:
         self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
         self.relative = np.ones((2, *self.shape), np.float32)
-        self.hot = np.zeros(self.shape, bool)
+        self.muted = np.zeros(self.shape, bool)
         if params.learn:
             found = calibrate_events(recording)
-            self.relative, self.hot = found.thresholds, found.hot
+            self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
         c = np.float32([params.c_on, params.c_off])
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
@@ -80,32 +82,31 @@ class WindowSolver:
             threshold=float(self.thresholds.mean()),
         )
 
-    def paths(self, start: int, stop: int, at: int) -> WindowPaths:
+    def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of points through a window, see `EventFlow.paths`."""
         if isinstance(self.flow, EventFlow):
-            return self.flow.paths(start, stop, at)
+            return self.flow.paths(start, stop, at, until=until)
         low, high = min(start, at), max(stop, at)
         knots = np.unique(np.linspace(low, high, N_MOTION_KNOTS).astype(np.int64))
         velocity = np.nan_to_num(np.asarray(self.flow.flow(knots, extrapolate=True), np.float32))
         return WindowPaths(at, knots, velocity)
 
-    def rows(self, first: int, last: int, at: int, span: tuple[int, int]) -> Rows:
-        """Return the equations of the events of some rows of the recording.
+    def events(self, first: int, last: int) -> Events:
+        """Return the events of some rows of the recording, without those of unused pixels.
 
         Args:
-            first: First row of the events.
-            last: Row after their last.
-            at: Time of the image, us.
-            span: Begin and end of the window, us.
+            first: First row.
+            last: Row after the last one.
 
         Returns:
-            The equations for the image at that time.
+            The events.
         """
         events = self.recording.events[first:last]
-        events = events[~self.hot[events.y, events.x]]
-        return make_rows(events, self.paths(*span, at), self.thresholds, self.shape, span)
+        return events[~self.muted[events.y, events.x]]
 
-    def __call__(self, t: int, *, variance: bool = True) -> SolvedWindow:
+    def __call__(
+        self, t: int, *, variance: bool = True, held_out: Callable[[Rows], NDArray] | None = None
+    ) -> SolvedWindow:
         """Solve for the image at a time.
 
         A window begins at a key of the memory, and ends at one or, where images are causal, at t.
@@ -113,6 +114,7 @@ class WindowSolver:
         Args:
             t: Time, us.
             variance: Whether the variance is wanted.
+            held_out: Chooses rows (booleans) that the solution does not see.
 
         Returns:
             The window's equations and solution.
@@ -126,6 +128,13 @@ class WindowSolver:
             last = memory.key_after(max(place + ahead, 2 * self.n_side))
             end, stop = memory.row(last), memory.time(last)
         start = memory.time(first)
-        rows = self.rows(memory.row(first), end, t, (min(start, t), max(stop, t)))
+        span = min(start, t), max(stop, t)
+        events = self.events(memory.row(first), end)
+        paths = self.paths(*span, t)
+        rows = make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
         prior = memory.prior(rows, t, first, last)
-        return SolvedWindow(rows, prior, solve(rows, prior, self.numbers, variance=variance))
+        seen = rows
+        if held_out is not None:
+            kept = ~held_out(rows)
+            seen = rows._replace(**{name: getattr(rows, name)[kept] for name in ROW_COLUMNS})
+        return SolvedWindow(rows, prior, solve(seen, prior, self.numbers, variance=variance))

@@ -1,0 +1,324 @@
+"""Evidence for a motion in the events of a short window: against rest and against its rivals.
+
+    test = EvidenceTest(model, xi)
+    found = test.measure(events, time, motion, covariance, 6.5, 0.1)
+    found.is_supported
+
+The events of the first and of the last third of the window are moved along a motion to its middle,
+and become two signed images, E and L. Their products are the votes of events for each other, as in
+`particle_filter`, for pairs of events that lie some pixels of motion apart. The sum over the pixels
+of a cell of the image is V_c(m). A motion m has the evidence
+
+    z = sum_c D_c / sqrt(sum_c D_c^2),  D_c = V_c(m) - V_c(rival)
+
+against a rival, where errors of cells are independent. Rivals are no motion, the opposite motion,
+motions as fast in other directions, and motions beside the estimate. The parabola through V at the
+latter and at m has its maximum beside m by an offset, which an estimate must explain by its sigma.
+
+One object that moves before a camera at rest is explained by a motion of the camera as well. It
+covers a part of the image. So a motion of the camera is told only where many of `N_BLOCKS`^2 blocks
+of the image support it: with D_b against rest their effective number is (sum D_b)^2 / sum D_b^2.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.codegen import njit_noalloc
+from jaxevent.egomotion.models import Model
+
+IMAGE_PIXEL_PX = 2.0  # of the images of moved events
+CELL_PX = 24  # of the parts of the image whose errors are independent
+N_BLOCKS = 4  # along each side of the image
+MARGIN_PIXELS = 8  # of an image around the sensor
+MAX_WINDOW_EVENTS = 6000  # of more, so many evenly
+MIN_WINDOW_EVENTS = 40
+RIVAL_RATIO = 0.2  # of the motion, least distance of the rivals beside it
+RIVAL_SIGMAS = 3.0  # of the estimate, least distance likewise
+MIN_REST_Z = 2.5  # against no motion
+MIN_RIVAL_Z = -0.5  # against the best rival
+MAX_OFFSET_RATIO = 0.15  # of the motion
+MIN_BLOCKS = 4.0  # effective number that support a motion of the camera
+# A motion that was told remains so until the evidence is clearly against it.
+LOST_REST_Z = 1.5
+LOST_RIVAL_Z = -3.0
+LOST_BLOCKS = 3.0
+N_SUPPORTING_WINDOWS = 2  # in a row, from which on a motion is told
+BLOCKS_WEIGHT = 0.2  # of a window in the mean number of blocks
+MAX_DRIFT_SIGMAS = 2.0  # of a motion since it was found
+MAX_DRIFT_WINDOWS = 2.0  # over which the drift is measured
+
+
+class Evidence(NamedTuple):
+    """Evidence for a motion in a window."""
+
+    rest: float  # z against no motion
+    rival: float  # least z against the other rivals
+    offset: NDArray[np.float64]  # (d,) of the window's best motion beside the estimate
+    offset_ratio: float  # its flow relative to the motion's
+    offset_sigmas: float  # its length in standard deviations of the estimate
+    blocks: float  # effective number of blocks of the image that support the motion
+    length: float  # s, of the window
+
+    @property
+    def is_supported(self) -> bool:
+        """Return whether the votes support the motion against rest and against its rivals."""
+        near = self.offset_ratio < MAX_OFFSET_RATIO or self.offset_sigmas < RIVAL_SIGMAS
+        return self.rest > MIN_REST_Z and self.rival > MIN_RIVAL_Z and near
+
+
+class EvidenceTest:
+    """Test of motions of a model whose flow is linear in its components.
+
+    Args:
+        model: Motion model of d components.
+        xi: (height, width, 2) positions of pixels, see `candidates.pixel_coordinates`.
+    """
+
+    def __init__(self, model: Model, xi: NDArray[np.floating]):
+        self.xi = xi - np.floor(xi.min((0, 1)))
+        self.basis = np.asarray(model.basis(xi), np.float64)
+        self._unit = 1 / np.sqrt((self.basis**2).sum(2).mean((0, 1)))  # of components, for 1 px/s
+        columns, rows = (self.xi.max((0, 1)) // IMAGE_PIXEL_PX).astype(int) + 2 * MARGIN_PIXELS + 2
+        self._images = np.zeros((2, rows, columns))
+        cell = int(CELL_PX / IMAGE_PIXEL_PX)
+        self._cells = -(-rows // cell), -(-columns // cell)
+        row, column = np.indices(self._cells)
+        side = np.array([rows, columns]) / N_BLOCKS
+        self._block = (
+            N_BLOCKS * np.minimum(((row + 0.5) * cell / side[0]).astype(int), N_BLOCKS - 1)
+            + np.minimum(((column + 0.5) * cell / side[1]).astype(int), N_BLOCKS - 1)
+        ).ravel()
+
+    def measure(
+        self,
+        events: Any,
+        time: int,
+        motion: NDArray[np.floating],
+        covariance: NDArray[np.floating],
+        displacement: float,
+        longest: float,
+    ) -> Evidence | None:
+        """Measure the evidence in the events before a time.
+
+        Args:
+            events: Events of a recording, of which slices are read.
+            time: End of the window, us.
+            motion: (d,) estimate.
+            covariance: (d, d) covariance of the estimate.
+            displacement: Displacement of the image in the window, px.
+            longest: Largest length of the window, s.
+
+        Returns:
+            The evidence, or None if the window holds too few events.
+        """
+        m = np.asarray(motion, np.float64) / self._unit
+        size = float(np.linalg.norm(m))
+        flow = self.basis[::8, ::8].reshape(-1, 2, len(m)) @ (m * self._unit)
+        length = min(displacement / max(float(np.sqrt((flow**2).sum(1).mean())), 1e-9), longest)
+        part = events[events.index(round(time - 1e6 * length)) : events.index(time)]
+        if len(part) < MIN_WINDOW_EVENTS or not size:
+            return None
+        tau = (part.t - time) * 1e-6 + length / 2
+        kept = np.flatnonzero(np.abs(tau) > length / 6)
+        kept = kept[:: -(-len(kept) // MAX_WINDOW_EVENTS) or 1]
+        x, y = part.x[kept].astype(int), part.y[kept].astype(int)
+        sign = np.where(part.p[kept], 1.0, -1.0)
+        scaled = np.asarray(covariance, np.float64) / np.outer(self._unit, self._unit)
+        variance, axes = np.linalg.eigh(scaled)
+        reach = np.maximum(RIVAL_SIGMAS * np.sqrt(np.maximum(variance, 0)), RIVAL_RATIO * size)
+        beside = np.concatenate([m + (reach * axes).T, m - (reach * axes).T])
+        across = size * np.linalg.svd(m[None])[2][1:]
+        hypotheses = np.concatenate([m[None], 0 * m[None], beside, -m[None], across, -across])
+        votes = np.zeros((len(hypotheses), self._cells[0] * self._cells[1]))
+        _accumulate_votes(
+            self.xi[y, x], tau[kept], sign, self.basis[y, x], hypotheses * self._unit,
+            self._images, self._cells[1], votes,
+        )  # fmt: skip
+        D = votes[0] - votes[1:]
+        z = D.sum(1) / np.sqrt(np.maximum((D**2).sum(1), 1e-12))
+        total, d = votes.sum(1), len(m)
+        bend = 2 * total[0] - total[2 : 2 + d] - total[2 + d : 2 + 2 * d]
+        slope = total[2 : 2 + d] - total[2 + d : 2 + 2 * d]
+        steps = np.where(bend > 0, slope / np.maximum(2 * bend, 1e-12), np.sign(slope)).clip(-3, 3)
+        offset = axes @ (steps * reach)
+        # Where sigma is larger than the grid of rivals, so is their distance.
+        sigmas = np.sqrt(((steps * reach) ** 2 / np.maximum(variance, 1e-12)).sum() / d)
+        of_block = np.bincount(self._block, D[0], N_BLOCKS**2)
+        blocks = max(of_block.sum(), 0.0) ** 2 / max(float((of_block**2).sum()), 1e-12)
+        ratio = float(np.linalg.norm(offset)) / size
+        return Evidence(
+            float(z[0]), float(z[1:].min()), offset * self._unit, ratio, float(sigmas), blocks,
+            length,
+        )  # fmt: skip
+
+
+class Lock:
+    """Decision, window by window, from when on the motion of a filter is told.
+
+    Args:
+        test: The test of a window.
+        displacement: Displacement of the image in a window, px.
+        longest: Largest length of a window, and pause after which all begins anew, s.
+        diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
+        camera_moves: Whether the camera is known to move, so that a part of the image suffices.
+    """
+
+    def __init__(
+        self,
+        test: EvidenceTest,
+        displacement: float,
+        longest: float,
+        diffusion: Callable[[NDArray], Any],
+        camera_moves: bool = False,
+    ):
+        self._test, self._displacement, self._longest = test, displacement, longest
+        self.diffusion, self._camera_moves = diffusion, camera_moves
+        self._end: int | None = None
+        self._restart()
+
+    def _restart(self) -> None:
+        self._is_settled, self._supporting = False, 0
+        self._blocks = np.nan  # mean effective number
+        self._history: list[tuple[int, NDArray]] = []  # times and motions since it was found
+
+    def update(
+        self,
+        events: Any,
+        t: NDArray[np.int64],
+        mean: NDArray[np.floating],
+        covariance: NDArray[np.floating],
+        searching: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Decide which estimates of some batches are told.
+
+        Args:
+            events: Events of the recording up to the last time or further.
+            t: (n,) times, us.
+            mean: (n, d) motions.
+            covariance: (n, d, d) covariances.
+            searching: (n,) whether the filter searches.
+
+        Returns:
+            (n,) booleans.
+        """
+        told = np.zeros(len(t), bool)
+        if not len(t):
+            return told
+        if self._end is not None and t[0] - self._end > 1e6 * self._longest:
+            self._restart()
+        self._end = int(t[-1])
+        if searching.any():
+            told[: searching.argmax()] = self._is_settled
+            self._restart()
+        if searching[-1]:
+            return told
+        self._weigh(events, int(t[-1]), mean[-1], covariance[-1])
+        first = len(t) - int(searching[::-1].argmax()) if searching.any() else 0
+        told[first:] = self._is_settled
+        return told
+
+    def _weigh(self, events: Any, t: int, mean: NDArray, covariance: NDArray) -> None:
+        """Update the decision by the window before a time."""
+        found = self._test.measure(events, t, mean, covariance, self._displacement, self._longest)
+        if found is None:
+            return
+        old = self._blocks if np.isfinite(self._blocks) else found.blocks
+        self._blocks = old + BLOCKS_WEIGHT * (found.blocks - old)
+        if self._is_settled:
+            is_compact = self._blocks < LOST_BLOCKS and not self._camera_moves
+            against = found.rest < LOST_REST_Z or found.rival < LOST_RIVAL_Z or is_compact
+            self._is_settled = not against
+            self._supporting = 0
+            return
+        self._history.append((t, mean))
+        is_large = self._blocks > MIN_BLOCKS or self._camera_moves
+        is_told = found.is_supported and is_large and self._is_steady(covariance, found.length)
+        self._supporting = self._supporting + 1 if is_told else 0
+        if self._supporting >= N_SUPPORTING_WINDOWS:
+            self._is_settled, self._history = True, []
+
+    def _is_steady(self, covariance: NDArray, length: float) -> bool:
+        """Return whether the motion has not changed by more than its covariance and noise.
+
+        A cloud that has just collapsed is too narrow, and drifts until it is at the motion.
+        """
+        t, mean = self._history[-1]
+        if t - self._history[0][0] < 1e6 * length:
+            return False
+        since = max((self._history[0][0] + t) / 2, t - 1e6 * MAX_DRIFT_WINDOWS * length)
+        before, m = next(one for one in self._history if one[0] >= since)
+        far = np.asarray(mean - m, np.float64)
+        noise = np.asarray(self.diffusion(mean), np.float64) ** 2 * 1e-6 * (t - before)
+        C = 2 * np.asarray(covariance, np.float64) + np.diag(noise + 1e-12)
+        return float(far @ np.linalg.solve(C, far)) < MAX_DRIFT_SIGMAS**2 * len(far)
+
+
+def tell_from_later(
+    t: NDArray[np.int64],
+    mean: NDArray[np.floating],
+    covariance: NDArray[np.floating],
+    searching: NDArray[np.bool_],
+    told: NDArray[np.bool_],
+    diffusion: Callable[[NDArray], Any],
+) -> tuple[NDArray[np.bool_], NDArray[np.floating]]:
+    """Tell the estimates before a motion settled, too, as far as they agree with it.
+
+    A cloud that has just collapsed is too narrow, so how far they differ from it is added.
+
+    Args:
+        t: (n,) times, us.
+        mean: (n, d) motions.
+        covariance: (n, d, d) covariances.
+        searching: (n,) whether the filter searches.
+        told: (n,) whether the motion is told.
+        diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
+
+    Returns:
+        (n,) booleans, and the covariances (n, d, d).
+    """
+    told, covariance = told.copy(), covariance.copy()
+    eye = np.eye(mean.shape[1])
+    for first in np.flatnonzero(told & ~np.r_[False, told[:-1]]):
+        rate = eye * np.asarray(diffusion(mean[first]), np.float64) ** 2
+        for k in range(first - 1, -1, -1):
+            far = np.asarray(mean[k] - mean[first], np.float64)
+            C = covariance[k] + covariance[first] + rate * (t[first] - t[k]) * 1e-6 + 1e-12 * eye
+            if searching[k] or told[k]:
+                break
+            if float(far @ np.linalg.solve(C, far)) > MAX_DRIFT_SIGMAS**2 * len(far):
+                break
+            told[k] = True
+            covariance[k] += np.outer(far, far)
+    return told, covariance
+
+
+@njit_noalloc
+def _accumulate_votes(at, tau, sign, basis, hypotheses, images, columns, votes):
+    """Add for each hypothesis (H, d) the products of both images to its cells (H, cells)."""
+    cell = int(CELL_PX / IMAGE_PIXEL_PX)
+    for h in range(len(hypotheses)):
+        images[:] = 0
+        for e in range(len(tau)):
+            u, v = 0.0, 0.0
+            for k in range(hypotheses.shape[1]):
+                u += basis[e, 0, k] * hypotheses[h, k]
+                v += basis[e, 1, k] * hypotheses[h, k]
+            x = (at[e, 0] - u * tau[e]) / IMAGE_PIXEL_PX + MARGIN_PIXELS
+            y = (at[e, 1] - v * tau[e]) / IMAGE_PIXEL_PX + MARGIN_PIXELS
+            i, j = int(np.floor(x)), int(np.floor(y))
+            if i < 0 or j < 0 or i >= images.shape[2] - 1 or j >= images.shape[1] - 1:
+                continue
+            x, y = x - i, y - j
+            image = images[1 if tau[e] > 0 else 0]
+            image[j, i] += sign[e] * (1 - x) * (1 - y)
+            image[j, i + 1] += sign[e] * x * (1 - y)
+            image[j + 1, i] += sign[e] * (1 - x) * y
+            image[j + 1, i + 1] += sign[e] * x * y
+        for j in range(images.shape[1]):
+            for i in range(images.shape[2]):
+                product = images[0, j, i] * images[1, j, i]
+                if product != 0:
+                    votes[h, j // cell * columns + i // cell] += product

@@ -1,0 +1,157 @@
+"""Motion of a live stream of events: from a camera, a socket, any iterator.
+
+    live = jaxevent.egomotion.voting.live((240, 180), model="rotation", camera=camera)
+    for events in camera:  # `jaxevent.Events`, one chunk after another
+        live.add(events)
+        mean, covariance, valid = live(live.stop)
+    live.finish()
+
+Estimates are those of `voting.estimate` with `causal=True` on all events added so far, however they
+are divided into chunks. Only the latest estimates are held, and the events that later ones need.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.errors import InputError
+from jaxevent.estimator import Estimate
+from jaxevent.events.tail import Tail
+from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
+from jaxevent.recording import Events, Recording, Times
+
+HELD_ESTIMATES = 4096  # the latest ones, which are read
+DROPPED_EVENTS = 1 << 15  # from so many on they are dropped
+
+
+class ChunkRunner(Protocol):
+    """The filter over the chunks of a recording, see `particle_filter.estimator`."""
+
+    params: Any
+    sampler: Any
+
+    def has_chunk(self) -> bool: ...
+    def run(self) -> Any: ...
+    def causal_motion(self, parts: list[Any]) -> MotionEstimate: ...
+
+
+class LiveMotion:
+    """The motion of all events added so far: `mean, covariance, valid = live(times)`.
+
+    One thread may add what another reads.
+
+    Args:
+        recording: A recording without events, whose events are a `Tail`.
+        model: Motion model.
+        make_runner: Function that makes the runner of the filter, once the first event is there.
+    """
+
+    def __init__(
+        self, recording: Recording, model: type[Model], make_runner: Callable[[], ChunkRunner]
+    ):
+        self._turns = TurnLock("live motion")
+        assert isinstance(recording.events, Tail)
+        self._recording, self._tail = recording, recording.events
+        self._make_runner = make_runner
+        self._runner: ChunkRunner | None = None
+        self._motion = dataclasses.replace(MotionEstimate.empty(model), causal=True)
+        self._is_finished = False
+
+    def __repr__(self) -> str:
+        r = self._recording
+        return (
+            f"LiveMotion({self._motion.model.name}, {r.width}x{r.height}, "
+            f"{len(self._tail):,} events)"
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        refuse_to_pickle("live motion", "keep the estimates, live.motion")
+
+    @property
+    @synchronized
+    def stop(self) -> int:
+        """Time (us) of the last event."""
+        if not len(self._tail):
+            raise InputError("nothing has been added yet; add events first")
+        return self._tail.last
+
+    @property
+    @synchronized
+    def motion(self) -> MotionEstimate:
+        """The latest estimates."""
+        return self._motion
+
+    @synchronized
+    def add(self, events: Events) -> MotionEstimate:
+        """Add events that are not earlier than those before.
+
+        Args:
+            events: The events.
+
+        Returns:
+            The estimates that are new.
+
+        Raises:
+            InputError: The events are not valid, or the stream was finished.
+        """
+        if self._is_finished:
+            raise InputError("the live motion is finished; begin another one")
+        self._tail.add(events)
+        return self._run(until_end=False)
+
+    @synchronized
+    def finish(self) -> MotionEstimate:
+        """Estimate what the last events show, and return the estimates that are new."""
+        self._is_finished = True
+        return self._run(until_end=True)
+
+    @synchronized
+    def __call__(self, times: Times) -> Estimate:
+        """Return the motion at some times, as `MotionEstimate` does; later ones are predicted."""
+        return self._motion(times, extrapolate=True)
+
+    def _run(self, until_end: bool) -> MotionEstimate:
+        """Run the chunks that no event to come can change."""
+        if len(self._tail) and self._runner is None:
+            self._runner = self._make_runner()
+        runner, parts = self._runner, []
+        while runner is not None and (runner.has_chunk() or until_end):
+            if runner.sampler.is_exhausted:
+                break
+            parts.append(runner.run())
+        if runner is None or not parts:
+            return _rows(self._motion, slice(0, 0))
+        new = runner.causal_motion(parts)
+        last = _rows(self._motion, slice(-1, None))
+        joined = _join(last, new)._with_gaps(float(runner.params.tau_max))
+        new = _rows(joined, slice(len(last), None))
+        self._motion = _rows(_join(self._motion, new), slice(-HELD_ESTIMATES, None))
+        needed = self._tail.index(int(new.t[-1] - 1e6 * float(runner.params.tau_max)) - 1)
+        needed = min(needed, runner.sampler.next_row)
+        if needed - self._tail.dropped > DROPPED_EVENTS:
+            self._tail.drop(needed)
+        return new
+
+
+def _rows(motion: MotionEstimate, rows: slice) -> MotionEstimate:
+    """Return some estimates."""
+    arrays = {
+        f.name: v[rows]
+        for f in dataclasses.fields(motion)
+        if isinstance(v := getattr(motion, f.name), np.ndarray)
+    }
+    return dataclasses.replace(motion, **arrays)
+
+
+def _join(one: MotionEstimate, two: MotionEstimate) -> MotionEstimate:
+    """Return the estimates of both."""
+    arrays = {
+        f.name: np.concatenate([getattr(one, f.name), v])
+        for f in dataclasses.fields(two)
+        if isinstance(v := getattr(two, f.name), np.ndarray)
+    }
+    return dataclasses.replace(two, **arrays)

@@ -1,0 +1,108 @@
+"""Estimates that things which move before a camera at rest explain as well.
+
+A gyro measures a rotation directly: where its rates contradict an estimate, the events are those of
+moving things, or of another motion. Without a gyro, edges of frames make events where the camera
+moves (`patches`). Without either, one object covers a part of the image only, in which all events
+are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.egomotion.evidence import MIN_BLOCKS, N_BLOCKS
+from jaxevent.egomotion.patches import (
+    FIT_WINDOW_DISPLACEMENT_PX,
+    ImageSpeed,
+    edge_event_fraction,
+    is_camera_static,
+    measure_image_speed,
+    spread_times,
+)
+from jaxevent.egomotion.truth import MAX_GYRO_BIAS_RAD_S
+from jaxevent.recording import Imu, Recording
+
+GYRO_SPAN_US = 30_000  # over which rates are averaged
+GYRO_RELATIVE_ERROR = 0.1  # of the estimate's size and the gyro's, beside noise and bias
+GYRO_SIGMAS = 3.0
+N_TESTED_WINDOWS = 12  # of events, for the part of the image that moves
+
+
+class Turns(NamedTuple):
+    """Estimates of an angular velocity."""
+
+    t: NDArray[np.int64]  # (n,) us, at which they were observed
+    Omega: NDArray[np.floating]  # (n, 3) rad/s
+    covariance: NDArray[np.floating]  # (n, 3, 3)
+
+
+def find_undecided(
+    recording: Recording, told: NDArray[np.bool_], turns: Turns | None
+) -> tuple[NDArray[np.bool_], str]:
+    """Find the estimates that a camera at rest, before which things move, explains as well.
+
+    Args:
+        recording: The recording.
+        told: (n,) whether an estimate of its motion is told.
+        turns: The angular velocities of the estimates, or None.
+
+    Returns:
+        (n,) booleans, and a warning; "" if there are none.
+    """
+    none = np.zeros(len(told), bool)
+    if not told.any():
+        return none, ""
+    if recording.imu is not None and turns is not None:
+        undecided = told & _contradicts(recording.imu, turns)
+        if not undecided.any():
+            return none, ""
+        if undecided.sum() > told.sum() / 2:
+            undecided = told
+        return undecided, (
+            f"the gyro contradicts {100 * undecided.sum() / told.sum():.0f} % of the "
+            "estimates: things move, or the camera does otherwise; those rows are empty"
+        )
+    speed = measure_image_speed(recording)
+    if recording.frames and edge_event_fraction(recording, speed) is not None:
+        if is_camera_static(recording, speed):
+            return told, (
+                "the camera seems to stand still while objects move: edges in the frames make no "
+                "events; rows are empty, and jaxevent track follows objects"
+            )
+        return none, ""
+    blocks = N_BLOCKS**2 if speed is None else _active_blocks(recording, speed)
+    if blocks >= MIN_BLOCKS:
+        return none, ""
+    return told, (
+        f"the camera may stand still while objects move: only about {blocks:.1f} of "
+        f"{N_BLOCKS**2} parts of the image make events; rows are empty, and jaxevent track "
+        "follows objects"
+    )
+
+
+def _contradicts(imu: Imu, turns: Turns) -> NDArray[np.bool_]:
+    """Return where an angular velocity is of another size than the gyro's rates, in any axes."""
+    rates = np.asarray(imu.gyro, np.float64)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(rates, 0)])
+    first = np.searchsorted(imu.t, turns.t - GYRO_SPAN_US // 2)
+    last = np.searchsorted(imu.t, turns.t + GYRO_SPAN_US // 2)
+    count = np.maximum(last - first, 1)[:, None]
+    measured = np.linalg.norm((total[last] - total[first]) / count, axis=1)
+    size = np.linalg.norm(np.nan_to_num(turns.Omega), axis=1)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(turns.covariance)[:, -1], 0))
+    allowed = GYRO_SIGMAS * sigma + np.sqrt(3) * MAX_GYRO_BIAS_RAD_S
+    allowed = allowed + GYRO_RELATIVE_ERROR * np.maximum(size, measured)
+    return (last > first) & (np.abs(size - measured) > allowed)
+
+
+def _active_blocks(recording: Recording, speed: ImageSpeed) -> float:
+    """Return the median effective number of blocks that hold the events of short windows."""
+    half, numbers = round(5e5 * FIT_WINDOW_DISPLACEMENT_PX / speed.median), []
+    for middle in spread_times(recording, N_TESTED_WINDOWS):
+        index = recording.events.index
+        part = recording.events[index(middle - half) : index(middle + half)]
+        block = part.y.astype(int) * N_BLOCKS // recording.height * N_BLOCKS
+        count = np.bincount(block + part.x.astype(int) * N_BLOCKS // recording.width).astype(float)
+        numbers.append(count.sum() ** 2 / max(float((count**2).sum()), 1.0))
+    return float(np.median(numbers))

@@ -1,0 +1,161 @@
+"""Video from events alone: by the contract, against its own JAX path, differences and truth."""
+
+import functools
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import fails
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+import jaxevent
+from jaxevent.reconstruction.events_only.gradient import sample_variance, solve_equations
+from jaxevent.recording import Recording
+
+events_only = jaxevent.events_only
+SIZE = (24, 32)  # height, width
+VELOCITY = np.array([60.0, 25.0])  # px/s, x before y
+C_ON, C_OFF = 0.2, 0.3
+SPAN_US = 300_000
+NAMES = ("c_on", "c_off", "silence", "tail", "gradient", "edge", "leak")
+PLAIN = events_only.Params(learn=False)
+
+
+@functools.cache
+def log_scene() -> np.ndarray:
+    """A smooth log image, wider than what moves through the sensor."""
+    noise = np.random.default_rng(5).normal(size=(96, 128))
+    smooth = gaussian_filter(noise, 2, mode="wrap")
+    return 0.9 * smooth / smooth.std() - 0.8
+
+
+def log_image(t: float) -> np.ndarray:
+    """What the sensor sees at a time (s)."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    place = [y - t * VELOCITY[1], x - t * VELOCITY[0]]
+    return map_coordinates(log_scene(), place, order=1, mode="grid-wrap")
+
+
+@functools.cache
+def translated(shift_us: int = 0) -> Recording:
+    """Events of a scene that moves evenly."""
+    level, found = log_image(0.0), []
+    for k in range(1, SPAN_US // 500):
+        now = log_image(k * 5e-4)
+        for sign, c in ((1, C_ON), (-1, C_OFF)):
+            y, x = np.nonzero(sign * (now - level) >= c)
+            level[y, x] += sign * c
+            found.append((np.full(len(x), 500 * k), x, y, np.full(len(x), sign > 0)))
+    t, x, y, p = (np.concatenate(part) for part in zip(*found, strict=True))
+    size = {"width": SIZE[1], "height": SIZE[0]}
+    return Recording.from_arrays(t.astype(np.int64) + shift_us, x, y, p, **size)
+
+
+class EvenFlow:
+    """The true flow."""
+
+    def flow(self, times, extrapolate=False):
+        return np.broadcast_to(VELOCITY, (np.size(times), *SIZE, 2)).astype(np.float32)
+
+
+def correlation(image: np.ndarray, truth: np.ndarray) -> float:
+    inner = (slice(3, -3), slice(3, -3))
+    return float(np.corrcoef(image[inner].ravel(), truth[inner].ravel())[0, 1])
+
+
+def test_images_are_those_of_the_scene_up_to_scale():
+    params = PLAIN.replace(c_on=C_ON, c_off=C_OFF, window=1.0)
+    video = events_only.estimate(translated(), params, motion=EvenFlow())
+    for t in (0.1, 0.2):
+        L = np.log(video(t).mean[0] + float(params.I0))
+        assert correlation(L, log_image(t)) > 0.93
+    np.testing.assert_allclose(video.flow([0.1])[0, 5, 5], VELOCITY)
+    causal, earlier = (
+        events_only.estimate(events, params, motion=EvenFlow(), causal=True)
+        for events in (translated(), translated()[:0.2])
+    )
+    np.testing.assert_array_equal(causal(0.19).mean, earlier(0.19).mean)
+    assert (causal(0.19).mean != video(0.19).mean).any()
+
+
+def test_images_do_not_depend_on_order_time_or_copies():
+    times = np.array([80_000, 200_000, 140_000])
+    video = events_only.estimate(translated())
+    whole = video(times)
+    for row, t in enumerate(times):
+        np.testing.assert_array_equal(video(t).mean[0], whole.mean[row])
+    again = pickle.loads(pickle.dumps(video))(times)
+    np.testing.assert_array_equal(again.covariance, whole.covariance)
+    late = events_only.estimate(translated(7_000_000))(times + 7_000_000)
+    np.testing.assert_allclose(late.mean, whole.mean, rtol=1e-5)
+
+
+def test_jax_makes_the_images_of_the_host():
+    host = events_only.estimate(translated())(0.15)
+    with jax.enable_x64(False):
+        images = events_only.prepare_images(translated(), [0.15])
+        made = jax.jit(lambda params, images: images(params))(events_only.Params(), images)
+    np.testing.assert_allclose(made.mean.reshape(SIZE), host.mean[0], rtol=0.1)
+    assert 0.5 < np.median(made.covariance.reshape(SIZE) / host.covariance[0]) < 2
+
+
+def test_derivatives_are_differences():
+    """Of image and variance by all numbers at once, through the solution."""
+    weights = np.random.default_rng(0).normal(size=SIZE)
+    params = PLAIN.replace(leak=1e-2)
+    window = jax.tree.map(
+        lambda leaf: leaf[0], events_only.prepare(translated(), [0.15], params)[0]
+    )
+    random = np.random.default_rng(1)
+    direction = {name: float(random.normal()) for name in NAMES}
+
+    @jax.jit
+    def loss(step, window):
+        moved = params.replace(**{
+            name: getattr(params, name) * jnp.exp(step * direction[name])
+            for name in NAMES
+        })  # fmt: skip
+        u = solve_equations(window.equations, moved)
+        V = sample_variance(u, window.equations, moved)
+        return (weights * (u - u.mean() + 0.1 * jnp.log(V))).sum()
+
+    slope, step = jax.jit(jax.grad(loss))(0.0, window), 1e-3
+    difference = (loss(step, window) - loss(-step, window)) / (2 * step)
+    np.testing.assert_allclose(slope, difference, rtol=0.01)
+
+
+def test_the_likelihood_prefers_the_true_ratio_of_thresholds():
+    held = events_only.prepare_likelihood(translated(), [0.1, 0.2], PLAIN)
+    ratios = np.array([0.75, 1.0, 1.5, 2.25, 3.0])
+
+    def likelihood(ratio):
+        c = PLAIN.replace(c_on=0.2 / jnp.sqrt(ratio), c_off=0.2 * jnp.sqrt(ratio))
+        return events_only.log_likelihood(c, held)
+
+    assert ratios[np.argmax([likelihood(r) for r in ratios])] == C_OFF / C_ON
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (5, 1), (2, 3)])
+def test_any_size(size):
+    random, n = np.random.default_rng(1), 40
+    t, (y, x) = np.sort(random.integers(0, 50_000, n)), (random.integers(0, s, n) for s in size)
+    recording = Recording.from_arrays(
+        t, x, y, random.random(n) < 0.5, width=size[1], height=size[0]
+    )
+    found = events_only.estimate(recording)([recording.start, recording.stop])
+    assert all(np.isfinite(part).all() for part in found)
+
+
+def test_wrong_calls_end_in_a_sentence(tmp_path, capsys):
+    path = tmp_path / "events.h5"
+    jaxevent.save(translated(), path)
+    words = ["reconstruct", path, "--method", "events-only", "--out", tmp_path / "out.h5"]
+    fails(capsys, [*words, "--at", "frames"], "give --rate instead")
+    (tmp_path / "wrong.toml").write_text("window = -1.0")
+    fails(capsys, [*words, "--params", tmp_path / "wrong.toml"], "window is -1.0; it must not be")
+    with pytest.raises(jaxevent.InputError, match="no times to prepare images for"):
+        events_only.prepare(translated(), [])
+    with pytest.raises(jaxevent.InputError, match="has no option 'refine'"):
+        events_only.estimate(translated(), refine=True)
