@@ -27,8 +27,9 @@ from jaxevent.show.tables import markdown_table
 
 RECORDING_FILE = resources.files("jaxevent") / "data/slider_depth_crop.h5"
 RESULT_FILES = (
-    "comparison.png", "events_only.png", "events_only.mp4", "video.mp4", "results.md", "results.json",
-)  # fmt: skip
+    *("comparison.png", "events_only.png", "events_only.mp4", "video.mp4"),
+    *("results.md", "results.json"),
+)
 
 
 def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:

@@ -18,9 +18,11 @@ and would lag behind. The shares are means over simulated scenes (`experiments/s
 A path whose velocity has the covariance C is uncertain by C (t_b - t_a)^2, so that the image there
 is another. With the mean square `ROUGHNESS` of a gradient of log images, the row has the variance
 
-    1 + ROUGHNESS trace C (t_b - t_a)^2                                                      (1b)
+    1 + SHARED_ROWS ROUGHNESS trace C (t_b - t_a)^2                                          (1b)
 
-against that of a row with a known path. Where no event shows the motion, silence says nothing.
+against that of a row with a known path, as so many rows share the error of one path. Where no event
+shows the motion, silence says nothing. Weights are reciprocal variances times the share of the
+events around that motion explains (`silence`).
 The model of events is that of Zhang, Yezzi and Gallego (TPAMI 2022); silence is new.
 """
 
@@ -31,11 +33,13 @@ from jaxtyping import Float, Int32, UInt32
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.reconstruction.events_only.silence import explained_share
 from jaxevent.recording import Events
 
 EVENT, FIRST, LAST, SILENT = range(4)  # kinds of rows
 NONE, MUTED = -1, -2  # in place of the number of a pixel's last event
 FIRST_SHARE, LAST_SHARE = np.float32(0.55), np.float32(0.3)  # thresholds
+SHARED_ROWS = 10
 ROUGHNESS = 0.15  # mean square of an image's gradient along one axis, (c / px)^2
 
 
@@ -105,8 +109,12 @@ def make_rows(
     doubt = np.zeros(height * width, np.float32)  # (c / s)^2
     if paths.covariance is not None:
         doubt[:] = (
-            ROUGHNESS * np.einsum("khwii->hw", paths.covariance).ravel() / len(paths.covariance)
+            SHARED_ROWS
+            * ROUGHNESS
+            * np.einsum("khwii->hw", paths.covariance).ravel()
+            / len(paths.covariance)
         )
+    share = explained_share(pixel, events.p, at_event.astype(np.float32), shape)
     n = len(pixel) + height * width
     rows = Rows(
         shape,
@@ -124,7 +132,9 @@ def make_rows(
     ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
     times = (1e-6 * (events.t - span[0]), 1e-6 * (span[1] - span[0]), doubt)
     n = _lay_rows(pixel, change.astype(np.float32), ends, times, last, rows)
-    return Rows(shape, threshold, *(column[:n] for column in rows[2:]))
+    rows = Rows(shape, threshold, *(column[:n] for column in rows[2:]))
+    rows.weight[:] *= share[rows.pixel]
+    return rows
 
 
 @njit_noalloc

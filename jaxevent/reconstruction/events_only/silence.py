@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc
 
-NEIGHBOURHOOD_PX = 8.0  # standard deviation of the Gaussian weights in (6)
+NEIGHBOURHOOD_PX = 4.0  # standard deviation of the Gaussian weights in (6)
 N_SIGMAS = 2.0
 
 
