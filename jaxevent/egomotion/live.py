@@ -34,9 +34,17 @@ class ChunkRunner(Protocol):
     params: Any
     sampler: Any
 
-    def has_chunk(self) -> bool: ...
-    def run(self) -> Any: ...
-    def causal_motion(self, parts: list[Any]) -> MotionEstimate: ...
+    def has_chunk(self) -> bool:
+        """Return whether the next chunk is complete."""
+        ...
+
+    def run(self) -> Any:
+        """Run the next chunk."""
+        ...
+
+    def causal_motion(self, parts: list[Any]) -> MotionEstimate:
+        """Join chunks to an estimate."""
+        ...
 
 
 class LiveMotion:

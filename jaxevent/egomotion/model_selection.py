@@ -150,7 +150,8 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     every = {name: np.concatenate(parts) for name, parts in sharpness.items()}
     if lens is not None:
         gain = z_score(lens.sharpness - every["rotation"])
-        if gain > MIN_LENS_Z and z_score(lens.sharpness - every["planar"]) > 0:
+        others = (every["planar"], every["general"])
+        if gain > MIN_LENS_Z and all(z_score(lens.sharpness - one) > 0 for one in others):
             every["rotation"] = lens.sharpness
             camera = dataclasses.replace(camera, distortion=(lens.k1, 0.0, 0.0, 0.0, 0.0))
             lines = (

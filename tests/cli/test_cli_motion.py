@@ -374,9 +374,9 @@ def test_errors_of_centred_estimates():
     truth = KnownMotion(Planar, t, np.c_[1e-3 * t, 300 - 1e-3 * t])
     late = dataclasses.replace(motion_of(truth), t=t + 20_000, lag=np.full(len(t), 0.02))
     times = np.arange(40_000, 280_000, 1000)
-    told = score_motion(late, truth, times, centred=True)
+    told = score_motion(late, truth, times)
     assert told.figures["AEE"] < 1e-9 and told.count == len(times) and told.startup == 0
-    told = score_motion(late, truth, times, start=30_000)
+    told = score_motion(late, truth, times, start=30_000, centred=False)
     assert told.figures["AEE"] == pytest.approx(20 * np.sqrt(2)) and told.startup == 0.01
 
 

@@ -95,7 +95,7 @@ def test_noise_has_no_speed():
     assert "nothing was seen to move in windows of 1.6 ms to 0.3 s" in suited.message
     assert suited.params.values() == voting.Params().values()
     hasty = dataclasses.replace(noise, events=Events(t // 300, x, y, x % 2 == 0))
-    said = "in windows of 1.6 ms to 3 ms", "in so few events", "in so short a recording"
+    said = "in windows of 1.6 ms to 2.9 ms", "in so few events", "in so short a recording"
     for recording, words in zip((noise[:0.003], noise[:0.001], hasty), said, strict=True):
         with pytest.raises(InputError, match=f"nothing is seen to move {words};"):
             select_model(recording)

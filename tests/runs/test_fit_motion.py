@@ -70,7 +70,8 @@ def test_a_fit_of_process_noise_improves_what_it_has_not_seen(tmp_path, capsys):
     assert "error %" in said and "b.h5" in said
     rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
     before, after = (row for row in rows if row["recording"] == "b.h5")
-    assert after["error"] < 0.8 * before["error"]
+    # So noisy a filter is hardly ever told, as its votes do not support it.
+    assert after["lost"] < 0.8 * before["lost"] and after["error"] < 5
     params = voting.Params.load(tmp_path / "out" / "params.toml", "voting")
     assert float(params.noise) < 2.5 and params.particles == START["particles"]
 
@@ -142,7 +143,7 @@ def test_bad_settings(tmp_path, capsys):
 def test_loss_of_a_perfect_filter_is_small():
     params = voting.Params.of({**START, "particles": 100, "noise": 0.1})
     goal = FAMILY.goal(voting, params, {"truth": "*.csv"})
-    assert goal.loss == MotionLoss(False) and "tau_max" in params.without_gradient()
+    assert goal.loss == MotionLoss(True) and "tau_max" in params.without_gradient()
     with pytest.raises(InputError, match="true motion"):
         FAMILY.goal(voting, params, {})
 

@@ -620,10 +620,6 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     if change is not None and len(valid) == 1:
         k = int(valid[0])
         rate = np.outer(change[k], change[k]) / max(1e6 * spans[k], 1) ** 2
-    if change is not None:
-        # Halves tell how far the motion of a window may be from that at its middle.
-        half = change[:, :, None] * change[:, None, :] / 4
-        estimate = dataclasses.replace(estimate, covariance=estimate.covariance + half)
     calibration = COVARIANCE_CALIBRATION.with_lens(inputs.camera)
     estimate = estimate.with_calibrated_covariance(calibration, spans, change)
     before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))
