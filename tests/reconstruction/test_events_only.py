@@ -104,7 +104,7 @@ def test_jax_makes_the_images_of_the_host():
 def test_derivatives_are_differences():
     """Of image and variance by all numbers at once, through the solution."""
     weights = np.random.default_rng(0).normal(size=SIZE)
-    params = PLAIN.replace(leak=1e-2)
+    params = PLAIN.replace(leak=1e-2, edge=1.0, gradient=3.0, tail=5.0)
     features, _ = events_only.prepare(translated(), [0.15], params)
     # To the minimum itself, nearer than the host goes.
     window = jax.tree.map(lambda leaf: leaf[0], features.equations)._replace(slope=0.0)
