@@ -76,7 +76,7 @@ def central(n):
 
 def energy(u, rows, params, prior=None):
     """E (3) in double precision."""
-    weight = np.where(rows.kind == EVENT, 1, params.silence)
+    weight = np.where(rows.kind == EVENT, 1, params.silence) * rows.weight
     e = dense_rows(rows) @ u.ravel() - rows.change
     total = (weight * params.tail**2 * np.log1p(e**2 / (2 * params.tail**2))).sum()
     across, down = np.diff(u, axis=1) ** 2, np.diff(u, axis=0) ** 2
@@ -149,7 +149,8 @@ def test_quadratic_problem_equals_the_dense_one(window):
     params = SolverParams(tail=1e3, gradient=40.0, edge=20.0, leak=1e-2)
     prior = make_prior(window.shape)
     height, width = window.shape
-    D, d = dense_rows(window), window.change.astype(float)
+    root = np.sqrt(window.weight.astype(float))
+    D, d = root[:, None] * dense_rows(window), root * window.change
     s = params.gradient / (2 * params.edge**2)
     A = D.T @ D + params.leak * np.eye(height * width)
     for axis, n in ((0, height), (1, width)):

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior
 from jaxevent.reconstruction.events_only.rows import EVENT, Paths, Rows
+from jaxevent.reconstruction.events_only.silence import explained_share
 from jaxevent.recording import Events, Recording
 
 KEYS_PER_BLOCK = 16  # whose memories are kept at a time, for each direction
@@ -98,7 +99,7 @@ def _add_span(events, positions, errors, numbers, information, eta):
     """Add the rows of a span; events are in order of time, or in reverse order for the side -1."""
     pixel, change, last = events
     begin, middle, at_event = positions
-    variance, time, ends = errors
+    variance, share, time, ends = errors
     n_before, side, weight, silence = numbers
     width = eta.shape[1]
     for k in range(len(pixel)):
@@ -111,17 +112,17 @@ def _add_span(events, positions, errors, numbers, information, eta):
         if previous < 0:
             # In reverse order nothing happens between the event and the span's end.
             half = 0.5 * change[k] if side > 0 else np.float32(0)
-            w = silence / (1 + variance[x] * (ends[0] - time[k]) ** 2)
+            w = share[x] * silence / (1 + variance[x] * (ends[0] - time[k]) ** 2)
             _add_row((begin[x, 0], begin[x, 1]), here, half, w, information, eta)
         else:
             step = change[k] if side > 0 else change[previous]
             there = at_event[previous, 0], at_event[previous, 1]
-            w = weight / (1 + variance[x] * (time[previous] - time[k]) ** 2)
+            w = share[x] * weight / (1 + variance[x] * (time[previous] - time[k]) ** 2)
             _add_row(there, here, step, w, information, eta)
     for x in range(len(last)):
         if last[x] < n_before:
             here = np.float32(x % width), np.float32(x // width)
-            w = silence / (1 + variance[x] * ends[1] ** 2)
+            w = share[x] * silence / (1 + variance[x] * ends[1] ** 2)
             _add_row((middle[x, 0], middle[x, 1]), here, np.float32(0), w, information, eta)
 
 
@@ -452,13 +453,14 @@ class KeyMemories:
         variance = np.zeros(height * width, np.float32)
         if paths.covariance is not None:
             variance = np.trace(paths.covariance.mean(0), axis1=-2, axis2=-1).ravel()
+        share = explained_share(pixel, p, at_event, shape)
         information = np.zeros((*shape, 2, 2), np.float32)
         eta, gradient = np.zeros((2, *shape, 2), np.float32)
         seconds = 1e-6 * np.abs(t - times[2]), 1e-6 * np.abs(np.subtract(times[:2], times[2]))
         _add_span(
             (pixel, change, np.full(height * width, -1, np.int32)),
             (begin, middle, at_event),
-            (self.params.detail * variance, *seconds),
+            (self.params.detail * variance, share, *seconds),
             (len(before), side, 1 / self.threshold**2, self.silence / self.threshold**2),
             information,
             eta,

@@ -180,7 +180,7 @@ def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
         (height, width, 2, 2) F, a lower triangle.
     """
     factor = np.zeros((*xx.shape, 2, 2), np.float32)
-    factor[..., 0, 0] = np.sqrt(xx)
+    factor[..., 0, 0] = np.sqrt(np.maximum(xx, 0))
     factor[..., 1, 0] = xy / np.sqrt(np.maximum(xx, np.finfo(np.float32).tiny))
     factor[..., 1, 1] = np.sqrt(np.maximum(yy - factor[..., 1, 0] ** 2, 0))
     return factor
