@@ -353,6 +353,7 @@ def real_case(data, name):
     """Load a real recording: eight frames from 0.3 s on, or all before, and networks' images."""
     file, offset, golden = REAL[name]
     recording = jaxevent.load(data / file)
+    assert recording.frames is not None
     t = recording.frames.t + offset
     begin, end = recording.events[:1].t[0], recording.events[-1:].t[0]
     if "first" in name:

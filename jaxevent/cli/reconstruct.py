@@ -210,7 +210,9 @@ def run(
         from jaxevent.reconstruction.colour import colour_video
 
         colours = colour_video(video, recording)
-    how = write(video, chosen, out, tone or default_tone(estimator, recording), name, colours)
+    how = write(
+        video, chosen, out, tone or default_tone(estimator.has_covariance, recording), name, colours
+    )
     seconds = time.perf_counter() - clock
     print(
         f"{out}: {len(chosen):,} images{how}, {seconds:.2f} s, "

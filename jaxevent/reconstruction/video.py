@@ -53,6 +53,10 @@ class ImageMethod(Protocol):
     def fuses(self) -> bool:
         """True if images rest on events and frames together."""
 
+    @property
+    def has_covariance(self) -> bool:
+        """True if images have a variance."""
+
     def check(self, recording: Recording) -> None:
         """Raise `InputError` for a recording without what the method needs."""
 

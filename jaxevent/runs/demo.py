@@ -107,7 +107,7 @@ def _events_alone(recording: Recording, progress: bool | None) -> _EventsAlone:
     for name in ("high-pass", "events-only"):
         method = find(name)
         images, variance, _ = method.estimate(given, progress=progress)(frames.t)
-        tone = default_tone(method, given)
+        tone = default_tone(method.has_covariance, given)
         limits = display_limits(images, tone, variance)
         shown.append(tone_map(images, tone, limits, variance))
     return _EventsAlone(frames, *shown, np.sqrt(variance))

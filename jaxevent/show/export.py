@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import N_THREADS
 from jaxevent.errors import InputError
-from jaxevent.estimator import Estimator
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
@@ -219,11 +218,11 @@ class RangeCounter:
         return ""
 
 
-def default_tone(estimator: Estimator, recording: Recording) -> str:
+def default_tone(has_variance: bool, recording: Recording) -> str:
     """Return the tone that shows a method's images of a recording best.
 
     Args:
-        estimator: The method.
+        has_variance: Whether the method estimates a variance.
         recording: The recording.
 
     Returns:
@@ -231,7 +230,7 @@ def default_tone(estimator: Estimator, recording: Recording) -> str:
     """
     if recording.frames is not None:
         return "linear"
-    return "relative" if estimator.has_covariance else "changes"
+    return "relative" if has_variance else "changes"
 
 
 def display_images(

@@ -242,7 +242,7 @@ def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name:
     """Send a reconstruction at the frames' times, or at even times where there are no frames."""
     if recording.frames is None:
         times = evenly_spaced_times(recording, VIDEO_RATE_HZ)
-        tone = default_tone(video.estimator, recording)
+        tone = default_tone(video.estimator.has_covariance, recording)
         send.toned_images(f"image/{name}", display_images(video, times, tone))
         return
     t = recording.frames.t

@@ -47,7 +47,7 @@ def test_votes_equal_a_loop():
     recording = recorded(t, x, y, p)
     test, U = EvidenceTest(Planar(), pixel_coordinates(WIDTH, HEIGHT, None)[0]), [100.0, -50.0]
     found = test.measure(recording.events, 40_000, np.array(U), np.eye(2), 4.0, 0.1)
-    length = 4.0 / np.hypot(*U)
+    length = 4.0 / np.hypot(U[0], U[1])
 
     def votes(U):
         total = np.zeros((8, 8))

@@ -175,7 +175,7 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
     weight, e = _residuals(u, equations, params)
     total = (weight * numbers.tail**2 * jnp.log1p(e**2 / (2 * numbers.tail**2))).sum()
     total += numbers.gradient / 2 * jnp.log1p(_cells(u) / numbers.edge**2).sum()
-    return total + _quadratic(u, equations, numbers.leak)
+    return total + _quadratic(u, equations, jnp.asarray(numbers.leak))
 
 
 def _residuals(u: Array, equations: WindowEquations, params: Params) -> tuple[Array, Array]:

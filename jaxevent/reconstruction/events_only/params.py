@@ -1,5 +1,7 @@
 """Parameters of the reconstruction from events alone."""
 
+from typing import Any
+
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.events_only.prior import SolverParams
@@ -36,4 +38,5 @@ class Params(FrameParams):
 
     def solver(self) -> SolverParams:
         """Return the numbers of the model of one image; they may be traced."""
-        return SolverParams(self.silence, self.tail, self.gradient, self.edge, self.leak)
+        values: list[Any] = [self.silence, self.tail, self.gradient, self.edge, self.leak]
+        return SolverParams(*values)

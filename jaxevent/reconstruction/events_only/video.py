@@ -28,7 +28,15 @@ class IntensityScale(NamedTuple):
 
     @classmethod
     def of(cls, windows: Sequence[SolvedWindow], I0: float) -> "IntensityScale":
-        """Return the scales by frames, or those that are agreed where there are none."""
+        """Return the scales by frames, or those that are agreed where there are none.
+
+        Args:
+            windows: Solved windows of the images.
+            I0: Offset inside the logarithm.
+
+        Returns:
+            The scales.
+        """
         agreed = math.log(GREY + I0)
         pairs = [(1.0, agreed)] * len(windows)
         for k, (_, _, solution, scale) in enumerate(windows):

@@ -73,7 +73,7 @@ class WindowSolver:
         if params.learn:
             found = calibrate_events(recording)
             self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
-        c = np.float32([params.c_on, params.c_off])
+        c = np.array([params.c_on, params.c_off], np.float32)
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
         self.memory = KeyMemories(
