@@ -41,6 +41,7 @@ class MemoryParams(NamedTuple):
     blur: float = 0.3  # variance of a path when the memory enters an image, px^2
     detail: float = 0.5  # mean square of gradients, that errors of paths act by, (c / px)^2
     tail: float = 1.5  # difference, in standard deviations, beyond which memory counts less
+    independent: float = 0.3  # part of its information that an image takes; windows share errors
 
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
@@ -378,7 +379,8 @@ class KeyMemories:
             return GradientPrior(zeros, np.zeros((*zeros.shape, 2), np.float32))
         joint = known[0] if len(known) == 1 else fuse(*known, self.threshold)
         new = measure_gradient(rows, self.silence)
-        return discount(joint, new, self.threshold, self.params.tail)
+        joint = discount(joint, new, self.threshold, self.params.tail)
+        return joint._replace(information=np.float32(self.params.independent) * joint.information)
 
     def _carried(
         self, memory: GradientPrior | None, key: int, at: int, until: int, blur: float = 0.0
