@@ -418,7 +418,7 @@ def smooth(motion: MotionEstimate, params: Params | None = None) -> MotionEstima
         params: The filter's parameters; by default those of the model.
 
     Returns:
-        The smoothed estimate, with `lag` subtracted from its times.
+        The smoothed estimate, with `lag` subtracted from its times, none before the recording.
     """
     model = motion.model()
     params = Params(preset=model.preset) if params is None else params
@@ -441,10 +441,12 @@ def smooth(motion: MotionEstimate, params: Params | None = None) -> MotionEstima
         for part in model.parts:
             if part.direction:
                 m[k, part.rows] /= np.linalg.norm(m[k, part.rows])
-    lag = np.rint(1e6 * motion.lag).astype(np.int64)
+    seen = motion.t - np.rint(1e6 * motion.lag).astype(np.int64)
+    if motion.span is not None:
+        seen = np.maximum(seen, motion.span[0])
     return dataclasses.replace(
         motion,
-        t=np.maximum.accumulate(motion.t - lag),
+        t=np.maximum.accumulate(seen),
         mean=m.astype(motion.mean.dtype),
         covariance=P.astype(motion.mean.dtype),
         lag=np.zeros_like(motion.lag),
