@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
         metavar="NAME",
         help="mc, akf, aks, cf, cf-augmented, high-pass, events-only, edi, augmented, flow, blend, "
         "last-frame, or package.module:object of your own; default: mc, the best, or aks where mc "
-        "would take over ten minutes, or events-only where there are no frames",
+        "would take over ten minutes; where there are no frames events-only, or else high-pass",
     )
     when = one.add_mutually_exclusive_group()
     when.add_argument("--rate", metavar="HZ", type=float, help="images per second, evenly spaced")
@@ -88,16 +88,21 @@ def add(commands: Any) -> None:
 
 
 _MC_SECONDS_PER_PIXEL = 5e-6  # s of a core that `mc` takes for a pixel of an image: 0.2 for 240x180
-_MAX_MC_SECONDS = 600.0  # s
+_EVENTS_ONLY_SECONDS_PER_PIXEL = 15e-6  # s, of `events-only`
+_MAX_SECONDS = 600.0  # s
 
 
 def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
     """The method where none is named, for images of so many pixels in all; says why it is that."""
-    seconds = _MC_SECONDS_PER_PIXEL * pixels
-    if not has_frames:
+    each = _MC_SECONDS_PER_PIXEL if has_frames else _EVENTS_ONLY_SECONDS_PER_PIXEL
+    seconds = each * pixels
+    late = f"would take {seconds / 60:.0f} minutes of a core"
+    if not has_frames and seconds > _MAX_SECONDS:
+        method, why = "high-pass", f"there are no frames{missing}, and events-only {late}"
+    elif not has_frames:
         method, why = "events-only", f"there are no frames{missing}, so the scale is unknown"
-    elif seconds > _MAX_MC_SECONDS:
-        method, why = "aks", f"mc, the best, would take {seconds / 60:.0f} minutes of a core"
+    elif seconds > _MAX_SECONDS:
+        method, why = "aks", f"mc, the best, {late}"
     else:
         method, why = "mc", "the best where there are frames"
     print(f"method {method}: {why}; choose another with --method")

@@ -23,6 +23,7 @@ CELLS = (4, 2, 1)  # px, for motion sought from nothing
 LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
 LEVELS = range(-4, 5)  # powers of 2 of the window's size
 CHAIN_WINDOWS = 16  # half windows of a chain of anchors
+MAX_KNOTS = 16  # of paths, whose cost and memory they set
 N_CACHED_ANCHORS = 256
 UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
 MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
@@ -212,6 +213,8 @@ class EventFlow:
             inner = anchor.aligned.clock.t[1:-1]
             times.append(inner[(inner >= start) & (inner <= stop)])
         knots = np.unique(np.concatenate(times).astype(np.int64))
+        if len(knots) > MAX_KNOTS:
+            knots = knots[np.linspace(0, len(knots) - 1, MAX_KNOTS).round().astype(int)]
         return WindowPaths(int(at), knots, *self._fields(anchors, knots))
 
     def __call__(

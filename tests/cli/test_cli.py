@@ -522,11 +522,12 @@ def test_reconstruct_to_hdf5(folder, capsys):
 def test_the_usual_method(folder, capsys, monkeypatch):
     assert reconstruct._usual(True, 2800 * 240 * 180) == "aks"  # ten minutes of a core
     assert reconstruct._usual(True, 2700 * 240 * 180) == "mc"
+    assert reconstruct._usual(False, 950 * 240 * 180) == "high-pass"
     capsys.readouterr()
     bare = folder / "bare.h5"
     jaxevent.save(small(frames=None), bare)
     for patience, path, method in ((1e-9, "small.h5", "aks"), (1e9, bare, "events-only")):
-        monkeypatch.setattr("jaxevent.cli.reconstruct._MAX_MC_SECONDS", patience)
+        monkeypatch.setattr("jaxevent.cli.reconstruct._MAX_SECONDS", patience)
         for name, more in (("usual.h5", []), ("named.h5", ["--method", method])):
             argv = ["reconstruct", folder / path, "--rate", 100, "--out", folder / name, *more]
             assert cli.main([*map(str, argv), "--force"]) == 0
