@@ -135,7 +135,7 @@ def test_methods_that_need_no_calibration_get_none(path, tmp_path, capsys):
 
 
 def test_a_calibration_serves_any_method(path, found, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxevent.cli.reconstruct._MAX_MC_SECONDS", 0)  # aks is the usual method
+    monkeypatch.setattr("jaxevent.cli.reconstruct._MAX_SECONDS", 0)  # aks is the usual method
     mine, out = tmp_path / "mine.toml", tmp_path / "out.h5"
     run(capsys, "calibrate", path, "--out", mine)
     words = ("reconstruct", path, "--out", out, "--params", mine, "--rate", 20)

@@ -36,7 +36,7 @@ BLOCK_BITS = 1  # sides of blocks are powers of 2 to this
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
 # Chosen on simulated scenes (experiments/studies/events_only.md): how much larger errors are than
 # independent rows and the curvature at the solution say, and what is not known without any row.
-VARIANCE_FACTOR = 3.0
+VARIANCE_FACTOR = 1.5
 UNSEEN_VARIANCE = 25.0  # squared thresholds
 UNSEEN_INFORMATION = 0.13  # of rows about a pixel, in squared thresholds, from which it is seen
 BLUR_PX = 1.5  # of variance and information
