@@ -13,9 +13,9 @@ import os
 import time
 from pathlib import Path
 
-import numba
 import numpy as np
 from scipy.ndimage import gaussian_filter, median_filter, zoom
+from tile_images import tile_scores
 
 import jaxevent
 from jaxevent.egomotion.baselines.planes import normal_flow
@@ -61,27 +61,6 @@ def camera_flow(camera, t: float):
     return np.stack([lens.fx * u, lens.fy * v], -1)
 
 
-@numba.njit(cache=True)
-def tile_scores(x, y, s, p, us):
-    """Return the sum of squares of the image of moved events, for all displacements."""
-    n, half = 64, 32.0
-    scores = np.zeros((len(us), len(us)))
-    for a in range(len(us)):
-        for b in range(len(us)):
-            image = np.zeros((n, n))
-            for k in range(len(x)):
-                X, Y = x[k] - us[b] * s[k] + half, y[k] - us[a] * s[k] + half
-                i, j = int(np.floor(X)), int(np.floor(Y))
-                if 0 <= i < n - 1 and 0 <= j < n - 1:
-                    fx, fy = X - i, Y - j
-                    image[j, i] += p[k] * (1 - fx) * (1 - fy)
-                    image[j, i + 1] += p[k] * fx * (1 - fy)
-                    image[j + 1, i] += p[k] * (1 - fx) * fy
-                    image[j + 1, i + 1] += p[k] * fx * fy
-            scores[a, b] = (image**2).sum()
-    return scores
-
-
 def tile_flow(events, shape, at: int, fastest: float):
     """Maximise contrast per tile over constant velocities."""
     h, w = shape
@@ -100,7 +79,7 @@ def tile_flow(events, shape, at: int, fastest: float):
             )
             if m.sum() >= 30:
                 places = (events.x[m] - float(cx), events.y[m] - float(cy))
-                scores[i, j] = tile_scores(*places, s[m], p[m], us)
+                scores[i, j] = tile_scores(*places, s[m], p[m], us, us, np.zeros((64, 64)))
     scores -= scores.mean((2, 3), keepdims=True)
     scores = gaussian_filter(scores, (1, 1, 0.7, 0.7))
     a, b = np.unravel_index(scores.reshape(*scores.shape[:2], -1).argmax(-1), scores.shape[2:])

@@ -18,7 +18,7 @@ TV, LEAK, SILENCE = 0.2, 0.02, 0.5
 
 
 @numba.njit(cache=True)
-def _scores(x, y, t, p, vx, vy, image):
+def tile_scores(x, y, t, p, vx, vy, image):
     """Return the sum of squares of the image of events warped with each velocity, (vy, vx)."""
     scores, half = np.zeros((len(vy), len(vx))), len(image) / 2
     for a in range(len(vy)):
@@ -48,7 +48,7 @@ def tile_flow(x, y, t, p, shape, fastest=(240, 240)):
             near = (abs(x - column) < WIDTH_PX / 2) & (abs(y - row) < WIDTH_PX / 2)
             if near.sum() >= 30:
                 at = x[near] - float(column), y[near] - float(row), t[near], p[near]
-                scores[i, j] = _scores(*at, vx, vy, np.zeros((64, 64)))
+                scores[i, j] = tile_scores(*at, vx, vy, np.zeros((64, 64)))
     scores -= scores.mean((2, 3), keepdims=True)
     scores = nd.gaussian_filter(scores, (1, 1, 0.7, 0.7))
     a, b = np.unravel_index(scores.reshape(*scores.shape[:2], -1).argmax(-1), scores.shape[2:])

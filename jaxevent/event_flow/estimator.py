@@ -182,15 +182,18 @@ class EventFlow:
         if not anchors:
             covariance[:] = UNKNOWN_VARIANCE * np.eye(2)
             return velocity, covariance
-        fields = [self._align.fill(anchor.aligned.u) for anchor in anchors]
-        spreads = [self._align.fill(self._align.covariance(a.aligned)) for a in anchors]
-        times = [anchor.t for anchor in anchors]
-        for n, t in enumerate(knots.tolist()):
-            for k, anchor in enumerate(anchors):
-                weight = np.interp(t, times, np.eye(len(times))[k])
-                if weight > 0:
-                    velocity[n] += np.float32(weight * anchor.aligned.clock.rate(t)) * fields[k]
-                    covariance[n] += np.float32(weight * anchor.rate**2) * spreads[k]
+        times, stamps = [anchor.t for anchor in anchors], knots.tolist()
+        for anchor, one in zip(anchors, np.eye(len(anchors)), strict=True):
+            weights = np.interp(stamps, times, one)
+            used = np.flatnonzero(weights > 0)
+            if not len(used):
+                continue
+            field = self._align.fill(anchor.aligned.u)
+            spread = self._align.fill(self._align.covariance(anchor.aligned))
+            for n in used.tolist():
+                rate = anchor.aligned.clock.rate(stamps[n])
+                velocity[n] += np.float32(weights[n] * rate) * field
+                covariance[n] += np.float32(weights[n] * anchor.rate**2) * spread
         return velocity, covariance
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:

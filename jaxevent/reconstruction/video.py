@@ -42,6 +42,23 @@ N_DEVICE_BATCH_IMAGES = 32  # on a GPU, where each call costs as much as several
 
 
 @runtime_checkable
+class FlowSource(Protocol):
+    """A source of optical flow: a `RigidFlow` of egomotion, or a video with flow."""
+
+    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
+        """Return the optical flow at some times.
+
+        Args:
+            times: (T,) times, us or seconds as of images.
+            extrapolate: Whether times may lie outside the data.
+
+        Returns:
+            (T, H, W, 2) flow along x and y, px/s; not finite where it is not known.
+        """
+        ...
+
+
+@runtime_checkable
 class ImageMethod(Protocol):
     """Members of an estimator that a sequence of images needs; see `estimator.ImageEstimator`."""
 

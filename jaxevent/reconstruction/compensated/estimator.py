@@ -10,7 +10,7 @@ import collections
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -106,7 +106,7 @@ from jaxevent.reconstruction.compensated.warp import (
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages, time_span
-from jaxevent.reconstruction.video import ImageSequence
+from jaxevent.reconstruction.video import FlowSource, ImageSequence
 from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -215,23 +215,6 @@ class TrajectoryEstimate(NamedTuple):
         """Paths of all pixels, (h, w, 4), px."""
         paths = interpolate_paths(self.p, self.L.shape[1:])
         return paths if self.path_index is None else paths.reshape(-1, 4)[self.path_index]
-
-
-@runtime_checkable
-class FlowSource(Protocol):
-    """A source of optical flow: a `RigidFlow` of egomotion, or a video with flow."""
-
-    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
-        """Return the optical flow at some times.
-
-        Args:
-            times: (T,) times, us or seconds as of images.
-            extrapolate: Whether times may lie outside the data.
-
-        Returns:
-            (T, H, W, 2) flow along x and y, px/s; not finite where it is not known.
-        """
-        ...
 
 
 @dataclasses.dataclass(frozen=True)

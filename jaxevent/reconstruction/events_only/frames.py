@@ -98,11 +98,8 @@ class FrameMeasurements:
         gradient = np.stack(np.gradient(filled)[::-1], -1) / factor
         information = np.zeros((*F.shape, 2, 2), np.float32)
         information[...] = np.eye(2) * (known * 2 * (factor / noise) ** 2)[..., None, None]
-        numbers, seconds = MemoryParams(), 1e-6 * abs(t - at)
-        variances = (
-            numbers.forgetting * threshold**2 * seconds,
-            numbers.drift * seconds + numbers.blur,
-        )
+        numbers = MemoryParams()
+        variances = numbers.noise(1e-6 * abs(t - at), threshold, numbers.blur)
         paths = self.windows.paths(min(t, at), max(t, at), at)
         measured = GradientPrior(gradient.astype(np.float32), information)
         return carry(measured, paths, t, variances), FrameScale(factor, _sample(F, paths, t))

@@ -43,6 +43,19 @@ class MemoryParams(NamedTuple):
     tail: float = 1.5  # difference, in standard deviations, beyond which memory counts less
     independent: float = 0.3  # part of its information that an image takes; windows share errors
 
+    def noise(self, seconds: float, threshold: float, blur: float) -> tuple[float, float]:
+        """Return the variances that gradients, (ln I / px)^2, and paths, px^2, gain in a time.
+
+        Args:
+            seconds: The time, s.
+            threshold: Threshold c, ln I.
+            blur: Further variance of paths, px^2.
+
+        Returns:
+            Both variances.
+        """
+        return self.forgetting * threshold**2 * seconds, self.drift * seconds + blur
+
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
     """Return what the rows of a window say of the gradient at each pixel (4).
@@ -389,9 +402,9 @@ class KeyMemories:
             return None
         start = self.time(key)
         seconds = 1e-6 * abs(at - start)
-        gain = self.params.forgetting * self.threshold**2 * seconds
+        noise = self.params.noise(seconds, self.threshold, blur)
         paths = self.windows.paths(min(start, at), max(start, at), start, until=until)
-        return carry(memory, paths, at, (gain, self.params.drift * seconds + blur))
+        return carry(memory, paths, at, noise)
 
     def _at_key(self, key: int, side: int) -> GradientPrior | None:
         """Return the memory at a key of the windows before (side 1) or after it (side -1)."""

@@ -1,7 +1,7 @@
 """The windows of a recording's events: equations, and their solutions on the host."""
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +14,11 @@ from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import Rows, make_rows
 from jaxevent.reconstruction.events_only.solve import Solution, solve
-from jaxevent.recording import Events, Recording, Times
+from jaxevent.reconstruction.video import FlowSource
+from jaxevent.recording import Events, Recording
 
 ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
-
-
-@runtime_checkable
-class FlowSource(Protocol):
-    """A source of optical flow: a `RigidFlow` of egomotion, or a video with flow."""
-
-    def flow(self, times: Times, extrapolate: bool = False) -> NDArray[np.floating]:
-        """Return the optical flow at some times.
-
-        Args:
-            times: (T,) times, us or seconds as of images.
-            extrapolate: Whether times may lie outside the data.
-
-        Returns:
-            (T, H, W, 2) flow along x and y, px/s; not finite where it is not known.
-        """
-        ...
 
 
 class SolvedWindow(NamedTuple):
