@@ -476,8 +476,13 @@ class ChunkRunner:
             )  # fmt: skip
             motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
         motion = motion._with_gaps(float(self.params.tau_max))
-        found = filtering.smooth(motion, self.params) if smooth else motion
-        return calibrate(found, self.camera, 2 * motion.lag)
+        span = 2 * motion.lag
+        if smooth:
+            motion = filtering.smooth(motion, self.params)
+            if not self.model.half_line:
+                mean = filtering.undo_averages(motion, span, self.params)
+                motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
+        return calibrate(motion, self.camera, span)
 
     def has_chunk(self) -> bool:
         """Return whether the next chunk is complete, whatever events are still to come."""
