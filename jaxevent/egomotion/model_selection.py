@@ -52,7 +52,8 @@ MIN_DEPTH_SELECTION_Z = 4.0
 MAX_EXCLUSION_Z = 0.0
 N_LONG_WINDOWS = 2  # in which a translation is tested
 MIN_REPORTED_WEIGHT = 0.01  # of a model that was not chosen
-TRIED_K1 = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2)  # of a lens of which none is known
+TRIED_DIVISIONS = (-0.6, -0.45, -0.3, -0.2, -0.1, 0.1, 0.2)  # of a lens of which none is known
+MIN_DIVISOR = 0.2  # 1 + l |x|^2 / f^2 at the patches, below which a lens is not tried
 MIN_LENS_Z = 3.0  # from which a distortion explains more than none
 
 
@@ -150,13 +151,14 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     every = {name: np.concatenate(parts) for name, parts in sharpness.items()}
     if lens is not None:
         gain = z_score(lens.sharpness - every["rotation"])
-        others = (every["planar"], every["general"])
-        if gain > MIN_LENS_Z and all(z_score(lens.sharpness - one) > 0 for one in others):
+        ahead = z_score(every["general"] - lens.sharpness) < MIN_DEPTH_SELECTION_Z
+        if gain > MIN_LENS_Z and ahead and z_score(lens.sharpness - every["planar"]) > 0:
             every["rotation"] = lens.sharpness
-            camera = dataclasses.replace(camera, distortion=(lens.k1, 0.0, 0.0, 0.0, 0.0))
+            camera = dataclasses.replace(camera, distortion=lens.distortion(recording, camera))
             lines = (
-                f"a lens that distorts, k1 about {lens.k1:g}, explains a rotation better than one "
-                f"that does not (z = {gain:.1f}); it is used, and a calibration is better",
+                f"a lens that distorts, k1 about {camera.distortion[0]:.2g}, explains a rotation "
+                f"better than one that does not (z = {gain:.1f}); it is used, and a calibration is "
+                "better",
             )
     z = {
         pair: z_score(every[pair[0]] - every[pair[1]])
@@ -229,34 +231,46 @@ def _model_doubt(
 class _LensFit(NamedTuple):
     """Rotations before a lens that distorts."""
 
-    k1: float
+    division: float
     sharpness: NDArray[np.float64]  # of held-out pixels
+
+    def distortion(self, recording: Recording, camera: PinholeCamera) -> tuple[float, ...]:
+        """Return coefficients k1, k2, p1, p2, k3 that distort about alike on a sensor."""
+        size = np.array([recording.width, recording.height]) / 2
+        farthest = float(np.hypot(*(size / [camera.fx, camera.fy])))
+        r = np.linspace(0.05, 1, 40) * farthest
+        u = r / (1 + self.division * r**2)
+        powers = u[:, None] ** [3, 5, 7]
+        k1, k2, k3 = np.linalg.lstsq(powers, r - u, rcond=None)[0].tolist()
+        return k1, k2, 0.0, 0.0, k3
 
 
 def _fit_lens(
     windows: list[PatchSharpness], f: float, turns: list[NDArray[np.float64]]
-) -> _LensFit:
-    """Fit rotations and one k1 to patches' own half of the pixels.
+) -> _LensFit | None:
+    """Fit rotations and one distortion to patches' own half of the pixels.
 
-    A pixel x = u (1 + k1 |u|^2 / f^2) moves with J B(u) Omega, u being where it is without the
-    distortion, and J = dx / du.
+    A pixel x would be at u = x / (1 + l |x|^2 / f^2) without the distortion (Fitzgibbon,
+    "Simultaneous linear estimation of multiple view geometry and lens distortion", 2001). It moves
+    with (du / dx)^-1 B(u) Omega.
     """
     best = (-np.inf, 0.0, np.zeros(0))
-    for k1 in TRIED_K1:
+    for division in TRIED_DIVISIONS:
         trained, held = 0.0, []
         for window, turn in zip(windows, turns, strict=True):
-            u = window.xi
-            for _ in range(10):
-                u = window.xi / (1 + k1 * (u**2).sum(1, keepdims=True) / f**2)
-            r2 = (u**2).sum(1)[:, None, None] / f**2
-            J = (1 + k1 * r2) * np.eye(2) + 2 * k1 * u[:, :, None] * u[:, None, :] / f**2
-            basis = J @ np.asarray(rotation_basis(u, f))
+            x = window.xi
+            s = 1 + division * (x**2).sum(1) / f**2
+            if s.min() < MIN_DIVISOR:
+                break
+            outer = 2 * division / f**2 * x[:, :, None] * x[:, None, :]
+            slope = (s[:, None, None] * np.eye(2) - outer) / s[:, None, None] ** 2
+            basis = np.linalg.solve(slope, np.asarray(rotation_basis(x / s[:, None], f)))
             turned = basis @ refine_rotation(window, basis, turn)
             trained += float(log_sharpness(window, 0, turned).sum())
             held.append(log_sharpness(window, 1, turned))
-        if trained > best[0]:
-            best = trained, k1, np.concatenate(held)
-    return _LensFit(best[1], best[2])
+        if len(held) == len(windows) and trained > best[0]:
+            best = trained, division, np.concatenate(held)
+    return _LensFit(best[1], best[2]) if len(best[2]) else None
 
 
 def select_by_z(
