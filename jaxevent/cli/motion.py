@@ -60,8 +60,7 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--centred",
         action="store_true",
-        help="with --method voting, do not smooth, but assign each estimate to the middle of the "
-        "events that it rests on, some ms earlier",
+        help="do not smooth, but assign each estimate of voting to the middle of its events",
     )
     one.add_argument("--smooth", action="store_true", help="smooth by later events: the default")
     one.add_argument(
@@ -112,8 +111,8 @@ def _add_known(one: Any) -> None:
         "--imu-rotation",
         metavar="AXES",
         help="the gyro's axes: camera (x right, y down, z forward; default), y-up (x right, y up, "
-        "z backward, as jAER), x-left (x left, y down, z backward), turned (x left, y up), or nine "
-        "numbers of the rotation from its axes to the camera's, row by row",
+        "z backward), x-left (x left, y down, z backward), turned (x left, y up), or a rotation of "
+        "nine numbers from its axes to the camera's",
     )
     one.add_argument(
         "--still",
