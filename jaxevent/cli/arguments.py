@@ -249,6 +249,11 @@ def show_progress() -> bool:
     return sys.stderr.isatty()
 
 
+def print_written(out: Path, names: Sequence[str] = ()) -> None:
+    """Print the files that were written: `out`, or those of these names in it, one line each."""
+    print("", *(f"written: {path}" for path in [out / name for name in names] or [out]), sep="\n")
+
+
 def print_stored(recording: Any, path: Path) -> None:
     frames = len(recording.frames) if recording.frames else 0
     size_mb = path.stat().st_size / 1e6
