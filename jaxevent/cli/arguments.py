@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxevent.errors import InputError
+
 
 class HelpFormatter(argparse.HelpFormatter):
     """Help with a usage of one line, that of required arguments, and examples line by line."""
@@ -77,8 +79,7 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
     group.add_argument(
         "--stream",
         metavar="NAME",
-        help="camera of a file that holds several: a topic, left, right or a number; none "
-        "reads the images without events",
+        help="which camera of a file: a topic, left, right or a number; none: images alone",
     )
     group.add_argument(
         "--camera",
@@ -99,13 +100,39 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
     )
 
 
+def add_live(one: argparse.ArgumentParser, printed: str) -> None:
+    """Add the option --live, by which a command prints what events show as they come."""
+    one.add_argument(
+        "--live",
+        action="store_true",
+        help=f"print {printed} as events come, instead of writing --out; PATH may be -, for "
+        "lines t x y p on standard input, t in us, or in s with a decimal point; needs --size then",
+    )
+
+
+def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
+    """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
+    from jaxevent.io import chunks
+
+    if str(path) != "-":
+        recording = open_recording(path, reading)
+        return recording, chunks.divide(recording)
+    from jaxevent.io.calibration import read_camera
+    from jaxevent.recording import Events, Recording
+
+    if reading["size"] is None:
+        raise InputError("standard input: does not state the sensor's size; give --size W,H")
+    lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
+    recording = Recording("standard input", *reading["size"], Events.empty(), camera=lens)
+    return recording, chunks.read_lines(sys.stdin.buffer)
+
+
 def add_frames(one: Any, name: str, source: str) -> None:
     """Add the option that chooses the frames of a recording, named in its help as `source`."""
     one.add_argument(
         name,
         metavar="NAME",
-        help=f"which images become the frames, of {source} that holds several kinds: a topic or a "
-        "number; none leaves frames out",
+        help=f"which images of {source} are the frames: a topic or a number; none: no frames",
     )
 
 
