@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxevent.errors import InputError
+
 
 def command(
     commands: Any, run: Callable, description: str, *examples: str, part: str = ""
@@ -66,6 +68,34 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
     one.set_defaults(
         reading=("size", "stream", "camera", "time_unit", *(("frames",) if frames else ()))
     )
+
+
+def add_live(one: argparse.ArgumentParser, printed: str) -> None:
+    """Add the option --live, by which a command prints what events show as they come."""
+    one.add_argument(
+        "--live",
+        action="store_true",
+        help=f"take events as they come, in constant memory, and print {printed} instead of "
+        "writing --out; PATH may be -, for lines t x y p on standard input (t in s if it has a "
+        "decimal point, else in us), with --size",
+    )
+
+
+def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
+    """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
+    from jaxevent.io import chunks
+
+    if str(path) != "-":
+        recording = open_recording(path, reading)
+        return recording, chunks.divide(recording)
+    from jaxevent.io.calibration import read_camera
+    from jaxevent.recording import Events, Recording
+
+    if reading["size"] is None:
+        raise InputError("standard input: does not state the sensor's size; give --size W,H")
+    lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
+    recording = Recording("standard input", *reading["size"], Events.empty(), camera=lens)
+    return recording, chunks.read_lines(sys.stdin.buffer)
 
 
 def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:

@@ -176,7 +176,7 @@ def _video(recording: Recording, path: Path, progress: bool | None) -> float:
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
         for _, image in display_images(
-            video, evenly_spaced_times(recording, rate)[:longest], "linear"
+            video, evenly_spaced_times(recording, rate)[:longest], "display"
         ):
             write(np.kron(image, np.ones((zoom, zoom), np.uint8)))
     return rate / fps

@@ -587,23 +587,40 @@ def test_reconstruct_to_images(folder):
     lines = [f"{t / 1e6:.6f} {name}\n" for t, name in zip(times, names, strict=True)]
     assert (folder / "a" / "images.txt").read_text() == "".join(lines)
     images, _, _ = jaxevent.blend.estimate(small())(times)
-    for name, image in zip(names, tone_map(images), strict=True):
+    limits = display_limits(small().frames.intensity, "display")
+    for name, image in zip(names, tone_map(images, "display", limits), strict=True):
         with Image.open(folder / "a" / name) as stored_image:
             np.testing.assert_array_equal(np.asarray(stored_image), image)
 
 
 def test_images_are_as_bright_as_frames(folder, capsys):
-    """Linear images at frames are these frames, grey for grey; the range they use is said."""
+    """Linear images at frames are these frames, grey for grey; what is cut off is said."""
     ramp = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 122
-    for name, brightest, said in (("dark", 121, "121 of 255"), ("bright", 255, "--tone log")):
-        greys = np.where(ramp == 121, brightest, ramp).astype(np.uint8)
-        frames = Frames(STAMPS, np.broadcast_to(greys, (6, HEIGHT, WIDTH)), np.zeros_like(STAMPS))
-        jaxevent.save(small(frames=frames), folder / "small.h5")
+    frames = {
+        "dark": ramp.astype(np.uint8),
+        "bright": np.where(ramp > 100, 255, ramp).astype(np.uint8),
+    }
+    for name, greys in frames.items():
+        images = np.broadcast_to(greys, (6, HEIGHT, WIDTH))
+        recording = small(frames=Frames(STAMPS, images, np.zeros_like(STAMPS)))
+        jaxevent.save(recording, folder / "small.h5")
         argv = f"reconstruct {folder}/small.h5 --method blend --at frames --out {folder}/{name}"
-        assert cli.main(argv.split()) == 0
-        assert said in capsys.readouterr().out
+        assert cli.main(f"{argv} --tone linear".split()) == 0
+        assert ("--tone log" in capsys.readouterr().out) == (name == "bright")
         with Image.open(folder / name / "frame_00000002.png") as image:
             np.testing.assert_array_equal(np.asarray(image), greys)
+
+
+def test_dark_frames_are_shown_as_screens_expect(folder):
+    """White is the brightest 0.5 % of the frames, half of its light grey 188 of sRGB."""
+    greys = np.where(np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 3, 40, 20).astype(np.uint8)
+    images = np.broadcast_to(greys, (6, HEIGHT, WIDTH))
+    recording = small(frames=Frames(STAMPS, images, np.zeros_like(STAMPS)))
+    jaxevent.save(recording, folder / "small.h5")
+    argv = f"reconstruct {folder}/small.h5 --method blend --at frames --out {folder}/a"
+    assert cli.main(argv.split()) == 0
+    with Image.open(folder / "a" / "frame_00000002.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), np.where(greys == 40, 255, 188))
 
 
 @pytest.mark.parametrize(
@@ -654,7 +671,7 @@ def test_reconstruct_in_colour(folder):
     frames = Frames(STAMPS, images, np.zeros_like(STAMPS))
     recording = small(frames=frames, extra={"rgb": rgb})
     jaxevent.save(recording, folder / "small.h5")
-    outs = {"a.h5": [], "b": ["--tone", "percentile"], "c.mp4": []}
+    outs = {"a.h5": [], "b": ["--tone", "percentile"], "c.mp4": ["--tone", "linear"]}
     for name, tone in outs.items():
         argv = f"reconstruct {folder}/small.h5 --method blend --rate 300 --colour --out"
         assert cli.main([*argv.split(), str(folder / name), *tone]) == 0
