@@ -103,7 +103,7 @@ def test_pages_are_short():
     words = {page.relative_to(DOCS).as_posix(): len(page.read_text().split())
              for page in DOCS.rglob("*.md")}  # fmt: skip
     assert words["index.md"] <= 1000
-    assert sum(count for page, count in words.items() if page.startswith("results/")) < 7500
+    assert sum(count for page, count in words.items() if page.startswith("results/")) < 7000
     for page, count in words.items():
         assert count <= 2500 or page.startswith("theory/") or page == "formats.md", page
 
@@ -117,3 +117,16 @@ def test_pages_of_the_reference_show_names_that_exist():
     for module, members in shown:
         known = dir(pkgutil.resolve_name(module))
         assert {name.strip() for name in members.split(",")} <= {*known}, module
+
+
+def test_links_outside_of_the_site_lead_somewhere():
+    """MkDocs checks those of its pages."""
+    link = re.compile(r"\]\(((?:https://github.com/jaxevent/jaxevent/blob/main/)?)([^)#]+)[^)]*\)")
+    pages = [*ROOT.glob("*.md"), *(ROOT / "experiments" / "studies").glob("*.md")]
+    count = 0
+    for page in pages:
+        for absolute, place in link.findall(page.read_text()):
+            if absolute or "://" not in place:
+                assert ((ROOT if absolute else page.parent) / place).exists(), (page.name, place)
+                count += 1
+    assert count > 50
