@@ -25,11 +25,14 @@ def read_notebook(path: Path, execute: bool) -> Any:
 
     notebook = jupytext.read(path)
     if execute:
+        from jupyter_client.manager import AsyncKernelManager
         from nbclient import NotebookClient
 
+        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc")
         with tempfile.TemporaryDirectory() as folder:
             resources = {"metadata": {"path": folder}}
-            NotebookClient(notebook, timeout=TIMEOUT_S, resources=resources).execute()
+            client = NotebookClient(notebook, kernel, timeout=TIMEOUT_S, resources=resources)
+            client.execute()
     return notebook
 
 
@@ -50,7 +53,8 @@ def format_output(output: Any, stem: str, pictures: dict[str, bytes]) -> str:
     if "text/html" in data:
         html = re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL)
         return f'<div class="output">{"".join(map(str.strip, html.splitlines()))}</div>'
-    return fence(data["text/plain"], "text") if "text/plain" in data else ""
+    text = data.get("text/plain", "")
+    return "" if re.match(r"<.* at 0x\w+>$", text) or not text else fence(text, "text")
 
 
 def format_page(notebook: Any, stem: str) -> tuple[str, dict[str, bytes]]:
@@ -60,7 +64,7 @@ def format_page(notebook: Any, stem: str) -> tuple[str, dict[str, bytes]]:
         if cell.cell_type == "markdown":
             parts.append(cell.source)
             continue
-        parts.append(fence(cell.source.rstrip().removesuffix(";"), "python"))
+        parts.append(fence(cell.source, "python"))
         parts += [format_output(output, stem, pictures) for output in cell.outputs]
     title, _, rest = "\n\n".join(part for part in parts if part).partition("\n")
     return f"{title}\n\n[Download this notebook]({stem}.ipynb)\n{rest}\n", pictures
