@@ -25,14 +25,15 @@ def read_notebook(path: Path, execute: bool) -> Any:
 
     notebook = jupytext.read(path)
     if execute:
-        from jupyter_client.manager import AsyncKernelManager
         from nbclient import NotebookClient
 
-        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc")
         with tempfile.TemporaryDirectory() as folder:
-            resources = {"metadata": {"path": folder}}
-            client = NotebookClient(notebook, kernel, timeout=TIMEOUT_S, resources=resources)
-            client.execute()
+            options = {
+                "timeout": TIMEOUT_S,
+                "resources": {"metadata": {"path": folder}},
+                "extra_arguments": ["--log-level=ERROR"],
+            }
+            NotebookClient(notebook, **options).execute()
     return notebook
 
 
@@ -64,7 +65,7 @@ def format_page(notebook: Any, stem: str) -> tuple[str, dict[str, bytes]]:
         if cell.cell_type == "markdown":
             parts.append(cell.source)
             continue
-        parts.append(fence(cell.source, "python"))
+        parts.append(fence(cell.source.replace("  # fmt: skip", ""), "python"))
         parts += [format_output(output, stem, pictures) for output in cell.outputs]
     title, _, rest = "\n\n".join(part for part in parts if part).partition("\n")
     return f"{title}\n\n[Download this notebook]({stem}.ipynb)\n{rest}\n", pictures
