@@ -457,7 +457,7 @@ def score_general(seed: int) -> dict[str, float]:
 
 
 def score_voting(
-    recording: Recording, doubt: ModelSelection | None, model: str, seed: int, truth: Any
+    name: str, recording: Recording, doubt: ModelSelection | None, model: str, seed: int, truth: Any
 ) -> dict[str, dict[str, float]]:
     """Return figures of the command's estimate, and of the causal one of the same votes."""
     times = np.arange(recording.start, recording.stop, 1000)
@@ -472,6 +472,8 @@ def score_voting(
         ("causal ", runner.causal_motion(parts).with_recording(recording)),
     ):
         told = doubt.include_doubt(motion) if doubt else motion
+        if name == "focal 10 % wrong":
+            told = told.with_focal_error()
         told, _ = told.with_flow_consistency(recording)
         rows[prefix], false = score_rows(told(times), truth(times))
         rows[prefix]["false locks"] = float((np.diff(np.r_[0, false]) == 1).sum())
@@ -523,7 +525,7 @@ def part_situations(seeds: range) -> Table:
                 def truth(t: NDArray, turn: Any = truth) -> NDArray:
                     return LENS_FOCAL * turn(t)[:, [1, 0]] * [-1, 1]
 
-            found = score_voting(recording, doubt, model, seed, truth)
+            found = score_voting(name, recording, doubt, model, seed, truth)
             for prefix, one in found.items():
                 runs[prefix].append(one)
             is_silent = doubt is not None and doubt.doubt is None and doubt.camera is None

@@ -22,6 +22,7 @@ TANGENTIAL_SIGMA_RATIO = 0.1
 # Relative error of a motion that a calibrated lens leaves: of a rotation, if f is off by 0.5 %, the
 # centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_model_selection.py).
 RELATIVE_LENS_ERROR = 0.01
+RELATIVE_FOCAL_ERROR = 0.05  # of a focal length that is given without a calibration
 CHANGE_OVER_LAG = 1.0  # error of estimates that lag, relative to the change over twice the lag
 MAX_DIRECTION_SIGMA_RAD = 1.0  # rad, standard deviation of a direction that the data determine
 
@@ -232,6 +233,19 @@ class MotionEstimate(HtmlRepr):
         covariance = covariance + calibration.share**2 * (mean**2).sum(1)[:, None, None] * eye
         covariance = covariance + calibration.speed**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, covariance=covariance)
+
+    def with_focal_error(self) -> "MotionEstimate":
+        """Add the error of a focal length without a calibration: turns are as many times wrong.
+
+        Returns:
+            The estimate with the larger covariance.
+        """
+        mean = np.nan_to_num(self.mean)
+        for part in self.model.parts:
+            if part.figure != "Omega":
+                mean[:, part.rows] = 0
+        added = RELATIVE_FOCAL_ERROR**2 * mean[:, :, None] * mean[:, None, :]
+        return dataclasses.replace(self, covariance=self.covariance + added)
 
     def with_flow_consistency(self, recording: Recording) -> tuple["MotionEstimate", str]:
         """Add the spread of the motions of parts of the image to the covariance.
