@@ -435,6 +435,7 @@ class MotionEstimate(HtmlRepr):
         mean = self.model.interpolate(self.mean[before], self.mean[after], fraction)
         fraction = fraction[:, None, None]
         covariance = (1 - fraction) * self.covariance[before] + fraction * self.covariance[after]
+        covariance = covariance + self._bend_between(at, times, before, after)
         beyond = np.maximum(at[0] - times, 0) + np.maximum(times - at[-1], 0)
         if beyond.any():
             covariance = covariance + beyond[:, None, None] ** 2 * self._change_rate()
@@ -443,6 +444,31 @@ class MotionEstimate(HtmlRepr):
         valid = self.valid[before] & self.valid[after] & (times >= at[0]) & inside
         valid &= np.isfinite(mean).all(1) & np.isfinite(covariance).all((1, 2))
         return self._without_undecided(mean, covariance, valid)
+
+    def _bend_between(
+        self,
+        at: NDArray[np.floating],
+        times: NDArray[np.int64],
+        before: NDArray[np.integer],
+        after: NDArray[np.integer],
+    ) -> NDArray[np.float64]:
+        """Return the covariance (times, d, d) of a motion that bends between estimates.
+
+        The error of the straight line is c (t - t_before) (t_after - t) / 2, with c the mean of the
+        second derivatives at both.
+        """
+        n, d = self.mean.shape
+        c = np.zeros((n, d))
+        if n > 2:
+            step = np.maximum(np.diff(at), 1.0)[:, None]
+            slope = np.diff(np.nan_to_num(self.mean), axis=0) / step
+            inner = 2 * np.diff(slope, axis=0) / (step[1:] + step[:-1])
+            told = self.valid[2:] & self.valid[1:-1] & self.valid[:-2]
+            c[1:-1] = np.where(told[:, None], inner, 0)
+            c[0], c[-1] = c[1], c[-2]
+        reach = np.maximum(times - at[before], 0) * np.maximum(at[after] - times, 0) / 2
+        off = reach[:, None] * (c[before] + c[after]) / 2
+        return off[:, :, None] * off[:, None, :]
 
     def _change_over_lag(
         self, times: NDArray[np.int64], mean: NDArray[np.floating], row: NDArray[np.int64]
