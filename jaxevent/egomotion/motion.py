@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
@@ -348,9 +349,8 @@ class MotionEstimate(HtmlRepr):
     def _change_rate(self) -> NDArray[np.float64]:
         """Return the mean square (d, d) of changes between successive estimates, per us^2."""
         found = np.flatnonzero(self.valid & np.isfinite(self.mean).all(1))
-        dt = np.diff(self.t[found]).astype(float)
-        rates = np.diff(self.mean[found], axis=0)[dt > 0] / dt[dt > 0, None]
-        return rates.T @ rates / max(len(rates), 1)
+        change, dt = np.diff(self.mean[found], axis=0), np.diff(self.t[found]).astype(float)
+        return change.T @ change / max(float(dt @ dt), 1.0)
 
     def to_dataframe(
         self, times: Times | None = None, *, centred: bool | None = None
@@ -460,9 +460,10 @@ class MotionEstimate(HtmlRepr):
         n, d = self.mean.shape
         c = np.zeros((n, d))
         if n > 2:
-            step = np.maximum(np.diff(at), 1.0)[:, None]
+            # Of estimates very near to each other, whose differences are noise, the next farther.
+            step = maximum_filter1d(np.maximum(np.diff(at), 1.0), 3)[:, None]
             slope = np.diff(np.nan_to_num(self.mean), axis=0) / step
-            inner = 2 * np.diff(slope, axis=0) / (step[1:] + step[:-1])
+            inner = np.diff(slope, axis=0) / np.maximum(step[1:], step[:-1])
             told = self.valid[2:] & self.valid[1:-1] & self.valid[:-2]
             c[1:-1] = np.where(told[:, None], inner, 0)
             c[0], c[-1] = c[1], c[-2]
