@@ -25,6 +25,7 @@ def draw_reconstruction(path: Path) -> None:
     """Draw a hidden frame as several methods reconstruct it, with the uncertainty of `mc`."""
     recording = jaxevent.load(RECORDING)
     given = recording.with_frames(slice(0, None, GAP))
+    assert recording.frames is not None and given.frames is not None
     hidden = recording.frames[GAP + GAP // 2 :][:1]
     params = aks.Params.for_recording(given)
     times = hidden.t + round(1e6 * float(params.clock_offset))
