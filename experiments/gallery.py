@@ -28,8 +28,12 @@ def read_notebook(path: Path, execute: bool) -> Any:
         from nbclient import NotebookClient
 
         with tempfile.TemporaryDirectory() as folder:
-            resources = {"metadata": {"path": folder}}
-            NotebookClient(notebook, timeout=TIMEOUT_S, resources=resources).execute()
+            options = {
+                "timeout": TIMEOUT_S,
+                "resources": {"metadata": {"path": folder}},
+                "extra_arguments": ["--log-level=ERROR"],
+            }
+            NotebookClient(notebook, **options).execute()
     return notebook
 
 
@@ -50,7 +54,8 @@ def format_output(output: Any, stem: str, pictures: dict[str, bytes]) -> str:
     if "text/html" in data:
         html = re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL)
         return f'<div class="output">{"".join(map(str.strip, html.splitlines()))}</div>'
-    return fence(data["text/plain"], "text") if "text/plain" in data else ""
+    text = data.get("text/plain", "")
+    return "" if re.match(r"<.* at 0x\w+>$", text) or not text else fence(text, "text")
 
 
 def format_page(notebook: Any, stem: str) -> tuple[str, dict[str, bytes]]:
@@ -60,7 +65,7 @@ def format_page(notebook: Any, stem: str) -> tuple[str, dict[str, bytes]]:
         if cell.cell_type == "markdown":
             parts.append(cell.source)
             continue
-        parts.append(fence(cell.source.rstrip().removesuffix(";"), "python"))
+        parts.append(fence(cell.source.replace("  # fmt: skip", ""), "python"))
         parts += [format_output(output, stem, pictures) for output in cell.outputs]
     title, _, rest = "\n\n".join(part for part in parts if part).partition("\n")
     return f"{title}\n\n[Download this notebook]({stem}.ipynb)\n{rest}\n", pictures

@@ -97,7 +97,7 @@ def methods_table(family: str) -> str:
     lines = ["| method | | variance | gradient |", "|---|---|---|---|"]
     for name in METHOD_HOMES[family]:
         method = jaxevent.METHODS[name]
-        about = re.split(r"(?<!al)\. ", method.about)[0].rstrip(".")
+        about = ". ".join(re.split(r"(?<!al)\. ", method.about)[:2]).rstrip(".")
         yes = ["yes" if flag else "" for flag in (method.has_covariance, method.differentiable)]
         lines.append(f"| [`{name}`](../parameters.md#{name}) | {about} | {' | '.join(yes)} |")
     return "\n".join(lines)

@@ -15,7 +15,7 @@ panorama = simulate.scene("tunnel")
 camera = simulate.Pan(panorama, speed="fast", size=(80, 60), duration=0.5)
 recording = simulate.simulate(camera, seed=100)
 truth, times = np.asarray(recording.extra["hdr"]), recording.extra["hdr_t"]
-recording, f"true intensity up to {truth.max():.0f}; 1 is the frames' white"
+print(f"{len(recording.events):,} events, true intensity up to {truth.max():.0f}, white is 1")
 
 # %% [markdown]
 # `preset="hdr"` recognises clipped pixels and starts from a sensor of high dynamic range. Clock and
@@ -57,6 +57,8 @@ for axis, (name, image) in zip(axes, panels.items(), strict=True):
 figure.colorbar(shown, ax=axes, label="log10 of intensity")
 # %% [markdown]
 # Along the row through the brightest point, with the standard deviation that the smoother reports.
+# A pixel that was never within the frames' range is known by its changes alone; there the deviation
+# is too small.
 
 # %%
 row = int(np.argmax(truth[k].max(axis=1)))

@@ -23,7 +23,8 @@ truth = hidden.intensity
 given, hidden
 
 # %% [markdown]
-# The error of each hidden image, as a function of the two contrast thresholds.
+# The error of each hidden image, as a function of the two contrast thresholds. The clock offset
+# acts both in `prepare` and in `run`, so both get it.
 
 # %%
 offset = jaxevent.calibrate(given).clock_offset.value  # s, of the frames' stamps
@@ -33,7 +34,7 @@ features, out = akf.prepare(given, times, akf.Params(clock_offset=offset))
 
 def errors(c_on, c_off):
     """Compute the mean squared error of every hidden image."""
-    params = akf.Params(c_on=c_on, c_off=c_off)
+    params = akf.Params(c_on=c_on, c_off=c_off, clock_offset=offset)
     trajectory, _ = akf.run(params, features)
     estimate = akf.read(params, trajectory, out)
     return jnp.mean((estimate.mean.reshape(truth.shape) - truth) ** 2, axis=(1, 2))
