@@ -37,9 +37,8 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--method",
         metavar="NAME",
-        help="voting, batch, contrast, planes or frames, or one of your own, "
-        "package.module:object; default: voting, and contrast where voting finds nothing, for "
-        "general motion batch",
+        help="voting (default, then contrast if it finds nothing), batch (default for general "
+        "motion), contrast, planes, frames, or package.module:object of your own",
     )
     one.add_argument(
         "--params",
@@ -55,14 +54,12 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--causal",
         action="store_true",
-        help="estimate each row from the events before it alone, as on a live stream; it lags; "
-        "with --method voting; by default later events are used too",
+        help="estimate each row of voting from the events before it alone; it lags",
     )
     one.add_argument(
         "--centred",
         action="store_true",
-        help="with --method voting, do not smooth, but assign each estimate to the middle of the "
-        "events that it rests on, some ms earlier",
+        help="do not smooth, but date each estimate of voting to the middle of its events",
     )
     one.add_argument("--smooth", action="store_true", help="smooth by later events: the default")
     one.add_argument(
@@ -114,14 +111,14 @@ def _add_known(one: Any) -> None:
         "--imu-rotation",
         metavar="AXES",
         help="the gyro's axes: camera (x right, y down, z forward; default), y-up (x right, y up, "
-        "z backward, as jAER), x-left (x left, y down, z backward), turned (x left, y up), or nine "
-        "numbers of the rotation from its axes to the camera's, row by row",
+        "z backward), x-left (x left, y down, z backward), turned (x left, y up), or a rotation of "
+        "nine numbers from its axes to the camera's",
     )
     one.add_argument(
         "--still",
         metavar="S,S",
         type=arguments.span,
-        help="time span in s in which the camera is still, from which the gyro's bias is measured",
+        help="times in s between which the camera is still, for the gyro's bias",
     )
 
 

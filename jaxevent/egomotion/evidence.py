@@ -267,9 +267,9 @@ def tell_from_later(
 ) -> tuple[NDArray[np.bool_], NDArray[np.floating]]:
     """Tell the estimates before a motion settled, too, as far as they agree with it.
 
-    A cloud that has just collapsed is too narrow, and its motion drifts on for up to
-    `DRIFT_RATIO` times as long as it took to settle. So estimates until then have the covariance of
-    their difference from the motion there.
+    A cloud that has just collapsed is too narrow, and its motion drifts on for up to `DRIFT_RATIO`
+    times as long as it took to settle. The square of the difference of estimates until then from
+    the motion there is to be added to their covariance.
 
     Args:
         t: (n,) times, us.
@@ -280,9 +280,9 @@ def tell_from_later(
         diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
 
     Returns:
-        (n,) booleans, and the covariances (n, d, d).
+        (n,) booleans, and what is to be added to the covariances, (n, d, d).
     """
-    told, covariance = told.copy(), covariance.copy()
+    told, added = told.copy(), np.zeros(covariance.shape)
     eye = np.eye(mean.shape[1])
     for first in np.flatnonzero(told & ~np.r_[False, told[:-1]]):
         rate = eye * np.asarray(diffusion(mean[first]), np.float64) ** 2
@@ -297,8 +297,8 @@ def tell_from_later(
         rows = np.arange(begin, np.searchsorted(t, until, "right"))
         rows = rows[np.cumsum(searching[rows]) == 0]
         drift = np.asarray(mean[rows] - mean[rows[-1]], np.float64)
-        covariance[rows] += drift[:, :, None] * drift[:, None, :]
-    return told, covariance
+        added[rows] = drift[:, :, None] * drift[:, None, :]
+    return told, added
 
 
 @njit_noalloc

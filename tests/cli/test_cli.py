@@ -1,5 +1,6 @@
 """The command line: what it writes, and that bad input is said in one line and leaves nothing."""
 
+import argparse
 import contextlib
 import gc
 import hashlib
@@ -572,6 +573,32 @@ def test_reconstruct_some_times(folder, capsys):
     (folder / "far.txt").write_text("0.01\n0.2\n")
     fails(capsys, [*blend, "--times", folder / "far.txt"], "small.h5", "200000")
     fails(capsys, [*blend, "--stream", "1"], "small.h5", "--stream")
+
+
+def parsers(parser, words=("jaxevent",)):
+    """Yield every command's words and parser, those of parts too."""
+    yield words, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, one in action.choices.items():
+                yield from parsers(one, (*words, name))
+
+
+def test_help_fits_two_screens_and_ends_with_an_example(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    known = list(parsers(cli._parser()))
+    assert len(known) == 1 + len(cli.COMMANDS) + 4  # four parts of camera
+    for words, parser in known:
+        lines = parser.format_help().splitlines()
+        name = " ".join(words)
+        assert lines[0].startswith(f"usage: {name} ") and lines[1] == "", name
+        assert len(lines) <= 60 and max(map(len, lines)) <= 130, name
+        examples = lines[[*map(str.strip, lines)].index("") :]
+        examples = [line for line in examples if line.startswith("  jaxevent ")]
+        assert examples and lines[-1] == examples[-1], name
+        for line in examples if len(words) > 1 else []:
+            assert line.strip().startswith(name), line
+            parser.parse_args(line.split()[len(words) :])
 
 
 def test_reconstruct_to_images(folder):

@@ -54,7 +54,7 @@ MIN_SEARCH_SPEED_RATIO = 2.5  # median image speeds, least largest speed of a se
 MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 # The maximum of the votes is up to about half a per cent beside the motion.
-PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.12)
+PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
 CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.05)  # other models'
 
 _run = eqx.filter_jit(filtering.run)
@@ -468,16 +468,24 @@ class ChunkRunner:
         motion = join_reports(self.model, parts).with_recording(self.sampler.recording)
         if not parts:
             return motion
+        drift, longest = np.zeros_like(motion.covariance), float(self.params.tau_max)
         if self.lock is not None:
             searching = np.concatenate([info.searching for _, info, _ in parts])
-            valid, covariance = tell_from_later(
+            valid, drift = tell_from_later(
                 motion.t, motion.mean, motion.covariance, searching, motion.valid,
                 self.lock.diffusion,
             )  # fmt: skip
-            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
-        motion = motion._with_gaps(float(self.params.tau_max))
-        found = filtering.smooth(motion, self.params) if smooth else motion
-        return calibrate(found, self.camera, 2 * motion.lag)
+            motion = dataclasses.replace(motion, valid=valid)
+        drift = dataclasses.replace(motion, covariance=drift)._with_gaps(longest).covariance
+        motion = motion._with_gaps(longest)
+        span = 2 * motion.lag
+        if smooth:
+            motion = filtering.smooth(motion, self.params)
+            if not self.model.half_line:
+                mean = filtering.undo_averages(motion, span, self.params)
+                motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
+        found = calibrate(motion, self.camera, span)
+        return dataclasses.replace(found, covariance=found.covariance + drift)
 
     def has_chunk(self) -> bool:
         """Return whether the next chunk is complete, whatever events are still to come."""
@@ -512,6 +520,9 @@ class ChunkRunner:
         self._state, info = self._run(sample.candidates, noise, self._state, cloud)
         used = int((sample.row >= 0).any(1).sum())
         info = jax.tree.map(lambda a: np.asarray(a)[:used], info)
+        # Events of a batch precede its end, on average by half of its duration.
+        duration = np.minimum(sample.candidates.elapsed[:used], float(self.params.longest))
+        info = eqx.tree_at(lambda report: report.lag, info, info.lag + duration / 2)
         t, told = sample.t[:used], ~info.searching
         if self.lock is not None:
             events = self.sampler.recording.events
