@@ -618,10 +618,10 @@ def select_paths(
     return path_index
 
 
-def refine_paths(
+def borrow_paths(
     images: PackedImages, p: NDArray[np.float32], cost: CostParams
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Refine trajectories by two steps, between which nodes take the paths of others.
+) -> NDArray[np.float32]:
+    """Let nodes take the trajectories of others nearby along which images agree better.
 
     Args:
         images: Packed images of full resolution.
@@ -629,14 +629,12 @@ def refine_paths(
         cost: Parameters of the cost, float32.
 
     Returns:
-        The trajectories of nodes, and for each pixel which path it takes, as `select_paths`.
+        (rows, columns, 4) the trajectories, px.
     """
     size = images.pixels.shape[1:3]
-    p = gauss_newton_step(images, p, cost)
     index = select_paths(images, interpolate_paths(p, size), cost, PATH_SEARCHES[:1])
     y, x = np.divmod(index[::2, ::2], size[1])
-    p = gauss_newton_step(images, p[y // 2, x // 2], cost)
-    return p, select_paths(images, interpolate_paths(p, size), cost)
+    return p[y // 2, x // 2]
 
 
 __getattr__ = renamed_names(__name__)
