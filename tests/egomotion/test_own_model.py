@@ -71,7 +71,7 @@ def test_methods_find_the_true_motion():
     late = told.valid & (recording.events.t > 200_000)
     at = np.stack([recording.events.x, recording.events.y], 1)[late] - MIDDLE
     error = np.linalg.norm(told.flow[late] - at @ MATRIX.T, axis=1)
-    assert np.median(error) < 0.05 * np.median(np.linalg.norm(at @ MATRIX.T, axis=1))
+    assert np.median(error) < 0.06 * np.median(np.linalg.norm(at @ MATRIX.T, axis=1))
     fast = contrast.Params(events=3000, duration=0.04, omega_max=3.0, starts=5, margin=8)
     motion = contrast.estimate(recording[0.1:0.2], fast, model=ZoomRoll)
     assert motion.valid.all() and off(motion.mean) < 0.05
