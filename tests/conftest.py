@@ -71,12 +71,12 @@ LONGEST = (
     "test_fit_every_method.py",
     "test_fit_motion.py",
     "test_fused.py",
+    "test_gallery.py",
     "test_readme.py",
     "test_reconstruction.py",
     "test_recovery.py",
     "test_smoother.py",
     "test_threads.py",
-    "test_tour.py",
 )
 
 
