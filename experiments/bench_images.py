@@ -585,7 +585,8 @@ def tile(recording: Recording, rows: int, columns: int) -> Recording:
     order = np.argsort(np.tile(e.t, rows * columns), kind="stable")
     x = (e.x + recording.width * j.reshape(-1, 1)).ravel()[order]
     y = (e.y + recording.height * i.reshape(-1, 1)).ravel()[order]
-    t, p = (np.tile(part, rows * columns)[order] for part in (e.t, e.p))
+    t = np.tile(e.t, rows * columns)[order]
+    p = np.tile(e.p, rows * columns)[order]
     images = np.tile(np.asarray(frames.images), (1, rows, columns))
     size = recording.width * columns, recording.height * rows
     return Recording("tiles", *size, Events(t, x, y, p), Frames(frames.t, images, frames.exposure))

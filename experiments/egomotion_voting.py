@@ -1,7 +1,7 @@
 """Motion by voting on simulated sequences with known motion, the thesis' literal likelihood beside.
 
     python experiments/egomotion_voting.py --out egomotion_voting [--seeds 10] [--first 100]
-        [--only planar frames rotation penalty situations]
+        [--only planar frames rotation penalty situations live]
 
 An ideal event camera of 160 x 120 pixels, f = 200 px, and the thesis' generator of frames 50 us
 apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.Params`, which were
@@ -23,6 +23,7 @@ frames. Writes a table of every part.
 """
 
 import dataclasses
+import resource
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -46,6 +47,7 @@ from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.scores import axis_error, relative_error, relative_magnitude_error
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.io.chunks import EVENTS_PER_CHUNK
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate import SENSORS, motion_scene, simulate
 from jaxevent.simulate.motion import simulate_frame_events, simulate_motion
@@ -279,6 +281,7 @@ IDEAL = dataclasses.replace(
 UNEVEN = dataclasses.replace(IDEAL, c_on=0.24, c_off=0.39, mismatch=0.15, jitter=5e-4)
 MIDDLE = (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2
 LENS_FOCAL = 100.0  # px, of the lens that distorts
+N_REPEATS = 12  # of a sequence, live
 SHORT_DURATION = 0.4  # s, of situations
 N_GENERAL_SEQUENCES = 2  # each takes as long as five others
 PAUSE_US, PAUSE_AT_US = 2_000_000, 200_000
@@ -552,12 +555,48 @@ def part_situations(seeds: range) -> Table:
     return "situations: as the command estimates by default, and causal", rows
 
 
+def part_live(seeds: range) -> Table:
+    """Memory of live motion while a sequence is repeated, and what an hour at its rate takes."""
+    recording, _ = planar("constant", seeds[0], "noise")
+    e = recording.events[:]
+    period, live = int(e.t[-1] - e.t[0]) + 1, voting.live(SIZE, model="planar", seed=seeds[0])
+    rows: list[Row] = []
+    for repeat in range(N_REPEATS):
+        clock = time.process_time()
+        moved = Events(e.t + repeat * period, e.x, e.y, e.p)
+        for first in range(0, len(e), EVENTS_PER_CHUNK):
+            live.add(moved[first : first + EVENTS_PER_CHUNK])
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        rows.append(
+            {
+                "events, M": 1e-6 * (repeat + 1) * len(e),
+                "recording, s": 1e-6 * (repeat + 1) * period,
+                "events held": len(live._tail.retained()),
+                "estimates held": len(live.motion),
+                "peak memory, MB": peak,
+                "CPU s per s": (time.process_time() - clock) / (1e-6 * period),
+            }
+        )
+    hour, half = 3600e6 / period, N_REPEATS // 2
+    growth = (rows[-1]["peak memory, MB"] - rows[half]["peak memory, MB"]) / (N_REPEATS - 1 - half)
+    rows.append(
+        {
+            **rows[-1],
+            "events, M": 1e-6 * hour * len(e),
+            "recording, s": 3600.0,
+            "peak memory, MB": rows[-1]["peak memory, MB"] + growth * (hour - N_REPEATS),
+        }
+    )
+    return "live motion: memory; the last row is extrapolated", rows
+
+
 PARTS: dict[str, Callable[[range], Table]] = {
     "planar": part_planar,
     "frames": part_frames,
     "rotation": part_rotation,
     "penalty": part_penalty,
     "situations": part_situations,
+    "live": part_live,
 }
 
 
