@@ -115,8 +115,8 @@ def voting_task(particles: int, points: float, size: tuple[int, int]) -> Callabl
 
 
 FAMILIES: dict[str, Callable[[], dict[str, dict[Any, Callable[[], object]]]]] = {
-    "akf": lambda: images_of(jaxevent.akf, 500_000, 20, 4),
-    "aks": lambda: images_of(jaxevent.aks, 500_000, 20, 4),
+    "akf": lambda: images_of(jaxevent.akf, 250_000, 10, 4),
+    "aks": lambda: images_of(jaxevent.aks, 250_000, 10, 4),
     "mc": lambda: packaged_images_of(jaxevent.mc),
     "events-only": lambda: packaged_images_of(jaxevent.events_only),
     "track": lambda: {
