@@ -892,5 +892,5 @@ class Recording(HtmlRepr):
         """Raise `InputError` if there is neither an event nor a frame."""
         if not len(self.events) and not self.frames:
             raise InputError(
-                f"{source or self.name}: holds no event and no frame; nothing can be estimated"
+                f"{source or self.name}: holds no event and no frame; choose a recording with some"
             )

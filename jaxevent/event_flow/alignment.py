@@ -10,9 +10,24 @@ variance of a count is its mean, the sum S of w I^2 has about these derivatives:
 over events, m the mean time of the events at x'. H is what S loses in curvature when all times show
 the same image. Displacements are those of nodes, bilinear between; each step solves
 
-    min_d  sum (d - H^-1 g)^T H (d - H^-1 g) + smoothness sum rho(u_i + d_i - u_j - d_j)        (2)
+    min_d  sum (d - H^-1 g)^T H (d - H^-1 g) + smoothness sum rho(r_i + d_i - r_j - d_j)        (2)
 
-over neighbours i, j with the robust rho(e) = log(1 + e^2 / edge^2).
+over neighbours i, j with the robust rho(e) = log(1 + e^2 / edge^2) and r = u - m. The surface
+
+    m(x) = a + A x + (c . x) x                                                                  (3)
+
+is the flow of a camera that turns, and of one before a plane (Longuet-Higgins and Prazdny 1980).
+Its eight coefficients are fitted in each step, so such flow is free of smoothness. Objects of their
+own motion, and other depths, are outliers of the fit:
+
+    min_m  sum w (u + d - m)^T H (u + d - m),    w = 1 / (1 + |u - m|^2 / edge^2)               (4)
+
+The covariance of a displacement is that of an estimate from the nodes within a Gaussian of reach r,
+which have the information I_r together, are n_r in effect, and differ by D_r in the mean square:
+
+    C = min_r  alpha I_r^-1 + (beta + gamma / n_r) D_r                                          (5)
+
+The first term is the noise of events, the second what smoothness and unequal motion add.
 """
 
 from typing import Any, NamedTuple
@@ -30,6 +45,9 @@ CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
 CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
 MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
 N_SWEEPS = 30  # of Gauss-Seidel
+N_SURFACE_FITS = 2  # in each step
+# 1/px^2, of the coefficients of (3) before alignment, in halves of the sensor's longer side.
+SURFACE_INFORMATION = (0.001, 30, 30, 0.001, 30, 30, 100, 100)
 N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
 # The curvature of S is that of the image before it is blurred, which is sharper.
@@ -37,12 +55,12 @@ CURVATURE = 3.0
 OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it is
 NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
-POOLING = (1, 2, 4)  # nodes, of the Gaussian whose nodes tell of one
+POOLING = (1, 2, 4)  # nodes, the reaches r of (5)
 MIN_INFORMATION = 0.1  # 1/px^2
-MIN_VARIANCE = 0.001  # px^2
+DATA_VARIANCE = 0.6  # alpha of (5)
+SCATTER = (0.3, 2.0)  # beta and gamma of (5)
 FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
-RELATIVE_VARIANCE = 0.0002  # of the square of the displacement
 
 
 @njit_noalloc_inlined
@@ -187,11 +205,11 @@ def _accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
 
 
 @njit_noalloc
-def _solve_step(u, normal, smoothness, edge, sweeps, step):
+def _solve_step(u, surface, normal, smoothness, edge, step):
     """Solve (2) for the step (rows, columns, 2) of the displacement, by Gauss-Seidel."""
     rows, columns = u.shape[0], u.shape[1]
     step[:] = 0
-    for _ in range(sweeps):
+    for _ in range(N_SWEEPS):
         for j in range(rows):
             for i in range(columns):
                 gx, gy = normal[j, i, 0], normal[j, i, 1]
@@ -199,7 +217,8 @@ def _solve_step(u, normal, smoothness, edge, sweeps, step):
                 for n in range(4):
                     b, a = i + (n == 0) - (n == 1), j + (n == 2) - (n == 3)
                     if 0 <= a < rows and 0 <= b < columns:
-                        ex, ey = u[a, b, 0] - u[j, i, 0], u[a, b, 1] - u[j, i, 1]
+                        ex = u[a, b, 0] - surface[a, b, 0] - u[j, i, 0] + surface[j, i, 0]
+                        ey = u[a, b, 1] - surface[a, b, 1] - u[j, i, 1] + surface[j, i, 1]
                         w = smoothness / (1 + (ex * ex + ey * ey) / (edge * edge))
                         gx += w * (ex + step[a, b, 0])
                         gy += w * (ey + step[a, b, 1])
@@ -230,6 +249,13 @@ def _fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[
         after = np.minimum(i + 1, u.shape[axis] - 1)
         u = (1 - f) * u.take(i, axis) + f * u.take(after, axis)
     return u.astype(np.float32)
+
+
+def _quadratic_basis(x: NDArray, y: NDArray) -> NDArray[np.float64]:
+    """Return the eight fields of (3) at places (n,), (2, 8, n)."""
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    along_x = [one, x, y, zero, zero, zero, x * x, x * y]
+    return np.array([along_x, [zero, zero, zero, one, x, y, x * y, y * y]])
 
 
 class Clock(NamedTuple):
@@ -297,6 +323,7 @@ class Displacement(NamedTuple):
     u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
     clock: Clock
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
+    covariance: NDArray[np.float64]  # (rows, columns, 2, 2), px^2
     score: float  # per event
 
 
@@ -311,16 +338,16 @@ def _rotate(axes: NDArray, values: NDArray) -> NDArray:
     return (axes * values[..., None, :]) @ np.swapaxes(axes, -1, -2)
 
 
-def _curvature(u: NDArray, reach: int) -> NDArray[np.float64]:
-    """Return the largest square of second differences around nodes, px^2; 0 of affine flow."""
+def _mean_square_difference(u: NDArray, reach: int) -> NDArray[np.float64]:
+    """Return the mean square of differences from nodes around, `reach` and twice as far, px^2."""
     far, (rows, columns) = 2 * reach, u.shape[:2]
-    near, most = np.pad(u, ((far, far), (far, far), (0, 0)), mode="edge"), np.zeros(u.shape[:2])
+    near, total = np.pad(u, ((far, far), (far, far), (0, 0)), mode="edge"), np.zeros(u.shape[:2])
     for distance in (reach, far):
         for j, i in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            y, x = j * distance, i * distance
-            one, other = (near[far + c * y :, far + c * x :][:rows, :columns] for c in (1, -1))
-            most = np.maximum(most, (((one + other) / 2 - u) ** 2).sum(-1))
-    return most
+            for c in (distance, -distance):
+                other = near[far + c * j :, far + c * i :][:rows, :columns]
+                total += ((other - u) ** 2).sum(-1)
+    return total / 16
 
 
 class Alignment:
@@ -335,33 +362,37 @@ class Alignment:
         self.shape, self.spacing = shape, float(params.spacing)
         self.nodes = _node_shape(shape, self.spacing)
         self.smoothness, self.edge = float(params.smoothness), float(params.edge)
+        y, x = np.mgrid[: self.nodes[0], : self.nodes[1]].reshape(2, -1) * 2 / max(self.nodes)
+        self._basis = _quadratic_basis(x - x.mean(), y - y.mean())
 
     def fill(self, values: NDArray) -> NDArray[np.float32]:
         """Interpolate values of nodes to all pixels."""
         return _fill_pixels(values, self.shape, self.spacing)
 
-    def covariance(self, aligned: Displacement) -> NDArray[np.float64]:
-        """Return the covariance of the nodes' displacement.
-
-        It is the inverse of what a node and those around tell, and by how much flow bends among
-        them, which is large at borders of objects; those near or far, which give the least.
+    def _covariance(self, u: NDArray, information: NDArray) -> NDArray[np.float64]:
+        """Return the covariance (5) of the nodes' displacement, the least over reaches.
 
         Args:
-            aligned: Displacement and information.
+            u: Displacement less the surface (3), px.
+            information: (rows, columns, 3), 1/px^2.
 
         Returns:
             (rows, columns, 2, 2), px^2.
         """
         best = np.full((*self.nodes, 2, 2), np.inf)
+        trace = np.maximum(information[..., 0] + information[..., 2], 0) + 1e-9
         for reach in POOLING:
-            values, axes = _principal(aligned.information, reach)
-            C = _rotate(axes, 1 / np.maximum(values, MIN_INFORMATION))
-            C = C + _curvature(aligned.u, reach)[..., None, None] * np.eye(2)
+            values, axes = _principal(information, reach)
+            C = _rotate(axes, DATA_VARIANCE / np.maximum(values, MIN_INFORMATION))
+            pooled, squares = (
+                gaussian_filter(one, reach, mode="constant") for one in (trace, trace**2)
+            )
+            n = 4 * np.pi * reach**2 * pooled**2 / squares
+            scatter = (SCATTER[0] + SCATTER[1] / n) * _mean_square_difference(u, reach)
+            C = C + scatter[..., None, None] * np.eye(2)
             less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
             best = np.where(less[..., None, None], C, best)
-        length2 = (aligned.u**2).sum(-1)[..., None, None]
-        floor = (MIN_VARIANCE + RELATIVE_VARIANCE * length2) * np.eye(2)
-        return best + floor
+        return best
 
     def shrink(self, aligned: Displacement) -> NDArray[np.float64]:
         """Return the displacement without components that events around do not determine.
@@ -391,6 +422,21 @@ class Alignment:
         order = np.argsort(length, kind="stable")
         total = np.cumsum(weight.ravel()[order])
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])
+
+    def _fit_surface(self, u: NDArray, before: NDArray, normal: NDArray) -> NDArray[np.float64]:
+        """Fit (3) to displacements and their steps; outliers from the surface before count less."""
+        B0, B1 = self._basis
+        gx, gy, xx, xy, yy = normal.reshape(-1, normal.shape[-1]).T[:5]
+        ux, uy = u.reshape(-1, 2).T
+        HB0, HB1 = xx * B0 + xy * B1, xy * B0 + yy * B1
+        surface = before
+        for _ in range(N_SURFACE_FITS):
+            w = 1 / (1 + ((u - surface) ** 2).sum(-1).ravel() / self.edge**2)
+            A = (w * B0) @ HB0.T + (w * B1) @ HB1.T + np.diag(SURFACE_INFORMATION)
+            b = B0 @ (w * (xx * ux + xy * uy + gx)) + B1 @ (w * (xy * ux + yy * uy + gy))
+            c = np.linalg.solve(A, b)
+            surface = np.stack([c @ B0, c @ B1], -1).reshape(u.shape)
+        return surface
 
     def _turn(self, clock: Clock, at: int, s: NDArray, turns: NDArray) -> NDArray[np.float64]:
         """Return a clock's s after a step of (1), on the whole as fast as `clock`."""
@@ -428,7 +474,7 @@ class Alignment:
         warped = np.empty((len(x), 2), np.float32)
         place = np.interp(t, clock.t, np.arange(len(clock.t))).astype(np.float32)
         turns, ahead = np.zeros((len(clock.t), 2)), clock.s.copy()
-        score = 0.0
+        surface, score = u, 0.0
         for cell in cells:
             image = np.zeros((3, *_image_shape(self.shape, cell)), np.float32)
             scratch = np.empty_like(image[0])
@@ -441,7 +487,8 @@ class Alignment:
                 score = _accumulate(
                     warped, s, p, place, u, self.spacing, cell, image, normal, turns
                 )
-                _solve_step(u, normal, self.smoothness, self.edge, N_SWEEPS, step)
+                surface = self._fit_surface(u, surface, normal)
+                _solve_step(u, surface, normal, self.smoothness, self.edge, step)
                 # Sharp images have a smaller range than their curvature tells: steps that turn
                 # back are halved.
                 reach *= np.where((step * before).sum(-1, keepdims=True) < 0, 0.5, 1)
@@ -451,4 +498,7 @@ class Alignment:
                 if adapt:
                     ahead = self._turn(clock, at, ahead, turns)
         information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
-        return Displacement(u, Clock(clock.t, ahead), information, score / max(len(x), 1))
+        covariance = self._covariance(u - surface, information)
+        return Displacement(
+            u, Clock(clock.t, ahead), information, covariance, score / max(len(x), 1)
+        )

@@ -32,11 +32,19 @@ MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from
 class FlowParams(Parameters):
     """Parameters of the flow from events."""
 
-    density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
-    displacement = Positive(3.0, "px", "typical displacement before and after a time; windows grow")
-    spacing = Count(8, "px", "distance between nodes of the flow")
-    smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
-    edge = Positive(0.5, "px", "difference from which neighbours are taken for different objects")
+    density: Positive = Positive(
+        0.23, "1/px", "events per pixel on either side of a time, at first"
+    )
+    displacement: Positive = Positive(
+        3.0, "px", "typical displacement before and after a time; windows grow"
+    )
+    spacing: Count = Count(8, "px", "distance between nodes of the flow")
+    smoothness: Positive = Positive(
+        8.0, "1/px^2", "weight of differences between neighbouring nodes"
+    )
+    edge: Positive = Positive(
+        0.2, "px", "difference from which neighbours are taken for different objects"
+    )
 
 
 class Anchor(NamedTuple):
@@ -175,25 +183,18 @@ class EventFlow:
 
     def _fields(
         self, anchors: list[Anchor], knots: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return velocity and covariance of all pixels at some times (us)."""
-        velocity = np.zeros((len(knots), *self.shape, 2), np.float32)
-        covariance = np.zeros((*velocity.shape, 2), np.float32)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return velocity and covariance of all nodes at some times (us)."""
+        velocity = np.zeros((len(knots), *self._align.nodes, 2))
+        covariance = np.zeros((*velocity.shape, 2))
         if not anchors:
             covariance[:] = UNKNOWN_VARIANCE * np.eye(2)
-            return velocity, covariance
         times, stamps = [anchor.t for anchor in anchors], knots.tolist()
         for anchor, one in zip(anchors, np.eye(len(anchors)), strict=True):
             weights = np.interp(stamps, times, one)
-            used = np.flatnonzero(weights > 0)
-            if not len(used):
-                continue
-            field = self._align.fill(anchor.aligned.u)
-            spread = self._align.fill(self._align.covariance(anchor.aligned))
-            for n in used.tolist():
-                rate = anchor.aligned.clock.rate(stamps[n])
-                velocity[n] += np.float32(weights[n] * rate) * field
-                covariance[n] += np.float32(weights[n] * anchor.rate**2) * spread
+            for n in np.flatnonzero(weights > 0).tolist():
+                velocity[n] += weights[n] * anchor.aligned.clock.rate(stamps[n]) * anchor.aligned.u
+                covariance[n] += weights[n] * anchor.rate**2 * anchor.aligned.covariance
         return velocity, covariance
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
@@ -218,7 +219,9 @@ class EventFlow:
         knots = np.unique(np.concatenate(times).astype(np.int64))
         if len(knots) > MAX_KNOTS:
             knots = knots[np.linspace(0, len(knots) - 1, MAX_KNOTS).round().astype(int)]
-        return WindowPaths(int(at), knots, *self._fields(anchors, knots))
+        velocity, covariance = self._fields(anchors, knots)
+        spread = self._align.fill(covariance.mean(0))
+        return WindowPaths(int(at), knots, velocity, spread[None], self._align.spacing)
 
     def __call__(
         self, times: Times, extrapolate: bool = False
@@ -245,7 +248,8 @@ class EventFlow:
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
                 anchors = self._around(t, t, t)
-            (mean[row],), (covariance[row],) = self._fields(anchors, wanted[row : row + 1])
+            found = self._fields(anchors, wanted[row : row + 1])
+            mean[row], covariance[row] = (self._align.fill(one[0]) for one in found)
             if anchors:
                 rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])
                 valid[row] = np.linalg.eigvalsh(covariance[row])[..., 1] < MAX_VARIANCE * rate**2

@@ -9,9 +9,11 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
 
 @njit_noalloc_inlined
-def _velocity_at(velocity, k, weight, x, y):
+def _velocity_at(velocity, spacing, k, weight, x, y):
     """Return the velocity (px/s) at a place, bilinear, between the knots k and k + 1."""
     h, w = velocity.shape[1], velocity.shape[2]
+    first = 0.5 * spacing if spacing > 1 else 0.0
+    x, y = (x - first) / spacing, (y - first) / spacing
     x, y = min(max(x, 0.0), w - 1.0), min(max(y, 0.0), h - 1.0)
     i, j = min(int(x), max(w - 2, 0)), min(int(y), max(h - 2, 0))
     fx, fy = x - i, y - j
@@ -31,7 +33,7 @@ def _velocity_at(velocity, k, weight, x, y):
 
 
 @njit_noalloc
-def _integrate_paths(x, y, t, knots, velocity, at, out_x, out_y):
+def _integrate_paths(x, y, t, knots, velocity, spacing, at, out_x, out_y):
     """Integrate dx/dt = v(x, t) from t to `at`, by the midpoint rule between times of knots."""
     n_knots = len(knots)
     for n in range(len(x)):
@@ -53,11 +55,10 @@ def _integrate_paths(x, y, t, knots, velocity, at, out_x, out_y):
                 scale = 1.0 / (knots[k + 1] - knots[k])
                 shift = now - knots[k]
             step = end - now
-            u, v = _velocity_at(velocity, low, shift * scale, px, py)
+            u, v = _velocity_at(velocity, spacing, low, shift * scale, px, py)
             half = 0.5e-6 * step
-            u, v = _velocity_at(
-                velocity, low, (shift + 0.5 * step) * scale, px + half * u, py + half * v
-            )
+            middle = (shift + 0.5 * step) * scale
+            u, v = _velocity_at(velocity, spacing, low, middle, px + half * u, py + half * v)
             px, py, now = px + 2 * half * u, py + 2 * half * v, end
         out_x[n], out_y[n] = px, py
 
@@ -69,14 +70,17 @@ class WindowPaths(NamedTuple):
         at: Time to which `carry` takes points, us.
         knots: (K,) int64 times of the velocities, us, rising. Between them velocity is linear in
             time, outside it is constant.
-        velocity: (K, H, W, 2) float32 velocity along x and y at each pixel, px/s.
-        covariance: (K, H, W, 2, 2) float32 covariance of the velocity, (px/s)^2, or None.
+        velocity: (K, rows, columns, 2) velocity of nodes along x and y, px/s; bilinear between.
+        covariance: (1, H, W, 2, 2) mean covariance of the pixels' velocity, (px/s)^2, or None.
+        spacing: Distance of nodes, px; the outer ones are half of it from the border. 1: nodes are
+            pixels.
     """
 
     at: int
     knots: NDArray[np.int64]
-    velocity: NDArray[np.float32]
+    velocity: NDArray
     covariance: NDArray[np.float32] | None = None
+    spacing: float = 1.0
 
     def carry(
         self, x: NDArray, y: NDArray, t: NDArray[np.int64]
@@ -94,5 +98,8 @@ class WindowPaths(NamedTuple):
         out_x, out_y = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
         places = (np.ascontiguousarray(c, np.float32) for c in (x, y))
         stamps = np.ascontiguousarray(t, np.int64)
-        _integrate_paths(*places, stamps, self.knots, self.velocity, self.at, out_x, out_y)
+        velocity = np.ascontiguousarray(self.velocity, np.float32)
+        _integrate_paths(
+            *places, stamps, self.knots, velocity, float(self.spacing), self.at, out_x, out_y
+        )
         return out_x, out_y

@@ -130,6 +130,30 @@ class ImageEstimator(Estimator[P]):
         super().check(recording)
         recording.refuse_empty()
 
+    def check_request(
+        self, recording: Recording, times: Times, params: P | None, extrapolate: bool
+    ) -> P:
+        """Check what `prepare` is given.
+
+        Args:
+            recording: Events and frames.
+            times: Times of images, integers in us or floats in s.
+            params: Parameters; the defaults if None.
+            extrapolate: Whether times may lie outside the recording.
+
+        Returns:
+            The parameters.
+
+        Raises:
+            InputError: The recording lacks what the method needs, or times lie outside it.
+        """
+        self.check(recording)
+        params = self.Params() if params is None else params
+        self.check_clocks(recording, params)
+        if not extrapolate:
+            self.check_span(recording, times, params)
+        return params
+
     def check_clocks(self, recording: Recording, params: P) -> None:
         """Check that frames and events that are combined can be on one clock (`events.clocks`).
 
@@ -298,11 +322,7 @@ class PixelEstimator(ImageEstimator[P]):
                 outside
                 the recording.
         """
-        self.check(recording)
-        params = self.Params() if params is None else params
-        self.check_clocks(recording, params)
-        if not extrapolate:
-            self.check_span(recording, times, params)
+        params = self.check_request(recording, times, params, extrapolate)
         return prepare(recording, times, EventTiming.of(params), filtering=self.is_event_driven)
 
     def estimate(

@@ -93,7 +93,7 @@ class Protocol(abc.ABC):
             progress: Whether to show a bar; None shows it in a terminal or notebook.
 
         Returns:
-            A row of results without names. A `sample` in it is the picture that the report shows.
+            A row of results without names. `samples` in it are images that the report shows.
 
         Raises:
             InputError: The recording or the method cannot be scored.
