@@ -574,6 +574,59 @@ def smoother_bench() -> tuple[dict[str, float], dict[str, float]]:
     return speed, ratio
 
 
+TILES = (4, 5)  # copies of the packaged recording below and beside each other: 1200x720
+
+
+def tile(recording: Recording, rows: int, columns: int) -> Recording:
+    """Lay copies of a recording out side by side."""
+    e, frames = recording.events[:], recording.frames
+    assert frames is not None
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    order = np.argsort(np.tile(e.t, rows * columns), kind="stable")
+    x = (e.x + recording.width * j.reshape(-1, 1)).ravel()[order]
+    y = (e.y + recording.height * i.reshape(-1, 1)).ravel()[order]
+    t = np.tile(e.t, rows * columns)[order]
+    p = np.tile(e.p, rows * columns)[order]
+    images = np.tile(np.asarray(frames.images), (1, rows, columns))
+    size = recording.width * columns, recording.height * rows
+    return Recording("tiles", *size, Events(t, x, y, p), Frames(frames.t, images, frames.exposure))
+
+
+def motion_compensated_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure `mc` on the packaged recording: a video, single images, and one of a large sensor.
+
+    Beside it runs optical flow between frames, with the video's images. Single images are as far
+    apart as share nothing.
+    """
+    recording, params = load(str(RECORDING_FILE)), jaxevent.mc.Params()
+    large, second = tile(recording, *TILES), recording.start + np.arange(1_000_000)
+    video, single = second[200_000:600_000:10_000], second[150_000:950_000:200_000]
+
+    def images(method: Any, params: Any, given: Recording, times: np.ndarray) -> object:
+        return method.estimate(given, params, progress=False)(times)
+
+    make = functools.partial
+    tasks: dict[str, Callable[[], object]] = {
+        "flow": make(images, jaxevent.METHODS["flow"], None, recording, video),
+        "video": make(images, jaxevent.mc, params, recording, video),
+        "single": make(images, jaxevent.mc, params, recording, single),
+        "large": make(images, jaxevent.mc, params, large, single[1:2]),
+    }
+    counts = {"flow": len(video), "video": len(video), "single": len(single), "large": 1}
+    least = {name: cpu / counts[name] for name, cpu in least_cpu(tasks, 2).items()}
+    pixels = TILES[0] * TILES[1]
+    return {}, {
+        "mc: CPU seconds of an image of 100 Hz video": least["video"],
+        "mc: CPU seconds of a single image": least["single"],
+        "mc: CPU seconds of a single image, 1200x720": least["large"],
+        "mc: image of 100 Hz video / optical flow": least["video"] / least["flow"],
+        "mc: single image / optical flow": least["single"] / least["flow"],
+        "mc: single image, pixel of 1200x720 / of 240x180": least["large"]
+        / least["single"]
+        / pixels,
+    }
+
+
 GPU_REPEAT = 3  # of which the first compiles
 GPU_EVENTS = 5_000_000
 
