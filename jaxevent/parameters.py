@@ -265,7 +265,7 @@ def _inherited(base: Any, owner: str) -> Any:
 @dataclass_transform(
     kw_only_default=True, field_specifiers=(Number, Positive, UnitInterval, Choice, Count)
 )
-class _Stored(_Module):
+class _ParameterArrays(_Module):
     """State of `Parameters`."""
 
     raw: dict[str, Array]
@@ -276,7 +276,7 @@ class _Stored(_Module):
     point: Array
 
 
-class Parameters(_Stored):
+class Parameters(_ParameterArrays):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
     `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of

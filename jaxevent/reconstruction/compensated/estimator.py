@@ -318,8 +318,9 @@ class TrajectoryEstimator:
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
         self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
-        self._cached_anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._anchor)
-        self._frame_motion = functools.lru_cache(N_CACHED_ANCHORS)(self._seek_by_frames)
+        cached = functools.lru_cache(N_CACHED_ANCHORS)  # by their times
+        self._anchor, self._sought_motion = cached(self._make_anchor), cached(self._seek_motion)
+        self._frame_motion = cached(self._seek_by_frames)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
@@ -340,8 +341,8 @@ class TrajectoryEstimator:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
-    def _anchor_time(self, t: int) -> int:
-        """Return the time (us) of the anchor next to a time.
+    def _anchor_times(self, t: int) -> list[int]:
+        """Return the times (us) of the anchors next to a time, at most two, the nearest first.
 
         Anchors are evenly spaced between two frames, and between a frame and the end of the data.
         """
@@ -352,12 +353,14 @@ class TrajectoryEstimator:
         count = max(round((end - begin) / (ANCHOR_STEPS * self.schedule.step)), 1)
         place = (t - begin) * count // max(end - begin, 1)
         place = min(max(place, 0), count - 1)
-        return begin + (2 * place + 1) * (end - begin) // (2 * count)
+        times = [begin + (2 * n + 1) * (end - begin) // (2 * count) for n in range(count)]
+        beside = place + (1 if t >= times[place] else -1)
+        return [times[n] for n in (place, beside) if 0 <= n < count]
 
-    def _anchor(self, at: int) -> Anchor:
-        """Seek the motion of the target at a time (us) from nothing, and fuse its image."""
+    def _seek_motion(self, at: int) -> Motion:
+        """Seek the motion of the target at a time (us) from nothing, at half resolution."""
         instants = self.schedule(at)
-        L, V, clear, smooth = self._images(instants)
+        L, V, clear, _ = self._images(instants)
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
         p = self._seek(pyramid, instants.s, instants.first_horizon)
         doubt = 1 - self.event_noise.trust(at) ** 4
@@ -365,7 +368,7 @@ class TrajectoryEstimator:
         if other is not None:
             images, several = PackedImages.of(pyramid[1], instants.s), (p, other.carry(instants))
             p = choose_trajectories(images, several, self._cost, (1.0, doubt))
-        return self._make_anchor(instants, (L, V, clear, smooth), pyramid, p)
+        return self._improve(pyramid[1], Motion(instants, p))
 
     def _motion_of_frames(self, t: int) -> Motion | None:
         """Return the motion halfway between two frames by frames alone, at half resolution."""
@@ -391,16 +394,14 @@ class TrajectoryEstimator:
         motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
         return motion.at_level(1, self.images.image_shape).p
 
-    def _make_anchor(
-        self,
-        instants: TargetInstants,
-        images: tuple[NDArray, NDArray, NDArray, NDArray | None],
-        pyramid: ImagePyramid,
-        p: NDArray[np.float32],
-    ) -> Anchor:
-        """Improve motion at half resolution, and refine it with the image that it gives."""
-        L, V, clear, smooth = images
-        instants, p = self._improve(pyramid[1], instants, p)
+    def _make_anchor(self, at: int) -> Anchor:
+        """Find the motion of the target at a time (us), and fuse its image."""
+        return self._refine(self._sought_motion(at))
+
+    def _refine(self, motion: Motion) -> Anchor:
+        """Refine motion at half resolution with the image that it gives."""
+        instants, p = motion
+        L, V, clear, smooth = self._images(instants)
         t, size = int(instants.t[instants.target]), self.images.image_shape
         p = NodeTrajectories(p, 1).at_level(0, size).p
         estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=self._noise(t))
@@ -417,13 +418,12 @@ class TrajectoryEstimator:
         V[target.instants.target] = FUSED_VARIANCE_FACTOR * P + self._cost.floor
         return PackedImages.of(pack_images(L, V), target.instants.s)
 
-    def _improve(
-        self, pixels: NDArray[np.float32], instants: TargetInstants, p: NDArray[np.float32]
-    ) -> tuple[TargetInstants, NDArray[np.float32]]:
+    def _improve(self, pixels: NDArray[np.float32], motion: Motion) -> Motion:
         """Take a few steps at half resolution, on the clock on which frames agree better.
 
         Images from events have the faults of their clock, so that they do not judge it.
         """
+        instants, p = motion
         judges = np.isin(instants.t, self.schedule.frames)
         if judges.sum() <= 2:  # agree on any clock
             judges[:] = True
@@ -438,12 +438,12 @@ class TrajectoryEstimator:
 
         found = improved(instants, p)
         if not instants.clock.event_share:
-            return instants, found
+            return Motion(instants, found)
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
         if cost(instants, found) < cost(timed, other):
-            return instants, found
-        return timed, other
+            return Motion(instants, found)
+        return Motion(timed, other)
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
@@ -451,13 +451,14 @@ class TrajectoryEstimator:
         L, V, clear, smooth = self._images(instants)
         size, noise = self.images.image_shape, self._noise(t)
         known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
+        others: list[int] = []
         if known is None:
-            anchor = self._cached_anchor(self._anchor_time(t))
+            nearest, *others = self._anchor_times(t)
+            anchor = self._anchor(nearest)
         elif self.start is not None and self.start.refine:
-            images = L, V, clear, smooth
             pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
             known = NodeTrajectories(known, 0).at_level(1, size).p
-            anchor = self._make_anchor(instants, images, pyramid, known)
+            anchor = self._refine(self._improve(pyramid[1], Motion(instants, known)))
         else:
             return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
         if not anchor.motion.instants.clock.event_share:
@@ -465,10 +466,23 @@ class TrajectoryEstimator:
         p = anchor.motion.carry(instants)
         target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         packed = self._pack(target, *self._carry_image(anchor, target))
+        for at in others:
+            p = self._choose(packed, p, self._sought_motion(at).carry(instants))
         p = gauss_newton_step(packed, p, self._cost)
         # Nodes of the anchor have taken paths from farther away.
         path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
         return target._replace(p=p, path_index=path_index)
+
+    def _choose(
+        self, images: PackedImages, p: NDArray[np.float32], other: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Choose between trajectories and others at half resolution, where images agree better."""
+        size = self.images.image_shape
+        L, V = images.pixels[..., 0], images.pixels[..., 1]
+        half = PackedImages.of(ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)[1], images.s)
+        own = NodeTrajectories(p, 0).at_level(1, size).p
+        change = choose_trajectories(half, (own, other), self._cost, (1.0, 1.0)) - own
+        return p + NodeTrajectories(change, 1).at_level(0, size).p
 
     def _carry_image(
         self, anchor: Anchor, target: TrajectoryEstimate
