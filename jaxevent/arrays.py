@@ -492,8 +492,7 @@ def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]
         row = int(np.argmin(good))
         raise InputError(
             f"{_place(source)}event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 "
-            "for ON and 0 or -1 for OFF; give p > 0 if all positive numbers are ON, or p == 2 if the "
-            "polarities are 1 and 2"
+            "for ON and 0 or -1 for OFF; give p > 0 if these are ON, or p == 2 of 1 and 2"
         )
     if off.any() and negative.any():
         raise InputError(

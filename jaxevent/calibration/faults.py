@@ -128,7 +128,8 @@ def _check_times(recording: Recording, sample: Sample) -> Iterator[Fault]:
         yield Fault(
             "missing events", float(most), MAX_MISSED_EVENTS,
             f"about {100 * lost / (total + lost):.2g} % of the events are missing in {len(gaps)} "
-            f"{plural('gap', len(gaps))}, as about {most:,} from {begin / 1e6:.6f} to {end / 1e6:.6f} s",
+            f"{plural('gap', len(gaps))}, about {most:,} from {begin / 1e6:.6f} to "
+            f"{end / 1e6:.6f} s",
             "record again with a larger buffer or a lower event rate; images between frames around "
             "the gaps rest on the frames",
         )  # fmt: skip
