@@ -18,6 +18,8 @@ from typing import Any
 FOLDER = "gallery"
 TIMEOUT_S = 300
 
+last_pictures: dict[str, str] = {}  # of each notebook that was executed, for the index
+
 
 def read_notebook(path: Path, execute: bool) -> Any:
     """Read a script as a notebook, with its outputs where it is executed."""
@@ -71,6 +73,15 @@ def format_page(notebook: Any, stem: str) -> tuple[str, dict[str, bytes]]:
     return f"{title}\n\n[Download this notebook]({stem}.ipynb)\n{rest}\n", pictures
 
 
+def on_page_markdown(markdown: str, page: Any, **context: Any) -> str:
+    """Show a picture of each notebook in the index."""
+    if page.file.src_uri == f"{FOLDER}/index.md":
+        for stem, picture in last_pictures.items():
+            row = re.compile(rf"\| (\[(.*?)\]\({stem}\.md\))")
+            markdown = row.sub(rf"| [![\2]({picture})]({stem}.md)<br>\1", markdown)
+    return markdown
+
+
 def on_files(files: Any, config: Any) -> Any:
     """Replace the scripts by their pages, notebooks and pictures."""
     import nbformat
@@ -81,6 +92,7 @@ def on_files(files: Any, config: Any) -> Any:
         files.remove(files.get_file_from_path(f"{FOLDER}/{path.name}"))
         notebook = read_notebook(path, execute)
         page, pictures = format_page(notebook, path.stem)
+        last_pictures.update((path.stem, name) for name in pictures)
         made = {f"{path.stem}.md": page, f"{path.stem}.ipynb": nbformat.writes(notebook)}
         for name, content in (made | pictures).items():
             files.append(File.generated(config, f"{FOLDER}/{name}", content=content))

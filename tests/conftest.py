@@ -49,19 +49,25 @@ hypothesis.settings.register_profile(
     "any", hypothesis.settings.get_profile("tests"), phases=(hypothesis.Phase.generate,)
 )
 
-# They take over 40 s of CPU each. Begun first, they leave no worker waiting for another at the end.
+# They take over 20 s of CPU each with nothing kept. Begun first, they leave no worker waiting for
+# another at the end.
 LONGEST = (
     "test_blob_filters.py",
     "test_blob_fused.py",
     "test_blob_tracker.py",
     "test_cli_motion.py",
+    "test_compensated.py",
     "test_devices.py",
     "test_docs.py",
     "test_egomotion_batch.py",
+    "test_egomotion_flow.py",
+    "test_egomotion_patches.py",
     "test_egomotion_voting.py",
     "test_evaluate_scores.py",
+    "test_events_only.py",
     "test_extremes.py",
     "test_fit.py",
+    "test_fit_blob.py",
     "test_fit_every_method.py",
     "test_fit_motion.py",
     "test_fused.py",
@@ -70,6 +76,7 @@ LONGEST = (
     "test_reconstruction.py",
     "test_recovery.py",
     "test_smoother.py",
+    "test_threads.py",
 )
 
 

@@ -9,6 +9,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import browser
 import pytest
 from pages import run_page, shortened
 
@@ -29,22 +30,41 @@ def generated(page: str) -> str:
     return runpy.run_path(str(ROOT / "experiments" / "generated_pages.py"))[page]()
 
 
-@pytest.mark.slow
-def test_the_site_builds(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built without running the notebooks."""
     pytest.importorskip("jupytext", reason="needs the extra 'docs'")
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
+    folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [*build, "--site-dir", tmp_path / "site"], cwd=ROOT, capture_output=True, text=True,
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder],
+        cwd=ROOT, capture_output=True, text=True,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1", "JAXEVENT_GALLERY": "0"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    pages = list((tmp_path / "site").rglob("*.html"))
-    assert len(pages) > 20
-    # Nothing is fetched from elsewhere when a page is looked at.
+    return folder
+
+
+@pytest.mark.slow
+def test_the_site_needs_no_network(site):
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 40
     fetched = re.compile(r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="?https?://')
     assert not [page for page in pages if fetched.search(page.read_text())]
-    theory = (tmp_path / "site" / "theory" / "reconstruction" / "index.html").read_text()
-    assert theory.count('class="arithmatex"') > 20 and "mathematics.js" in theory
+
+
+@pytest.mark.slow
+def test_equations_are_set_as_mathematics(site, tmp_path):
+    program = browser.find()
+    if program is None:
+        pytest.skip(f"no browser: none of {', '.join(browser.NAMES)} is installed")
+    count = "document.querySelectorAll({!r}).length"
+    with browser.Browser(program, tmp_path) as opened:
+        for page in sorted((DOCS / "theory").glob("*.md")):
+            opened.open(site / "theory" / page.stem / "index.html", 1200)
+            opened.ask("MathJax.startup.promise")
+            written = opened.ask(count.format(".arithmatex"))
+            assert opened.ask(count.format("mjx-container")) == written > 10, page.stem
+            assert opened.ask(count.format("[data-mml-node=merror]")) == 0, page.stem
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-// MathJax 3.2.2 (Apache-2.0), in tex-svg.js beside this file, for pages that hold equations.
+// MathJax 3.2.2 (Apache-2.0, LICENSE-MathJax.txt), in tex-svg.js, for pages that hold equations.
 window.MathJax = {
   tex: {inlineMath: [["\\(", "\\)"]], displayMath: [["\\[", "\\]"]], processEscapes: true},
   options: {ignoreHtmlClass: ".*|", processHtmlClass: "arithmatex", enableMenu: false},

@@ -16,7 +16,7 @@ class HelpFormatter(argparse.HelpFormatter):
     def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: str | None = None) -> None:
         if usage is None:
             names = {a: " ".join([*a.option_strings[:1], *_metavars(a)]) for a in actions}
-            parts = ["%(prog)s" + " [options]" * any(a.option_strings for a in actions)]
+            parts: list[str] = ["%(prog)s" + " [options]" * any(a.option_strings for a in actions)]
             choices = [group._group_actions for group in groups if group.required]
             parts += [f"({' | '.join(names.pop(a) for a in group)})" for group in choices]
             parts += [
@@ -123,7 +123,8 @@ def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     if reading["size"] is None:
         raise InputError("standard input: does not state the sensor's size; give --size W,H")
     lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
-    recording = Recording("standard input", *reading["size"], Events.empty(), camera=lens)
+    width, height = reading["size"]
+    recording = Recording("standard input", width, height, Events.empty(), camera=lens)
     return recording, chunks.read_lines(sys.stdin.buffer)
 
 

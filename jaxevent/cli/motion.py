@@ -76,7 +76,7 @@ def add(commands: Any) -> None:
         metavar="PX",
         type=float,
         help="focal length in px, for a recording without calibration; the principal point is "
-        "the sensor's centre",
+        "the sensor's centre, and sigmas of rotations count 5 %% of them for its error",
     )
     arguments.add_live(one, "rows of motion.csv, as with --causal,")
     arguments.add_reading(one)
@@ -210,6 +210,8 @@ def run(
     estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
     if choice is not None:
         told = choice.include_doubt(told)
+    if focal is not None:
+        told = told.with_focal_error()
     told, warning = told.with_flow_consistency(recording)
     if warning:
         print(warning)

@@ -202,7 +202,8 @@ class _WindowFits(NamedTuple):
             return self.planar if turn is None else self.basis.mean(0) @ turn
         if turn is None:
             flow = np.tile(self.planar, len(self.basis))
-            turn = np.asarray(np.linalg.lstsq(self.basis.reshape(-1, 3), flow, rcond=None)[0])
+            rows = self.basis.reshape(-1, 3)
+            turn = np.asarray(np.linalg.lstsq(rows, flow, rcond=None)[0], np.float64)
         return turn
 
 

@@ -21,7 +21,7 @@ from jaxevent.errors import InputError, require
 from jaxevent.events import event_image
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, EventSource, Recording, Times, microseconds
-from jaxevent.show.images import new_figure
+from jaxevent.show.images import COLOURS, new_figure
 from jaxevent.show.motion_figures import motion_figure
 from jaxevent.show.track_figures import draw_paths
 from jaxevent.tuning import FitResult
@@ -224,11 +224,11 @@ def plot_losses(fitted: FitResult | Sequence[FitResult], names: Sequence[str] = 
         length = 1 + max((line[2] for line in one.history), default=0)
         for start in sorted({line[0] for line in one.history}):
             lines = [line for line in one.history if line[0] == start]
-            for column, colour, name in ((3, "C0", "fit"), (4, "C1", "validation")):
+            for column, colour, name in ((3, COLOURS[0], "fit"), (4, COLOURS[1], "validation")):
                 seen = [line for line in lines if line[column] is not None]
                 at = [line[1] * length + line[2] for line in seen]
                 losses = [line[column] for line in seen]
-                axis.plot(at, losses, colour, lw=1, label=name if start == 0 else None)
+                axis.plot(at, losses, color=colour, lw=1, label=name if start == 0 else None)
         axis.set(title=title, xlabel="iteration", ylabel="loss")
         axis.spines[["top", "right"]].set_visible(False)
         if axis.lines:

@@ -425,15 +425,16 @@ def _spreads(
                 continue
             mean = float(values.mean()) if mean is None else column[2] * mean
             every.append(np.append(values, mean))
-            boxes.append({"mean": mean, "text": format_number(mean / column[2], column)})
+            box: dict[str, Any] = {"mean": mean, "text": format_number(mean / column[2], column)}
+            boxes.append(box)
             if len(values) > 1:
                 low, middle, high = np.percentile(values, [25, 50, 75])
                 reach = 1.5 * (high - low)
                 near = values[(values >= low - reach) & (values <= high + reach)]
                 far = values[(values < low - reach) | (values > high + reach)]
                 far = far[spread_rows(len(far), MAX_OUTLIERS)]
-                boxes[-1] |= {"box": _rounded([near[0], low, middle, high, near[-1]])}
-                boxes[-1] |= {"far": _rounded(far)}
+                box |= {"box": _rounded([near[0], low, middle, high, near[-1]])}
+                box |= {"far": _rounded(far)}
         if not every:
             continue
         better = "" if measure in own else f", {HIGHER if measure in HIGHER_IS_BETTER else LOWER}"

@@ -56,9 +56,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Toy(Parameters):
-    a = Positive(1.0, "1", "least at 2")
-    b = Number(0.0, "1", "least at -1")
-    c = Number(0.0, "1", "searched, least at 0.3")
+    a: Positive = Positive(1.0, "1", "least at 2")
+    b: Number = Number(0.0, "1", "least at -1")
+    c: Number = Number(0.0, "1", "searched, least at 0.3")
 
     def __init__(self, **values: Any):
         super().__init__(**values)

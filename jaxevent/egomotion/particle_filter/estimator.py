@@ -55,7 +55,7 @@ MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 # The maximum of the votes is up to about half a per cent beside the motion.
 PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
-CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.05)  # other models'
+CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)  # other models'
 
 _run = eqx.filter_jit(filtering.run)
 _init = eqx.filter_jit(filtering.init)
@@ -471,11 +471,11 @@ class ChunkRunner:
         drift, longest = np.zeros_like(motion.covariance), float(self.params.tau_max)
         if self.lock is not None:
             searching = np.concatenate([info.searching for _, info, _ in parts])
-            valid, drift = tell_from_later(
+            valid, covariance, drift = tell_from_later(
                 motion.t, motion.mean, motion.covariance, searching, motion.valid,
                 self.lock.diffusion,
             )  # fmt: skip
-            motion = dataclasses.replace(motion, valid=valid)
+            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
         drift = dataclasses.replace(motion, covariance=drift)._with_gaps(longest).covariance
         motion = motion._with_gaps(longest)
         span = 2 * motion.lag

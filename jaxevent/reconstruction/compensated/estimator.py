@@ -805,12 +805,8 @@ class MotionCompensation(ImageEstimator[Params]):
         Raises:
             InputError: If the recording has no frames, or times are missing or outside the data.
         """
-        self.check(recording)
-        params = self.Params() if params is None else params
-        self.check_clocks(recording, params)
+        params = self.check_request(recording, times, params, extrapolate)
         wanted = np.atleast_1d(microseconds(times))
-        if not extrapolate:
-            self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
         trajectories = make_trajectory_estimator(recording, params, MAX_WINDOW_EVENTS)
