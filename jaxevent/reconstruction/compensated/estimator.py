@@ -339,7 +339,10 @@ class TrajectoryEstimator:
 
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         """Return the variances with which motion is estimated."""
-        return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
+        cautious = V * np.float32(self._caution)
+        for k in np.flatnonzero(clear.max((1, 2)) > 0):
+            np.copyto(cautious[k], V[k], where=clear[k] > 0)
+        return cautious
 
     def _anchor_times(self, t: int) -> list[int]:
         """Return the times (us) of the anchors next to a time, at most two, the nearest first.

@@ -277,9 +277,9 @@ class FrameBrightness:
             )
             return cut.swapaxes(1, 2).reshape(h * w, MEDIAN_BLOCK_PX**2)
 
-        changes = [
-            float(np.median(values[chosen]))
-            for values, chosen in zip(blocks(change), blocks(quiet), strict=True)
-            if chosen.sum() >= MIN_BLOCK_PIXELS
-        ]
+        chosen = blocks(quiet)
+        number, found = chosen.sum(1), np.sort(np.where(chosen, blocks(change), np.inf), axis=1)
+        rows = np.flatnonzero(number >= MIN_BLOCK_PIXELS)
+        low, high = (number[rows] - 1) // 2, number[rows] // 2
+        changes = (found[rows, low] + found[rows, high]) / 2
         return float(np.median(changes)) if len(changes) >= MIN_BLOCKS else 0.0
