@@ -3,7 +3,7 @@
     python experiments/bench.py [PART ...] [--gate | --bless] [--json FILE]
 
 Parts: images (the complete path from a file to images, losses, gradients), xla (the scan, where
-there is no kernel), calibration, smoother, tracker (bench_blob.py), voting and motion
+there is no kernel), calibration, smoother, mc, tracker (bench_blob.py), voting and motion
 (bench_motion.py), events-only (events_only.py), memory (streaming.py). Without any, all but
 motion, which takes minutes.
 CPU seconds of this process are compared, so other programs on the machine change little: `--gate`
@@ -49,6 +49,9 @@ GATED = {
     "general voting, N = 500 / numba loop": ("higher", 0.4),
     "events-only / images of tiles": ("higher", 0.4),
     "events-only: pixel of 640x480 / of 240x180": ("lower", 0.4),
+    "mc: image of 100 Hz video / optical flow": ("lower", 0.3),
+    "mc: single image / optical flow": ("lower", 0.3),
+    "mc: single image, pixel of 1200x720 / of 240x180": ("lower", 0.4),
     "peak memory of 10 M events, GB": ("lower", 0.25),
 }
 
@@ -59,6 +62,7 @@ PARTS = {
     "xla": "bench_images.xla_bench",
     "calibration": "bench_images.calibration_bench",
     "smoother": "bench_images.smoother_bench",
+    "mc": "bench_images.motion_compensated_bench",
     "tracker": "bench_blob.tracker_bench",
     "voting": "bench_motion.voting_bench",
     "motion": "bench_motion.motion_bench",

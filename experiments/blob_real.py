@@ -27,7 +27,7 @@ DOT_ROWS: dict[str, dict[str, Any]] = {
     "moment": {"gate_shape": "ellipse"},
     "moment, M = 32": {"gate_shape": "ellipse", "events_per_step": 32},
 }
-DOT_FOUND = {"gate_shape": "ellipse", "events_per_step": 32, "prefilter": True}
+DOT_FOUND: dict[str, Any] = {"gate_shape": "ellipse", "events_per_step": 32, "prefilter": True}
 
 STREET_PARTS = {"chosen": (0.05, 1.0), "reported": (1.0, 2.36)}
 # Cars cross their own length in 0.5 s: a velocity averaged over tenths of a second (Q_v), and life

@@ -2,8 +2,9 @@
 
 `SCENES` has each kind of target once, on which the search was built, `VARIED` came later: other
 sensors, outlines, bars, pairs of edges, one polarity only, targets that come and go, flicker, a
-background that moves with the camera, very short and very long recordings, stars. Constants were
-chosen on seeds below 20. Each is called with a seed and gives the recording and its truth.
+background that moves with the camera, very short and very long recordings, stars; `OBJECTS` are
+rigid bodies, flocks, hands and targets that leave. Constants were chosen on seeds below 20, and of
+`OBJECTS` on seeds from 100 on. Each is called with a seed and gives the recording and its truth.
 """
 
 import dataclasses
@@ -567,4 +568,218 @@ VARIED: dict[str, Scene] = {
     "1 x 300k/s, 100 ms, 10 x": lambda s: drifting(1, 3e5, 5e3, 12, 0.1, 3e6, s, frame=HD),
     "noise 1M/s, 1280x720": _noise(1e6, HD, 0.5, 30),
     "noise 500/s, 346x260, 20 s": _noise(500, DAVIS, 20.0, 5),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Paced:
+    """An outline or target whose events come as it moves: none at rest, all at its top speed."""
+
+    target: Any
+    top: float  # px/s
+
+    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.target.state(t)
+
+    def visible(self, t: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.hypot(*self.target.motion.state(t)[:, 2:4].T) > 0.1 * self.top
+
+    def events(self, duration, rng):
+        t, xi, on = self.target.events(duration, rng)
+        speed = np.hypot(*self.target.motion.state(t)[:, 2:4].T)
+        kept = rng.random(len(t)) < speed / self.top
+        return t[kept], xi[kept], on[kept]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tailed:
+    """A target and a dim tail: a share of its events come late, where it was, and are OFF."""
+
+    target: Target
+    late: float  # s, mean
+    share: float
+
+    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.target.state(t)
+
+    def visible(self, t: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.ones(t.shape, bool)
+
+    def events(self, duration, rng):
+        t, xi, on = self.target.events(duration, rng)
+        tail = rng.random(len(t)) < self.share
+        t = t + np.where(tail, rng.exponential(self.late, len(t)), 0)
+        on = np.where(tail, False, True)
+        kept = t < duration
+        return t[kept], xi[kept], on[kept]
+
+
+@dataclasses.dataclass(frozen=True)
+class Strip:
+    """A strip (left, top, right, bottom) px with events at a steady rate: background."""
+
+    box: tuple[float, float, float, float]
+    rate: float
+
+    def events(self, duration, rng):
+        n = rng.poisson(self.rate * duration)
+        low, high = self.box[:2], self.box[2:]
+        return rng.uniform(0, duration, n), rng.uniform(low, high, (n, 2)), rng.random(n) < 0.5
+
+
+class SwingMotion:
+    """A swing about a centre: amplitude (px) along x, a shallow arc, `rate` rad/s."""
+
+    def __init__(self, centre: tuple[float, float], amplitude: float, rate: float, phase: float):
+        self.centre, self.amplitude, self.rate, self.phase = centre, amplitude, rate, phase
+
+    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, out = self.rate * t + self.phase, np.zeros((len(t), 8))
+        s, c = np.sin(a), np.cos(a)
+        out[:, 0] = self.centre[0] + self.amplitude * s
+        out[:, 1] = self.centre[1] + 0.25 * self.amplitude * (1 - s * s)
+        out[:, 2] = self.amplitude * self.rate * c
+        out[:, 3] = -0.5 * self.amplitude * self.rate * s * c
+        out[:, 4:6] = 1.0
+        return out
+
+
+def _circle(radius: float, corners: int = 24) -> NDArray[np.float64]:
+    angle = np.linspace(0, 2 * np.pi, corners + 1)
+    return radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def _segments(*lines: NDArray) -> NDArray[np.float64]:
+    gap = np.full((1, 2), np.nan)
+    return np.concatenate([part for line in lines for part in (line, gap)][:-1])
+
+
+def _ball_and_arm(seed: int) -> tuple[Recording, BlobTruth]:
+    """A ball is thrown out of the lower edge at 0.28 s; the arm that threw it goes on."""
+    rng = np.random.default_rng([seed, 131])
+    speed = np.array([rng.uniform(-150, 150), 180 / 0.28])
+    start = np.array([173 + rng.uniform(-30, 30), 90.0])
+    ball = Outline(LinearMotion(tuple(start), tuple(speed), spin=6.0), 6e4, _circle(18))
+    place = start + (rng.choice([-1, 1]) * 15.0, 135.0)
+    arm_motion = LissajousMotion(
+        tuple(place), (12.0, 8.0), (1.3, 0.9), (rng.uniform(0, 6), rng.uniform(0, 6)), spin=0.8
+    )
+    arm: Any = Outline(arm_motion, 1.5e4, _square(7, 5))
+    parts: list[Any] = [ball, arm]
+    return simulate_blobs(parts, DAVIS, 0.75, 5e3, seed)
+
+
+def _pendulum(seed: int) -> tuple[Recording, BlobTruth]:
+    """A bob, silent where it turns, swings before a strip of steady events for 5 s."""
+    rng = np.random.default_rng([seed, 141])
+    swing: Any = SwingMotion((64, 70), 40.0, rng.uniform(3.5, 5.5), rng.uniform(0, 6))
+    bob: Any = Paced(Outline(swing, 2e4, _circle(7)), 40.0 * swing.rate)
+    low = rng.uniform(66, 74)
+    strip: Any = Strip((10, low, 118, low + 6), 6e3)
+    return with_background([bob], DVS, 5.0, 1e3, seed, [strip])
+
+
+def _pen(seed: int) -> tuple[Recording, BlobTruth]:
+    """A pen of 90 px turns about a point that hardly moves."""
+    rng = np.random.default_rng([seed, 151])
+    motion = LissajousMotion(
+        (173, 130), (10.0, 8.0), (0.4, 0.5), (rng.uniform(0, 6), rng.uniform(0, 6)),
+        theta=rng.uniform(0, 3), spin=rng.choice([-1, 1]) * rng.uniform(4, 9),
+    )  # fmt: skip
+    pen: Any = Outline(motion, 4e4, _square(4, 11))
+    return simulate_blobs([pen], DAVIS, 2.0, 5e3, seed)
+
+
+def _textured_disc(seed: int) -> tuple[Recording, BlobTruth]:
+    """A disc of 45 px with twelve lines on it turns in its place, or drifts."""
+    rng = np.random.default_rng([seed, 161])
+    lines = []
+    for _ in range(12):
+        r, a = 38 * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+        d = rng.uniform(4, 12) * np.array([np.cos(b := rng.uniform(0, np.pi)), np.sin(b)])
+        middle = r * np.array([np.cos(a), np.sin(a)])
+        lines.append(np.stack([middle - d / 2, middle + d / 2]))
+    v = (0.0, 0.0) if seed % 2 else (float(rng.uniform(20, 60)), float(rng.uniform(-20, 20)))
+    motion = LinearMotion((140, 130), v, spin=rng.choice([-1, 1]) * rng.uniform(3, 8))
+    disc: Any = Outline(motion, 8e4, _segments(_circle(45), *lines))
+    return simulate_blobs([disc], DAVIS, 1.5, 5e3, seed)
+
+
+def _rim(seed: int) -> tuple[Recording, BlobTruth]:
+    """A rim of 40 px rolls across the sensor."""
+    rng = np.random.default_rng([seed, 171])
+    speed = float(rng.choice([-1, 1]) * rng.uniform(80, 160))
+    motion = LinearMotion((173 - speed * 0.75, 130 + rng.uniform(-40, 40)), (speed, 10.0))
+    rim: Any = Outline(motion, 3e4, _circle(40))
+    return simulate_blobs([rim], DAVIS, 1.5, 5e3, seed)
+
+
+def _thirty(seed: int) -> tuple[Recording, BlobTruth]:
+    """30 blobs of 3 px on curves of their own, which cross."""
+    rng = np.random.default_rng([seed, 181])
+    targets = [
+        Target(
+            LissajousMotion(
+                tuple(rng.uniform((60, 50), (286, 210))), tuple(rng.uniform(20, 45, 2)),
+                tuple(rng.uniform(0.15, 0.4, 2)), tuple(rng.uniform(0, 6, 2)), size=(3.0, 2.5),
+            ),
+            2e3,
+        )
+        for _ in range(30)
+    ]  # fmt: skip
+    return simulate_blobs(targets, DAVIS, 2.0, 3e3, seed)
+
+
+def _hand(seed: int) -> tuple[Recording, BlobTruth]:
+    """The outline of a hand of 100 px waves before the camera."""
+    rng = np.random.default_rng([seed, 191])
+    points = [(-25, 45), (-28, 0)]
+    for k in range(4):
+        x = -28 + 14 * k
+        points += [(x, -rng.uniform(35, 55)), (x + 9, -rng.uniform(35, 55)), (x + 11, 0)]
+    points += [(45, -5), (48, 4), (28, 25), (25, 45)]
+    motion = LissajousMotion(
+        (173, 130), (50.0, 20.0), (0.8, 0.6), tuple(rng.uniform(0, 6, 2)), spin=0.3
+    )
+    hand: Any = Outline(motion, 6e4, np.array(points, float))
+    return simulate_blobs([hand], DAVIS, 2.0, 5e3, seed)
+
+
+def _close_flock(seed: int) -> tuple[Recording, BlobTruth]:
+    """Twelve birds of 3 px that fly together, 18 px apart, each a little its own way."""
+    rng = np.random.default_rng([seed, 201])
+    heading, targets = rng.uniform(0, 2 * np.pi), []
+    v = 60 * np.array([np.cos(heading), np.sin(heading)])
+    for k in range(12):
+        place = np.array([173, 130]) - v * 1.0 + 18 * np.array([k % 4 - 1.5, k // 4 - 1])
+        own = v + rng.normal(size=2) * 2.0
+        start = tuple(place + rng.normal(size=2) * 1.5)
+        targets.append(Target(LinearMotion(start, tuple(own), size=(3.0, 2.0)), 2e3))
+    return simulate_blobs(targets, DAVIS, 2.0, 3e3, seed)
+
+
+def _dim_tails(seed: int) -> tuple[Recording, BlobTruth]:
+    """Five lights that leave dim tails of OFF events for 0.3 s."""
+    rng = np.random.default_rng([seed, 211])
+    targets: list[Any] = []
+    for k in range(5):
+        circle = CircularMotion(
+            (60 + 56 * k, 90 + 80 * (k % 2)), 25, 2.4 * rng.choice([-1, 1]), rng.uniform(0, 6),
+            size=(2.5, 2.5),
+        )  # fmt: skip
+        targets.append(Tailed(Target(circle, 3e3), 0.3, 0.4))
+    return simulate_blobs(targets, DAVIS, 3.0, 3e3, seed)
+
+
+OBJECTS: dict[str, Scene] = {
+    "ball leaves, arm stays": _ball_and_arm,
+    "pendulum before a strip": _pendulum,
+    "pen that turns": _pen,
+    "bar of 80 px, turning": _outline(40, 2e4, 80, DAVIS, 2.0, "bar"),
+    "textured disc that turns": _textured_disc,
+    "rim of 40 px": _rim,
+    "30 blobs, 346x260": _thirty,
+    "hand": _hand,
+    "flock of 12, close": _close_flock,
+    "dim tails": _dim_tails,
 }

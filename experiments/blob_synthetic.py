@@ -243,11 +243,11 @@ def contact(seeds: Sequence[int]) -> dict[str, Any]:
 def cars(seeds: Sequence[int]) -> dict[str, Any]:
     """Measure errors of 1 / TTC of each car at every event of its lights."""
     runs: dict[str, list[dict[str, float]]] = {}
-    settings = {"preset": "ttc", "lambda0": 6.0, "events_per_step": 8, "P0_p": 1.0, "P0_v": 1e4}
+    params = moment.Params(preset="ttc", lambda0=6.0, events_per_step=8, P0_p=1.0, P0_v=1e4)
     for seed in seeds[:2]:
         recording, truth = blob_scene("cars", seed, rate=6e4)
         points = [(*state[:2], 6.0) for state in truth(0.0)[0]]
-        tracks = moment.estimate(recording, moment.Params(**settings), seeds=points)
+        tracks = moment.estimate(recording, params, seeds=points)
         window = (1.0, 1.2)
         whose = np.concatenate([one.id for one in tracks.events(*window)])
         t = np.concatenate([one.t for one in tracks.events(*window)])

@@ -456,6 +456,8 @@ def coordinates(
         known = max(size) < MAX_SIDE_PX
         on = f"on the {size[0]}x{size[1]} sensor " if known else ""
         remedy = "give the sensor's size or remove the event" if known else "remove the event"
+        if values[bad_row] != np.rint(values[bad_row]):
+            remedy = "round x and y to the pixels of the sensor"
         raise InputError(
             f"{_place(source)}event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; "
             f"{on}{name} is a whole number from {origin} to {last}, so {remedy}"
@@ -490,7 +492,7 @@ def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]
         row = int(np.argmin(good))
         raise InputError(
             f"{_place(source)}event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 "
-            "for ON and 0 or -1 for OFF; p > 0 makes it so where other positive numbers are ON"
+            "for ON and 0 or -1 for OFF; give p > 0 if these are ON, or p == 2 of 1 and 2"
         )
     if off.any() and negative.any():
         raise InputError(

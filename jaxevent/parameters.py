@@ -5,9 +5,9 @@ import inspect
 import math
 import tomllib
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform, overload
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from jaxevent.dispatch import check_platform_available
 from jaxevent.display import with_article
 from jaxevent.errors import InputError, InputWarning
 
+Numeric = float | Array | np.ndarray | np.number  # a number, or a traced one
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
 
@@ -97,6 +98,10 @@ class Number(Setting):
         raw = instance.raw[self.name]
         follows = self.gradient or self.name in instance.followed
         return self.physical(raw if follows else jax.lax.stop_gradient(raw))
+
+    if TYPE_CHECKING:  # the type of an argument of a `Params`
+
+        def __set__(self, instance: Any, value: Numeric | Sequence[Numeric]) -> None: ...
 
     def physical(self, raw: Array) -> Array:
         """Convert the stored number to the value."""
@@ -198,6 +203,10 @@ class Choice(Setting):
     def __get__(self, instance: "Parameters | None", owner: type) -> Any:
         return self if instance is None else dict(instance.chosen)[self.name]
 
+    if TYPE_CHECKING:
+
+        def __set__(self, instance: Any, value: str | bool) -> None: ...
+
     def __repr__(self) -> str:
         return f"{super().__repr__()} (one of {', '.join(map(format_value, self.options))})"
 
@@ -223,6 +232,10 @@ class Count(Setting):
     def __get__(self, instance: "Parameters | None", owner: type) -> Any:
         return self if instance is None else dict(instance.chosen)[self.name]
 
+    if TYPE_CHECKING:
+
+        def __set__(self, instance: Any, value: int) -> None: ...
+
     def check(self, value: Any) -> None:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise InputError(
@@ -231,8 +244,8 @@ class Count(Setting):
 
 
 if TYPE_CHECKING:
-    # To type checkers and editors a plain class: subclasses take what `Parameters.__init__` takes,
-    # not the fields, as those of an `eqx.Module` would.
+    # To type checkers and editors a plain class, whose arguments are keywords; those of an
+    # `eqx.Module` may be positional.
     class _Module:
         pass
 else:
@@ -249,7 +262,21 @@ def _inherited(base: Any, owner: str) -> Any:
     return init
 
 
-class Parameters(_Module):
+@dataclass_transform(
+    kw_only_default=True, field_specifiers=(Number, Positive, UnitInterval, Choice, Count)
+)
+class _ParameterArrays(_Module):
+    """State of `Parameters`."""
+
+    raw: dict[str, Array]
+    chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
+    followed: frozenset[str] = eqx.field(static=True)  # see `Parameters.with_derivatives`
+    # The homogeneous coordinate of `raw`: 1 of parameters, 0 of what is derived by them, and of
+    # differences of two. Nothing depends on it, so JAX makes it 0 in every gradient and tangent.
+    point: Array
+
+
+class Parameters(_ParameterArrays):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
     `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of
@@ -262,12 +289,8 @@ class Parameters(_Module):
     params)` has those by the parameters themselves.
     """
 
-    raw: dict[str, Array]
-    chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
-    followed: frozenset[str] = eqx.field(static=True)  # see `with_derivatives`
-    # The homogeneous coordinate of `raw`: 1 of parameters, 0 of what is derived by them, and of
-    # differences of two. Nothing depends on it, so JAX makes it 0 in every gradient and tangent.
-    point: Array
+    if TYPE_CHECKING:
+        preset: str | None = None
 
     numbers: ClassVar[Mapping[str, Number]] = {}
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
@@ -277,6 +300,10 @@ class Parameters(_Module):
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
+        # Editors know the arguments by these annotations; to Equinox they would be fields.
+        for name, value in vars(cls).items():
+            if isinstance(value, Setting):
+                cls.__annotations__.pop(name, None)
         own = vars(cls).items()
         cls.numbers = {**cls.numbers, **{k: v for k, v in own if isinstance(v, Number)}}
         cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice | Count)}}

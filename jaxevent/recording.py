@@ -113,6 +113,14 @@ class EventColumns(NamedTuple):
 class ColumnSource(EventSource, Protocol):
     """An `EventSource` that can be read without checks."""
 
+    def image_rows(self, rows: slice) -> NDArray[np.uint16] | None:
+        """Read the y of a range of rows; None where `columns` returns None.
+
+        Args:
+            rows: The rows, step 1.
+        """
+        ...
+
     def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
         """Read a range of rows as they are stored.
 
@@ -892,5 +900,5 @@ class Recording(HtmlRepr):
         """Raise `InputError` if there is neither an event nor a frame."""
         if not len(self.events) and not self.frames:
             raise InputError(
-                f"{source or self.name}: holds no event and no frame; nothing can be estimated"
+                f"{source or self.name}: holds no event and no frame; choose a recording with some"
             )

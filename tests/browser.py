@@ -35,6 +35,7 @@ class Browser:
     def __init__(self, program: str, folder: Path):
         self._program, self._folder = program, folder
         self._number, self._rest = 0, b""
+        self.errors: list[str] = []  # of the console, since the page was opened
 
     def __enter__(self) -> "Browser":
         theirs, self._commands = os.pipe()
@@ -53,7 +54,8 @@ class Browser:
             target = self.call("Target.createTarget", url="about:blank")["targetId"]
             attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
             self._session = attached["sessionId"]
-            self.call("Page.enable")
+            for domain in ("Page", "Runtime", "Log"):
+                self.call(f"{domain}.enable")
         except BaseException:
             self.__exit__()
             raise
@@ -71,7 +73,12 @@ class Browser:
             assert part, "Chromium ended"
             self._rest += part
         message, _, self._rest = self._rest.partition(b"\0")
-        return json.loads(message)
+        answer = json.loads(message)
+        said = answer.get("params", {})
+        kind = said.get("type") or said.get("entry", {}).get("level")
+        if answer.get("method") == "Runtime.exceptionThrown" or kind in ("error", "warning"):
+            self.errors.append(str(said))
+        return answer
 
     def call(self, method: str, **values: Any) -> dict[str, Any]:
         """Send a command of the DevTools protocol and wait for its answer."""
@@ -87,6 +94,7 @@ class Browser:
 
     def open(self, path: Path, width: int, height: int = 900, *, dark: bool = False) -> None:
         """Show a file in a window of so many px."""
+        self.errors.clear()
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
         self.call(
@@ -126,9 +134,10 @@ class Browser:
 
     def press(self, key: str, code: int) -> None:
         """Press a key."""
+        text = {"text": "\r"} if key == "Enter" else {}
         for kind in ("keyDown", "keyUp"):
             self.call(
-                "Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=code, text="\r"
+                "Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=code, **text
             )
 
     def picture(self, path: Path) -> None:

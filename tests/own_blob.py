@@ -12,7 +12,7 @@ from jaxevent.parameters import Positive
 class Params(TrackerParams):
     """Parameters of the Student tracker."""
 
-    nu = Positive(4.0, "", "degrees of freedom of the events' scatter")
+    nu: Positive = Positive(4.0, "", "degrees of freedom of the events' scatter")
 
 
 def squared(expected, e):

@@ -15,9 +15,11 @@ from jaxevent.reconstruction.filtering import Event, Filter, FrameModel, Observa
 class Params(FrameParams):
     """Parameters of the trend filter."""
 
-    alpha = Positive(10.0, "rad/s", "rate at which the last frame pulls")
-    gain = UnitInterval(0.1, "1", "part of an event's slope that the slope takes over")
-    tau = Positive(0.02, "s", "time constant in which a slope fades")
+    alpha: Positive = Positive(10.0, "rad/s", "rate at which the last frame pulls")
+    gain: UnitInterval = UnitInterval(
+        0.1, "1", "part of an event's slope that the slope takes over"
+    )
+    tau: Positive = Positive(0.02, "s", "time constant in which a slope fades")
 
 
 class State(eqx.Module):

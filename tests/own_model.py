@@ -35,8 +35,8 @@ class ZoomRoll(Model):
 class Params(Parameters):
     """What the guess is."""
 
-    zoom = Number(0.5, "1/s", "guess of the zoom")
-    roll = Number(1.0, "rad/s", "guess of the roll")
+    zoom: Number = Number(0.5, "1/s", "guess of the zoom")
+    roll: Number = Number(1.0, "rad/s", "guess of the roll")
 
 
 class Told(eqx.Module):

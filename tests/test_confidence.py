@@ -15,12 +15,12 @@ from jaxevent.tuning import Settings, optimise
 
 
 class Toy(Parameters):
-    mean = Number(0.0, "px", "of normal numbers")
-    spread = Positive(1.0, "px", "their standard deviation")
-    idle = Positive(1.0, "1", "does nothing")
-    gain = Positive(1.0, "1", "the larger the better, ever less", most=1e6)
-    capped = Positive(0.5, "1", "least at 1, beyond its bound", most=0.8)
-    late = Number(0.0, "s", "is searched", gradient=False)
+    mean: Number = Number(0.0, "px", "of normal numbers")
+    spread: Positive = Positive(1.0, "px", "their standard deviation")
+    idle: Positive = Positive(1.0, "1", "does nothing")
+    gain: Positive = Positive(1.0, "1", "the larger the better, ever less", most=1e6)
+    capped: Positive = Positive(0.5, "1", "least at 1, beyond its bound", most=0.8)
+    late: Number = Number(0.0, "s", "is searched", gradient=False)
 
     def __init__(self, **values: Any):
         super().__init__(**values)

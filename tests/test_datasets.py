@@ -264,13 +264,14 @@ def test_a_data_set_is_evaluated_and_fitted(tmp_path, monkeypatch):
     )
     (tmp_path / "set").mkdir()
     (tmp_path / "set/a_data.hdf5").write_bytes(whole)
-    text = 'recordings = ["mvsec:set"]\n{}[[method]]\nname = "akf"\n'
+    text = 'recordings = ["mvsec:set"]\n{}[[method]]\nname = "blend"\n'
     config = tmp_path / "run.toml"
     config.write_text(text.format(""))
     refuses("2 cameras, left, right; choose one", jaxevent.evaluate, config)
     config.write_text(text.format('stream = "left"\n'))
     (row,) = jaxevent.evaluate(config, tmp_path / "out")
     assert row["recording"] == "mvsec:a" and np.isfinite(row["mse"])
-    config.write_text(text.format('stream = "left"\niterations = 2\n') + 'fit = ["c_on"]\n')
+    text = text.format('stream = "left"\niterations = 2\n')
+    config.write_text(text + "search = { I0 = [1, 2, 3] }\n")
     jaxevent.fit(config, tmp_path / "fitted", ["mvsec:set"])
     assert (tmp_path / "fitted/params.toml").is_file()

@@ -1,7 +1,7 @@
 """The site builds without a warning, its examples run, its tables are those of the code."""
 
-import importlib
 import os
+import pkgutil
 import re
 import runpy
 import subprocess
@@ -9,35 +9,62 @@ import sys
 import tomllib
 from pathlib import Path
 
+import browser
 import pytest
 from pages import run_page, shortened
 
 import jaxevent
 from jaxevent.metrics import MEASURE_MEANINGS
-from jaxevent.show.tables import COLUMNS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 WITH_CODE = [
     page.relative_to(DOCS).as_posix()
     for page in sorted(DOCS.rglob("*.md"))
-    if "```" in page.read_text() and page.name != "notebook.md"  # see test_notebook_tasks.py
+    if "```" in page.read_text()
 ]
 
 
-@pytest.mark.slow
-def test_the_site_builds(tmp_path):
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
+def generated(page: str) -> str:
+    """Return a page that is made from the code."""
+    return runpy.run_path(str(ROOT / "experiments" / "generated_pages.py"))[page]()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built without running the notebooks."""
+    pytest.importorskip("jupytext", reason="needs the extra 'docs'")
+    folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [*build, "--site-dir", tmp_path / "site"], cwd=ROOT, capture_output=True, text=True,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder],
+        cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1", "JAXEVENT_GALLERY": "0"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    pages = list((tmp_path / "site").rglob("*.html"))
-    assert len(pages) > 20
-    # Nothing is fetched from elsewhere when a page is looked at.
+    return folder
+
+
+@pytest.mark.slow
+def test_the_site_needs_no_network(site):
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 40
     fetched = re.compile(r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="?https?://')
     assert not [page for page in pages if fetched.search(page.read_text())]
+
+
+@pytest.mark.slow
+def test_equations_are_set_as_mathematics(site, tmp_path):
+    program = browser.find()
+    if program is None:
+        pytest.skip(f"no browser: none of {', '.join(browser.NAMES)} is installed")
+    count = "document.querySelectorAll({!r}).length"
+    with browser.Browser(program, tmp_path) as opened:
+        for page in sorted((DOCS / "theory").glob("*.md")):
+            opened.open(site / "theory" / page.stem / "index.html", 1200)
+            opened.ask("MathJax.startup.promise")
+            written = opened.ask(count.format(".arithmatex"))
+            assert opened.ask(count.format("mjx-container")) == written > 10, page.stem
+            assert opened.ask(count.format("[data-mml-node=merror]")) == 0, page.stem
 
 
 @pytest.mark.slow
@@ -55,7 +82,7 @@ def test_examples_run(page, tmp_path, monkeypatch, float32):
 
 
 def test_table_of_parameters_is_that_of_the_code():
-    text = runpy.run_path(str(ROOT / "experiments" / "parameters.py"))["page"]()
+    text = generated("parameters_page")
     for name, method in jaxevent.METHODS.items():
         own = text.split(f"### {name}\n")[1].split("\n### ")[0].split("\n## ")[0]
         values = method.Params().values()
@@ -70,12 +97,12 @@ def test_table_of_parameters_is_that_of_the_code():
             assert told[setting] == (pytest.approx(value, rel=1e-3) if number else value), setting
 
 
-def test_every_number_is_explained_as_in_the_code():
-    text = (DOCS / "fitting.md").read_text()
-    told = re.findall(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$", text, re.MULTILINE)
-    titles = {place: title for title, place, _, _ in COLUMNS}
-    expected = [(name, titles.get(name, ""), text) for name, text in MEASURE_MEANINGS.items()]
-    assert [(name, title, text.replace(r"\|", "|")) for name, title, text in told] == expected
+def test_the_page_of_measures_explains_every_number():
+    text = generated("measures_page")
+    rows = re.findall(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$", text, re.MULTILINE)
+    assert [name for name, _, _ in rows] == list(MEASURE_MEANINGS)
+    assert {title for _, title, _ in rows} >= {"MSE x 1e-2", "SSIM", "IDF1"}
+    assert any("mean of |U - U_true|" in row[2].replace(r"\|", "|") for row in rows)
 
 
 def test_toml_is_toml():
@@ -86,8 +113,19 @@ def test_toml_is_toml():
 
 def test_every_page_is_in_the_navigation():
     nav = (ROOT / "mkdocs.yml").read_text()
-    for page in DOCS.rglob("*.md"):
+    pages = [*DOCS.rglob("*.md"), *(page.with_suffix(".md") for page in DOCS.rglob("*.py"))]
+    for page in pages:
         assert page.relative_to(DOCS).as_posix() in nav
+
+
+def test_pages_are_short():
+    """Results together, the start page, and every page but theory and formats."""
+    words = {page.relative_to(DOCS).as_posix(): len(page.read_text().split())
+             for page in DOCS.rglob("*.md")}  # fmt: skip
+    assert words["index.md"] <= 1000
+    assert sum(count for page, count in words.items() if page.startswith("results/")) < 7000
+    for page, count in words.items():
+        assert count <= 2500 or page.startswith("theory/") or page == "formats.md", page
 
 
 def test_pages_of_the_reference_show_names_that_exist():
@@ -97,5 +135,18 @@ def test_pages_of_the_reference_show_names_that_exist():
     ]
     assert len(shown) > 10
     for module, members in shown:
-        known = vars(importlib.import_module(module))
-        assert {name.strip() for name in members.split(",")} <= known.keys(), module
+        known = dir(pkgutil.resolve_name(module))
+        assert {name.strip() for name in members.split(",")} <= {*known}, module
+
+
+def test_links_outside_of_the_site_lead_somewhere():
+    """MkDocs checks those of its pages."""
+    link = re.compile(r"\]\(((?:https://github.com/jaxevent/jaxevent/blob/main/)?)([^)#]+)[^)]*\)")
+    pages = [*ROOT.glob("*.md"), *(ROOT / "experiments" / "studies").glob("*.md")]
+    count = 0
+    for page in pages:
+        for absolute, place in link.findall(page.read_text()):
+            if absolute or "://" not in place:
+                assert ((ROOT if absolute else page.parent) / place).exists(), (page.name, place)
+                count += 1
+    assert count > 50

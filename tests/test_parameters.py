@@ -13,11 +13,11 @@ from jaxevent.parameters import Count, Number, Parameters, Positive, UnitInterva
 class Given(Parameters):
     """Parameters of this test."""
 
-    offset = Number(-1.0, "s", "an offset")
-    sigma = Positive(0.5, "px", "a spread")
-    outliers = UnitInterval(0.1, "", "share of outliers")
-    late = Positive(0.2, "s", "acts when data are prepared", gradient=False)
-    cells = Count(3, "", "number of cells")
+    offset: Number = Number(-1.0, "s", "an offset")
+    sigma: Positive = Positive(0.5, "px", "a spread")
+    outliers: UnitInterval = UnitInterval(0.1, "", "share of outliers")
+    late: Positive = Positive(0.2, "s", "acts when data are prepared", gradient=False)
+    cells: Count = Count(3, "", "number of cells")
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,9 @@ def test_examples_run_in_order(tmp_path, monkeypatch, capsys, float32):
 
 def check_demo(out: Path, said: str) -> None:
     """What `jaxevent demo` writes and prints."""
-    assert (out / "results.md").read_text() in said and f"Written to {out.name}" in said
+    assert (
+        out / "results.md"
+    ).read_text() in said and f"written: {out.name}/comparison.png\n" in said
     rows = json.loads((out / "results.json").read_text())["rows"]
     errors = {row["method"]: row["mse"] for row in rows}
     known = names("reconstruction")

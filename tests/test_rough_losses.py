@@ -21,8 +21,8 @@ FAR = 600.0
 
 
 class Toy(Parameters):
-    a = Positive(1.0, "px", "least at TRUE")
-    b = Number(0.0, "px", "least at -1")
+    a: Positive = Positive(1.0, "px", "least at TRUE")
+    b: Number = Number(0.0, "px", "least at -1")
 
 
 def rough(params: Toy, batch: Any) -> jax.Array:

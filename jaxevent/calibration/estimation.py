@@ -94,7 +94,7 @@ def find_offset(sample: Sample, I0: float) -> Clock:
     if found[top] < max(MIN_CORRELATION, MIN_PEAK_RATIO * others):
         why = f"events and frames agree at no offset (correlation {found[top]:.2f})"
     if -np.nanmin(found) > found[top]:
-        why = f"events tell the opposite of frames (correlation {np.nanmin(found):.2f})"
+        why = f"events show the opposite of frames (correlation {np.nanmin(found):.2f})"
     return Clock(tried * 1e-6, found, math.nan if why else float(tried[top]) * 1e-6, why)
 
 

@@ -19,6 +19,7 @@ from jaxevent.calibration.correspondence import (
 )
 from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
+from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording
 
@@ -127,7 +128,8 @@ def _check_times(recording: Recording, sample: Sample) -> Iterator[Fault]:
         yield Fault(
             "missing events", float(most), MAX_MISSED_EVENTS,
             f"about {100 * lost / (total + lost):.2g} % of the events are missing in {len(gaps)} "
-            f"gaps, as about {most:,} from {begin / 1e6:.6f} to {end / 1e6:.6f} s",
+            f"{plural('gap', len(gaps))}, about {most:,} from {begin / 1e6:.6f} to "
+            f"{end / 1e6:.6f} s",
             "record again with a larger buffer or a lower event rate; images between frames around "
             "the gaps rest on the frames",
         )  # fmt: skip

@@ -35,7 +35,7 @@ from jaxevent.cli import (
     track,
     view,
 )
-from jaxevent.cli.arguments import guarded
+from jaxevent.cli.arguments import HelpFormatter, guarded
 from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
@@ -305,8 +305,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxevent",
         description="Video of high rate and dynamic range, tracks, and motion, from event cameras.",
-        epilog="example:\n  jaxevent demo",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="examples:\n  jaxevent demo\n  jaxevent reconstruct --help",
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"jaxevent {jaxevent.__version__}")
     parser.add_argument(
@@ -316,7 +316,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=["bash", "zsh", "tcsh"],
         help="print a script that completes words in a shell, for its folder of completions",
     )
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for module in COMMANDS:
         module.add(commands)
     return parser

@@ -3,10 +3,41 @@
 import argparse
 import contextlib
 import sys
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from jaxevent.errors import InputError
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Help with a usage of one line, that of required arguments, and examples line by line."""
+
+    def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: str | None = None) -> None:
+        if usage is None:
+            names = {a: " ".join([*a.option_strings[:1], *_metavars(a)]) for a in actions}
+            parts: list[str] = ["%(prog)s" + " [options]" * any(a.option_strings for a in actions)]
+            choices = [group._group_actions for group in groups if group.required]
+            parts += [f"({' | '.join(names.pop(a) for a in group)})" for group in choices]
+            parts += [
+                name if action.required else f"[{name}]"
+                for action, name in names.items()
+                if action.required or not action.option_strings
+            ]
+            usage = " ".join(parts)
+        super().add_usage(usage, actions, groups, prefix)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if "\n" in text:
+            return "".join(indent + line for line in text.splitlines(keepends=True))
+        return super()._fill_text(text, width, indent)
+
+
+def _metavars(action: argparse.Action) -> tuple[str, ...]:
+    """Return the names of the values that an argument takes."""
+    if action.nargs == 0 or action.metavar is None:
+        return ()
+    return action.metavar if isinstance(action.metavar, tuple) else (action.metavar,)
 
 
 def command(
@@ -21,15 +52,15 @@ def command(
     one = commands.add_parser(
         part or name,
         help=description.partition(".")[0],
-        description="\n".join(textwrap.wrap(description, 79)),
+        description=description,
         epilog=f"example{'s' * (len(examples) > 1)}:{lines}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     one.set_defaults(command=run)
     return one
 
 
-def add_size(one: argparse.ArgumentParser) -> None:
+def add_size(one: Any) -> None:
     one.add_argument(
         "--size",
         metavar="W,H",
@@ -43,38 +74,66 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
 
     Without `frames` there is no option that chooses the frames.
     """
-    add_size(one)
-    one.add_argument(
+    group = one.add_argument_group("reading the recording")
+    add_size(group)
+    group.add_argument(
         "--stream",
         metavar="NAME",
-        help="camera of a file that holds several: a topic, left, right or a number; none "
-        "reads the images without events",
+        help="which camera of a file: a topic, left, right or a number; none: images alone",
     )
-    one.add_argument(
+    group.add_argument(
         "--camera",
         metavar="FILE",
         help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
         "camera_info of ROS or OpenCV; FILE:NAME takes one of several",
     )
-    one.add_argument(
+    group.add_argument(
         "--time-unit",
+        metavar="UNIT",
         choices=("s", "ms", "us", "ns"),
-        help="unit of the event times, for a table that does not state it; default: inferred",
+        help="s, ms, us or ns: unit of the event times of a table; default: inferred",
     )
     if frames:
-        add_frames(one, "--frames", "a file")
+        add_frames(group, "--frames", "a file")
     one.set_defaults(
         reading=("size", "stream", "camera", "time_unit", *(("frames",) if frames else ()))
     )
 
 
-def add_frames(one: argparse.ArgumentParser, name: str, source: str) -> None:
+def add_live(one: argparse.ArgumentParser, printed: str) -> None:
+    """Add the option --live, by which a command prints what events show as they come."""
+    one.add_argument(
+        "--live",
+        action="store_true",
+        help=f"print {printed} as events come, instead of writing --out; PATH may be -, for "
+        "lines t x y p on standard input, t in us, or in s with a decimal point; needs --size then",
+    )
+
+
+def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
+    """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
+    from jaxevent.io import chunks
+
+    if str(path) != "-":
+        recording = open_recording(path, reading)
+        return recording, chunks.divide(recording)
+    from jaxevent.io.calibration import read_camera
+    from jaxevent.recording import Events, Recording
+
+    if reading["size"] is None:
+        raise InputError("standard input: does not state the sensor's size; give --size W,H")
+    lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
+    width, height = reading["size"]
+    recording = Recording("standard input", width, height, Events.empty(), camera=lens)
+    return recording, chunks.read_lines(sys.stdin.buffer)
+
+
+def add_frames(one: Any, name: str, source: str) -> None:
     """Add the option that chooses the frames of a recording, named in its help as `source`."""
     one.add_argument(
         name,
         metavar="NAME",
-        help=f"which images become the frames, of {source} that holds several kinds: a topic or a "
-        "number; none leaves frames out",
+        help=f"which images of {source} are the frames: a topic or a number; none: no frames",
     )
 
 
@@ -216,6 +275,11 @@ def _numbers(text: str, counts: tuple[int, ...], kind: Callable, meant: str) -> 
 
 def show_progress() -> bool:
     return sys.stderr.isatty()
+
+
+def print_written(out: Path, names: Sequence[str] = ()) -> None:
+    """Print the files that were written: `out`, or those of these names in it, one line each."""
+    print("", *(f"written: {path}" for path in [out / name for name in names] or [out]), sep="\n")
 
 
 def print_stored(recording: Any, path: Path) -> None:

@@ -71,7 +71,7 @@ def run(*, path: Path, I0: float | int, reading: dict[str, Any], out: Path | Non
         with complete(out, directory=True) as partial:
             for name, content in contents.items():
                 _write(partial / name, content)
-    print(f"\nwritten to {out}{': ' * (not out.suffix)}{', '.join(contents) * (not out.suffix)}")
+    arguments.print_written(out, () if out.suffix else tuple(contents))
 
 
 def _numbers_of_methods(recording: Any) -> dict[str, dict[str, float]]:

@@ -22,9 +22,9 @@ def add(commands: Any) -> None:
         description="What frames say of intensity: a camera's response from an exposure stack, HDR "
         "images merged of one, and both given to a recording.",
         epilog="example:\n  jaxevent camera response stack --out response.csv",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=arguments.HelpFormatter,
     )
-    parts = camera.add_subparsers(metavar="PART", required=True)
+    parts = camera.add_subparsers(title="parts", metavar="PART", required=True)
     _add_response(parts)
     _add_merge(parts)
     _add_attach(parts)

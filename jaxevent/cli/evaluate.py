@@ -88,7 +88,7 @@ def run(
     force: bool,
 ) -> None:
     from jaxevent.errors import install_command
-    from jaxevent.runs.evaluate import evaluate
+    from jaxevent.runs.evaluate import RESULT_FILES, evaluate
     from jaxevent.show.tables import markdown_table
 
     rows = evaluate(
@@ -107,11 +107,10 @@ def run(
     for line in _calibrated_lines(rows):
         print(line)
     if out is not None:
-        files = "report.html, results.json, results.md, results.parquet, config.toml"
-        if not (out / "results.parquet").exists():
-            files = files.replace("results.parquet, ", "")
-            files += f"; results.parquet needs {install_command('parquet')}"
-        print(f"\nwritten to {out}: {files}")
+        files = [name for name in RESULT_FILES if (out / name).exists()]
+        if "results.parquet" not in files:
+            print(f"results.parquet is left out: it needs {install_command('parquet')}")
+        arguments.print_written(out, files)
     skipped = [f"{row['method']} is skipped: {row['error']}" for row in rows if "skipped" in row]
     for sentence in dict.fromkeys(skipped):
         print(f"jaxevent: {sentence}", file=sys.stderr)

@@ -87,8 +87,9 @@ def run(
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")
     files = [name for name in RESULT_FILES if (out / name).exists()]
-    missing = "" if "loss.png" in files else f"; loss.png needs {install_command('plot')}"
-    print(f"\nwritten to {out}: {', '.join(files)}{missing}")
+    if "loss.png" not in files:
+        print(f"\nloss.png is left out: it needs {install_command('plot')}")
+    arguments.print_written(out, files)
     warnings = dict.fromkeys(row["warning"] for row in rows if "warning" in row)
     if warnings:
         raise InputError(f"{config}: {'; '.join(warnings)}")

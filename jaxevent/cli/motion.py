@@ -23,6 +23,7 @@ def add(commands: Any) -> None:
         "slider_depth.zip --out slider",
         "spin.h5 --model rotation --truth spin.csv --flow --out spin",
         "drone.h5 --model general --imu --start 2 --stop 3 --out drone",
+        "- --live --size 240,180 --model rotation --focal 200",
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
     one.add_argument(
@@ -36,9 +37,8 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--method",
         metavar="NAME",
-        help="voting, batch, contrast, planes or frames, or one of your own, "
-        "package.module:object; default: voting, and contrast where voting finds nothing, for "
-        "general motion batch",
+        help="voting (default, then contrast if it finds nothing), batch (default for general "
+        "motion), contrast, planes, frames, or package.module:object of your own",
     )
     one.add_argument(
         "--params",
@@ -54,14 +54,12 @@ def add(commands: Any) -> None:
     one.add_argument(
         "--causal",
         action="store_true",
-        help="estimate each row from the events before it alone, as on a live stream; it lags; "
-        "with --method voting; by default later events are used too",
+        help="estimate each row of voting from the events before it alone; it lags",
     )
     one.add_argument(
         "--centred",
         action="store_true",
-        help="with --method voting, do not smooth, but assign each estimate to the middle of the "
-        "events that it rests on, some ms earlier",
+        help="do not smooth, but date each estimate of voting to the middle of its events",
     )
     one.add_argument("--smooth", action="store_true", help="smooth by later events: the default")
     one.add_argument(
@@ -78,10 +76,11 @@ def add(commands: Any) -> None:
         metavar="PX",
         type=float,
         help="focal length in px, for a recording without calibration; the principal point is "
-        "the sensor's centre",
+        "the sensor's centre, and sigmas of rotations count 5 %% of them for its error",
     )
+    arguments.add_live(one, "rows of motion.csv, as with --causal,")
     arguments.add_reading(one)
-    arguments.add_output(one, "--out", metavar="DIR", required=True, help="folder to write")
+    arguments.add_output(one, "--out", metavar="DIR", help="folder to write; needed without --live")
 
 
 def _add_known(one: Any) -> None:
@@ -112,14 +111,14 @@ def _add_known(one: Any) -> None:
         "--imu-rotation",
         metavar="AXES",
         help="the gyro's axes: camera (x right, y down, z forward; default), y-up (x right, y up, "
-        "z backward, as jAER), x-left (x left, y down, z backward), turned (x left, y up), or nine "
-        "numbers of the rotation from its axes to the camera's, row by row",
+        "z backward), x-left (x left, y down, z backward), turned (x left, y up), or a rotation of "
+        "nine numbers from its axes to the camera's",
     )
     one.add_argument(
         "--still",
         metavar="S,S",
         type=arguments.span,
-        help="time span in s in which the camera is still, from which the gyro's bias is measured",
+        help="times in s between which the camera is still, for the gyro's bias",
     )
 
 
@@ -143,8 +142,9 @@ def run(
     stop: float | int | None,
     flow: bool,
     focal: float | int | None,
+    live: bool,
     reading: dict[str, Any],
-    out: Path,
+    out: Path | None,
 ) -> None:
     from jaxevent.egomotion import find_model
     from jaxevent.egomotion.model_selection import select_model
@@ -154,6 +154,20 @@ def run(
     from jaxevent.show.motion import Output
 
     kind = None if model == "auto" else find_model(model)
+    if live:
+        options = {
+            "--method": method not in (None, "voting"), "--truth": truth is not None, "--imu": imu,
+            "--centred": centred, "--smooth": smooth, "--start": start is not None,
+            "--stop": stop is not None, "--flow": flow, "--out": out is not None,
+        }  # fmt: skip
+        if wrong := [name for name, given in options.items() if given]:
+            raise InputError(f"--live is not for {wrong[0]}; leave out one of the two")
+        if kind is None:
+            raise InputError("--live cannot see all events to choose a model; name it by --model")
+        _print_live(path, kind, params, seed, float(rate), focal, reading)
+        return
+    if out is None:
+        raise InputError("there is nowhere to write; give a folder, --out DIR, or --live")
     if kind is not None:
         _check(find_estimator(method or kind.best_method), kind, imu, causal, smooth)
     if causal and (centred or smooth):
@@ -196,6 +210,8 @@ def run(
     estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
     if choice is not None:
         told = choice.include_doubt(told)
+    if focal is not None:
+        told = told.with_focal_error()
     told, warning = told.with_flow_consistency(recording)
     if warning:
         print(warning)
@@ -211,6 +227,33 @@ def run(
         f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
         f"{count / seconds:,.0f} events/s"
     )
+
+
+def _print_live(
+    path: Path,
+    kind: Any,
+    params: Path | None,
+    seed: int,
+    rate: float,
+    focal: float | None,
+    reading: dict[str, Any],
+) -> None:
+    """Print rows of motion.csv as events come, each as soon as an estimate after it is there."""
+    from jaxevent.egomotion import voting
+    from jaxevent.show.motion import LiveTable
+
+    recording, chunks = arguments.open_live(path, reading)
+    recording = _with_camera(recording, focal)
+    _need_camera(recording, kind)
+    values, _ = _parameters(voting, kind, params)
+    size = recording.width, recording.height
+    live = voting.live(size, values, model=kind, camera=recording.camera, seed=seed)
+    table = LiveTable(live, rate)
+    for events in chunks:
+        live.add(events)
+        print(table.rows(), end="", flush=True)
+    live.finish()
+    print(table.rows(), end="", flush=True)
 
 
 def _check(estimator: Any, kind: Any, imu: bool, causal: bool, smooth: bool) -> None:

@@ -67,13 +67,13 @@ def add(commands: Any) -> None:
     arguments.add_no_calibrate(one)
     one.add_argument(
         "--tone",
-        choices=["linear", "log", "percentile", "clahe", "changes", "relative"],
-        help="how intensity becomes grey in PNG and MP4: linear (default), from the frames' black "
-        "to their white, so that images are as bright as frames and what is brighter is cut off; "
-        "log, the logarithm of 99 %% of the intensities, for high dynamic range; percentile, their "
-        "intensity; clahe, log with contrast evened out; relative (default where there are no "
-        "frames), log that fades to grey where nothing is known; changes (default of high-pass "
-        "then), grey where nothing changed. All images have the same limits",
+        choices=["display", "linear", "log", "percentile", "clahe", "changes", "relative"],
+        metavar="TONE",
+        help="brightness of PNG and MP4: display (default), white is the brightest 0.5 %% of the "
+        "frames, encoded as screens expect; linear, intensity as the frames have it; log, all of a "
+        "high dynamic range; percentile, 99 %% of the intensities; clahe, log with even contrast; "
+        "relative (default without frames), log that fades to grey where nothing is known; changes "
+        "(default of high-pass then), grey where nothing changed",
     )
     one.add_argument(
         "--colour",

@@ -49,6 +49,7 @@ N_SUPPORTING_WINDOWS = 2  # in a row, from which on a motion is told
 BLOCKS_WEIGHT = 0.2  # of a window in the mean number of blocks
 MAX_DRIFT_SIGMAS = 2.0  # of a motion since it was found
 MAX_DRIFT_WINDOWS = 2.0  # over which the drift is measured
+DRIFT_RATIO = 2.0  # time for which a motion that is told drifts on, per time until it was told
 
 
 class Evidence(NamedTuple):
@@ -263,10 +264,12 @@ def tell_from_later(
     searching: NDArray[np.bool_],
     told: NDArray[np.bool_],
     diffusion: Callable[[NDArray], Any],
-) -> tuple[NDArray[np.bool_], NDArray[np.floating]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.floating], NDArray[np.floating]]:
     """Tell the estimates before a motion settled, too, as far as they agree with it.
 
-    A cloud that has just collapsed is too narrow, so how far they differ from it is added.
+    A cloud that has just collapsed is too narrow, so how far they differ from it is added. The
+    motion drifts on for up to `DRIFT_RATIO` times as long as it took to settle. The square of the
+    difference of estimates until then from the motion there is to be added after smoothing.
 
     Args:
         t: (n,) times, us.
@@ -277,22 +280,26 @@ def tell_from_later(
         diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
 
     Returns:
-        (n,) booleans, and the covariances (n, d, d).
+        (n,) booleans, the covariances, and what is to be added to them after smoothing, (n, d, d).
     """
-    told, covariance = told.copy(), covariance.copy()
+    told, covariance, added = told.copy(), covariance.copy(), np.zeros(covariance.shape)
     eye = np.eye(mean.shape[1])
     for first in np.flatnonzero(told & ~np.r_[False, told[:-1]]):
         rate = eye * np.asarray(diffusion(mean[first]), np.float64) ** 2
-        for k in range(first - 1, -1, -1):
+        begin = int(np.flatnonzero(searching[:first] | told[:first]).max(initial=-1)) + 1
+        for k in range(first - 1, begin - 1, -1):
             far = np.asarray(mean[k] - mean[first], np.float64)
             C = covariance[k] + covariance[first] + rate * (t[first] - t[k]) * 1e-6 + 1e-12 * eye
-            if searching[k] or told[k]:
-                break
             if float(far @ np.linalg.solve(C, far)) > MAX_DRIFT_SIGMAS**2 * len(far):
                 break
             told[k] = True
             covariance[k] += np.outer(far, far)
-    return told, covariance
+        until = t[first] + DRIFT_RATIO * (t[first] - t[begin])
+        rows = np.arange(begin, np.searchsorted(t, until, "right"))
+        rows = rows[np.cumsum(searching[rows]) == 0]
+        drift = np.asarray(mean[rows] - mean[rows[-1]], np.float64)
+        added[rows] = drift[:, :, None] * drift[:, None, :]
+    return told, covariance, added
 
 
 @njit_noalloc

@@ -51,18 +51,26 @@ RELATIVE_DEPTH_SPREAD = 0.3  # relative deviation of the inverse depths of one p
 class Params(Parameters):
     """Parameters of the flow of events from a known motion."""
 
-    radius = Count(8, "px", "candidates are so near, in x and y; baseline + 1.5 or more")
-    per_pixel = Count(8, "", "latest events of a pixel that are candidates")
-    candidates = Count(192, "", "most candidates of an event; of more, these many in even steps")
-    speeds = Count(48, "", "general: speeds due to translation that are tried, by equal factors")
+    radius: Count = Count(8, "px", "candidates are so near, in x and y; baseline + 1.5 or more")
+    per_pixel: Count = Count(8, "", "latest events of a pixel that are candidates")
+    candidates: Count = Count(
+        192, "", "most candidates of an event; of more, these many in even steps"
+    )
+    speeds: Count = Count(
+        48, "", "general: speeds due to translation that are tried, by equal factors"
+    )
 
-    baseline = Positive(6.5, "px", "b: candidates have moved by b/2 to b")
-    tau_max = Positive(0.1, "s", "oldest candidates")
-    sigma_x = Positive(1.0, "px", "spread of a candidate")
-    slowest = Positive(3.0, "px/s", "general: least speed due to translation but 0")
-    fastest = Positive(1000.0, "px/s", "general: most speed due to translation")
-    gain = Number(0.25, "", "general: g, exponent of the speed; 0 prefers slow flow, 1 fast flow")
-    limit = Positive(1.0, "px", "an event none of whose candidates is so near is an outlier")
+    baseline: Positive = Positive(6.5, "px", "b: candidates have moved by b/2 to b")
+    tau_max: Positive = Positive(0.1, "s", "oldest candidates")
+    sigma_x: Positive = Positive(1.0, "px", "spread of a candidate")
+    slowest: Positive = Positive(3.0, "px/s", "general: least speed due to translation but 0")
+    fastest: Positive = Positive(1000.0, "px/s", "general: most speed due to translation")
+    gain: Number = Number(
+        0.25, "", "general: g, exponent of the speed; 0 prefers slow flow, 1 fast flow"
+    )
+    limit: Positive = Positive(
+        1.0, "px", "an event none of whose candidates is so near is an outlier"
+    )
 
 
 @renamed_methods(outliers="outlier_percentage")

@@ -89,6 +89,14 @@ class LiveMotion:
 
     @property
     @synchronized
+    def start(self) -> int:
+        """Time (us) of the first event."""
+        if not len(self._tail):
+            raise InputError("nothing has been added yet; add events first")
+        return int(self._tail[:1].t[0])
+
+    @property
+    @synchronized
     def motion(self) -> MotionEstimate:
         """The latest estimates."""
         return self._motion

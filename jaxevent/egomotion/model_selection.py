@@ -51,9 +51,12 @@ MIN_DEPTH_SELECTION_Z = 4.0
 # parameters that general motion adds fit noise too, and general motion 2.8 and more.
 MAX_EXCLUSION_Z = 0.0
 N_LONG_WINDOWS = 2  # in which a translation is tested
+LENS = "a rotation before a lens that distorts"
 MIN_REPORTED_WEIGHT = 0.01  # of a model that was not chosen
-TRIED_K1 = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2)  # of a lens of which none is known
+TRIED_DIVISIONS = (-0.6, -0.45, -0.3, -0.2, -0.1, 0.1, 0.2)  # of a lens of which none is known
+MIN_DIVISOR = 0.2  # 1 + l |x|^2 / f^2 at the patches, below which a lens is not tried
 MIN_LENS_Z = 3.0  # from which a distortion explains more than none
+MIN_LENS_DOUBT_Z = 1.0  # from which it may
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,21 +153,32 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     every = {name: np.concatenate(parts) for name, parts in sharpness.items()}
     if lens is not None:
         gain = z_score(lens.sharpness - every["rotation"])
-        others = (every["planar"], every["general"])
-        if gain > MIN_LENS_Z and all(z_score(lens.sharpness - one) > 0 for one in others):
+        ahead = z_score(every["general"] - lens.sharpness) < MIN_DEPTH_SELECTION_Z
+        if gain > MIN_LENS_Z and ahead and z_score(lens.sharpness - every["planar"]) > 0:
             every["rotation"] = lens.sharpness
-            camera = dataclasses.replace(camera, distortion=(lens.k1, 0.0, 0.0, 0.0, 0.0))
+            camera = dataclasses.replace(camera, distortion=lens.distortion(recording, camera))
             lines = (
-                f"a lens that distorts, k1 about {lens.k1:g}, explains a rotation better than one "
-                f"that does not (z = {gain:.1f}); it is used, and a calibration is better",
+                f"a lens that distorts, k1 about {camera.distortion[0]:.2g}, explains a rotation "
+                f"better than one that does not (z = {gain:.1f}); it is used, and a calibration is "
+                "better",
             )
     z = {
         pair: z_score(every[pair[0]] - every[pair[1]])
         for pair in (("rotation", "planar"), ("general", "planar"), ("general", "rotation"))
     }
     step = -(-len(guesses) // N_LONG_WINDOWS)
-    found = select_by_z(z, lambda: translation_z(recording, camera, guesses[::step]))
-    doubt, doubts = _model_doubt(found, fits)
+    # What a lens that is known roughly leaves looks like parallax in longer windows.
+    test = None if lines else translation_z
+    found = select_by_z(z, lambda: test(recording, camera, guesses[::step]) if test else None)
+    chosen = found.model.name
+    both_ways = found.z | {(other, one): -value for (one, other), value in found.z.items()}
+    against = {other: both_ways[chosen, other] for other in MODELS if other != chosen}
+    if lens is not None and not lines:
+        gain = z_score(lens.sharpness - every["rotation"])
+        if gain > MIN_LENS_DOUBT_Z:
+            against[LENS] = z_score(every[chosen] - lens.sharpness)
+            fits = [one._replace(lens=turn) for one, turn in zip(fits, lens.turns, strict=True)]
+    doubt, doubts = _model_doubt(found.model, fits, against)
     return dataclasses.replace(
         found, lines=(*lines, *doubts, *found.lines), doubt=doubt, camera=camera if lines else None
     )
@@ -178,34 +192,40 @@ class _WindowFits(NamedTuple):
     turn: NDArray[np.float64]  # (3,) rad
     general: NDArray[np.float64]  # (6,) heading and rad
 
+    lens: NDArray[np.float64] | None = None  # (3,) rad, before a lens that distorts
+
     def motion(self, name: str, model: type[Model]) -> NDArray[np.float64]:
         """Return what the fit of a model tells of the components of another, in the window."""
+        turns = {Rotation.name: self.turn, General.name: self.general[3:], LENS: self.lens}
+        turn = turns.get(name)
         if model is Planar:
-            turn = self.turn if name == Rotation.name else self.general[3:]
-            return self.planar if name == Planar.name else self.basis.mean(0) @ turn
-        rows = self.basis.reshape(-1, 3)
-        flow = np.tile(self.planar, len(self.basis))
-        turn = {"rotation": self.turn, "general": self.general[3:]}.get(name)
+            return self.planar if turn is None else self.basis.mean(0) @ turn
         if turn is None:
+            flow = np.tile(self.planar, len(self.basis))
+            rows = self.basis.reshape(-1, 3)
             turn = np.asarray(np.linalg.lstsq(rows, flow, rcond=None)[0], np.float64)
         return turn
 
 
 def _model_doubt(
-    found: ModelSelection, fits: list[_WindowFits]
+    model: type[Model], fits: list[_WindowFits], against: dict[str, float]
 ) -> tuple[NDArray[np.float64] | None, list[str]]:
     """Average what other models tell, by their weights exp(-z^2 / 2) relative to the chosen one.
 
-    z is the evidence against them, at least 0.
+    Args:
+        model: The chosen model.
+        fits: Fits of all models.
+        against: z, the evidence against other models by their names; below 0 it counts as 0.
+
+    Returns:
+        (d, d) covariance relative to the motion's size, None without doubt; and lines about it.
     """
-    model, lines = found.model, []
+    lines = []
     d = len(model.components)
     total = np.zeros((d, d))
     rows = slice(3, 6) if model is General else slice(0, d)
-    for other in (name for name in MODELS if name != model.name):
-        pair = (model.name, other)
-        against = found.z[pair] if pair in found.z else -found.z[pair[::-1]]
-        odds = np.exp(-(max(against, 0.0) ** 2) / 2)
+    for other, z in against.items():
+        odds = np.exp(-(max(z, 0.0) ** 2) / 2)
         weight = float(odds / (1 + odds))
         if weight < MIN_REPORTED_WEIGHT:
             continue
@@ -219,8 +239,9 @@ def _model_doubt(
         if model is General:
             total[:3, :3] += weight * np.eye(3)
         share = 100 * np.sqrt(np.trace(away) / max(size, 1e-12))
+        title = MODELS[other].title if other in MODELS else other
         lines.append(
-            f"{MODELS[other].title} is not excluded: its weight is {weight:.2f}, and it differs by "
+            f"{title} is not excluded: its weight is {weight:.2f}, and it differs by "
             f"{share:.0f} %; sigmas include that"
         )
     return (total if lines else None), lines
@@ -229,34 +250,61 @@ def _model_doubt(
 class _LensFit(NamedTuple):
     """Rotations before a lens that distorts."""
 
-    k1: float
+    division: float
+    likelihood: float  # of the pixels that it was fitted to
     sharpness: NDArray[np.float64]  # of held-out pixels
+    turns: list[NDArray[np.float64]]  # rad, of windows
+
+    def distortion(self, recording: Recording, camera: PinholeCamera) -> tuple[float, ...]:
+        """Return coefficients k1, k2, p1, p2, k3 that distort about alike on a sensor."""
+        size = np.array([recording.width, recording.height]) / 2
+        farthest = float(np.hypot(*(size / [camera.fx, camera.fy])))
+        r = np.linspace(0.05, 1, 40) * farthest
+        u = r / (1 + self.division * r**2)
+        powers = u[:, None] ** [3, 5, 7]
+        k1, k2, k3 = np.linalg.lstsq(powers, r - u, rcond=None)[0].tolist()
+        return k1, k2, 0.0, 0.0, k3
 
 
 def _fit_lens(
     windows: list[PatchSharpness], f: float, turns: list[NDArray[np.float64]]
-) -> _LensFit:
-    """Fit rotations and one k1 to patches' own half of the pixels.
+) -> _LensFit | None:
+    """Fit rotations and one distortion to patches' own half of the pixels.
 
-    A pixel x = u (1 + k1 |u|^2 / f^2) moves with J B(u) Omega, u being where it is without the
-    distortion, and J = dx / du.
+    A pixel x would be at u = x / (1 + l |x|^2 / f^2) without the distortion (Fitzgibbon,
+    "Simultaneous linear estimation of multiple view geometry and lens distortion", 2001). It moves
+    with (du / dx)^-1 B(u) Omega.
     """
-    best = (-np.inf, 0.0, np.zeros(0))
-    for k1 in TRIED_K1:
-        trained, held = 0.0, []
-        for window, turn in zip(windows, turns, strict=True):
-            u = window.xi
-            for _ in range(10):
-                u = window.xi / (1 + k1 * (u**2).sum(1, keepdims=True) / f**2)
-            r2 = (u**2).sum(1)[:, None, None] / f**2
-            J = (1 + k1 * r2) * np.eye(2) + 2 * k1 * u[:, :, None] * u[:, None, :] / f**2
-            basis = J @ np.asarray(rotation_basis(u, f))
-            turned = basis @ refine_rotation(window, basis, turn)
-            trained += float(log_sharpness(window, 0, turned).sum())
-            held.append(log_sharpness(window, 1, turned))
-        if trained > best[0]:
-            best = trained, k1, np.concatenate(held)
-    return _LensFit(best[1], best[2])
+    tried = [_try_lens(windows, f, turns, division) for division in TRIED_DIVISIONS]
+    likelihood = np.array([-np.inf if one is None else one.likelihood for one in tried])
+    best = int(likelihood.argmax())
+    near = slice(max(best - 1, 0), best + 2)
+    if not np.isfinite(likelihood[near]).all() or best in (0, len(tried) - 1):
+        return tried[best]
+    bend, slope, _ = np.polyfit(TRIED_DIVISIONS[near], likelihood[near], 2)
+    refined = _try_lens(windows, f, turns, -slope / 2 / bend)
+    better = refined is not None and refined.likelihood > likelihood[best]
+    return refined if better else tried[best]
+
+
+def _try_lens(
+    windows: list[PatchSharpness], f: float, turns: list[NDArray[np.float64]], division: float
+) -> _LensFit | None:
+    """Fit rotations before a lens; None if it is impossible at the patches."""
+    likelihood, held, found = 0.0, [], []
+    for window, turn in zip(windows, turns, strict=True):
+        x = window.xi
+        s = 1 + division * (x**2).sum(1) / f**2
+        if s.min() < MIN_DIVISOR:
+            return None
+        outer = 2 * division / f**2 * x[:, :, None] * x[:, None, :]
+        slope = (s[:, None, None] * np.eye(2) - outer) / s[:, None, None] ** 2
+        basis = np.linalg.solve(slope, np.asarray(rotation_basis(x / s[:, None], f)))
+        found.append(refine_rotation(window, basis, turn))
+        turned = basis @ found[-1]
+        likelihood += float(log_sharpness(window, 0, turned).sum())
+        held.append(log_sharpness(window, 1, turned))
+    return _LensFit(division, likelihood, np.concatenate(held), found)
 
 
 def select_by_z(

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
@@ -22,6 +23,7 @@ TANGENTIAL_SIGMA_RATIO = 0.1
 # Relative error of a motion that a calibrated lens leaves: of a rotation, if f is off by 0.5 %, the
 # centre by 1 px, k1 by 0.01 and k2 by 0.02 (tests/egomotion/test_model_selection.py).
 RELATIVE_LENS_ERROR = 0.01
+RELATIVE_FOCAL_ERROR = 0.05  # of a focal length that is given without a calibration
 CHANGE_OVER_LAG = 1.0  # error of estimates that lag, relative to the change over twice the lag
 MAX_DIRECTION_SIGMA_RAD = 1.0  # rad, standard deviation of a direction that the data determine
 
@@ -233,6 +235,19 @@ class MotionEstimate(HtmlRepr):
         covariance = covariance + calibration.speed**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, covariance=covariance)
 
+    def with_focal_error(self) -> "MotionEstimate":
+        """Add the error of a focal length without a calibration: turns are as many times wrong.
+
+        Returns:
+            The estimate with the larger covariance.
+        """
+        mean = np.nan_to_num(self.mean)
+        for part in self.model.parts:
+            if part.figure != "Omega":
+                mean[:, part.rows] = 0
+        added = RELATIVE_FOCAL_ERROR**2 * mean[:, :, None] * mean[:, None, :]
+        return dataclasses.replace(self, covariance=self.covariance + added)
+
     def with_flow_consistency(self, recording: Recording) -> tuple["MotionEstimate", str]:
         """Add the spread of the motions of parts of the image to the covariance.
 
@@ -334,9 +349,8 @@ class MotionEstimate(HtmlRepr):
     def _change_rate(self) -> NDArray[np.float64]:
         """Return the mean square (d, d) of changes between successive estimates, per us^2."""
         found = np.flatnonzero(self.valid & np.isfinite(self.mean).all(1))
-        dt = np.diff(self.t[found]).astype(float)
-        rates = np.diff(self.mean[found], axis=0)[dt > 0] / dt[dt > 0, None]
-        return rates.T @ rates / max(len(rates), 1)
+        change, dt = np.diff(self.mean[found], axis=0), np.diff(self.t[found]).astype(float)
+        return change.T @ change / max(float(dt @ dt), 1.0)
 
     def to_dataframe(
         self, times: Times | None = None, *, centred: bool | None = None
@@ -421,6 +435,7 @@ class MotionEstimate(HtmlRepr):
         mean = self.model.interpolate(self.mean[before], self.mean[after], fraction)
         fraction = fraction[:, None, None]
         covariance = (1 - fraction) * self.covariance[before] + fraction * self.covariance[after]
+        covariance = covariance + self._bend_between(at, times, before, after)
         beyond = np.maximum(at[0] - times, 0) + np.maximum(times - at[-1], 0)
         if beyond.any():
             covariance = covariance + beyond[:, None, None] ** 2 * self._change_rate()
@@ -429,6 +444,32 @@ class MotionEstimate(HtmlRepr):
         valid = self.valid[before] & self.valid[after] & (times >= at[0]) & inside
         valid &= np.isfinite(mean).all(1) & np.isfinite(covariance).all((1, 2))
         return self._without_undecided(mean, covariance, valid)
+
+    def _bend_between(
+        self,
+        at: NDArray,
+        times: NDArray[np.int64],
+        before: NDArray[np.integer],
+        after: NDArray[np.integer],
+    ) -> NDArray[np.float64]:
+        """Return the covariance (times, d, d) of a motion that bends between estimates.
+
+        The error of the straight line is c (t - t_before) (t_after - t) / 2, with c the mean of the
+        second derivatives at both.
+        """
+        n, d = self.mean.shape
+        c = np.zeros((n, d))
+        if n > 2:
+            # Of estimates very near to each other, whose differences are noise, the next farther.
+            step = maximum_filter1d(np.maximum(np.diff(at), 1.0), 3)[:, None]
+            slope = np.diff(np.nan_to_num(self.mean), axis=0) / step
+            inner = np.diff(slope, axis=0) / np.maximum(step[1:], step[:-1])
+            told = self.valid[2:] & self.valid[1:-1] & self.valid[:-2]
+            c[1:-1] = np.where(told[:, None], inner, 0)
+            c[0], c[-1] = c[1], c[-2]
+        reach = np.maximum(times - at[before], 0) * np.maximum(at[after] - times, 0) / 2
+        off = reach[:, None] * (c[before] + c[after]) / 2
+        return off[:, :, None] * off[:, None, :]
 
     def _change_over_lag(
         self, times: NDArray[np.int64], mean: NDArray[np.floating], row: NDArray[np.int64]

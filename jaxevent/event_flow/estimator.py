@@ -35,11 +35,19 @@ MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from
 class FlowParams(Parameters):
     """Parameters of the flow from events."""
 
-    density = Positive(0.23, "1/px", "events per pixel on either side of a time, at first")
-    displacement = Positive(3.0, "px", "typical displacement before and after a time; windows grow")
-    spacing = Count(8, "px", "distance between nodes of the flow")
-    smoothness = Positive(8.0, "1/px^2", "weight of differences between neighbouring nodes")
-    edge = Positive(0.2, "px", "difference from which neighbours are taken for different objects")
+    density: Positive = Positive(
+        0.23, "1/px", "events per pixel on either side of a time, at first"
+    )
+    displacement: Positive = Positive(
+        3.0, "px", "typical displacement before and after a time; windows grow"
+    )
+    spacing: Count = Count(8, "px", "distance between nodes of the flow")
+    smoothness: Positive = Positive(
+        8.0, "1/px^2", "weight of differences between neighbouring nodes"
+    )
+    edge: Positive = Positive(
+        0.2, "px", "difference from which neighbours are taken for different objects"
+    )
 
 
 class Anchor(NamedTuple):

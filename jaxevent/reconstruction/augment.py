@@ -34,17 +34,19 @@ T = TypeVar("T", bound="FrameParams")
 class FrameParams(Parameters):
     """Parameters of every estimator: thresholds, dead time, and the frames' clock and offset."""
 
-    c_on = Positive(0.1, "ln I", "contrast threshold of ON events")
-    c_off = Positive(0.1, "ln I", "contrast threshold of OFF events")
-    I0 = Positive(1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
-    clock_offset = Number(
+    c_on: Positive = Positive(0.1, "ln I", "contrast threshold of ON events")
+    c_off: Positive = Positive(0.1, "ln I", "contrast threshold of OFF events")
+    I0: Positive = Positive(
+        1.0, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6
+    )
+    clock_offset: Number = Number(
         0.0, "s", "added to the frames' time stamps", gradient=False, least=-1e10, most=1e10
     )
-    deblur = Choice((True, False), "deblur frames by the events within their exposures")
-    exposure = Positive(
+    deblur: Choice = Choice((True, False), "deblur frames by the events within their exposures")
+    exposure: Positive = Positive(
         0.0, "s", "exposure of frames whose own is not known", gradient=False, most=1e6
     )
-    rho_ref = Positive(
+    rho_ref: Positive = Positive(
         0.0,
         "s",
         "dead time of a pixel after an event; lost events are compensated",
@@ -124,11 +126,13 @@ def calibrated_values(
 class CertaintyParams(FrameParams):
     """Parameters of the certainty of frames (4), as far as the response leaves it open."""
 
-    w_min = Positive(
+    w_min: Positive = Positive(
         0.09, "1", "least certainty w of frames, and that of clipped pixels", least=1e-9
     )
-    margin = Positive(0.0, "grey / 255", "distance from black and white within which frames clip")
-    certainty = Positive(
+    margin: Positive = Positive(
+        0.0, "grey / 255", "distance from black and white within which frames clip"
+    )
+    certainty: Positive = Positive(
         (1.0,), "1", "factors on the certainty w at evenly spaced greys, a spline in ln w"
     )
 
@@ -136,17 +140,17 @@ class CertaintyParams(FrameParams):
 class AugmentParams(CertaintyParams):
     """Parameters of the augmented frame: calibrated contrasts (10), weights of two frames."""
 
-    calibrate = Choice((True, False), "fit each pixel's threshold between frames")
-    ratio_min = Positive(
+    calibrate: Choice = Choice((True, False), "fit each pixel's threshold between frames")
+    ratio_min: Positive = Positive(
         0.01, "1", "smallest accepted ratio of calibrated to nominal threshold", gradient=False
     )
-    ratio_max = Positive(
+    ratio_max: Positive = Positive(
         1 / 0.6, "1", "largest accepted ratio of calibrated to nominal threshold", gradient=False
     )
-    ratio_width = Positive(
+    ratio_width: Positive = Positive(
         0.4, "1", "width about both bounds over which ratios fade to 1; 0: hard", gradient=False
     )
-    weighting = Choice(
+    weighting: Choice = Choice(
         ("linear", "certainty"), "weights of two frames between them: by time, or by certainty too"
     )
 

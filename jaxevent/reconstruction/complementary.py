@@ -35,13 +35,13 @@ from jaxevent.reconstruction.filtering import (
 class Params(FrameParams):
     """Parameters of the complementary and the high-pass filter."""
 
-    alpha = Positive(15.0, "rad/s", "cut-off frequency")
+    alpha: Positive = Positive(15.0, "rad/s", "cut-off frequency")
 
 
 class AugmentedParams(AugmentParams):
     """Parameters of the complementary filter with augmentation."""
 
-    alpha = Positive(15.0, "rad/s", "cut-off frequency")
+    alpha: Positive = Positive(15.0, "rad/s", "cut-off frequency")
 
 
 class ConstantRateModel(FrameModel):

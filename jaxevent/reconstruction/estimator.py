@@ -130,6 +130,30 @@ class ImageEstimator(Estimator[P]):
         super().check(recording)
         recording.refuse_empty()
 
+    def check_request(
+        self, recording: Recording, times: Times, params: P | None, extrapolate: bool
+    ) -> P:
+        """Check what `prepare` is given.
+
+        Args:
+            recording: Events and frames.
+            times: Times of images, integers in us or floats in s.
+            params: Parameters; the defaults if None.
+            extrapolate: Whether times may lie outside the recording.
+
+        Returns:
+            The parameters.
+
+        Raises:
+            InputError: The recording lacks what the method needs, or times lie outside it.
+        """
+        self.check(recording)
+        params = self.Params() if params is None else params
+        self.check_clocks(recording, params)
+        if not extrapolate:
+            self.check_span(recording, times, params)
+        return params
+
     def check_clocks(self, recording: Recording, params: P) -> None:
         """Check that frames and events that are combined can be on one clock (`events.clocks`).
 
@@ -160,6 +184,28 @@ class ImageEstimator(Estimator[P]):
         Raises:
             InputError: The recording lacks what the method needs.
         """
+
+    def live(
+        self, size: tuple[int, int], params: P | None = None, *, frames: bool, **options: Any
+    ) -> LiveVideo:
+        """Make images of events that are still to come, which per-pixel methods alone can.
+
+        Args:
+            size: Width and height of the sensor, px.
+            params: Parameters; the defaults if None.
+            frames: Whether frames will come.
+            **options: Options of the method.
+
+        Returns:
+            The images, to which events are added.
+
+        Raises:
+            InputError: The method takes whole recordings.
+        """
+        raise InputError(
+            f"the method {self.name!r} takes whole recordings; use akf, cf or high-pass for events "
+            "that are still to come"
+        )
 
     def prepare_images(
         self,
@@ -276,11 +322,7 @@ class PixelEstimator(ImageEstimator[P]):
                 outside
                 the recording.
         """
-        self.check(recording)
-        params = self.Params() if params is None else params
-        self.check_clocks(recording, params)
-        if not extrapolate:
-            self.check_span(recording, times, params)
+        params = self.check_request(recording, times, params, extrapolate)
         return prepare(recording, times, EventTiming.of(params), filtering=self.is_event_driven)
 
     def estimate(

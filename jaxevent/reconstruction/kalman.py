@@ -31,25 +31,38 @@ from jaxevent.reconstruction.variance import ERROR_PARAMETERS, AugmentedFrameErr
 class Params(AugmentParams):
     """Parameters of the AKF."""
 
-    sigma_proc = Positive(5e-4**0.5, "ln I / sqrt(s)", "process noise, per time since last event")
-    sigma_iso = Positive(0.03**0.5, "ln I / sqrt(s)", "isolated noise, per time since neighbours")
-    sigma_ref = Positive(0.01**0.5, "ln I", "noise of events within rho of the last one")
-    rho = Positive(0.01, "s", "bound on the refractory period")
-    rho_width = Positive(0.0, "1", "width in ln time of the step at rho; 0: a sharp step")
-    kappa = Positive(
+    sigma_proc: Positive = Positive(
+        5e-4**0.5, "ln I / sqrt(s)", "process noise, per time since last event"
+    )
+    sigma_iso: Positive = Positive(
+        0.03**0.5, "ln I / sqrt(s)", "isolated noise, per time since neighbours"
+    )
+    sigma_ref: Positive = Positive(0.01**0.5, "ln I", "noise of events within rho of the last one")
+    rho: Positive = Positive(0.01, "s", "bound on the refractory period")
+    rho_width: Positive = Positive(0.0, "1", "width in ln time of the step at rho; 0: a sharp step")
+    kappa: Positive = Positive(
         7e5, "1 / (intensity^2 s)", "certainty of frames: 7e5 DAVIS, 7e7 FLIR", least=1e-12
     )
-    log_bias = Number(
+    log_bias: Number = Number(
         0.0,
         "Hz",
         "added to ln I of frames for noise (6): the frame rate; -1 as the paper prints it",
     )
-    P0 = Positive(0.09, "(ln I)^2", "variance at the start")
-    above = Number(0.0, "ln I", "initial distance of saturated pixels above the clipping bound")
-    below = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
-    one_sided = Choice((False, True), "use clipped frames as evidence that L lies beyond the clip")
-    clip_rate = Positive(1000.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided")
-    frame_noise, error_event, error_still, error_change = ERROR_PARAMETERS
+    P0: Positive = Positive(0.09, "(ln I)^2", "variance at the start")
+    above: Number = Number(
+        0.0, "ln I", "initial distance of saturated pixels above the clipping bound"
+    )
+    below: Number = Number(0.0, "ln I", "initial distance of black pixels below the clipping bound")
+    one_sided: Choice = Choice(
+        (False, True), "use clipped frames as evidence that L lies beyond the clip"
+    )
+    clip_rate: Positive = Positive(
+        1000.0, "1 / ((ln I)^2 s)", "1/R of clipped frames, if one-sided"
+    )
+    frame_noise: Positive = ERROR_PARAMETERS[0]
+    error_event: Positive = ERROR_PARAMETERS[1]
+    error_still: Positive = ERROR_PARAMETERS[2]
+    error_change: Positive = ERROR_PARAMETERS[3]
 
     presets = {
         "paper": {"ratio_width": 0.0},

@@ -251,10 +251,7 @@ class Flow(ImageEstimator[Params]):
         Raises:
             InputError: As `check`, and for times outside the recording.
         """
-        self.check(recording)
-        params = self.Params() if params is None else params
-        if not extrapolate:
-            self.check_span(recording, times, params)
+        params = self.check_request(recording, times, params, extrapolate)
         clock = FrameClock.of(recording, EventTiming.of(params))
         images = FrameImages(recording, np.dtype(jnp.result_type(float)))
         frames = _read_frames(images, clock, slice(0, len(clock)))

@@ -19,7 +19,7 @@ frames, which needs no reference: all parameters can be fitted with it.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -68,12 +68,18 @@ from jaxevent.reconstruction.variance import (
 class Params(CertaintyParams):
     """Parameters of the smoother."""
 
-    sigma_event = Positive(0.3, "c", "noise of an event's step, relative to its threshold")
-    sigma_bg = Positive(0.25, "ln I / sqrt(s)", "drift without events")
-    sigma_frame = Positive(0.007, "intensity", "noise of frames where the certainty w is 1")
-    sigma_floor = Positive(0.02, "ln I", "noise of frames in log intensity, however certain")
-    start = Positive(0.5, "intensity", "mean before the first frame")
-    P_start = Positive(4.0, "(ln I)^2", "variance before the first frame", least=1e-12)
+    sigma_event: Positive = Positive(
+        0.3, "c", "noise of an event's step, relative to its threshold"
+    )
+    sigma_bg: Positive = Positive(0.25, "ln I / sqrt(s)", "drift without events")
+    sigma_frame: Positive = Positive(
+        0.007, "intensity", "noise of frames where the certainty w is 1"
+    )
+    sigma_floor: Positive = Positive(
+        0.02, "ln I", "noise of frames in log intensity, however certain"
+    )
+    start: Positive = Positive(0.5, "intensity", "mean before the first frame")
+    P_start: Positive = Positive(4.0, "(ln I)^2", "variance before the first frame", least=1e-12)
     presets = {
         "hdr": {
             "c_on": 0.2,
@@ -87,15 +93,19 @@ class Params(CertaintyParams):
         },
     }
 
-    share = Positive(0.5, "1", "fraction of an event's change that belongs to its 8 neighbours")
-    spread = Positive(
+    share: Positive = Positive(
+        0.5, "1", "fraction of an event's change that belongs to its 8 neighbours"
+    )
+    spread: Positive = Positive(
         0.0,
         "s",
         "longest time between events over which a change is spread",
         gradient=False,
         most=1e6,
     )
-    one_sided = Choice((True, False), "use clipped frames as evidence that L lies beyond the clip")
+    one_sided: Choice = Choice(
+        (True, False), "use clipped frames as evidence that L lies beyond the clip"
+    )
 
     calibrated = ("clock_offset", "c_on", "c_off", "share", "sigma_event")
 
@@ -110,7 +120,10 @@ SHOWN_CERTAINTY = 0.09  # least certainty w of a frame that shows a pixel
 class SmootherParams(Params):
     """Parameters of the smoother and of its variance."""
 
-    frame_noise, error_event, error_still, error_change = ERROR_PARAMETERS
+    frame_noise: Positive = ERROR_PARAMETERS[0]
+    error_event: Positive = ERROR_PARAMETERS[1]
+    error_still: Positive = ERROR_PARAMETERS[2]
+    error_change: Positive = ERROR_PARAMETERS[3]
 
 
 class Gaussian(eqx.Module):
@@ -635,9 +648,12 @@ def adjacent_counts(
     )
 
 
+AnyParams = TypeVar("AnyParams", bound=Params)
+
+
 @renamed_methods(keep="frame_info", tell="readout")
 @dataclasses.dataclass(frozen=True, repr=False)
-class Smoother(KernelEstimator[Params]):
+class Smoother(KernelEstimator[AnyParams]):
     """The asynchronous Kalman smoother."""
 
     has_likelihood: ClassVar[bool] = True

@@ -1,21 +1,24 @@
 """The packaged recording reconstructed by every method: table, figures and videos."""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import MissingExtra
+from jaxevent.estimator import Estimate
 from jaxevent.io import load
 from jaxevent.methods import find, names
-from jaxevent.recording import Frames, Recording
-from jaxevent.runs.protocols import frame_times, held_out
+from jaxevent.recording import Recording
+from jaxevent.runs.own import MethodFunction
+from jaxevent.runs.protocols import held_out
 from jaxevent.runs.results import check_folder, open_results, write_rows
-from jaxevent.runs.scores import score
-from jaxevent.show.export import default_tone, display_images, evenly_spaced_times
+from jaxevent.runs.scores import Sample, ScoringOptions, score_and_sample
+from jaxevent.show.export import display_images, evenly_spaced_times
 from jaxevent.show.images import (
     Kind,
     comparison_figure,
@@ -49,17 +52,22 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
             for name in ("akf", "augmented")
         ),
     ]
+    samples: dict[str, Sample] = {}  # of the hidden frame in the middle, by label
+    alone: dict[str, Estimate] = {}  # of events alone, at all hidden frames
     with open_results(out) as write:
         rows, skipped = [], []
         for label, method, params in runs:
+            fused = method.fuses or method.needs_frames
+            # The scale of images from events alone is not known, so it is fitted to the truth.
+            asked = ScoringOptions(normalise="none" if fused else "affine")
+            scored = method if fused else _remembered(method, alone, progress)
             try:
-                row = score(
-                    recording, method, params, normalise=_normalise(method), progress=progress
-                )
+                row, some = score_and_sample(recording, scored, params, asked, progress)
             except MissingExtra as error:
                 skipped.append(f"{label} is left out: {error}")
                 continue
             rows.append({**row, "method": label})
+            samples[label] = some[len(some) // 2]
         print(markdown_table(rows))
         print(
             "Every second frame was hidden and reconstructed; clock and thresholds are from the "
@@ -68,11 +76,14 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
         )
         write_rows(rows, write)
         written = ["results.md", "results.json"]
-        alone = _events_alone(recording, progress)
+        _, hidden = held_out(recording)
+        toned = [_toned(alone["high-pass"], "changes"), _toned(alone["events-only"], "relative")]
+        toned.append(tone_map(hidden.intensity, "display"))
+        doubt = np.sqrt(np.asarray(alone["events-only"].covariance))
         for name, draw in (
-            ("comparison.png", lambda path: _figure(recording, path)),
-            ("events_only.png", lambda path: _figure_of_events(recording.name, alone, path)),
-            ("events_only.mp4", lambda path: _video_of_events(alone, path)),
+            ("comparison.png", lambda path: _figure(recording.name, samples, path)),
+            ("events_only.png", lambda path: _figure_of_events(recording.name, toned, doubt, path)),
+            ("events_only.mp4", lambda path: _video_of_events(toned, hidden.t, path)),
             ("video.mp4", lambda path: _video(recording, path, progress)),
         ):
             try:
@@ -82,91 +93,70 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
             except MissingExtra as error:
                 skipped.append(f"{name} is left out: {error}")
         print(*skipped, sep="\n")
-    print(f"Written to {out}: {', '.join(written)}")
+    print(*(f"written: {out / name}" for name in written), sep="\n")
 
 
-def _normalise(method: Any) -> Any:
-    """Return how images are fitted to the truth: of events alone their scale is not known."""
-    return "none" if method.fuses or method.needs_frames else "affine"
+def _remembered(
+    method: Any, estimates: dict[str, Estimate], progress: bool | None
+) -> MethodFunction:
+    """Return a method of events alone that keeps what it estimates, by its name."""
+
+    def estimate(given: Recording, times: NDArray[np.int64]) -> Estimate:
+        alone = dataclasses.replace(given, frames=None)
+        estimates[method.name] = method.estimate(alone, progress=progress)(times)
+        return estimates[method.name]
+
+    return MethodFunction(method.name, estimate)
 
 
-class _EventsAlone(NamedTuple):
-    """Images of events without frames, (T, height, width), and the frames, which no method saw."""
-
-    frames: Frames
-    high_pass: NDArray[np.uint8]
-    image: NDArray[np.uint8]
-    doubt: NDArray[np.floating]  # standard deviation of ln I
+def _toned(estimate: Estimate, tone: str) -> NDArray[np.uint8]:
+    """Show images (T, height, width) with limits of their own."""
+    limits = display_limits(estimate.mean, tone, estimate.covariance)
+    return tone_map(estimate.mean, tone, limits, estimate.covariance)
 
 
-def _events_alone(recording: Recording, progress: bool | None) -> _EventsAlone:
-    """Reconstruct the recording without its frames, at every second one's time."""
-    assert recording.frames is not None
-    frames, given = recording.frames[2::2], dataclasses.replace(recording, frames=None)
-    shown = []
-    for name in ("high-pass", "events-only"):
-        method = find(name)
-        images, variance, _ = method.estimate(given, progress=progress)(frames.t)
-        tone = default_tone(method.has_covariance, given)
-        limits = display_limits(images, tone, variance)
-        shown.append(tone_map(images, tone, limits, variance))
-    return _EventsAlone(frames, *shown, np.sqrt(variance))
-
-
-def _figure_of_events(name: str, alone: _EventsAlone, path: Path) -> None:
+def _figure_of_events(
+    name: str, toned: Sequence[NDArray[np.uint8]], doubt: NDArray[np.floating], path: Path
+) -> None:
     """Draw one of the images of events alone, its uncertainty, and the frame."""
-    middle = len(alone.image) // 2
+    middle = len(doubt) // 2
+    labels = "high-pass filter of the events", "events-only", "the frame, which no method was given"
     panels: list[tuple[str, Any, Kind]] = [
-        ("high-pass filter of the events", alone.high_pass[middle] / 255, "image"),
-        ("events-only", alone.image[middle] / 255, "image"),
-        ("the frame, which no method was given", alone.frames.intensity[middle], "image"),
-        ("events-only, standard deviation of ln I", alone.doubt[middle], "uncertainty"),
+        (label, images[middle] / 255, "image") for label, images in zip(labels, toned, strict=True)
     ]
-    seconds = alone.frames.t[middle] / 1e6
-    comparison_figure(path, panels, f"{name} at {seconds:.3f} s, from events alone")
+    panels.append(("events-only, standard deviation of ln I", doubt[middle], "uncertainty"))
+    comparison_figure(path, panels, f"{name}, from events alone")
 
 
-def _video_of_events(alone: _EventsAlone, path: Path) -> float:
+def _video_of_events(toned: Sequence[NDArray[np.uint8]], t: NDArray[np.int64], path: Path) -> float:
     """Write the high-pass filter, `events-only` and frames side by side; return the slow-down."""
-    t = alone.frames.t
     rate, fps = (len(t) - 1) * 1e6 / (t[-1] - t[0]), 6.0
-    grey = tone_map(alone.frames.intensity)
     with video_writer(path, fps) as write:
-        for images in zip(alone.high_pass, alone.image, grey, strict=True):
+        for images in zip(*toned, strict=True):
             write(np.hstack(images))
     return rate / fps
 
 
-def _figure(recording: Recording, path: Path) -> None:
+def _figure(name: str, samples: Mapping[str, Sample], path: Path) -> None:
     """Draw the reconstructions of one hidden frame, and error and uncertainty of `mc`."""
-    given, hidden = held_out(recording)
-    middle = hidden[len(hidden) // 2 :][:1]
-    assert given.frames is not None
-    before = given.frames[int(np.searchsorted(given.frames.t, middle.t[0])) - 1 :][:1]
-    truth = middle.intensity[0]
-    ms = (middle.t[0] - before.t[0]) / 1000
+    best = samples["mc"]
+    limits = display_limits(best.truth, "display")
+    images = {
+        "input: the last frame given": best.given,
+        "AKF": samples["akf"].image,
+        "smoother": samples["aks"].image,
+        "flow between frames": samples["flow"].image if "flow" in samples else None,
+        "mc, motion-compensated": best.image,
+        "truth: the hidden frame": best.truth,
+    }
     panels: list[tuple[str, Any, Kind]] = [
-        (f"input: last frame given, {ms:.0f} ms old", before.intensity[0], "image")
+        (label, tone_map(image, "display", limits) / 255, "image")
+        for label, image in images.items()
+        if image is not None
     ]
-    error = doubt = truth
-    for name, label in (
-        ("akf", "AKF"),
-        ("aks", "smoother"),
-        ("flow", "flow between frames"),
-        ("mc", "mc, motion-compensated"),
-    ):
-        method: Any = find(name)
-        try:
-            values = method.usual_params(given)
-            image, variance, _ = method.estimate(given, values)(frame_times(middle, values))
-        except MissingExtra:
-            continue
-        panels.append((label, image[0], "image"))
-        error, doubt = np.clip(image[0], 0, 1) - truth, np.sqrt(variance[0])
-    panels.append(("truth: the hidden frame", truth, "image"))
-    panels.append(("mc minus truth", error, "error"))
-    panels.append(("mc, standard deviation of ln(I + 0.3)", doubt, "uncertainty"))
-    comparison_figure(path, panels, f"{recording.name} at {middle.t[0] / 1e6:.3f} s")
+    panels.append(("mc minus truth", np.clip(best.image, 0, 1) - best.truth, "error"))
+    panels.append(("mc, standard deviation of ln(I + 0.3)", best.deviation, "uncertainty"))
+    comparison_figure(path, panels, f"{name} at {best.t / 1e6:.3f} s")
 
 
 def _video(recording: Recording, path: Path, progress: bool | None) -> float:
@@ -176,7 +166,7 @@ def _video(recording: Recording, path: Path, progress: bool | None) -> float:
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
         for _, image in display_images(
-            video, evenly_spaced_times(recording, rate)[:longest], "linear"
+            video, evenly_spaced_times(recording, rate)[:longest], "display"
         ):
             write(np.kron(image, np.ones((zoom, zoom), np.uint8)))
     return rate / fps

@@ -115,7 +115,7 @@ from jaxevent.show.tables import write_parquet
 
 # Part of the keys of stored results: raised whenever the same recording, method and parameters give
 # other results than before.
-RESULTS_VERSION = 5
+RESULTS_VERSION = 6
 RESULT_FILES = ("report.html", "results.json", "results.md", "results.parquet", "config.toml")
 
 _opened = RecordingCache()
@@ -315,7 +315,7 @@ def _evaluate(
 
             write("config.toml", source.text)
             write_rows(rows, write)
-            pictures = [(o.result or {}).get("picture") for o in outcomes]
+            pictures = [(o.result or {}).get("pictures") for o in outcomes]
             hosts = sorted({o.host for o in outcomes if o.host})
             html = page(rows, pictures, plan.name, source.text.decode(), hosts, source.title)
             write("report.html", html.encode())
@@ -429,7 +429,7 @@ def _compute(
     version: str,
     progress: bool | None,
 ) -> dict[str, Any]:
-    """Compute one task: {"row", "picture"} of a recording and a method, on any machine."""
+    """Compute one task: {"row", "pictures"} of a recording and a method, on any machine."""
     from jaxevent.show.page import picture
 
     path = recording if isinstance(recording, str) else recording.name
@@ -445,7 +445,7 @@ def _compute(
         known = source.row(external_name(Path(path)))
         if known is not None:
             row = {"method": method, **known, "params": source.values()}
-            return {"row": row, "picture": None}
+            return {"row": row, "pictures": None}
     with double_precision(double):
         if isinstance(recording, str):
             recording = _opened.load(Path(recording), size, stream, progress)
@@ -458,10 +458,10 @@ def _compute(
                 values = source.Params.of(params)
                 told = values_of(values)
         row = kind.score(recording, source, values, options, progress)
-        sample = row.pop("sample", None)
+        samples = row.pop("samples", ())
     row = {"recording": recording.name, "method": source.name, **row}
     row.setdefault("params", told)
-    return {"row": row, "picture": None if sample is None else picture(sample)}
+    return {"row": row, "pictures": [picture(sample) for sample in samples] or None}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -61,18 +61,6 @@ class ExternalImages(Source):
 
     @classmethod
     def of(cls, table: Mapping[str, Any], folder: Path) -> "ExternalImages":
-        """Make them from the settings of a configuration.
-
-        Args:
-            table: Settings of a [[method]].
-            folder: Folder of the configuration.
-
-        Returns:
-            The images' place and format.
-
-        Raises:
-            InputError: A setting cannot be used; the message names it.
-        """
         known = {field.name: field for field in dataclasses.fields(cls) if field.name != "folder"}
         for name, value in table.items():
             if name not in known:

@@ -29,7 +29,18 @@ class Source(abc.ABC):
     @classmethod
     @abc.abstractmethod
     def of(cls, table: Mapping[str, Any], folder: Path) -> "Source":
-        """Make a source from the settings of a [[method]]; raise `InputError` naming a bad one."""
+        """Make a source from the settings of a [[method]].
+
+        Args:
+            table: The settings.
+            folder: Folder of the configuration, to which paths are relative.
+
+        Returns:
+            The source.
+
+        Raises:
+            InputError: A setting cannot be used; the message names it.
+        """
 
     @abc.abstractmethod
     def values(self) -> dict[str, Any]:
@@ -93,7 +104,7 @@ class Protocol(abc.ABC):
             progress: Whether to show a bar; None shows it in a terminal or notebook.
 
         Returns:
-            A row of results without names. A `sample` in it is the picture that the report shows.
+            A row of results without names. `samples` in it are images that the report shows.
 
         Raises:
             InputError: The recording or the method cannot be scored.

@@ -37,7 +37,7 @@ from jaxevent.recording import Recording
 RESERVED_NAMES = (
     "recording", "method", "params", "error", "skipped", "split", "warning", "per_frame",
     "per_time", "own_metrics", "regions", "moving", "clip", "normalise", "gap", "model", "frames",
-    "missing", "events", "times", "windows", "seconds", "t", "sample",
+    "missing", "events", "times", "windows", "seconds", "t", "samples",
 )  # fmt: skip
 
 

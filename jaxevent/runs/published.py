@@ -38,18 +38,6 @@ class PublishedResults(Source):
 
     @classmethod
     def of(cls, table: Mapping[str, Any], folder: Path) -> "PublishedResults":
-        """Make them from the settings of a configuration.
-
-        Args:
-            table: Settings of a [[method]].
-            folder: Folder of the configuration.
-
-        Returns:
-            The numbers.
-
-        Raises:
-            InputError: A setting cannot be used; the message names it.
-        """
         is_table = (lambda value: isinstance(value, dict) and bool(value), "a table of lists")
         check(table, {"measures": (is_texts, 'names, as ["mse", "ssim"]'), "values": is_table})
         for name in ("measures", "values"):

@@ -52,6 +52,7 @@ from jaxevent.runs.protocols import (
     is_gap,
 )
 from jaxevent.runs.published import PublishedResults
+from jaxevent.show.page import spread_rows
 
 # Further measures of an image and the truth, each a number per image; the first two need an extra.
 # Where an HDR reference has no value both images are 0, which is all that the authors' error needs.
@@ -107,6 +108,7 @@ def check_extras(names: Iterable[str]) -> None:
             require("pycvvdp", "hdr")
 
 
+MAX_SAMPLES = 5  # images of a recording that a report shows
 MIN_MOTION_CHANGE = 0.05  # of white, by which frames differ where something moves
 
 # The scores of one image; those of parts of it are nested under "regions" and "moving".
@@ -441,7 +443,7 @@ class ImageProtocol(Protocol):
         options: Mapping[str, Any],
         progress: bool | None = None,
     ) -> dict[str, Any]:
-        row, sample = score_and_sample(
+        row, samples = score_and_sample(
             recording,
             method,
             params,
@@ -456,7 +458,7 @@ class ImageProtocol(Protocol):
             progress,
             external_name(Path(recording.name)),
         )
-        return {**row, "sample": sample}
+        return {**row, "samples": samples}
 
 
 class HeldOut(ImageProtocol):
@@ -476,8 +478,8 @@ def score_and_sample(
     asked: ScoringOptions,
     progress: bool | None,
     name: str | None = None,
-) -> tuple[dict[str, Any], Sample | None]:
-    """Score a method as `score` does, and return the middle image too.
+) -> tuple[dict[str, Any], list[Sample]]:
+    """Score a method as `score` does, and return some images too.
 
     `name` finds external images.
     """
@@ -500,7 +502,8 @@ def score_and_sample(
         values, I0 = values_of(chosen), float(chosen.I0)
     scores: list[Scores] = []
     t: list[int] = []
-    sample: Sample | None = None
+    samples: list[Sample] = []
+    chosen_rows = spread_rows(len(hidden), MAX_SAMPLES)
     clock = time.perf_counter()  # after calibration, which costs the first method alone
     for first, images, variances in estimates:
         seconds += time.perf_counter() - clock
@@ -518,11 +521,12 @@ def score_and_sample(
             else:
                 scores.append(_hdr_measures(image, P, truth, hdr.clip, I0, **named))
             t.append(int(hidden.t[row]))
-            if row == len(hidden) // 2:
-                sample = Sample(
-                    t[-1], image, truth, hdr is not None,
-                    None if P is None else np.sqrt(P), _frame_before(given, t[-1]),
-                )  # fmt: skip
+            if row in chosen_rows:
+                deviation = None if P is None else np.sqrt(P)
+                before = _frame_before(given, t[-1])
+                samples.append(
+                    Sample(t[-1], image.copy(), truth, hdr is not None, deviation, before)
+                )
         clock = time.perf_counter()
     external = isinstance(method, ExternalImages)
     per_frame = {"t": t, **_as_list(scores)}
@@ -542,7 +546,7 @@ def score_and_sample(
         "params": values,
         "per_frame": per_frame,
     }
-    return row, sample
+    return row, samples
 
 
 def _calibrate(

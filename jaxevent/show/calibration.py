@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration import Calibration
 from jaxevent.display import plural
 from jaxevent.recording import Recording
-from jaxevent.show.images import new_figure
+from jaxevent.show.images import COLOURS, new_figure, tone_map
 from jaxevent.show.tables import format_aligned_table
 
 N_SHOWN_INTERVALS = 8  # between frames, whose pixels the picture shows
@@ -63,13 +63,16 @@ def plot_calibration(calibration: Calibration, recording: Recording, I0: float =
 
 def _draw_correlations(axis: Any, calibration: Calibration) -> None:
     clock = calibration.clock_offset
-    axis.plot(1e3 * calibration.offsets, calibration.correlations, "k.-", lw=1, ms=3)
+    line = {"color": COLOURS[-1], "lw": 1, "ms": 3, "label": "correlation"}
+    axis.plot(1e3 * calibration.offsets, calibration.correlations, ".-", **line)
     if clock.is_identifiable:
-        axis.axvline(1e3 * clock.value, color="C3", lw=1)
+        axis.axvline(1e3 * clock.value, color=COLOURS[1], lw=1, label="estimate")
         if np.isfinite([clock.low, clock.high]).all():
-            axis.axvspan(1e3 * clock.low, 1e3 * clock.high, color="C3", alpha=0.2, lw=0)
+            band = {"color": COLOURS[1], "alpha": 0.2, "lw": 0, "label": "95 % interval"}
+            axis.axvspan(1e3 * clock.low, 1e3 * clock.high, **band)
     title = f"clock {1e3 * clock.value:+.2f} ms" if clock.is_identifiable else "clock: not found"
     axis.set(title=title, xlabel="clock offset (ms)", ylabel="correlation of events and frames")
+    axis.legend(frameon=False, fontsize=8)
     axis.spines[["top", "right"]].set_visible(False)
 
 
@@ -86,13 +89,15 @@ def _draw_counts(axis: Any, calibration: Calibration, recording: Recording, I0: 
     )
     extent = (-end, end, -most - 0.5, most + 0.5)
     axis.imshow(np.log1p(counts.T), "Greys", origin="lower", extent=extent, aspect="auto")
-    lines = ((calibration.c_on, "C3", "ON", 1), (calibration.c_off, "C0", "OFF", -1))
+    lines = ((calibration.c_on, COLOURS[1], "ON", 1), (calibration.c_off, COLOURS[0], "OFF", -1))
     for threshold, colour, name, sign in lines:
         if threshold.is_identifiable:
             reach = sign * min(end, most * threshold.value)
             label = f"{name} {threshold.value:.3g}"
-            axis.plot([0, reach], [0, reach / threshold.value], colour, lw=1.5, label=label)
-    axis.set(xlim=(-end, end), ylim=(-most - 0.5, most + 0.5), title="thresholds")
+            axis.plot([0, reach], [0, reach / threshold.value], color=colour, lw=1.5, label=label)
+    axis.set(
+        xlim=(-end, end), ylim=(-most - 0.5, most + 0.5), title="thresholds; darker: more pixels"
+    )
     if axis.lines:
         axis.legend(frameon=False, loc="upper left")
 
@@ -128,8 +133,8 @@ def _draw_hot_pixels(axis: Any, calibration: Calibration, recording: Recording) 
     y, x = np.nonzero(calibration.hot_pixels)
     height, width = calibration.hot_pixels.shape
     if recording.frames is not None:
-        axis.imshow(recording.frames[:1].intensity[0], "gray", vmin=0, vmax=1)
-    axis.plot(x, y, "C3o", ms=4, mfc="none")
+        axis.imshow(tone_map(recording.frames[:1].intensity[0], "display"), "gray")
+    axis.plot(x, y, "o", color=COLOURS[1], ms=4, mfc="none")
     title = f"{len(x)} hot {plural('pixel', len(x))}"
     axis.set(title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axis.set(xticks=[], yticks=[], aspect="equal")

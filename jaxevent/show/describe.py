@@ -199,9 +199,9 @@ def _about_events(
         lines.append(("gaps", text))
     hot = np.flatnonzero(is_hot(at_pixel.reshape(height, width)))
     share = 100 * at_pixel[hot].sum() / count
-    lines.append(
-        ("hot pixels", f"{len(hot):,}, with {share:.2f} % of the events" if len(hot) else "none")
-    )
+    remedy = "jaxevent filter --hot-pixels leaves them out"
+    some = f"{len(hot):,}, with {share:.2f} % of the events ({remedy})"
+    lines.append(("hot pixels", some if len(hot) else "none"))
     hottest = np.argsort(-at_pixel, kind="stable")[:3]
     shown = []
     for pixel in hottest[at_pixel[hottest] > 0]:

@@ -73,7 +73,7 @@ def within(
     return chosen
 
 
-RARE_PIXEL_SHARE = 1e-3  # of the pixels; rarer values do not count for the range that images use
+MAX_WHITE_SHARE = 0.01  # of the pixels at white, twice what "display" leaves out of the frames
 
 # Chunks of one image, read by every HDF5 library; `deflate_shuffled` writes them faster than h5py.
 _COMPRESSION_OPTIONS = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
@@ -191,31 +191,25 @@ def _write_images(
 
 
 class RangeCounter:
-    """Part of the display's range that images of the tone "linear" use; `str` describes it.
-
-    That tone shows the frames' black and white as they are, so brighter values are cut off, and
-    images are as dark as the frames.
-    """
+    """Share of the pixels that a tone with fixed limits cuts off; `str` describes it."""
 
     def __init__(self, tone: str):
-        self._counts = np.zeros(256, np.int64) if tone == "linear" else None
+        self._counts = tone in ("display", "linear")
+        self._white = self._pixels = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Count the values of an image."""
-        if self._counts is not None:
-            self._counts += np.bincount(image.ravel(), minlength=256)
+        if self._counts:
+            self._white += int(np.count_nonzero(image == 255))
+            self._pixels += image.size
 
     def __str__(self) -> str:
-        if self._counts is None:
+        share = self._white / max(self._pixels, 1)
+        if share <= MAX_WHITE_SHARE:
             return ""
-        above = self._counts[::-1].cumsum()[::-1] / max(int(self._counts.sum()), 1)
-        if above[255] > RARE_PIXEL_SHARE:
-            share = 100 * above[255]
-            return f", {share:.2g} % of the pixels at white or cut off there (--tone log shows all)"
-        if above[128] < RARE_PIXEL_SHARE:
-            most = int(np.flatnonzero(above >= RARE_PIXEL_SHARE)[-1])
-            return f", as dark as the frames, up to grey {most} of 255 (--tone percentile spreads)"
-        return ""
+        return (
+            f", {100 * share:.2g} % of the pixels at white or cut off there (--tone log shows all)"
+        )
 
 
 def default_tone(has_variance: bool, recording: Recording) -> str:
@@ -229,7 +223,7 @@ def default_tone(has_variance: bool, recording: Recording) -> str:
         A tone of `tone_map`.
     """
     if recording.frames is not None:
-        return "linear"
+        return "display"
     return "relative" if has_variance else "changes"
 
 
@@ -238,7 +232,8 @@ def display_images(
 ) -> Iterator[tuple[int, NDArray]]:
     """Yield each time (us) and its image for the display, with limits common to all.
 
-    A colour image is its toned luminance with its former chrominance.
+    Those of the tone "display" are the frames', where there are frames. A colour image is its
+    toned luminance with its former chrominance.
 
     Args:
         video: A reconstruction.
@@ -246,11 +241,15 @@ def display_images(
         tone: Tone of `tone_map`.
         colours: Function from times to colour images; None for grey images.
     """
-    sample = times[np.unique(np.linspace(0, len(times) - 1, 16).round().astype(int))]
-    if tone == "linear":  # the limits are those of any image
-        sample = sample[:1]
-    seen = video(sample)
-    limits = display_limits(seen.mean, tone, seen.covariance)
+    frames = video.recording.frames
+    if tone == "linear":
+        limits = (0.0, 1.0)
+    elif tone == "display" and frames is not None and len(frames):
+        seen = [frames[row : row + 1].intensity for row in _spread(len(frames))]
+        limits = display_limits(np.concatenate(seen), tone)
+    else:
+        sample = video(times[_spread(len(times))])
+        limits = display_limits(sample.mean, tone, sample.covariance)
     for batch, values in _batches(video, times, colours):
         images = values["image"]
         if colours is None:
@@ -263,6 +262,11 @@ def display_images(
             shown = np.rint(shown.clip(0, 255)).astype(np.uint8)
         for at, image in zip(batch, shown, strict=True):
             yield int(at), image
+
+
+def _spread(count: int) -> NDArray[np.int64]:
+    """Return at most 16 evenly spaced rows of `count`."""
+    return np.unique(np.linspace(0, count - 1, 16).round().astype(np.int64))
 
 
 def _batches(

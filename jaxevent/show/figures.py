@@ -17,11 +17,11 @@ from jaxevent.blob.tracks import Tracks
 from jaxevent.display import plural
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.truth import KnownMotion
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, require
 from jaxevent.events import event_image
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, EventSource, Recording, Times, microseconds
-from jaxevent.show.images import new_figure
+from jaxevent.show.images import COLOURS, new_figure
 from jaxevent.show.motion_figures import motion_figure
 from jaxevent.show.track_figures import draw_paths
 from jaxevent.tuning import FitResult
@@ -103,7 +103,8 @@ def plot_events_3d(
 def plot_image(video: ImageSequence, time: Times) -> Any:
     """Draw the image of a reconstruction, and its uncertainty.
 
-    White is the image's brightest 0.5 %; black is the frames'. The uncertainty, if the method
+    White is the image's brightest 0.5 %; black is the frames'. Greys are encoded for screens, with
+    a gamma of 2.2. The uncertainty, if the method
     estimates it, is the standard deviation of ln(intensity + I0).
 
     Args:
@@ -119,7 +120,9 @@ def plot_image(video: ImageSequence, time: Times) -> Any:
     estimate = video(time)
     image = np.where(estimate.valid[0], estimate.mean[0], np.nan)
     deviation = np.sqrt(np.where(estimate.valid[0], estimate.covariance[0], np.nan))
-    panels = [(image, "intensity", {"cmap": "gray", "vmin": 0.0, "vmax": _bright(image, 1e-6)})]
+    colors: Any = require("matplotlib.colors", "plot")
+    grey = {"cmap": "gray", "norm": colors.PowerNorm(1 / 2.2, 0.0, _bright(image, 1e-6), clip=True)}
+    panels = [(image, "intensity", grey)]
     if np.isfinite(deviation).any():
         scale = {"cmap": "viridis", "vmin": 0.0, "vmax": _bright(deviation, 1e-6)}
         panels.append((deviation, "standard deviation of ln I", scale))
@@ -221,11 +224,11 @@ def plot_losses(fitted: FitResult | Sequence[FitResult], names: Sequence[str] = 
         length = 1 + max((line[2] for line in one.history), default=0)
         for start in sorted({line[0] for line in one.history}):
             lines = [line for line in one.history if line[0] == start]
-            for column, colour, name in ((3, "C0", "fit"), (4, "C1", "validation")):
+            for column, colour, name in ((3, COLOURS[0], "fit"), (4, COLOURS[1], "validation")):
                 seen = [line for line in lines if line[column] is not None]
                 at = [line[1] * length + line[2] for line in seen]
                 losses = [line[column] for line in seen]
-                axis.plot(at, losses, colour, lw=1, label=name if start == 0 else None)
+                axis.plot(at, losses, color=colour, lw=1, label=name if start == 0 else None)
         axis.set(title=title, xlabel="iteration", ylabel="loss")
         axis.spines[["top", "right"]].set_visible(False)
         if axis.lines:

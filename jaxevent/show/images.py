@@ -21,7 +21,12 @@ from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete
 from jaxevent.metrics import checked
 
-Tone = Literal["linear", "log", "percentile", "clahe", "changes", "relative"]
+# Colours of lines and areas on white, and on a dark page. Any two differ by 30 and more in CIELAB,
+# also to eyes that lack one kind of cone, and have a contrast of 3 or more to the page.
+COLOURS = ("#0847d0", "#f06900", "#09a771", "#c364b7", "#6e2800", "#1d2329")
+DARK_COLOURS = ("#29c7ff", "#b74505", "#498b69", "#a7479a", "#f1bc57", "#dde3e8")
+
+Tone = Literal["linear", "log", "percentile", "clahe", "changes", "relative", "display"]
 Kind = Literal["image", "error", "uncertainty"]
 
 # The logarithm shows at most this many halvings below the brightest value (96 dB): pixels that are
@@ -36,7 +41,8 @@ def display_limits(
 ) -> tuple[float, float]:
     """Compute the intensities shown as black and as white.
 
-    "linear" has the limits 0 and 1, whatever the images. The other tones leave out the darkest and
+    "linear" has the limits 0 and 1, whatever the images. "display" has 0 and the value that 0.5 %
+    exceed. The other tones leave out the darkest and
     the brightest 0.5 % of the values as outliers; "log" and "clahe" use positive values only.
     "changes" leaves out the largest 5 % of the values that differ from 0, and is symmetric about 0.
     "relative" leaves out 1 %, and has limits that are at least four standard deviations of most
@@ -62,6 +68,8 @@ def display_limits(
         size = size[size > MIN_LOG_CHANGE]
         most = float(np.percentile(size, 95)) if len(size) else 1.0
         return math.expm1(-most), math.expm1(most)
+    if how == "display":
+        return 0.0, _bright(images)
     values = images[images > 0] if logarithmic else images.ravel()
     if not len(values):
         return (2.0**-MAX_OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
@@ -86,7 +94,8 @@ def tone_map(
     """Convert images for the display.
 
     "linear" and "percentile" scale intensity, "log" its base-2 logarithm, from the limits to 0..255
-    and clip values outside. "changes" scales ln(1 + I), for images from events alone, whose
+    and clip values outside. "display" encodes intensity as screens expect it, by the curve of sRGB
+    (IEC 61966-2-1). "changes" scales ln(1 + I), for images from events alone, whose
     intensity 0 is no change: grey. "relative" is "log" for images whose scale is not known, and
     fades what is uncertain towards middle grey: the distance of the logarithm from grey is divided
     by 1 + P / d^2, with P its variance and d a quarter of the grey scale. "clahe" equalises the
@@ -121,7 +130,15 @@ def tone_map(
         shown = 0.5 + (shown - 0.5) / (1 + _fill_unknown(variance, images) / quarter**2)
     if how == "clahe":
         shown = _equalise(shown)
+    if how == "display":
+        shown = np.where(shown < 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
     return np.rint(shown * 255).astype(np.uint8)
+
+
+def _bright(images: NDArray[np.floating]) -> float:
+    """Return the intensity that the brightest 0.5 % exceed, or 1 where that is black."""
+    bright = float(np.percentile(images, 99.5)) if images.size else 0.0
+    return bright if bright > 0 else 1.0
 
 
 def _clip_infinite(images: ArrayLike) -> NDArray[np.floating]:

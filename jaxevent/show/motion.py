@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaxevent.display import plural
 from jaxevent.egomotion import flow as event_flow
+from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import MotionEstimate, is_observable, table_columns
 from jaxevent.egomotion.scores import MotionScores, score_motion
@@ -56,6 +57,45 @@ def write_motion_table(
         estimated: The motion at these times.
     """
     _write_csv(path, table_columns(model, times, estimated))
+
+
+def _check_rate(rate: float | int) -> None:
+    """Raise `InputError` for a number of rows per second that is not possible."""
+    if not 0 < rate <= 1e6:
+        raise InputError(f"--rate {rate:g} is not possible; give times per s, up to 1e6")
+
+
+class LiveTable:
+    """Table of a live motion, row by row, as `write_motion_table` writes that of a recording.
+
+    Args:
+        live: The live motion.
+        rate: Rows per second, from the first event on.
+
+    Raises:
+        InputError: The rate is not possible.
+    """
+
+    def __init__(self, live: LiveMotion, rate: float):
+        _check_rate(rate)
+        self._live, self._period, self._count, self._first = live, 1e6 / rate, 0, 0
+
+    def rows(self) -> str:
+        """Return the lines of CSV whose estimates are new; the first ones follow the header."""
+        motion = self._live.motion
+        if not len(motion):
+            return ""
+        if not self._count:
+            self._first = self._live.start
+        last = math.floor((int(motion.t[-1]) - self._first) / self._period + 1e-9)
+        steps = np.arange(self._count, last + 1)
+        times = self._first + np.rint(steps * self._period).astype(np.int64)
+        if not len(times):
+            return ""
+        columns = table_columns(motion.model, times, motion(times, extrapolate=True))
+        text = pd.DataFrame(columns).to_csv(index=False, header=not self._count)
+        self._count = last + 1
+        return text
 
 
 def write_known(
@@ -254,8 +294,7 @@ class Output:
             raise InputError(
                 f"{self.path}: is not a folder's name; the motion is written into a new folder"
             )
-        if not 0 < self.rate <= 1e6:
-            raise InputError(f"--rate {self.rate:g} is not possible; give times per s, up to 1e6")
+        _check_rate(self.rate)
         check_writable(self.path, directory=True)
 
     def known(

@@ -82,8 +82,9 @@ def motion_figure(
         value = estimated.mean[:, i] * trust[:, i]
         _cloud(axis, motion, i, centred)
         low, high = value - 2 * sigma[:, i], value + 2 * sigma[:, i]
-        axis.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0)
-        axis.plot(seconds, value, color=_ESTIMATE, lw=1.3, label="estimate, 2 sigma")
+        band = {"color": _ESTIMATE, "alpha": 0.25, "lw": 0, "label": "2 sigma"}
+        axis.fill_between(seconds, low, high, **band)
+        axis.plot(seconds, value, color=_ESTIMATE, lw=1.3, label="estimate")
         seen = [band[np.isfinite(band)] for band in (low, value, high)]
         seen = [np.percentile(band, [2, 98]) for band in seen if len(band)]
         if truth is not None:
@@ -119,14 +120,17 @@ def motion_figure(
         axis.set_xlabel("t (s)")
     for axis in figure.axes:
         for begin, end in _spans(seconds, ~estimated.valid):
-            axis.axvspan(begin, end, color=_LOST, alpha=0.4, lw=0)
+            axis.axvspan(begin, end, color=_LOST, alpha=0.4, lw=0, label="lost")
         if not estimated.valid.any():
             axis.text(0.5, 0.5, "never found", transform=axis.transAxes, ha="center", va="center")
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
+    drawn = [axis.get_legend_handles_labels() for axis in figure.axes]
+    known = {label: handle for pair in drawn for handle, label in zip(*pair, strict=True)}
     grid[0, 0].legend(
-        fontsize=8, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1), borderpad=0.2
-    )
+        list(known.values()), list(known), fontsize=8, frameon=False, ncols=5, loc="lower left",
+        bbox_to_anchor=(0, 1), borderpad=0.2,
+    )  # fmt: skip
     return figure
 
 

@@ -2,13 +2,12 @@
 
 import base64
 import datetime
-import importlib.util
 import io
+import json
 import math
 import os
 import platform
-import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 
 import jaxevent
 from jaxevent.display import plural
-from jaxevent.errors import install_command
 from jaxevent.metrics import LOG_OFFSET, MEASURE_MEANINGS
-from jaxevent.show.images import display_limits, tone_map
+from jaxevent.show.images import COLOURS, DARK_COLOURS, display_limits, tone_map
 from jaxevent.show.tables import (
+    COLUMNS,
     COST_COLUMNS,
     Column,
     column_mean,
@@ -38,8 +37,13 @@ MAX_SHOWN_RECORDINGS = (
 MAX_CURVE_POINTS = 300  # of a curve over time, means of so many parts of it
 # Standard deviations of log intensity shown black and white; between them by their logarithm.
 DEVIATION_LIMITS = 0.001, 0.1
-WIDTH_INCHES = 4.5  # inches of a plot: 27 rem of the page
-LABEL_LINE_LETTERS = 18  # letters of a line of a method's label in a plot
+MAX_PICTURES = 400  # of a page; with many recordings and methods there are fewer times
+MAX_OUTLIERS = 60  # values beyond the whiskers that are drawn
+MIN_LOG_RATIO = 5.0  # of the largest to the smallest error that has a logarithmic scale
+MAX_LIST_VALUES = 6  # numbers of a parameter that are printed
+# Series over time that are no columns of a table.
+SERIES_COLUMNS: list[Column] = [("distance px", "distance", 1, 3), ("error %", "error", 1, 2)]
+HIGHER, LOWER = "higher is better", "lower is better"
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL_SCALE_ERROR = {False: 0.1, True: 1.0}
 HIGHER_IS_BETTER = {  # of these more is better
@@ -62,7 +66,7 @@ Table = tuple[list[str], list[list[Cell]], int]  # titles, lines, how many colum
 
 def page(
     rows: Sequence[Mapping[str, Any]],
-    pictures: Sequence[Mapping[str, Any] | None],
+    pictures: Sequence[Sequence[Mapping[str, Any]] | None],
     protocol: str,
     config: str,
     hosts: Sequence[str],
@@ -72,7 +76,7 @@ def page(
 
     Args:
         rows: Rows of `evaluate.evaluate`, those with an error too.
-        pictures: A `picture` of each row, or None.
+        pictures: `picture`s of each row at some times, or None.
         protocol: Name of the protocol of evaluation.
         config: Text of the configuration.
         hosts: Names of the machines that computed it.
@@ -90,6 +94,13 @@ def page(
     hdr = any("log_mse" in row for row in done)
     now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     counts = {one["recordings"] for one in means(rows)}
+    plotted, over_time = _plotted(done)
+    shown = _recordings(rows, pictures, methods, over_time, names)
+    data = {
+        "methods": methods,
+        "spreads": _spreads(done, methods, [*plotted, over_time]),
+        "recordings": shown,
+    }
     values: dict[str, Any] = {
         "title": title,
         "about": f"{len(recordings)} {plural('recording', len(recordings))}, {len(methods)} "
@@ -102,7 +113,9 @@ def page(
         "failures": _failures(rows, names),
         "means": _means(rows, columns),
         "unequal": len(counts) > 1,
-        "strips": _strips(rows, pictures, recordings, names),
+        "several": len(recordings) > 1,
+        "recordings": shown,
+        "pictured": any(one["figures"] for one in shown),
         "full": f"{FULL_SCALE_ERROR[hdr]:g}",
         "unit": "ln(I + 0.003)" if hdr else "intensity",
         "certain": DEVIATION_LIMITS[0],
@@ -111,18 +124,15 @@ def page(
         "parameters": _parameters(rows, methods),
         "computed": _computed(hosts),
         "config": config,
+        "palette": list(zip(COLOURS, DARK_COLOURS, strict=True)),
+        "lower": LOWER,
+        # Nothing in the data may end the script that holds them.
+        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
     }
     if len(recordings) > MAX_SHOWN_RECORDINGS:
         values["first_only"] = (
             f"Of {len(recordings)} recordings the first {MAX_SHOWN_RECORDINGS} are shown."
         )
-    if importlib.util.find_spec("matplotlib") is None:
-        values["missing_plots"] = install_command("plot")
-    else:
-        plotted, over_time = _plotted(done)
-        values["points"] = _points(done, methods, plotted)
-        values["boxes"] = _boxes(done, methods, [*plotted, over_time])
-        values["curves"] = _curves(done, recordings, methods, over_time, names)
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
         undefined=jinja2.ChainableUndefined, keep_trailing_newline=True,
@@ -133,8 +143,8 @@ def page(
 def picture(sample: Any) -> dict[str, Any]:
     """Encode an image, its error, the truth and more as base64 of PNG.
 
-    With an HDR reference all are logarithmic, between the truth's limits. Otherwise they are
-    linear, and dark ones are brightened alike. `sample` is an `evaluate.Sample`.
+    With an HDR reference all are logarithmic, otherwise of the tone "display", in both cases with
+    the truth's limits. `sample` is an `evaluate.Sample`.
     """
     image, truth = (np.asarray(a, np.float64) for a in (sample.image, sample.truth))
     known = np.isfinite(truth) & np.isfinite(image)
@@ -144,8 +154,7 @@ def picture(sample: Any) -> dict[str, Any]:
         low = np.log(np.maximum(truth, 0) + LOG_OFFSET)
         error = np.log(np.maximum(image, 0) + LOG_OFFSET) - low
     else:
-        bright = float(np.percentile(truth, 99.5))
-        tone, limits = "linear", (0.0, bright if 0 < bright < 0.8 else 1.0)
+        tone, limits = "display", display_limits(truth, "display")
         error = image.clip(0, 1) - truth
     error = np.where(known, error / FULL_SCALE_ERROR[sample.hdr], 0).clip(-1, 1)
     shown = {
@@ -235,14 +244,16 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Tabl
         if len(values) > 1 and place not in unmarked:
             best[place] = (max if place in HIGHER_IS_BETTER else min)(values)
     lines = []
+    several = len({row["recording"] for row in rows}) > 1
     for one in found:
-        cells = [Cell(one["method"], "left"), Cell(str(one["recordings"]))]
+        cells = [Cell(one["method"], "left")] + [Cell(str(one["recordings"]))] * several
         for column in measures:
             place, value = column[1], one[column[1]]
             marked = value is not None and value == best.get(place) and one["recordings"] == most
             cells.append(Cell(format_number(value, column), "best" if marked else ""))
         lines.append(cells)
-    return ["method", "recordings", *(title for title, _, _, _ in measures)], lines, 1
+    titles = ["recordings"] * several + [title for title, _, _, _ in measures]
+    return ["method", *titles], lines, 1
 
 
 def _table(
@@ -267,9 +278,19 @@ def _parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Ta
     lines = []
     for method in methods:
         row = next(row for row in rows if row["method"] == method)
-        values = ", ".join(f"{k} = {v}" for k, v in row["params"].items() if v is not None)
-        lines.append([Cell(method, "left"), Cell(values, "wrap")])
+        values = [f"{k} = {_brief(v)}" for k, v in row["params"].items() if v is not None]
+        lines.append([Cell(method, "left"), Cell(", ".join(values), "wrap")])
     return ["method", "values"], lines, 2
+
+
+def _brief(value: Any) -> str:
+    """Format a parameter; of a long list the first numbers."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list | tuple):
+        ending = f", ... ({len(value)})" if len(value) > MAX_LIST_VALUES else ""
+        return f"[{', '.join(map(_brief, value[:MAX_LIST_VALUES]))}{ending}]"
+    return str(value)
 
 
 def _computed(hosts: Sequence[str]) -> Table:
@@ -289,44 +310,60 @@ def _computed(hosts: Sequence[str]) -> Table:
     return ["", ""], [[Cell(k, "left"), Cell(v, "wrap")] for k, v in facts.items()], 2
 
 
-def _strips(
+def _recordings(
     rows: Sequence[Mapping[str, Any]],
-    pictures: Sequence[Mapping[str, Any] | None],
-    recordings: Sequence[str],
+    pictures: Sequence[Sequence[Mapping[str, Any]] | None],
+    methods: Sequence[str],
+    measure: str,
     names: Mapping[str, str],
 ) -> list[dict[str, Any]]:
-    """Collect the truth, the frame before, and every method's pictures of each recording."""
-    strips = []
-    for recording in recordings[:MAX_SHOWN_RECORDINGS]:
-        shown = [
-            (row["method"], one)
+    """Collect curves and pictures of each recording.
+
+    Pictures are the truth, the frame before, and every method's, at some times.
+    """
+    recordings = list(names)[:MAX_SHOWN_RECORDINGS]
+    most = max(1, MAX_PICTURES // (3 * len(methods) * len(recordings)))
+    found = []
+    for recording in recordings:
+        mine = [
+            (row, one or [])
             for row, one in zip(rows, pictures, strict=True)
-            if row["recording"] == recording and one is not None and "error" not in row
+            if row["recording"] == recording and "error" not in row
         ]
-        if not shown:
-            continue
-        first = shown[0][1]
-        figures = [{"label": "truth", "images": [{"what": "image", "data": first["truth"]}]}]
-        if "given" in first:
-            before = [{"what": "image", "data": first["given"]}]
-            figures.append({"label": "last frame given", "images": before})
+        curves = _curves([row for row, _ in mine], methods, measure)
+        shown = [(row["method"], _choose(one, most)) for row, one in mine if one]
+        figures: list[dict[str, Any]] = []
+        times: list[float] = []
+        if shown:
+            first = shown[0][1]
+            times = [one["t"] / 1e6 for one in first]
+            figures.append({"label": "truth", "images": {"image": _of("truth", first)}})
+            if "given" in first[0]:
+                before = {"image": _of("given", first)}
+                figures.append({"label": "last frame given", "images": before})
         for method, one in shown:
             kinds = [("image", "image"), ("error", "error"), ("deviation", "uncertainty")]
-            images = [{"what": what, "data": one[kind]} for kind, what in kinds if kind in one]
+            images = {what: _of(kind, one) for kind, what in kinds if kind in one[0]}
             figures.append({"label": method, "images": images})
-        title = f"{names[recording]} at {first['t'] / 1e6:.3f} s"
-        strips.append({"title": title, "figures": figures})
-    return strips
+        if curves or figures:
+            name = names[recording]
+            found.append({"name": name, "curves": curves, "times": times, "figures": figures})
+    return found
 
 
-MEASURE_LABELS = {
-    "mse": "MSE", "ssim": "SSIM", "log_mse": "log MSE", "log_ssim": "log SSIM",
-    "AEE_rel": "relative AEE (%)", "AAE_U": "AAE (degrees)", "AAE_T": "heading (degrees)",
-    "vector_error": "error of Omega (%)", "AME_rel": "relative AME (%)", "error": "error (%)",
-    "rmse": "RMSE (px)", "covered": "covered", "distance": "distance (px)", "lpips": "LPIPS",
-    "hdr_quality": "JOD", "global_ssim": "global SSIM", "authors_ssim": "authors' SSIM",
-    "matlab_ssim": "MATLAB SSIM", "masked_mse": "masked MSE",
-}  # fmt: skip
+def _choose(pictures: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
+    """Choose pictures at even intervals, the middle one among them."""
+    return [pictures[row] for row in spread_rows(len(pictures), most)]
+
+
+def spread_rows(count: int, most: int) -> list[int]:
+    """Return at most so many evenly spaced rows of `count`, the middle one among them."""
+    most = min(count, most)
+    return [(2 * k + 1) * count // (2 * most) for k in range(most)]
+
+
+def _of(kind: str, pictures: Sequence[Mapping[str, Any]]) -> list[str | None]:
+    return [one.get(kind) for one in pictures]
 
 
 def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
@@ -344,162 +381,103 @@ def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
     return ["mse", "ssim"], "mse"
 
 
-def _points(
-    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
-) -> list[str]:
-    """Plot means over recordings for each measure, errors on a logarithmic scale."""
-    plots = []
-    for measure in measures:
-        figure, axis = _panel(methods)
-        values = [
-            column_mean([row for row in rows if row["method"] == method], measure)
-            for method in methods
-        ]
-        places = [math.nan if value is None else value for value in values]
-        colours = [_colour(i) for i in range(len(methods))]
-        axis.hlines(range(len(methods)), 0, 1, "0.9", transform=axis.get_yaxis_transform())
-        axis.scatter(places, range(len(methods)), c=colours, zorder=2)
-        if measure not in HIGHER_IS_BETTER and all(place > 0 for place in places if place == place):
-            axis.set_xscale("log")
-            _label_plainly(axis.xaxis)
-        axis.set_xlabel(MEASURE_LABELS[measure])
-        plots.append(_plot(figure))
-    return plots
-
-
-def _panel(methods: Sequence[str]) -> tuple[Any, Any]:
-    """Make a figure and its axes with a line for each method, from above."""
-    from matplotlib.figure import Figure
-
-    lines = sum(len(textwrap.wrap(method, LABEL_LINE_LETTERS)) for method in methods)
-    figure = Figure(
-        figsize=(WIDTH_INCHES, 0.8 + 0.14 * (lines + len(methods))), layout="constrained"
-    )
-    axis = figure.subplots()
-    labels = [textwrap.fill(method, LABEL_LINE_LETTERS) for method in methods]
-    axis.set(yticks=range(len(methods)), yticklabels=labels, ylim=(len(methods) - 0.5, -0.5))
-    axis.tick_params(left=False)
-    axis.spines[["top", "right", "left"]].set_visible(False)
-    return figure, axis
-
-
 def _series(row: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the values of a row by image or time; none of published numbers."""
     return row.get("per_frame") or row.get("per_time") or {}
 
 
-def _boxes(
-    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
-) -> list[str]:
-    """Plot the distribution of each measure over all images, or times, of all recordings.
+def _rounded(values: Any) -> Any:
+    """Round numbers to what a plot shows; None where not finite."""
+    return [float(f"{one:.5g}") if math.isfinite(one) else None for one in values]
 
-    A box reaches from the first to the third quartile, the line in it is the median, whiskers
-    reach to the last value within 1.5 times the box's length. Further metrics have plots too.
+
+def _is_logarithmic(measure: str, own: Collection[str], values: NDArray[np.float64]) -> bool:
+    """Return whether a plot of an error needs a logarithmic scale."""
+    if measure in HIGHER_IS_BETTER or measure in own or not len(values):
+        return False
+    return bool(values.min() > 0 and values.max() > MIN_LOG_RATIO * values.min())
+
+
+def _spreads(
+    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Summarise each measure over all images, or times, of all recordings, by method.
+
+    A box reaches from the first to the third quartile, whiskers to the last value within 1.5 times
+    the box's length. The mean is that of the table, in the table's unit.
     """
     own = {name for row in rows for name in row.get("own_metrics", ())}
-    further = [
-        name for row in rows for name in _series(row) if name in MEASURE_LABELS or name in own
-    ]
-    plots = []
+    places = {place for _, place, _, _ in COLUMNS}
+    further = [name for row in rows for name in _series(row) if name in places or name in own]
+    spreads = []
     for measure in dict.fromkeys([*measures, *further]):
-        lists = [
-            [v for row in rows if row["method"] == one for v in _series(row).get(measure, [])]
-            for one in methods
-        ]
-        columns = [np.array(one, np.float64) for one in lists]  # None becomes NaN
-        columns = [one[np.isfinite(one)] for one in columns]
-        if not any(len(one) for one in columns):
+        column = _column(measure)
+        boxes: list[dict[str, Any] | None] = []
+        every = []
+        for method in methods:
+            mine = [row for row in rows if row["method"] == method]
+            lists = [np.array(_series(row).get(measure, []), np.float64) for row in mine]
+            values = np.concatenate([np.zeros(0), *lists])  # None becomes NaN
+            values = column[2] * np.sort(values[np.isfinite(values)])
+            mean = column_mean(mine, measure)
+            if mean is None and not len(values):
+                boxes.append(None)
+                continue
+            mean = float(values.mean()) if mean is None else column[2] * mean
+            every.append(np.append(values, mean))
+            box: dict[str, Any] = {"mean": mean, "text": format_number(mean / column[2], column)}
+            boxes.append(box)
+            if len(values) > 1:
+                low, middle, high = np.percentile(values, [25, 50, 75])
+                reach = 1.5 * (high - low)
+                near = values[(values >= low - reach) & (values <= high + reach)]
+                far = values[(values < low - reach) | (values > high + reach)]
+                far = far[spread_rows(len(far), MAX_OUTLIERS)]
+                box |= {"box": _rounded([near[0], low, middle, high, near[-1]])}
+                box |= {"far": _rounded(far)}
+        if not every:
             continue
-        figure, axis = _panel(methods)
-        drawn = axis.boxplot(
-            columns, positions=range(len(methods)), orientation="horizontal", widths=0.6,
-            patch_artist=True, flierprops={"marker": ".", "markersize": 2, "alpha": 0.4},
-            medianprops={"color": "black"}, manage_ticks=False,
-        )  # fmt: skip
-        for i, box in enumerate(drawn["boxes"]):
-            box.set(facecolor=_colour(i), alpha=0.6)
-        if measure not in HIGHER_IS_BETTER | own and all((one > 0).all() for one in columns):
-            axis.set_xscale("log")
-            _label_plainly(axis.xaxis)
-        axis.set_xlabel(MEASURE_LABELS.get(measure, measure))
-        plots.append(_plot(figure))
-    return plots
+        better = "" if measure in own else f", {HIGHER if measure in HIGHER_IS_BETTER else LOWER}"
+        spreads.append(
+            {
+                "title": column[0] + better,
+                "log": _is_logarithmic(measure, own, np.concatenate(every)),
+                "boxes": boxes,
+            }
+        )
+    return spreads
 
 
 def _curves(
-    rows: Sequence[Mapping[str, Any]],
-    recordings: Sequence[str],
-    methods: Sequence[str],
-    measure: str,
-    names: Mapping[str, str],
-) -> list[tuple[str, str]]:
-    """Plot the error of every method at every image, for each recording by its name."""
-    from matplotlib.figure import Figure
-
-    parts = []
-    for recording in recordings[:MAX_SHOWN_RECORDINGS]:
-        figure = Figure(figsize=(WIDTH_INCHES, 2.8), layout="constrained")
-        axis = figure.subplots()
-        for row in rows:
-            if row["recording"] != recording:
-                continue
-            series = _series(row)
-            if not series:
-                continue
-            t = np.array(series["t"], np.float64) / 1e6
-            values = np.array(series[measure], np.float64)  # None becomes NaN
-            pieces = [
-                (float(np.mean(a)), float(np.mean(b)))
-                for a, b in zip(
-                    np.array_split(t, min(MAX_CURVE_POINTS, len(t))),
-                    np.array_split(values, min(MAX_CURVE_POINTS, len(t))),
-                    strict=True,
-                )
-            ]
-            if not pieces or not np.isfinite([b for _, b in pieces]).any():
-                continue
-            place = methods.index(row["method"])
-            axis.plot(
-                *zip(*pieces, strict=True),
-                label=row["method"],
-                color=_colour(place),
-                linestyle=("-", "--", ":")[place // 10 % 3],
-                linewidth=1.2,
-                marker="." if len(pieces) < 60 else None,
-                markersize=3,
-            )
-        if not axis.lines:
+    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measure: str
+) -> dict[str, Any] | None:
+    """Collect the error of every method over the time of one recording."""
+    title, _, factor, _ = _column(measure)
+    lines, every = [], []
+    for row in rows:
+        t, values = (np.array(_series(row).get(name, []), np.float64) for name in ("t", measure))
+        if not np.isfinite(values).any():
             continue
-        axis.set(xlabel="time (s)", ylabel=MEASURE_LABELS[measure])
-        if all(np.nanmin(np.asarray(line.get_ydata())) > 0 for line in axis.lines):
-            axis.set_yscale("log")
-            _label_plainly(axis.yaxis)
-        axis.spines[["top", "right"]].set_visible(False)
-        longest = max(len(str(line.get_label())) for line in axis.lines)
-        columns = max(1, 60 // (longest + 6))
-        figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
-        parts.append((names[recording], _plot(figure)))
-    return parts
+        order = np.argsort(t, kind="stable")  # tracks follow each other
+        t, values = t[order], values[order]
+        parts = min(MAX_CURVE_POINTS, len(t))
+        t, values = (
+            np.array([part.mean() for part in np.array_split(one, parts)])
+            for one in (t / 1e6, factor * values)
+        )
+        every.append(values[np.isfinite(values)])
+        place = methods.index(row["method"])
+        lines.append({"method": place, "t": _rounded(t), "values": _rounded(values)})
+    if not lines:
+        return None
+    return {
+        "title": title,
+        "log": _is_logarithmic(measure, (), np.concatenate(every)),
+        "lines": lines,
+    }
 
 
-def _label_plainly(axis: Any) -> None:
-    """Put ticks of a logarithmic axis at 1, 2 and 5 of each decade, as plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def _colour(place: int) -> str:
-    return f"C{place % 10}"
-
-
-def _plot(figure: Any) -> str:
-    """Encode a figure as base64 of SVG."""
-    import matplotlib
-
-    held = io.BytesIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxevent"}):
-        figure.savefig(held, format="svg", metadata={"Date": None}, transparent=True)
-    return base64.b64encode(held.getvalue()).decode()
+def _column(measure: str) -> Column:
+    """Return title, place, factor and digits of a measure, as tables have them."""
+    known = (column for column in (*COLUMNS, *SERIES_COLUMNS) if column[1] == measure)
+    return next(known, (measure, measure, 1, 4))

@@ -21,7 +21,7 @@ from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_ran
 from jaxevent.errors import InputError
 from jaxevent.events import count_events
 from jaxevent.recording import Recording, Times
-from jaxevent.show.images import new_figure, save_figure
+from jaxevent.show.images import COLOURS, new_figure, save_figure
 from jaxevent.show.track_tables import check_tracks
 
 _BACKGROUND, _ON, _OFF = (24, 24, 28), (235, 235, 235), (110, 130, 190)  # RGB of a video
@@ -137,10 +137,10 @@ def draw_frames(
         yield np.asarray(large)
 
 
-def track_colour(track_id: int, dark: bool = False) -> tuple[int, int, int]:
+def track_colour(track_id: int) -> tuple[int, int, int]:
     """Return red, green and blue (0 to 255) of a track; neighbouring ids differ."""
     hue = (0.07 + track_id * 0.618034) % 1
-    r, g, b = colorsys.hsv_to_rgb(hue, 0.9 if dark else 0.65, 0.75 if dark else 1.0)
+    r, g, b = colorsys.hsv_to_rgb(hue, 0.65, 1.0)
     return round(255 * r), round(255 * g), round(255 * b)
 
 
@@ -274,7 +274,7 @@ def _draw_states(
     grown, spread, grows = growths
     for i in np.flatnonzero(valid.any(0)).tolist():
         one, seen, label = known[i], valid[:, i], f"{known[i]}"
-        colour = "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
+        colour = COLOURS[i % len(COLOURS)]
         for axis, more in enumerate(({"label": label}, {"ls": "--"})):
             size, variance = (part[:, i, axis] for part in sizes)
             bands.add(_SIZE, size, variance, seen, colour, **more)
@@ -420,9 +420,8 @@ def draw_paths(
         for k in np.unique(np.linspace(0, len(seen) - 1, _N_PATH_ELLIPSES).astype(np.int64)):
             colour = lines.to_rgba(seconds[seen[k]])
             axis.plot(*outline(mean[seen[k], i], 2.0).T, color=colour, lw=0.8)
-        dark = "#{:02x}{:02x}{:02x}".format(*track_colour(one, dark=True))
         axis.annotate(
-            str(one), places[-1], (4, 4), textcoords="offset points", color=dark, fontsize=9,
+            str(one), places[-1], (4, 4), textcoords="offset points", color=COLOURS[-1], fontsize=9,
             weight="bold",
         )  # fmt: skip
     if lines is not None:

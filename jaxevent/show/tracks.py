@@ -443,7 +443,7 @@ def _high_pass(recording: Recording, times: NDArray[np.int64]) -> Iterator[NDArr
     from jaxevent.show.export import display_images
 
     video = high_pass.estimate(recording)
-    return (image for _, image in display_images(video, times, "percentile"))
+    return (image for _, image in display_images(video, times, "changes"))
 
 
 def _per_event(tracks: Tracks, progress: bool | None) -> Iterator[_EventStates]:

@@ -18,6 +18,7 @@ from jaxevent.io.output import complete
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, microseconds
 from jaxevent.show.export import default_tone, display_images, evenly_spaced_times
+from jaxevent.show.images import tone_map
 from jaxevent.show.track_tables import STATE_COLUMNS
 
 ON_COLOUR, OFF_COLOUR = (200, 64, 30), (58, 120, 181)
@@ -149,8 +150,8 @@ class _Sender:
             values = np.asarray(image(row))
             bright = np.nanpercentile(values, 99.5) if np.isfinite(values).any() else 0.0
             self._white = max(self._white, float(bright))
-            grey = np.clip(np.nan_to_num(values) / (self._white or 1.0), 0, 1)
-            self._image(name, time, np.rint(255 * grey).astype(np.uint8))
+            limits = (0.0, self._white or 1.0)
+            self._image(name, time, tone_map(np.nan_to_num(values), "display", limits))
 
     def toned_images(self, name: str, images: Iterable[tuple[int, NDArray[np.uint8]]]) -> None:
         """Send times (us) and images for the display."""

@@ -1,5 +1,6 @@
 """The command line: what it writes, and that bad input is said in one line and leaves nothing."""
 
+import argparse
 import contextlib
 import gc
 import hashlib
@@ -574,6 +575,32 @@ def test_reconstruct_some_times(folder, capsys):
     fails(capsys, [*blend, "--stream", "1"], "small.h5", "--stream")
 
 
+def parsers(parser, words=("jaxevent",)):
+    """Yield every command's words and parser, those of parts too."""
+    yield words, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, one in action.choices.items():
+                yield from parsers(one, (*words, name))
+
+
+def test_help_fits_two_screens_and_ends_with_an_example(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    known = list(parsers(cli._parser()))
+    assert len(known) == 1 + len(cli.COMMANDS) + 4  # four parts of camera
+    for words, parser in known:
+        lines = parser.format_help().splitlines()
+        name = " ".join(words)
+        assert lines[0].startswith(f"usage: {name} ") and lines[1] == "", name
+        assert len(lines) <= 60 and max(map(len, lines)) <= 130, name
+        examples = lines[[*map(str.strip, lines)].index("") :]
+        examples = [line for line in examples if line.startswith("  jaxevent ")]
+        assert examples and lines[-1] == examples[-1], name
+        for line in examples if len(words) > 1 else []:
+            assert line.strip().startswith(name), line
+            parser.parse_args(line.split()[len(words) :])
+
+
 def test_reconstruct_to_images(folder):
     stored = []
     for name in ("a", "b"):
@@ -587,23 +614,40 @@ def test_reconstruct_to_images(folder):
     lines = [f"{t / 1e6:.6f} {name}\n" for t, name in zip(times, names, strict=True)]
     assert (folder / "a" / "images.txt").read_text() == "".join(lines)
     images, _, _ = jaxevent.blend.estimate(small())(times)
-    for name, image in zip(names, tone_map(images), strict=True):
+    limits = display_limits(small().frames.intensity, "display")
+    for name, image in zip(names, tone_map(images, "display", limits), strict=True):
         with Image.open(folder / "a" / name) as stored_image:
             np.testing.assert_array_equal(np.asarray(stored_image), image)
 
 
 def test_images_are_as_bright_as_frames(folder, capsys):
-    """Linear images at frames are these frames, grey for grey; the range they use is said."""
+    """Linear images at frames are these frames, grey for grey; what is cut off is said."""
     ramp = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 122
-    for name, brightest, said in (("dark", 121, "121 of 255"), ("bright", 255, "--tone log")):
-        greys = np.where(ramp == 121, brightest, ramp).astype(np.uint8)
-        frames = Frames(STAMPS, np.broadcast_to(greys, (6, HEIGHT, WIDTH)), np.zeros_like(STAMPS))
-        jaxevent.save(small(frames=frames), folder / "small.h5")
+    frames = {
+        "dark": ramp.astype(np.uint8),
+        "bright": np.where(ramp > 100, 255, ramp).astype(np.uint8),
+    }
+    for name, greys in frames.items():
+        images = np.broadcast_to(greys, (6, HEIGHT, WIDTH))
+        recording = small(frames=Frames(STAMPS, images, np.zeros_like(STAMPS)))
+        jaxevent.save(recording, folder / "small.h5")
         argv = f"reconstruct {folder}/small.h5 --method blend --at frames --out {folder}/{name}"
-        assert cli.main(argv.split()) == 0
-        assert said in capsys.readouterr().out
+        assert cli.main(f"{argv} --tone linear".split()) == 0
+        assert ("--tone log" in capsys.readouterr().out) == (name == "bright")
         with Image.open(folder / name / "frame_00000002.png") as image:
             np.testing.assert_array_equal(np.asarray(image), greys)
+
+
+def test_dark_frames_are_shown_as_screens_expect(folder):
+    """White is the brightest 0.5 % of the frames, half of its light grey 188 of sRGB."""
+    greys = np.where(np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 3, 40, 20).astype(np.uint8)
+    images = np.broadcast_to(greys, (6, HEIGHT, WIDTH))
+    recording = small(frames=Frames(STAMPS, images, np.zeros_like(STAMPS)))
+    jaxevent.save(recording, folder / "small.h5")
+    argv = f"reconstruct {folder}/small.h5 --method blend --at frames --out {folder}/a"
+    assert cli.main(argv.split()) == 0
+    with Image.open(folder / "a" / "frame_00000002.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), np.where(greys == 40, 255, 188))
 
 
 @pytest.mark.parametrize(
@@ -654,7 +698,7 @@ def test_reconstruct_in_colour(folder):
     frames = Frames(STAMPS, images, np.zeros_like(STAMPS))
     recording = small(frames=frames, extra={"rgb": rgb})
     jaxevent.save(recording, folder / "small.h5")
-    outs = {"a.h5": [], "b": ["--tone", "percentile"], "c.mp4": []}
+    outs = {"a.h5": [], "b": ["--tone", "percentile"], "c.mp4": ["--tone", "linear"]}
     for name, tone in outs.items():
         argv = f"reconstruct {folder}/small.h5 --method blend --rate 300 --colour --out"
         assert cli.main([*argv.split(), str(folder / name), *tone]) == 0

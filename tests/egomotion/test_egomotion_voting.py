@@ -534,6 +534,30 @@ def test_smoothing_equals_the_dense_posterior():
     np.testing.assert_allclose(cut.mean[20], means[20])
 
 
+def test_means_over_the_ages_of_candidates_are_undone():
+    """Of a sine of seven periods per second, whose mean over 80 ms is half as large."""
+    t, span, w = np.arange(0, 1_500_000, 1000), 0.08, 2 * np.pi * 7
+    params, size = voting.Params.of({"noise_rotation": 2.0}), np.array([0.3, -0.2, 0.1])
+    true = 1 + size * np.sin(w * 1e-6 * t)[:, None]
+    mean = 1 + size * np.sin(w * 1e-6 * t)[:, None] * np.sin(w * span / 2) / (w * span / 2)
+    assert np.abs(mean - true).max() > 0.1
+    for sigma, low, high in ((1e-4, 0.0, 0.08), (1.0, 0.4, 1.1)):
+        covariance = np.tile(sigma**2 * np.eye(3), (len(t), 1, 1))
+        motion = MotionEstimate.from_arrays("rotation", t, mean, covariance)
+        found = filtering.undo_averages(motion, np.full(len(t), span), params)
+        off = np.abs(found - true)[100:-100] / np.abs(size)
+        assert low <= off.max() <= high  # noise may hide the change
+    # Each stretch counts by itself, and lost rows stay.
+    valid = (t < 700_000) | (t > 800_000)
+    covariance = np.tile(1e-8 * np.eye(3), (len(t), 1, 1))
+    motion = MotionEstimate.from_arrays("rotation", t, mean, covariance, valid)
+    part = motion.from_arrays("rotation", t[:701], mean[:701], covariance[:701], valid[:701])
+    found = filtering.undo_averages(motion, np.full(len(t), span), params)
+    alone = filtering.undo_averages(part, np.full(701, span), params)
+    np.testing.assert_array_equal(found[:700], alone[:700])
+    np.testing.assert_array_equal(found[~valid], mean[~valid])
+
+
 def test_general_particles():
     params = voting.Params.of({"preset": "general"})
     kind = General(100.0)

@@ -174,9 +174,6 @@ def test_frames_on_one_side_do_not_confirm_each_other():
     video = mc.estimate(
         given, mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4), progress=False
     )
-    _, references = estimator.compare_images(video.params, video.trajectories(t))
-    assert float(references.beyond) == 1 and references.inside_before.max() == 1
-    assert np.asarray(references.inside_after).max() == 0
     sources = video.sources(np.array([t]))
     assert sources["visible_after"].max() == 0 and sources["visible_before"].max() > 0.5
     assert sources["blend"].mean() < 0.5  # what is last references is no longer there

@@ -23,7 +23,7 @@ from jaxevent.show.tables import COLUMNS, markdown_table
 
 pytestmark = pytest.mark.slow
 
-TONES = ["linear", "log", "percentile", "clahe", "changes"]
+TONES = ["display", "linear", "log", "percentile", "clahe", "changes"]
 RAMP = np.linspace(-0.2, 1.3, 40 * 60).reshape(40, 60)
 
 
@@ -41,6 +41,15 @@ def test_percentile_tone_leaves_out_half_a_percent_at_each_end():
     assert np.mean(RAMP < low) == np.mean(RAMP > high) == 0.005
     np.testing.assert_array_equal(shown[low > RAMP], 0)
     np.testing.assert_array_equal(shown[high < RAMP], 255)
+
+
+def test_display_tone_is_the_curve_of_srgb():
+    """Greys 1, 10, 118, 188 and 255 of sRGB are 0.0303, 0.3035, 18.1, 50.3 and 100 % of white."""
+    light = np.array([[-1.0, 0, 0.000303, 0.003035, 0.1812, 0.5029, 1.0, 3.0]])
+    shown = tone_map(4 * light, "display", limits=(0.0, 4.0))
+    np.testing.assert_array_equal(shown, [[0, 0, 1, 10, 118, 188, 255, 255]])
+    assert display_limits(RAMP, "display") == (0.0, float(np.percentile(RAMP, 99.5)))
+    assert display_limits(0 * RAMP, "display") == (0.0, 1.0)
 
 
 def test_log_tone_gives_each_octave_the_same_share():
@@ -83,7 +92,7 @@ def test_relative_fades_what_is_uncertain_and_does_not_stretch_noise():
         np.testing.assert_allclose(np.log(2 * np.array(limits)), [-0.98, 0.98], atol=1e-3)
 
 
-@pytest.mark.parametrize("how", ["linear", "log", "percentile", "changes", "relative"])
+@pytest.mark.parametrize("how", ["display", "linear", "log", "percentile", "changes", "relative"])
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e3))
 def test_brighter_is_never_shown_darker(how, seed, scale):
     values = scale * np.random.default_rng(seed).normal(size=(8, 9)) ** 3

@@ -106,8 +106,8 @@ def test_events_are_shown_in_windows_and_frames_at_their_times(sent):
     assert on != off and points["colors"][4].tolist() == on
     frames = [one for one in sent if one[0] == "image/frames"]
     assert [time for _, time, _ in frames] == pytest.approx([0, 0.02])
-    # White is the brightest of the first frame.
-    assert np.unique(frames[0][2].values[0]).tolist() == [128, 255]
+    # White is the brightest of the first frame, half of its light grey 188 of sRGB.
+    assert np.unique(frames[0][2].values[0]).tolist() == [188, 255]
     (view_of_frames,) = Stream.layout.values[0].values
     assert view_of_frames.named["contents"][:2] == ["/image/frames", "/image/events"]
     assert view_of_frames.named["visual_bounds"].named == {"x_range": (0, 8), "y_range": (0, 8)}

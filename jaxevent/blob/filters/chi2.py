@@ -40,8 +40,8 @@ MAX_POSITION_VARIANCE_PX2 = 1e6  # px^2; in single precision a longer pause woul
 class WindowParams(TrackerParams):
     """Parameters of `chi2_split`."""
 
-    n = Count(10, "", "steps in the window of squared residuals")
-    beta = Positive(
+    n: Count = Count(10, "", "steps in the window of squared residuals")
+    beta: Positive = Positive(
         0.01, "", "ratio of the position's variance to that of the events, in the window"
     )
 
@@ -49,14 +49,14 @@ class WindowParams(TrackerParams):
 class Params(WindowParams):
     """Parameters of `chi2`."""
 
-    target = Choice(
+    target: Choice = Choice(
         ("2n+4", "2n"),
         "expected sum of the window; 2n biases sizes by sqrt((n+1)/(n-1))",
     )
-    current_in_jacobian = Choice(
+    current_in_jacobian: Choice = Choice(
         (False, True), "whether the newest event's residual acts on p and theta through the window"
     )
-    formulation = Choice(
+    formulation: Choice = Choice(
         ("corrected", "authors"),
         "authors: leaves the newest event out of the window, has no guards, and has lambda in "
         "the state, not its logarithm",

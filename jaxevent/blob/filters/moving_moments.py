@@ -30,7 +30,7 @@ class WeightedMoments(eqx.Module):
 class Params(TrackerParams):
     """Parameters of `moving_moments`."""
 
-    tau_moments = Positive(0.002, "s", "time constant of the window")
+    tau_moments: Positive = Positive(0.002, "s", "time constant of the window")
 
 
 def init(params: Params, position: Array, size: Array) -> WeightedMoments:

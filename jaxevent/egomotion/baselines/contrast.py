@@ -74,25 +74,37 @@ Numeric = Array | np.ndarray
 class Params(Parameters):
     """Parameters of contrast maximisation."""
 
-    window = Choice(("duration", "events"), "windows of `duration`, or of `events` events each")
-    polarity = Choice(("signed", "ignored"), "OFF counts -1, or as ON")
-    measure = Choice(("mean square", "variance"), "of the image of warped events")
-    taper = Choice((True, False), "weight events by cos(pi t / length), or all alike")
-    whole = Choice((True, False), "count points that are in view all the time only, or all")
-    dither = Choice((True, False), "place events anywhere in their pixels, randomly, or at middles")
+    window: Choice = Choice(
+        ("duration", "events"), "windows of `duration`, or of `events` events each"
+    )
+    polarity: Choice = Choice(("signed", "ignored"), "OFF counts -1, or as ON")
+    measure: Choice = Choice(("mean square", "variance"), "of the image of warped events")
+    taper: Choice = Choice((True, False), "weight events by cos(pi t / length), or all alike")
+    whole: Choice = Choice((True, False), "count points that are in view all the time only, or all")
+    dither: Choice = Choice(
+        (True, False), "place events anywhere in their pixels, randomly, or at middles"
+    )
 
-    events = Count(20000, "", "events of a window; of more within `duration`, these many evenly")
-    fewest = Count(300, "", "least number of events of an estimate")
-    blur = Count(1, "", "times [1 2 1] / 4 over the image, at last")
-    steps = Count(20, "", "most steps of the ascent at each blur")
-    starts = Count(7, "", "motions of each of the search's grids in each component")
-    margin = Count(16, "px", "of the image around the sensor")
+    events: Count = Count(
+        20000, "", "events of a window; of more within `duration`, these many evenly"
+    )
+    fewest: Count = Count(300, "", "least number of events of an estimate")
+    blur: Count = Count(1, "", "times [1 2 1] / 4 over the image, at last")
+    steps: Count = Count(20, "", "most steps of the ascent at each blur")
+    starts: Count = Count(7, "", "motions of each of the search's grids in each component")
+    margin: Count = Count(16, "px", "of the image around the sensor")
 
-    duration = Positive(0.1, "s", "length of a window, in which the motion is constant")
-    overlap = UnitInterval(0.5, "", "fraction of a window that the next one has too")
-    speed_max = Positive(4000.0, "px/s", "planar: largest component of motions of the search")
-    omega_max = Positive(30.0, "rad/s", "rotation: largest component of motions of the search")
-    contrast = Positive(1.2, "", "square of J, relative to chance, below which the motion is lost")
+    duration: Positive = Positive(0.1, "s", "length of a window, in which the motion is constant")
+    overlap: UnitInterval = UnitInterval(0.5, "", "fraction of a window that the next one has too")
+    speed_max: Positive = Positive(
+        4000.0, "px/s", "planar: largest component of motions of the search"
+    )
+    omega_max: Positive = Positive(
+        30.0, "rad/s", "rotation: largest component of motions of the search"
+    )
+    contrast: Positive = Positive(
+        1.2, "", "square of J, relative to chance, below which the motion is lost"
+    )
 
 
 class Window(eqx.Module):

@@ -42,23 +42,31 @@ COVARIANCE_CALIBRATION = CovarianceCalibration(share=0.009, speed=0.015, change=
 class Params(Parameters):
     """Parameters of motion by local planes."""
 
-    burst = Choice(("first", "latest"), "event of an edge's burst that the surface keeps")
+    burst: Choice = Choice(("first", "latest"), "event of an edge's burst that the surface keeps")
 
-    radius = Count(2, "px", "largest distance of neighbours to which a plane is fitted, in x and y")
-    fewest = Count(8, "", "least number of neighbours of a plane")
-    iterations = Count(4, "", "number of times that outliers of the plane are removed")
-    every = Count(1, "", "a plane is fitted for one event in so many")
-    constraints = Count(100, "", "least number of planes of a window")
+    radius: Count = Count(
+        2, "px", "largest distance of neighbours to which a plane is fitted, in x and y"
+    )
+    fewest: Count = Count(8, "", "least number of neighbours of a plane")
+    iterations: Count = Count(4, "", "number of times that outliers of the plane are removed")
+    every: Count = Count(1, "", "a plane is fitted for one event in so many")
+    constraints: Count = Count(100, "", "least number of planes of a window")
 
-    oldest = Positive(
+    oldest: Positive = Positive(
         0.04, "s", "largest age of neighbours; several times radius / (expected speed)"
     )
-    apart = Positive(0.02, "s", "events of a pixel nearer than that are one burst")
-    tolerance = Positive(2.0, "", "standard deviations from the plane beyond which are outliers")
-    rough = Positive(0.1, "", "largest fraction of the times' variance that the plane leaves")
-    speed_max = Positive(2000.0, "px/s", "largest speed of an edge; flatter planes are left out")
-    window = Positive(0.02, "s", "time whose planes make an estimate")
-    step = Positive(0.01, "s", "time from an estimate to the next")
+    apart: Positive = Positive(0.02, "s", "events of a pixel nearer than that are one burst")
+    tolerance: Positive = Positive(
+        2.0, "", "standard deviations from the plane beyond which are outliers"
+    )
+    rough: Positive = Positive(
+        0.1, "", "largest fraction of the times' variance that the plane leaves"
+    )
+    speed_max: Positive = Positive(
+        2000.0, "px/s", "largest speed of an edge; flatter planes are left out"
+    )
+    window: Positive = Positive(0.02, "s", "time whose planes make an estimate")
+    step: Positive = Positive(0.01, "s", "time from an estimate to the next")
 
 
 class NormalFlow(NamedTuple):

@@ -59,16 +59,24 @@ COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.02)
 class Params(Parameters):
     """Parameters of motion by tracked points."""
 
-    corners = Count(400, "", "most points that are tracked from a frame to the next")
-    window = Count(11, "px", "side of the patch that is compared; levels are not smaller than it")
-    levels = Count(5, "", "most levels of the pyramid, each half as large; 4 suit about 30 px")
-    iterations = Count(30, "", "most iterations of a level")
-    fewest = Count(5, "", "least number of points of an estimate")
+    corners: Count = Count(400, "", "most points that are tracked from a frame to the next")
+    window: Count = Count(
+        11, "px", "side of the patch that is compared; levels are not smaller than it"
+    )
+    levels: Count = Count(
+        5, "", "most levels of the pyramid, each half as large; 4 suit about 30 px"
+    )
+    iterations: Count = Count(30, "", "most iterations of a level")
+    fewest: Count = Count(5, "", "least number of points of an estimate")
 
-    quality = UnitInterval(0.01, "", "least strength of a corner, relative to the best one")
-    spacing = Positive(5.0, "px", "least distance of two corners")
-    returns = Positive(0.5, "px", "largest distance from the start of a point tracked back")
-    span = Positive(0.4, "s", "general motion: least time between the two frames")
+    quality: UnitInterval = UnitInterval(
+        0.01, "", "least strength of a corner, relative to the best one"
+    )
+    spacing: Positive = Positive(5.0, "px", "least distance of two corners")
+    returns: Positive = Positive(
+        0.5, "px", "largest distance from the start of a point tracked back"
+    )
+    span: Positive = Positive(0.4, "s", "general motion: least time between the two frames")
 
 
 def solve(params: Params, inputs: HostInputs) -> MotionEstimate:

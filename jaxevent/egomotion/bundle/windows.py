@@ -72,28 +72,40 @@ FramePair = tuple[NDArray, NDArray, NDArray]
 class Params(Parameters):
     """Parameters of the fit of a window, and of the sequence of windows."""
 
-    half_window = Positive(
+    half_window: Positive = Positive(
         0.15, "s", "half the length of a window; first alignments use 1/3 and 2/3 of it"
     )
-    step = Positive(0.1, "s", "time from one window to the next")
-    events = Count(60000, "", "most events of a window, of pixels taken at random")
-    fewest = Count(2000, "", "events that a window needs")
-    fresh = Count(5, "", "windows until new starts compete; twice as many each time they agree")
-    starts = Count(3, "", "headings that are refined, of each of two short windows")
-    cell = Count(24, "px", "size of a cell of one depth")
-    iterations = Count(8, "", "steps of the alignment of segments on the whole window")
-    rivals = Count(3, "", "aligned starts, some degrees apart, that the bundle adjustment refines")
+    step: Positive = Positive(0.1, "s", "time from one window to the next")
+    events: Count = Count(60000, "", "most events of a window, of pixels taken at random")
+    fewest: Count = Count(2000, "", "events that a window needs")
+    fresh: Count = Count(
+        5, "", "windows until new starts compete; twice as many each time they agree"
+    )
+    starts: Count = Count(3, "", "headings that are refined, of each of two short windows")
+    cell: Count = Count(24, "px", "size of a cell of one depth")
+    iterations: Count = Count(8, "", "steps of the alignment of segments on the whole window")
+    rivals: Count = Count(
+        3, "", "aligned starts, some degrees apart, that the bundle adjustment refines"
+    )
 
-    smooth = Positive(1.0, "", "weight of differences of log depth between cells")
-    relief = Positive(0.1, "", "weight of differences of log depth from its mean")
-    change = Positive(0.02, "1/px^2", "weight of changes of the twist, in px at the window's end")
-    bond = Positive(1.0, "", "weight of differences of log depth between nodes")
-    flat = Positive(0.01, "1/C^2", "weight of differences of log intensity between pixels")
-    alike = Positive(10.0, "", "number of events that count as one, as their errors are alike")
-    omega_scale = Number(0.0, "rad/s", "standard deviation of |Omega| by a prior; 0: no prior")
-    gyro_std = Positive(0.03, "rad/s", "standard deviation of a gyro, if one is given")
-    frames = Choice((True, False), "whether frames are fitted beside the events")
-    flow_max = Positive(
+    smooth: Positive = Positive(1.0, "", "weight of differences of log depth between cells")
+    relief: Positive = Positive(0.1, "", "weight of differences of log depth from its mean")
+    change: Positive = Positive(
+        0.02, "1/px^2", "weight of changes of the twist, in px at the window's end"
+    )
+    bond: Positive = Positive(1.0, "", "weight of differences of log depth between nodes")
+    flat: Positive = Positive(
+        0.01, "1/C^2", "weight of differences of log intensity between pixels"
+    )
+    alike: Positive = Positive(
+        10.0, "", "number of events that count as one, as their errors are alike"
+    )
+    omega_scale: Number = Number(
+        0.0, "rad/s", "standard deviation of |Omega| by a prior; 0: no prior"
+    )
+    gyro_std: Positive = Positive(0.03, "rad/s", "standard deviation of a gyro, if one is given")
+    frames: Choice = Choice((True, False), "whether frames are fitted beside the events")
+    flow_max: Positive = Positive(
         220.0, "px/s", "largest flow of patches that is tried, without the rotation"
     )
 

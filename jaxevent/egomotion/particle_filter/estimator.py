@@ -53,8 +53,9 @@ TIME_PENALTY_RATIO = 25.0  # r_t per median image speed
 MIN_SEARCH_SPEED_RATIO = 2.5  # median image speeds, least largest speed of a search
 MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
-PLANAR_CALIBRATION = CovarianceCalibration(change=0.12)
-CAMERA_MOTION_CALIBRATION = CovarianceCalibration(factor=0.7, change=0.05)  # of other models
+# The maximum of the votes is up to about half a per cent beside the motion.
+PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
+CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)  # other models'
 
 _run = eqx.filter_jit(filtering.run)
 _init = eqx.filter_jit(filtering.init)
@@ -232,37 +233,57 @@ class VotingEstimator(MotionEstimator[Params]):
             found, _ = self.find_model_and_camera(recording, model, camera)
             start = self.initial_params(found)
             params = self.adapt_params(recording, start, camera=camera).params
-        kind, sampler = self.sampler(recording, params, model, camera)
-        events = len(recording.events) // params.every
-        runner = ChunkRunner(
-            params, kind, sampler,
-            self._kernel(params, kind, compiler, events),
-            self._make_lock(recording, params, kind, sampler, camera), seed,
-        )  # fmt: skip
-        lock, parts = runner.lock, []
+        runner = self.make_runner(
+            recording, params, model=model, camera=camera, seed=seed, compiler=compiler
+        )
+        parts = []
         with bar(
             total=len(recording.events), desc="find motion", unit="event", unit_scale=True,
             progress=progress,
         ) as shown:  # fmt: skip
-            while not sampler.is_exhausted:
+            while not runner.sampler.is_exhausted:
                 parts.append(runner.run(cloud))
                 shown.update(runner.row - shown.n)
-
-        motion = join_reports(kind, parts, cloud > 0).with_recording(recording)
-        if not parts:
-            return motion
-        if lock is not None and not causal:
-            searching = np.concatenate([info.searching for _, info, _ in parts])
-            valid, covariance = tell_from_later(
-                motion.t, motion.mean, motion.covariance, searching, motion.valid, lock.diffusion
-            )
-            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
-        motion = dataclasses.replace(motion, causal=causal)._with_gaps(float(params.tau_max))
-        camera = camera or recording.camera
         if causal:
-            return calibrate(motion, camera)
-        smoothed = motion if smooth is False else filtering.smooth(motion, params)
-        return calibrate(smoothed, camera, 2 * motion.lag)
+            motion = runner.causal_motion(parts).with_recording(recording)
+            return motion._with_gaps(float(params.tau_max))
+        return runner.motion(parts, smooth=smooth is not False)
+
+    def make_runner(
+        self,
+        recording: Recording,
+        params: Params,
+        *,
+        model: str | type[Model] | None = None,
+        camera: PinholeCamera | None = None,
+        seed: int = 0,
+        compiler: str | None = None,
+    ) -> "ChunkRunner":
+        """Make the filter over the chunks of a recording.
+
+        Args:
+            recording: The recording; that of a live stream holds the events so far.
+            params: The parameters.
+            model: Motion model, or its name.
+            camera: The camera; by default the recording's.
+            seed: Seed of the random numbers.
+            compiler: "numba" or "xla", see `estimate`.
+
+        Returns:
+            The runner.
+
+        Raises:
+            InputError: The model is unknown, it needs a camera and there is none, or the compiler
+                is "numba" and there is no kernel.
+        """
+        kind, sampler = self.sampler(recording, params, model, camera)
+        events = len(recording.events) // params.every
+        if isinstance(recording.events, Tail):
+            events = MIN_KERNEL_EVENTS
+        lock = self._make_lock(recording, params, kind, sampler, camera)
+        kernel = self._kernel(params, kind, compiler, events)
+        camera = camera or recording.camera
+        return ChunkRunner(params, kind, sampler, kernel, lock, camera, seed)
 
     def live(
         self,
@@ -295,12 +316,10 @@ class VotingEstimator(MotionEstimator[Params]):
         found, _ = self.find_model_and_camera(recording, model, camera)
         used = self.initial_params(found) if params is None else params
 
-        def make_runner() -> ChunkRunner:
-            kind, sampler = self.sampler(recording, used, found, camera)
-            lock = self._make_lock(recording, used, kind, sampler, camera)
-            kernel = self._kernel(used, kind, compiler, MIN_KERNEL_EVENTS)
-            return ChunkRunner(used, kind, sampler, kernel, lock, seed)
-
+        make_runner = functools.partial(
+            self.make_runner, recording, used, model=found, camera=camera, seed=seed,
+            compiler=compiler,
+        )  # fmt: skip
         return LiveMotion(recording, found, make_runner)
 
     def _make_lock(
@@ -401,6 +420,7 @@ class ChunkRunner:
         sampler: Sampler of the recording's candidates.
         kernel: The filter as a kernel, or None.
         lock: The test of what it finds, or None.
+        camera: The calibration, or None.
         seed: Seed of the random numbers.
     """
 
@@ -411,9 +431,11 @@ class ChunkRunner:
         sampler: CandidateSampler,
         kernel: CompiledFilter | None,
         lock: Lock | None,
+        camera: PinholeCamera | None,
         seed: int,
     ):
         self.params, self.model, self.sampler, self.lock = params, model, sampler, lock
+        self.camera = camera
         self.batches = -(-EVENTS_PER_CHUNK // params.batch)
         self.span = MAX_CHUNK_TAUS * float(params.tau_max)  # s
         self.row = 0  # after the last event that was scored
@@ -426,8 +448,44 @@ class ChunkRunner:
         self, parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]]
     ) -> MotionEstimate:
         """Join what `run` returned for some chunks to a causal estimate."""
-        motion = dataclasses.replace(join_reports(self.model, parts, False), causal=True)
-        return calibrate(motion, self.sampler.recording.camera)
+        motion = dataclasses.replace(join_reports(self.model, parts), causal=True)
+        return calibrate(motion, self.camera)
+
+    def motion(
+        self,
+        parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]],
+        smooth: bool = True,
+    ) -> MotionEstimate:
+        """Join what `run` returned for all chunks to an estimate.
+
+        Args:
+            parts: What it returned.
+            smooth: Whether later events smooth it.
+
+        Returns:
+            The motion.
+        """
+        motion = join_reports(self.model, parts).with_recording(self.sampler.recording)
+        if not parts:
+            return motion
+        drift, longest = np.zeros_like(motion.covariance), float(self.params.tau_max)
+        if self.lock is not None:
+            searching = np.concatenate([info.searching for _, info, _ in parts])
+            valid, covariance, drift = tell_from_later(
+                motion.t, motion.mean, motion.covariance, searching, motion.valid,
+                self.lock.diffusion,
+            )  # fmt: skip
+            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
+        drift = dataclasses.replace(motion, covariance=drift)._with_gaps(longest).covariance
+        motion = motion._with_gaps(longest)
+        span = 2 * motion.lag
+        if smooth:
+            motion = filtering.smooth(motion, self.params)
+            if not self.model.half_line:
+                mean = filtering.undo_averages(motion, span, self.params)
+                motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
+        found = calibrate(motion, self.camera, span)
+        return dataclasses.replace(found, covariance=found.covariance + drift)
 
     def has_chunk(self) -> bool:
         """Return whether the next chunk is complete, whatever events are still to come."""
@@ -462,6 +520,9 @@ class ChunkRunner:
         self._state, info = self._run(sample.candidates, noise, self._state, cloud)
         used = int((sample.row >= 0).any(1).sum())
         info = jax.tree.map(lambda a: np.asarray(a)[:used], info)
+        # Events of a batch precede its end, on average by half of its duration.
+        duration = np.minimum(sample.candidates.elapsed[:used], float(self.params.longest))
+        info = eqx.tree_at(lambda report: report.lag, info, info.lag + duration / 2)
         t, told = sample.t[:used], ~info.searching
         if self.lock is not None:
             events = self.sampler.recording.events
@@ -546,9 +607,7 @@ def calibrate(
     return motion.with_calibrated_covariance(calibration, length)
 
 
-def join_reports(
-    model: Model, parts: list[tuple[NDArray, Any, NDArray]], cloud: bool
-) -> MotionEstimate:
+def join_reports(model: Model, parts: list[tuple[NDArray, Any, NDArray]]) -> MotionEstimate:
     """Join the times and reports of chunks to an estimate."""
     if not parts:
         return MotionEstimate.empty(type(model))
@@ -556,6 +615,7 @@ def join_reports(
     def join(name: str) -> NDArray:
         return np.concatenate([getattr(info, name) for _, info, _ in parts])
 
+    cloud = join("cloud")
     return MotionEstimate(
         type(model),
         np.concatenate([t for t, *_ in parts]),
@@ -565,7 +625,7 @@ def join_reports(
         join("lag"),
         join("contrast"),
         join("evidence"),
-        join("cloud") if cloud else None,
+        cloud if cloud.shape[1] else None,
     )
 
 

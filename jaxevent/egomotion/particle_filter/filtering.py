@@ -10,6 +10,8 @@ import numpy as np
 from jax import lax
 from jax.nn import logsumexp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
 from jaxevent.devices import full_precision
 from jaxevent.egomotion.candidates import Candidates
@@ -22,6 +24,8 @@ CONTRAST_TIME_CONSTANT_MEMORIES = 5.0  # time constant of the mean contrast, in 
 SEARCH_NOISE_SIGMAS = 0.1  # noise of a search, per batch, in standard deviations of the particles
 MAX_LOG_WEIGHT_STD = 0.5  # of a batch over particles, in a search
 MIN_RELATIVE_HISTORY = 0.99  # of the oldest candidates of a search
+KNOTS_PER_LAG = 4  # of the motion whose means over candidates' ages are estimated
+MIN_RUN_ESTIMATES = 16  # in a row, from which such means are undone
 
 
 class RandomNumbers(eqx.Module):
@@ -451,3 +455,69 @@ def smooth(motion: MotionEstimate, params: Params | None = None) -> MotionEstima
         covariance=P.astype(motion.mean.dtype),
         lag=np.zeros_like(motion.lag),
     )
+
+
+def undo_averages(motion: MotionEstimate, span: NDArray[np.floating], params: Params) -> NDArray:
+    """Return the motions of which smoothed estimates are the means over the ages of candidates.
+
+    Where the image is slow, candidates are as old as the motion takes to change, so that estimates
+    are flatter than it. Motions y at knots, of which a span holds 2 `KNOTS_PER_LAG`, minimise
+
+        sum_k |x_k - (B y)_k|^2 / s_k^2 + sum_k |y_k+1 - y_k|^2 / (q h_k),
+
+    where B takes the mean over the span about a knot, q is the process noise of `params`, and h_k
+    the time between knots. Estimates within a span share events, so their errors are about alike:
+    s_k^2 is their variance times the knots of a span.
+
+    Args:
+        motion: Smoothed estimates of a model whose flow is linear in its components.
+        span: (n,) length of the time span of an estimate's events, s.
+        params: The filter's parameters.
+
+    Returns:
+        (n, d) motions.
+    """
+    mean, model = np.array(motion.mean, np.float64), motion.model()
+    change = np.flatnonzero(np.diff(motion.valid.astype(int), prepend=0, append=0))
+    for first, last in change.reshape(-1, 2):
+        if last - first < MIN_RUN_ESTIMATES:
+            continue
+        rows = slice(first, last)
+        t = (motion.t[rows] - motion.t[first]) * 1e-6
+        per_s = 2 * KNOTS_PER_LAG / np.maximum(span[rows], 1e-6)
+        u = np.append(0, np.cumsum(np.diff(t) * (per_s[1:] + per_s[:-1]) / 2))
+        count = int(u[-1]) + 1
+        if count < 2 * KNOTS_PER_LAG:
+            continue
+        at = np.interp(np.arange(-0.5, count) * (u[-1] / (count - 1)), u, t)  # cells' ends
+        middle = (at[1:] + at[:-1]) / 2
+        h = np.diff(np.interp(np.arange(count) * (u[-1] / (count - 1)), u, t))
+        x = mean[rows]
+        total = np.concatenate(
+            [0 * x[:1], np.cumsum(np.diff(t)[:, None] * (x[1:] + x[:-1]) / 2, 0)]
+        )
+        variance = np.diagonal(motion.covariance[rows], axis1=1, axis2=2)
+        noise = np.asarray(model.diffusion(params, jnp.asarray(x.mean(0)))) ** 2
+        for k in range(x.shape[1]):
+            cells = np.diff(np.interp(at, t, total[:, k])) / np.diff(at)
+            s2 = 2 * KNOTS_PER_LAG * np.interp(middle, t, variance[:, k])
+            y = _solve_averages(cells, s2, noise[k] * h)
+            mean[rows, k] = np.interp(t, middle, y)
+    return mean
+
+
+def _solve_averages(x: NDArray, s2: NDArray, q: NDArray) -> NDArray[np.float64]:
+    """Return the values whose means over spans are x (n,), with variances q (n - 1,) of steps."""
+    reach = KNOTS_PER_LAG
+    n = len(x) + 2 * reach  # with knots beyond both ends
+    weights = np.r_[0.5, np.ones(2 * reach - 1), 0.5] / (2 * reach)
+    steps = np.pad(1 / q, reach, mode="edge")
+    band, side = np.zeros((2 * reach + 1, n)), np.zeros(n)
+    for i, a in enumerate(weights):
+        side[i : i + len(x)] += a * x / s2
+        for j, b in enumerate(weights[: i + 1]):
+            band[i - j, j : j + len(x)] += a * b / s2
+    band[0, :-1] += steps
+    band[0, 1:] += steps
+    band[1, :-1] -= steps
+    return solveh_banded(band, side, lower=True)[reach:-reach]

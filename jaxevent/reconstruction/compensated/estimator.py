@@ -6,10 +6,10 @@ instants around a target time, frames among them, show the motion of the points 
 target (`trajectories`). Along these paths the images are fused (`fusion`).
 """
 
-import collections
 import dataclasses
+import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -41,7 +41,6 @@ from jaxevent.reconstruction.compensated.exposures import (
 from jaxevent.reconstruction.compensated.fusion import (
     SOURCE_NAMES,
     FusedImage,
-    ReferenceImages,
     after_weight,
     fuse,
     fuse_candidates,
@@ -81,9 +80,11 @@ from jaxevent.reconstruction.compensated.robust_mean import (
 )
 from jaxevent.reconstruction.compensated.thresholds import learn_thresholds
 from jaxevent.reconstruction.compensated.trajectories import (
+    PATH_SEARCHES,
     ImagePyramid,
     NodeTrajectories,
     advect_nodes,
+    borrow_paths,
     change_clock,
     choose_trajectories,
     estimate_trajectories,
@@ -91,10 +92,11 @@ from jaxevent.reconstruction.compensated.trajectories import (
     node_shape,
     pack_images,
     plan_stages,
-    refine_paths,
     robust_cost,
+    select_paths,
 )
 from jaxevent.reconstruction.compensated.warp import (
+    WarpedImages,
     interpolate_paths,
     interpolate_paths_jax,
     path_positions,
@@ -112,11 +114,11 @@ from jaxevent.recording import Recording, Times, microseconds
 
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
-ANCHOR_STEPS: int = 8  # steps of the schedule between anchors
+ANCHOR_STEPS = 8  # steps of the schedule between anchors
 # 1 - (trust in events)^4, up to which frames alone are not asked: images would seldom choose them.
 MIN_DOUBT = 0.1
 N_CACHED_ANCHORS = 4
-N_TARGET_STEPS = 2  # with which a target's motion is found at half resolution
+N_ANCHOR_STEPS = 2  # at half resolution, on each clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
 
@@ -194,7 +196,29 @@ def make_instant_schedule(
     return InstantSchedule(frames, (first, last), speed, motion_clock)
 
 
-Anchor = tuple[TargetInstants, NDArray[np.float32]]
+class Motion(NamedTuple):
+    """The motion of a target's points."""
+
+    instants: TargetInstants
+    p: NDArray[np.float32]  # (rows, columns, 4), of nodes, px at s = 1
+
+    def carry(self, instants: TargetInstants) -> NDArray[np.float32]:
+        """Carry the motion to another target, on the clock of that one."""
+        there, p = self
+        now = there.with_clock(instants.clock)
+        if there.clock.event_share != instants.clock.event_share:
+            p = change_clock(p, there.s, now.s)
+        s = float(now.to_relative_times(instants.t[[instants.target]])[0])
+        return advect_nodes(p, s, instants.unit / now.unit)
+
+
+class Anchor(NamedTuple):
+    """A target whose motion was sought from nothing, and its image."""
+
+    motion: Motion  # at full resolution
+    L: NDArray[np.float32]  # (h, w), ln I
+    P: NDArray[np.float32]  # (h, w), its variance
+    is_steady: bool  # no smooth part was subtracted from L
 
 
 class TrajectoryEstimate(NamedTuple):
@@ -208,7 +232,7 @@ class TrajectoryEstimate(NamedTuple):
     # (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
     path_index: NDArray[np.int32] | None = None
     smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
-    noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `ReferenceImages`
+    noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `fusion.ReferenceImages`
 
     @property
     def paths(self) -> NDArray[np.float32]:
@@ -267,9 +291,11 @@ class InitialMotion:
 class TrajectoryEstimator:
     """Estimates the motion of a recording's targets: `estimate = trajectories(t)`, t in us.
 
-    Motion is sought from nothing at anchors only, which are evenly spaced in time. A target starts
-    from the nearest anchor's motion. So the images of a video cost less than single ones, and none
-    depends on which others were requested. Where motion is known beforehand it starts from that.
+    Motion is sought from nothing, improved and refined with the image that it gives at anchors
+    only, whose times depend on the recording alone. A target starts from the motion and the image
+    of the anchor next to it, and takes one more step. So the images of a video cost less than
+    single ones, and none depends on which others were requested. Where motion is known beforehand
+    each target is its own anchor.
 
     Args:
         recording: The recording.
@@ -292,8 +318,9 @@ class TrajectoryEstimator:
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
         self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
-        # By their times, and whether they are of frames alone.
-        self._anchors: collections.OrderedDict[tuple[int, bool], Anchor] = collections.OrderedDict()
+        cached = functools.lru_cache(N_CACHED_ANCHORS)  # by their times
+        self._anchor, self._sought_motion = cached(self._make_anchor), cached(self._seek_motion)
+        self._frame_motion = cached(self._seek_by_frames)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
@@ -314,46 +341,51 @@ class TrajectoryEstimator:
         """Return the variances with which motion is estimated."""
         return (V * np.where(clear > 0, 1, self._caution)).astype(np.float32)
 
-    def _anchor(self, t: int) -> Anchor:
-        """Return the anchor next to a time (us), and its motion at half resolution."""
-        first, last = self.schedule.span
-        interval = ANCHOR_STEPS * self.schedule.step
-        at = min(max(first + round((t - first) / interval) * interval, first), last)
-        return self._remember((at, False), self._make_anchor)
+    def _anchor_times(self, t: int) -> list[int]:
+        """Return the times (us) of the anchors next to a time, at most two, the nearest first.
 
-    def _frame_anchor(self, t: int) -> Anchor | None:
-        """Return the anchor halfway between two frames, and its motion by frames alone."""
+        Anchors are evenly spaced between two frames, and between a frame and the end of the data.
+        """
+        frames, (first, last) = self.schedule.frames, self.schedule.span
+        after = int(np.searchsorted(frames, t, "right"))
+        begin = int(frames[after - 1]) if after > 0 else first
+        end = int(frames[after]) if after < len(frames) else last
+        count = max(round((end - begin) / (ANCHOR_STEPS * self.schedule.step)), 1)
+        place = (t - begin) * count // max(end - begin, 1)
+        place = min(max(place, 0), count - 1)
+        times = [begin + (2 * n + 1) * (end - begin) // (2 * count) for n in range(count)]
+        beside = place + (1 if t >= times[place] else -1)
+        return [times[n] for n in (place, beside) if 0 <= n < count]
+
+    def _seek_motion(self, at: int) -> Motion:
+        """Seek the motion of the target at a time (us) from nothing, at half resolution."""
+        instants = self.schedule(at)
+        L, V, clear, _ = self._images(instants)
+        pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+        p = self._seek(pyramid, instants.s, instants.first_horizon)
+        doubt = 1 - self.event_noise.trust(at) ** 4
+        other = self._motion_of_frames(at) if doubt > MIN_DOUBT else None
+        if other is not None:
+            images, several = PackedImages.of(pyramid[1], instants.s), (p, other.carry(instants))
+            p = choose_trajectories(images, several, self._cost, (1.0, doubt))
+        return self._improve(pyramid[1], Motion(instants, p))
+
+    def _motion_of_frames(self, t: int) -> Motion | None:
+        """Return the motion halfway between two frames by frames alone, at half resolution."""
         frames = self.schedule.frames
         after = int(np.searchsorted(frames, t, "right"))
         if not 0 < after < len(frames):
             return None
-        at = int(frames[after - 1] + frames[after]) // 2
-        return self._remember((at, True), self._make_frame_anchor)
+        return self._frame_motion(int(frames[after - 1] + frames[after]) // 2)
 
-    def _remember(self, key: tuple[int, bool], make: Callable[[int], Anchor]) -> Anchor:
-        if key in self._anchors:
-            self._anchors.move_to_end(key)
-        else:
-            self._anchors[key] = make(key[0])
-            if len(self._anchors) > N_CACHED_ANCHORS:
-                self._anchors.popitem(last=False)
-        return self._anchors[key]
-
-    def _make_anchor(self, at: int) -> Anchor:
-        """Seek the motion of the target at a time (us) from nothing."""
-        instants = self.schedule(at)
-        L, V, clear, _ = self._images(instants)
-        pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-        return instants, self._seek(pyramid, instants.s, instants.first_horizon)
-
-    def _make_frame_anchor(self, at: int) -> Anchor:
+    def _seek_by_frames(self, at: int) -> Motion:
         """Seek the motion of the target at a time (us) from nothing, by frames alone."""
         instants = self.schedule(at)
         L, V, _, _ = self._images(instants)
         framed = np.isin(instants.t, self.schedule.frames)
         frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
         nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        return instants, self._seek(frames, instants.s[framed], nearest)
+        return Motion(instants, self._seek(frames, instants.s[framed], nearest))
 
     def _seek(
         self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float
@@ -362,48 +394,42 @@ class TrajectoryEstimator:
         motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
         return motion.at_level(1, self.images.image_shape).p
 
-    def _known_motion(self, t: int, instants: TargetInstants) -> NDArray[np.float32] | None:
-        """Return the motion that is known beforehand, at half resolution, or None."""
-        known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
-        if known is None:
-            return None
-        return NodeTrajectories(known, 0).at_level(1, self.images.image_shape).p
+    def _make_anchor(self, at: int) -> Anchor:
+        """Find the motion of the target at a time (us), and fuse its image."""
+        return self._refine(self._sought_motion(at))
 
-    def _sought_motion(
-        self, pixels: NDArray[np.float32], instants: TargetInstants
-    ) -> NDArray[np.float32]:
-        """Return the motion of the anchors that images agree with, at half resolution."""
-        t = int(instants.t[instants.target])
-        doubt = 1 - self.event_noise.trust(t) ** 4
-        other = self._frame_anchor(t) if doubt > MIN_DOUBT else None
-        p = self._carry(self._anchor(t), instants)
-        if other is None:
-            return p
-        images, several = PackedImages.of(pixels, instants.s), (p, self._carry(other, instants))
-        return choose_trajectories(images, several, self._cost, (1.0, doubt))
+    def _refine(self, motion: Motion) -> Anchor:
+        """Refine motion at half resolution with the image that it gives."""
+        instants, p = motion
+        L, V, clear, smooth = self._images(instants)
+        t, size = int(instants.t[instants.target]), self.images.image_shape
+        p = NodeTrajectories(p, 1).at_level(0, size).p
+        estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=self._noise(t))
+        fused = fuse_target(self.params, estimate)
+        image, P = np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
+        packed = self._pack(estimate, image, P)
+        p = borrow_paths(packed, gauss_newton_step(packed, p, self._cost), self._cost)
+        return Anchor(Motion(instants, p), image, P, smooth is None)
 
-    def _carry(self, anchor: Anchor, instants: TargetInstants) -> NDArray[np.float32]:
-        """Carry the motion of an anchor to another target, on the clock of that one."""
-        there, p = anchor
-        now = there.with_clock(instants.clock)
-        if there.clock.event_share != instants.clock.event_share:
-            p = change_clock(p, there.s, now.s)
-        s = float(now.to_relative_times(instants.t[[instants.target]])[0])
-        return advect_nodes(p, s, instants.unit / now.unit)
+    def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
+        """Pack the images of a target, its own replaced by one with less noise."""
+        L, V = target.L.copy(), self._cautious(target.V, target.clear)
+        L[target.instants.target] = image
+        V[target.instants.target] = FUSED_VARIANCE_FACTOR * P + self._cost.floor
+        return PackedImages.of(pack_images(L, V), target.instants.s)
 
-    def _improve(
-        self, pixels: NDArray[np.float32], instants: TargetInstants, p: NDArray[np.float32]
-    ) -> tuple[TargetInstants, NDArray[np.float32]]:
+    def _improve(self, pixels: NDArray[np.float32], motion: Motion) -> Motion:
         """Take a few steps at half resolution, on the clock on which frames agree better.
 
         Images from events have the faults of their clock, so that they do not judge it.
         """
+        instants, p = motion
         judges = np.isin(instants.t, self.schedule.frames)
         if judges.sum() <= 2:  # agree on any clock
             judges[:] = True
 
         def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
-            for _ in range(N_TARGET_STEPS):
+            for _ in range(N_ANCHOR_STEPS):
                 p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
             return p
 
@@ -412,61 +438,83 @@ class TrajectoryEstimator:
 
         found = improved(instants, p)
         if not instants.clock.event_share:
-            return instants, found
+            return Motion(instants, found)
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
         if cost(instants, found) < cost(timed, other):
-            return instants, found
-        return timed, other
+            return Motion(instants, found)
+        return Motion(timed, other)
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
         instants = self.schedule(t)
-        known = self._known_motion(t, instants)
         L, V, clear, smooth = self._images(instants)
-        size, noise = L.shape[1:], self._noise(t)
-        if known is not None and self.start is not None and not self.start.refine:
-            p = NodeTrajectories(known, 1).at_level(0, size).p
-            return TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
-        variance = self._cautious(V, clear)
-        pyramid = ImagePyramid(L, variance, PYRAMID_VARIANCE_FACTOR)
-        p = self._sought_motion(pyramid[1], instants) if known is None else known
-        instants, p = self._improve(pyramid[1], instants, p)
-        p = NodeTrajectories(p, 1).at_level(0, size).p
-        # The target's own image is the smoother's. The image fused so far is a better one to refine
-        # with.
-        fused = fuse_target(self.params, TrajectoryEstimate(instants, L, V, clear, p, noise=noise))
-        better, target = L.copy(), instants.target
-        better[target] = fused.L
-        variance[target] = FUSED_VARIANCE_FACTOR * np.asarray(fused.P) + self._cost.floor
-        images = PackedImages.of(pack_images(better, variance), instants.s)
-        p, path_index = refine_paths(images, p, self._cost)
-        return TrajectoryEstimate(instants, L, V, clear, p, path_index, smooth, noise)
+        size, noise = self.images.image_shape, self._noise(t)
+        known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
+        others: list[int] = []
+        if known is None:
+            nearest, *others = self._anchor_times(t)
+            anchor = self._anchor(nearest)
+        elif self.start is not None and self.start.refine:
+            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+            known = NodeTrajectories(known, 0).at_level(1, size).p
+            anchor = self._refine(self._improve(pyramid[1], Motion(instants, known)))
+        else:
+            return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
+        if not anchor.motion.instants.clock.event_share:
+            instants = instants.with_clock(TIME_CLOCK)
+        p = anchor.motion.carry(instants)
+        target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
+        packed = self._pack(target, *self._carry_image(anchor, target))
+        for at in others:
+            p = self._choose(packed, p, self._sought_motion(at).carry(instants))
+        p = gauss_newton_step(packed, p, self._cost)
+        # Nodes of the anchor have taken paths from farther away.
+        path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
+        return target._replace(p=p, path_index=path_index)
+
+    def _choose(
+        self, images: PackedImages, p: NDArray[np.float32], other: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Choose between trajectories and others at half resolution, where images agree better."""
+        size = self.images.image_shape
+        L, V = images.pixels[..., 0], images.pixels[..., 1]
+        half = PackedImages.of(ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)[1], images.s)
+        own = NodeTrajectories(p, 0).at_level(1, size).p
+        change = choose_trajectories(half, (own, other), self._cost, (1.0, 1.0)) - own
+        return p + NodeTrajectories(change, 1).at_level(0, size).p
+
+    def _carry_image(
+        self, anchor: Anchor, target: TrajectoryEstimate
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Carry the image of an anchor to a target: log intensity and variance, each (h, w)."""
+        if anchor.is_steady != (target.smooth is None):
+            fused = fuse_target(self.params, target)
+            return np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
+        there, here = anchor.motion.instants, target.instants
+        at = here.to_relative_times(there.t[[there.target]]).astype(np.float32)
+        if not at[0]:
+            return anchor.L, anchor.P
+        L, P = anchor.L[None], anchor.P[None]
+        warped = warp_images(L, P, np.zeros_like(L), at, target.paths)
+        inside = warped.inside[0] > 0
+        own = here.target
+        return (
+            np.where(inside, warped.L[0], target.L[own]),
+            np.where(inside, warped.V[0], self._caution * target.V[own]),
+        )
 
 
 @jax.jit
-def _fuse(params: Params, mean: RobustMean, images: ReferenceImages) -> FusedImage:
-    return fuse_candidates(params, fusion_features(mean, images))
-
-
-def compare_images(
-    params: Params, target: TrajectoryEstimate
-) -> tuple[RobustMean, ReferenceImages]:
-    """Compute the robust mean of a target, and the images that it is compared with.
-
-    Args:
-        params: Parameters of `mc`.
-        target: The target.
-
-    Returns:
-        The arguments of `fusion.fusion_features`.
-    """
-    instants, L, V, clear, *_ = target
-    paths = target.paths
-    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
-    layout = make_layout(instants, clear, len(instants))
-    mean = robust_mean(params, L, warped, layout)
-    return mean, reference_images(L, V, warped, layout, squared_reach(paths), noise=target.noise)
+def _fuse(
+    params: Params,
+    mean: RobustMean,
+    images: tuple[Numeric, Numeric, WarpedImages, InstantLayout],
+    paths: Numeric,
+    noise: Numeric | float,
+) -> FusedImage:
+    compared = reference_images(*images, squared_reach(paths), noise=noise)
+    return fuse_candidates(params, fusion_features(mean, compared))
 
 
 def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
@@ -479,7 +527,18 @@ def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
     Returns:
         The image, without the smooth part that was subtracted.
     """
-    return _fuse(params, *compare_images(params, target))
+    instants, L, V, clear, *_ = target
+    paths = target.paths
+    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
+    layout = make_layout(instants, clear, len(instants))
+    mean = robust_mean(params, L, warped, layout)
+    # The images that it is compared with are few, and are all that is handed over.
+    names = ("target", "before", "after", "other")
+    rows = [int(getattr(layout, name)) for name in names]
+    places = {name: np.int32(rows.index(k)) for name, k in zip(names, rows, strict=True)}
+    warped = WarpedImages(*(part[rows] for part in warped))
+    layout = InstantLayout(*(part[rows] for part in layout[:4]), **places, rest=layout.rest)
+    return _fuse(params, mean, (L[rows], V[rows], warped, layout), paths, target.noise)
 
 
 def add_smooth_part(
@@ -743,12 +802,8 @@ class MotionCompensation(ImageEstimator[Params]):
         Raises:
             InputError: If the recording has no frames, or times are missing or outside the data.
         """
-        self.check(recording)
-        params = self.Params() if params is None else params
-        self.check_clocks(recording, params)
+        params = self.check_request(recording, times, params, extrapolate)
         wanted = np.atleast_1d(microseconds(times))
-        if not extrapolate:
-            self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
         trajectories = make_trajectory_estimator(recording, params, MAX_WINDOW_EVENTS)

@@ -224,13 +224,15 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     """
     X, beyond = given.features, given.beyond > 0
     weights = jnp.where(beyond, params.choice_beyond, params.choice)
-    logits = jnp.tensordot(weights.reshape(len(FALLBACK_SOURCES), -1), X, 1) + jnp.log(
-        given.in_place
-    )
+    smoothed, blend = jnp.tensordot(weights.reshape(len(FALLBACK_SOURCES), -1), X, 1)
     # At rest events are noise, which the smoother in place adds up.
-    logits = logits.at[0].add(jnp.log(jnp.maximum(1 - given.rest, MIN_SQUARED_DIFFERENCE)))
-    logits = logits.at[0].add(-2 * jnp.log(given.noise))
-    q = jax.nn.softmax(jnp.concatenate([jnp.zeros_like(logits[:1]), logits]), axis=0)
+    events = jnp.maximum(1 - given.rest, MIN_SQUARED_DIFFERENCE) / given.noise**2
+    place = jnp.log(given.in_place)
+    smoothed, blend = smoothed + place + jnp.log(events), blend + place
+    # A sum over the first axis of an array takes longer than this.
+    top = jnp.maximum(jnp.maximum(smoothed, blend), 0)
+    parts = [jnp.exp(-top), jnp.exp(smoothed - top), jnp.exp(blend - top)]
+    q = [part / (parts[0] + parts[1] + parts[2]) for part in parts]
     quiet = MIN_SQUARED_DIFFERENCE / jnp.exp(X[FEATURE_NAMES.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
     # with those around the target.
@@ -243,8 +245,9 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     P = jnp.exp(jnp.tensordot(weights, features, 1))
     # Where frames are clipped all instants rest on the same events; more of them add nothing.
     P = jnp.maximum(P, params.common * given.image_variance)
-    sources = jnp.concatenate([q[:1] * given.shares, q[1:]])
-    return FusedImage((q * given.candidates).sum(0), P, sources, given.visible)
+    sources = jnp.stack([*(q[0] * share for share in given.shares), *q[1:]])
+    L = sum(weight * image for weight, image in zip(q, given.candidates, strict=True))
+    return FusedImage(L, P, sources, given.visible)
 
 
 def variance_features(X: Array, in_place: Array, beyond: Array, intervals_away: Array) -> Array:
@@ -268,13 +271,15 @@ def variance_features(X: Array, in_place: Array, beyond: Array, intervals_away: 
     squares = (
         (jnp.exp(X[difference]) - MIN_SQUARED_DIFFERENCE) * part * jnp.maximum(intervals_away, 1)
     )
-    adapted = jnp.where(beyond, jnp.log(squares + MIN_SQUARED_DIFFERENCE), X[difference])
-    return X.at[difference].set(adapted).at[both].multiply(part)
+    rows = list(X)  # scattered into the array they would take far longer
+    rows[difference] = jnp.where(beyond, jnp.log(squares + MIN_SQUARED_DIFFERENCE), X[difference])
+    rows[both] = X[both] * part
+    return jnp.stack(rows)
 
 
-def _shift_weight(q: Array, part: Array, to: int) -> Array:
-    """Give a part (h, w) of the weights q (3, h, w) of all candidates to one of them."""
-    return (1 - part) * q + part * jnp.eye(3)[to][:, None, None]
+def _shift_weight(q: list[Array], part: Array, to: int) -> list[Array]:
+    """Give a part (h, w) of the weights q (h, w) of all candidates to one of them."""
+    return [(1 - part) * weight + part * (k == to) for k, weight in enumerate(q)]
 
 
 def fuse(

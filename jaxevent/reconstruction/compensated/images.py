@@ -57,7 +57,7 @@ class FrameLevels(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class InstantSmoother(Smoother):
+class InstantSmoother(Smoother[Params]):
     """Smoother whose images are the frames themselves at the middle of their exposures.
 
     It reads log intensity L, its variance V, and whether a frame shows the pixel unclipped. The

@@ -112,7 +112,6 @@ class TrajectorySamples(NamedTuple):
 
     points: NDArray[np.float32]  # (h, 4, K, w): log intensity, robust weight, gradient along x, y
     M: NDArray[np.float32]  # (h, w), their robust mean
-    s: NDArray[np.float32]  # (K,), -1..1
 
 
 @njit_noalloc_inlined
@@ -181,27 +180,45 @@ def _read_channels(image, pixel, part, k, points):
             )
 
 
-@njit_noalloc
-def _sample(begin, end, inputs, scratch, out):
+class _SampleScratch(NamedTuple):
+    """Scratch memory for each row that a kernel begins with."""
+
+    rows: RowScratch
+    information: NDArray[np.float32]  # (rows, K, w)
+    sums: NDArray[np.float32]  # (rows, 2, w)
+
+    @classmethod
+    def allocate(cls, rows: int, instants: int, width: int) -> "_SampleScratch":
+        """Allocate scratch memory for `run_over_rows`."""
+        shapes = (instants, width), (2, width)
+        return cls(RowScratch.allocate(rows, width), *(row_scratch(rows, *s) for s in shapes))
+
+
+@njit_noalloc_inlined
+def _sample_row(y, begin, inputs, scratch, points, means):
+    """Write what images show along the trajectories of a row: (4, K, w), and their means (w,)."""
     images, p, cost = inputs
     count, h, w, _ = images.pixels.shape
-    rows, W, sums = scratch
+    rows, info = scratch.rows, scratch.information[begin]
     path, at, pixel = rows.path[begin], rows.x[begin], rows.pixel[begin]
-    part, inside, info = rows.part[begin], rows.inside[begin], W[begin]
-    points, M, half = out.points, out.M, np.float32(0.5)
+    part, inside, half = rows.part[begin], rows.inside[begin], np.float32(0.5)
+    at_y = np.float32(y) * half - np.float32(0.25)
     for x in range(w):
         at[x] = np.float32(x)
+        interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
+    for k in range(count):
+        row = (path, at, pixel, part, inside)
+        locate_points(np.float32(y), images.s[k], (h, w), w, row)
+        _read_channels(images.pixels[k], pixel, part, k, points)
+        fill_information(points[1, k], inside, cost.floor, info[k])
+    found = (points[1], means, scratch.sums[begin])
+    robust_means(points[0], info, images.near, cost.robust, found)
+
+
+@njit_noalloc
+def _sample(begin, end, inputs, scratch, out):
     for y in range(begin, end):
-        at_y = np.float32(y) * half - np.float32(0.25)
-        for x in range(w):
-            interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
-        for k in range(count):
-            row = (path, at, pixel, part, inside)
-            locate_points(np.float32(y), images.s[k], (h, w), w, row)
-            _read_channels(images.pixels[k], pixel, part, k, points[y])
-            fill_information(points[y, 1, k], inside, cost.floor, info[k])
-        found = (points[y, 1], M[y], sums[begin])
-        robust_means(points[y, 0], info, images.near, cost.robust, found)
+        _sample_row(y, begin, inputs, scratch, out.points[y], out.M[y])
 
 
 def sample_trajectories(
@@ -219,8 +236,8 @@ def sample_trajectories(
     """
     count, h, w, _ = images.pixels.shape
     points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
-    samples = TrajectorySamples(points, M, images.s)
-    scratch = RowScratch.allocate(h, w), row_scratch(h, count, w), row_scratch(h, 2, w)
+    samples = TrajectorySamples(points, M)
+    scratch = _SampleScratch.allocate(h, count, w)
     run_over_rows(_sample, h, (images, p, cost), scratch, samples)
     return samples
 
@@ -232,14 +249,15 @@ def _add_product(a, b, out):
 
 
 @njit_noalloc_inlined
-def _add_pixels(samples, y, grad_M, scratch, sums):
+def _add_pixels(points, M, s, grad_M, scratch, sums):
     """Add the equations of each pixel of a row to sums (14, w): N (10) and b (4).
+
+    `points` are the row's, as of `TrajectorySamples`, and M (w,) are their means.
 
     The derivative of values by a path's four numbers is J = g (s, s^2). The gradient g along
     trajectories and that of the mean, `grad_M` (2, w), are both that of the scene; the mean of the
     two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
     """
-    points, M, s = samples.points[y], samples.M[y], samples.s
     J, total, means, r = scratch[:4], scratch[4], scratch[5:9], scratch[9]
     total[:] = np.float32(0)
     means[:] = np.float32(0)
@@ -271,20 +289,27 @@ def _add_pixels(samples, y, grad_M, scratch, sums):
 
 
 @njit_noalloc
-def _linearise(begin, end, samples, scratch, out):
-    """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each."""
-    M = samples.M
+def _linearise(begin, end, inputs, scratch, M, out):
+    """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each.
+
+    Samples of four rows of pixels are kept: memory does not grow with the image.
+    """
     h, w = M.shape
-    own, grad_M, sums = scratch[begin, :10], scratch[begin, 10:12], scratch[begin, 12:]
+    samples, lines, recent = scratch
+    own, grad_M, sums = lines[begin, :10], lines[begin, 10:12], lines[begin, 12:]
+    points, sampled = recent[begin], max(2 * begin - 2, 0)
     for i in range(begin, end):
         sums[:] = np.float32(0)
         below = min(2 * i + 2, h)
+        while sampled < min(2 * i + 4, h):
+            _sample_row(sampled, begin, inputs, samples, points[sampled % 4], M[sampled])
+            sampled += 1
         for y in range(2 * i, below):
             for x in range(w):
                 gx, gy = gradient_at_pixel(M, y, x)
                 grad_M[0, x], grad_M[1, x] = gx, gy
                 sums[14, x] += np.sqrt(gx * gx + gy * gy)
-            _add_pixels(samples, y, grad_M, own, sums)
+            _add_pixels(points[y % 4], M[y], inputs[0].s, grad_M, own, sums)
         for j in range(out.shape[1]):
             left, right = 2 * j, min(2 * j + 1, w - 1)
             both = np.float32(right - left)  # 0 or 1
@@ -331,26 +356,25 @@ def _weigh_differences(p, edge, horizon, cost, out):
                 out[turn, i, j] = weight
 
 
-def linearise(
-    samples: TrajectorySamples, p: NDArray[np.float32], cost: CostParams
-) -> NormalEquations:
+def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> NormalEquations:
     """Set up the normal equations at some trajectories.
 
     Args:
-        samples: Images along these trajectories.
+        images: The packed images.
         p: (rows, columns, 4) the trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
         The equations, N as the 10 entries of its upper triangle.
     """
-    shape = p.shape[:2]
-    entries = np.empty((*shape, 15), np.float32)
-    scratch = row_scratch(shape[0], 12 + 15, samples.M.shape[1])
-    run_over_rows(_linearise, shape[0], samples, scratch, entries)
+    shape, (count, h, w, _) = p.shape[:2], images.pixels.shape
+    entries, M = np.empty((*shape, 15), np.float32), np.empty((h, w), np.float32)
+    samples = _SampleScratch.allocate(shape[0], count, w)
+    scratch = samples, row_scratch(shape[0], 12 + 15, w), row_scratch(shape[0], 4, 4, count, w)
+    run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
     blurred = np.empty((*shape, 14), np.float32)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
-    horizon = max_instant_distance(samples.s)
+    horizon = max_instant_distance(images.s)
     weights = np.zeros((2, *shape), np.float32)
     _weigh_differences(p, entries[..., 14], horizon, cost, weights)
     squared = horizon * horizon

@@ -52,68 +52,82 @@ VARIANCE_WEIGHTS_BEYOND = (
 class Params(smoother.Params):
     """Parameters of `mc`; those of the smoother are of the images at single instants."""
 
-    c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
-    c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
-    I0 = Positive(0.3, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
-    w_min = Positive(
+    c_on: Positive = Positive(0.2, "ln I", "contrast threshold of ON events")
+    c_off: Positive = Positive(0.2, "ln I", "contrast threshold of OFF events")
+    I0: Positive = Positive(
+        0.3, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6
+    )
+    w_min: Positive = Positive(
         0.6, "1", "least certainty w of frames, and that of clipped pixels", least=1e-9
     )
-    sigma_event = Positive(0.6, "c", "noise of an event's step, relative to its threshold")
-    sigma_bg = Positive(0.05, "ln I / sqrt(s)", "drift without events")
-    sigma_frame = Positive(0.002, "intensity", "noise of frames where the certainty w is 1")
-    share = Positive(0.7, "1", "fraction of an event's change that belongs to its 8 neighbours")
+    sigma_event: Positive = Positive(
+        0.6, "c", "noise of an event's step, relative to its threshold"
+    )
+    sigma_bg: Positive = Positive(0.05, "ln I / sqrt(s)", "drift without events")
+    sigma_frame: Positive = Positive(
+        0.002, "intensity", "noise of frames where the certainty w is 1"
+    )
+    share: Positive = Positive(
+        0.7, "1", "fraction of an event's change that belongs to its 8 neighbours"
+    )
 
-    sigma_pixel = Positive(0.004, "intensity", "noise of a frame's pixel, along trajectories")
-    floor = Positive(2e-4, "(ln I)^2", "least variance of an image read between pixels")
-    information = UnitInterval(
+    sigma_pixel: Positive = Positive(
+        0.004, "intensity", "noise of a frame's pixel, along trajectories"
+    )
+    floor: Positive = Positive(2e-4, "(ln I)^2", "least variance of an image read between pixels")
+    information: UnitInterval = UnitInterval(
         0.15, "1", "weight of an instant without frame, as errors of instants are correlated"
     )
-    sigma_place = Positive(0.1, "px", "error of trajectories where images are fused")
-    sigma_between = Positive(0.003, "ln I", "error of interpolation between pixels")
-    tolerance = Positive(3.0, "1", "standardised squared difference beyond which a point is hidden")
-    caution = Positive(
+    sigma_place: Positive = Positive(0.1, "px", "error of trajectories where images are fused")
+    sigma_between: Positive = Positive(0.003, "ln I", "error of interpolation between pixels")
+    tolerance: Positive = Positive(
+        3.0, "1", "standardised squared difference beyond which a point is hidden"
+    )
+    caution: Positive = Positive(
         6.0, "1", "factor on the smoother's variance where motion is estimated", gradient=False
     )
-    robust = Positive(
+    robust: Positive = Positive(
         10.0,
         "1",
         "standardised squared residual of motion beyond which weights fall",
         gradient=False,
         least=1e-6,
     )
-    smooth = Positive(40.0, "1 / px^2", "weight of spatial differences of motion", gradient=False)
-    jump = Positive(
+    smooth: Positive = Positive(
+        40.0, "1 / px^2", "weight of spatial differences of motion", gradient=False
+    )
+    jump: Positive = Positive(
         0.04, "px", "difference of motion beyond which costs are linear", gradient=False, least=1e-6
     )
-    edge = Positive(
+    edge: Positive = Positive(
         0.1, "ln I / px", "gradient across which motion may change", gradient=False, least=1e-6
     )
-    straight = Positive(0.2, "1 / px^2", "weight of acceleration", gradient=False)
-    choice = Number(
+    straight: Positive = Positive(0.2, "1 / px^2", "weight of acceleration", gradient=False)
+    choice: Number = Number(
         CHOICE_WEIGHTS, "1", "weights of features in the logits of the smoother and the blend"
     )
-    doubt = Number(
+    doubt: Number = Number(
         VARIANCE_WEIGHTS, "1", "weights of features in the logarithm of the result's variance"
     )
-    choice_beyond = Number(
+    choice_beyond: Number = Number(
         CHOICE_WEIGHTS_BEYOND, "1", "`choice` after the last frame and before the first"
     )
-    doubt_beyond = Number(
+    doubt_beyond: Number = Number(
         VARIANCE_WEIGHTS_BEYOND, "1", "`doubt` after the last frame and before the first"
     )
-    common = Positive(
+    common: Positive = Positive(
         0.6, "1", "least variance of the result, as part of that of images from events alone"
     )
-    integrate = Choice(
+    integrate: Choice = Choice(
         (True, False), "whether images are fitted to the frames' exposures and clipped pixels"
     )
-    learn = Choice(
+    learn: Choice = Choice(
         (True, False), "whether thresholds of single pixels are learned where events suffice"
     )
-    smear = Positive(
+    smear: Positive = Positive(
         1.2, "1", "variance of the result, as part of the squared change by the exposure's blur"
     )
-    vague = Positive(
+    vague: Positive = Positive(
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )
     # Thresholds are learned (`learn`) along trajectories, from more than events between frames. But

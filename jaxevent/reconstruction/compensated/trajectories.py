@@ -144,16 +144,17 @@ class ImagePyramid:
 
     def __init__(self, L: NDArray, V: NDArray, variance_factor: float):
         self._levels = [(np.asarray(L, np.float32), np.asarray(V, np.float32))]
-        self._packed: list[NDArray[np.float32]] = []
+        self._packed: dict[int, NDArray[np.float32]] = {}
         self._factor = np.float32(variance_factor)
+        self.image_shape: tuple[int, int] = self._levels[0][0].shape[1:]
 
     def __getitem__(self, level: int) -> NDArray[np.float32]:
         """Return the packed images of a level; 0 is full resolution."""
-        while len(self._packed) <= level:
-            if len(self._levels) == len(self._packed):
-                L, V = self._levels[-1]
-                self._levels.append((halve_resolution(L), halve_resolution(V) * self._factor))
-            self._packed.append(pack_images(*self._levels[len(self._packed)]))
+        while len(self._levels) <= level:
+            L, V = self._levels[-1]
+            self._levels.append((halve_resolution(L), halve_resolution(V) * self._factor))
+        if level not in self._packed:
+            self._packed[level] = pack_images(*self._levels[level])
         return self._packed[level]
 
 
@@ -208,7 +209,7 @@ def gauss_newton_step(
     Returns:
         (rows, columns, 4) the new trajectories, px.
     """
-    d = solve_normal_equations(linearise(sample_trajectories(images, p, cost), p, cost), p)
+    d = solve_normal_equations(linearise(images, p, cost), p)
     rows, columns, channels = p.shape
     out, flat, horizon = (
         np.empty_like(p),
@@ -232,7 +233,7 @@ def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) 
     Returns:
         The mean over pixels and instants.
     """
-    points, M, _ = sample_trajectories(images, p, cost)
+    points, M = sample_trajectories(images, p, cost)
     return float(((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).mean())
 
 
@@ -255,7 +256,7 @@ def choose_trajectories(
     """
     costs = []
     for p, share in zip(several, shares, strict=True):
-        points, M, _ = sample_trajectories(images, p, cost)
+        points, M = sample_trajectories(images, p, cost)
         squares = ((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).sum(1)
         rows, columns = p.shape[:2]
         unpaired = [(0, 2 * rows - len(squares)), (0, 2 * columns - squares.shape[1])]
@@ -367,7 +368,7 @@ def estimate_trajectories(
     Returns:
         The trajectories at the level of the last stage.
     """
-    _, h, w, _ = pyramid[0].shape
+    h, w = pyramid.image_shape
     first = plan[0].levels[0]
     found = NodeTrajectories(np.zeros((*node_shape(h, w, first), 4), np.float32), first)
     for stage in plan:
@@ -618,10 +619,10 @@ def select_paths(
     return path_index
 
 
-def refine_paths(
+def borrow_paths(
     images: PackedImages, p: NDArray[np.float32], cost: CostParams
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Refine trajectories by two steps, between which nodes take the paths of others.
+) -> NDArray[np.float32]:
+    """Let nodes take the trajectories of others nearby along which images agree better.
 
     Args:
         images: Packed images of full resolution.
@@ -629,14 +630,12 @@ def refine_paths(
         cost: Parameters of the cost, float32.
 
     Returns:
-        The trajectories of nodes, and for each pixel which path it takes, as `select_paths`.
+        (rows, columns, 4) the trajectories, px.
     """
     size = images.pixels.shape[1:3]
-    p = gauss_newton_step(images, p, cost)
     index = select_paths(images, interpolate_paths(p, size), cost, PATH_SEARCHES[:1])
     y, x = np.divmod(index[::2, ::2], size[1])
-    p = gauss_newton_step(images, p[y // 2, x // 2], cost)
-    return p, select_paths(images, interpolate_paths(p, size), cost)
+    return p[y // 2, x // 2]
 
 
 __getattr__ = renamed_names(__name__)

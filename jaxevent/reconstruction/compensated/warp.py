@@ -237,7 +237,7 @@ def _read_bicubic(image, pixel, weights, out):
 
 @njit_noalloc
 def _warp(begin, end, inputs, scratch, cubic, out):
-    L, V, clear, s, paths = inputs
+    L, V, clear, shown, s, paths = inputs
     count, h, w = L.shape
     path, pixel, part = scratch.path[begin], scratch.pixel[begin], scratch.part[begin]
     at, weights = scratch.x[begin], cubic[begin]
@@ -254,7 +254,10 @@ def _warp(begin, end, inputs, scratch, cubic, out):
             _cubic_weights(part[1], weights[4:])
             _read_bicubic(L[k], pixel, weights, out.L[k, y])
             _read_bilinear(V[k], pixel, part, out.V[k, y])
-            _read_bilinear(clear[k], pixel, part, out.clear[k, y])
+            if shown[k]:
+                _read_bilinear(clear[k], pixel, part, out.clear[k, y])
+            else:
+                out.clear[k, y] = np.float32(0)
 
 
 def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> WarpedImages:
@@ -272,7 +275,7 @@ def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArr
     """
     _, h, w = L.shape
     out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    inputs = (L, V, clear, s, paths)
+    inputs = (L, V, clear, clear.any((1, 2)), s, paths)
     run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
 

@@ -628,11 +628,8 @@ def make_kernel_images(
     backend = choose_backend(compiler, serves)
     if backend == "xla" or not IS_SYNCHRONOUS or "rho_ref" in params.followed:
         return None
-    method.check(recording)
-    method.check_clocks(recording, params)
     times = sorted_times(times)
-    if not extrapolate:
-        method.check_span(recording, times, params)
+    method.check_request(recording, times, params, extrapolate)
 
     def make() -> KernelImages:
         return KernelImages.of(kind(method, recording, times, params), len(times))

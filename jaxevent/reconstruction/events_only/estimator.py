@@ -135,11 +135,8 @@ class EventsOnly(ImageEstimator[Params]):
         params: Params | None,
         extrapolate: bool = False,
     ) -> tuple[WindowSolver, NDArray[np.int64], Params]:
-        self.check(recording)
-        params = self.Params() if params is None else params
+        params = self.check_request(recording, times, params, extrapolate)
         wanted = np.atleast_1d(microseconds(times))
-        if not extrapolate:
-            self.check_span(recording, wanted, params)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
         return WindowSolver(recording, params), wanted, params

@@ -16,22 +16,32 @@ class Params(FrameParams):
     of the log intensity.
     """
 
-    c_on = Positive(0.2, "ln I", "contrast threshold of ON events")
-    c_off = Positive(0.2, "ln I", "contrast threshold of OFF events")
-    I0 = Positive(0.02, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6)
-    window = Positive(0.35, "events / px", "events of the window on each side", gradient=False)
-    silence = Positive(_SOLVER.silence, "1", "weight of silence, against that of an event")
-    tail = Positive(_SOLVER.tail, "c", "residual from which an equation counts less", least=1e-6)
-    gradient = Positive(_SOLVER.gradient, "1", "weight of the prior of gradients")
-    edge = Positive(_SOLVER.edge, "c / px", "scale of the prior of gradients", least=1e-6)
-    leak = Positive(_SOLVER.leak, "1 / c^2", "weight of the squared log intensity", least=1e-9)
-    vague = Positive(
+    c_on: Positive = Positive(0.2, "ln I", "contrast threshold of ON events")
+    c_off: Positive = Positive(0.2, "ln I", "contrast threshold of OFF events")
+    I0: Positive = Positive(
+        0.02, "intensity", "offset inside the logarithm, L = ln(I + I0)", least=1e-6
+    )
+    window: Positive = Positive(
+        0.35, "events / px", "events of the window on each side", gradient=False
+    )
+    silence: Positive = Positive(
+        _SOLVER.silence, "1", "weight of silence, against that of an event"
+    )
+    tail: Positive = Positive(
+        _SOLVER.tail, "c", "residual from which an equation counts less", least=1e-6
+    )
+    gradient: Positive = Positive(_SOLVER.gradient, "1", "weight of the prior of gradients")
+    edge: Positive = Positive(_SOLVER.edge, "c / px", "scale of the prior of gradients", least=1e-6)
+    leak: Positive = Positive(
+        _SOLVER.leak, "1 / c^2", "weight of the squared log intensity", least=1e-9
+    )
+    vague: Positive = Positive(
         1.0, "ln I", "standard deviation from which an image is not valid", gradient=False
     )
-    learn = Choice(
+    learn: Choice = Choice(
         (True, False), "whether the thresholds are scaled by the ratios that the events show"
     )
-    use_frames = Choice(
+    use_frames: Choice = Choice(
         (False, True), "whether a frame at hand shows gradients, too, and the scale of intensity"
     )
     calibrated = ()

@@ -122,7 +122,10 @@ def solve(
     height, width = rows.shape
     c = np.float32(rows.threshold)
     u = np.zeros(rows.shape, np.float32) if start is None else (start / c).astype(np.float32)
+    # Rows that look up the same pixels lie together in memory.
+    order = np.argsort(rows.corner[:, 0], kind="stable")
     base = np.where(rows.kind == EVENT, 1, params.silence).astype(np.float32) * rows.weight
+    base, change = base[order], rows.change[order]
     information = np.zeros((0, width, 3), np.float32)
     pull = np.zeros(rows.shape, np.float32)
     if prior is not None:
@@ -131,8 +134,8 @@ def solve(
         g = np.einsum("hwij,hwj->hwi", L, prior.gradient / c).astype(np.float32)
         _add_gradient_transposed(g, pull)
     system = _System(
-        rows.corner,
-        rows.fraction,
+        rows.corner[order],
+        rows.fraction[order],
         base,
         *np.zeros((2, height, width), np.float32),
         information,
@@ -144,18 +147,19 @@ def solve(
     numbers = tuple(np.float32(v) for v in (params.tail, params.gradient, params.edge))
     iterations = 0
     for _ in range(REWEIGHTINGS):
-        _reweight(system, u, (rows.change, base), numbers, residual)
+        _reweight(system, u, (change, base), numbers, residual)
         b[:] = pull
-        _add_transposed(system, rows.change * system.weight, b)
+        _add_transposed(system, change * system.weight, b)
         preconditioner.update(system)
         iterations += _conjugate_gradients(system, b, u, preconditioner.arrays, CG_LIMITS)
-    _reweight(system, u, (rows.change, base), numbers, residual)
+    _reweight(system, u, (change, base), numbers, residual)
     V = np.full(rows.shape, np.inf, np.float32)
     unseen = _unseen_variance(system, preconditioner.of_rows[0]) * c**2
     if variance:
-        samples = _sample_variance(system, preconditioner, np.random.default_rng(seed))
+        samples = _sample_variance(system, preconditioner, order, np.random.default_rng(seed))
         V = VARIANCE_FACTOR * c**2 * samples + unseen
-    return Solution(u * c, V, unseen, residual, system.weight, iterations)
+    place = np.argsort(order, kind="stable")
+    return Solution(u * c, V, unseen, residual[place], system.weight[place], iterations)
 
 
 def _unseen_variance(system, of_rows):
@@ -186,7 +190,7 @@ def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
     return factor
 
 
-def _sample_variance(system, preconditioner, rng):
+def _sample_variance(system, preconditioner, order, rng):
     """Perturb and solve: with b of covariance A, the solution has the covariance A^-1."""
     from scipy.ndimage import gaussian_filter
 
@@ -196,7 +200,7 @@ def _sample_variance(system, preconditioner, rng):
     preconditioner.update(system)
     for _ in range(SAMPLES):
         b = np.zeros((height, width), np.float32)
-        noise = rng.standard_normal(len(system.weight), np.float32)
+        noise = rng.standard_normal(len(system.weight), np.float32)[order]
         _add_transposed(system, noise * np.sqrt(system.weight), b)
         n = rng.standard_normal((3, height, width), np.float32)
         across, down = np.sqrt(system.across) * n[0], np.sqrt(system.down) * n[1]

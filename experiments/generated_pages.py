@@ -1,14 +1,21 @@
-"""The page of all parameters of all methods, made from the code when the site is built.
+"""Pages and tables made from the code when the site is built: parameters, measures, methods.
 
-`python experiments/parameters.py` prints it; `on_files` is a hook of MkDocs (`mkdocs.yml`).
+`python experiments/generated_pages.py` prints the parameters. `on_files` and `on_page_markdown` are
+hooks of MkDocs (`mkdocs.yml`). The changelog and the security page are those of the repository.
 """
 
+import re
+from pathlib import Path
 from typing import Any
 
 import jaxevent
 from jaxevent.estimator import Estimator
 from jaxevent.methods import METHOD_HOMES
+from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.parameters import Choice, Parameters, UnitInterval, format_value
+from jaxevent.show.tables import COLUMNS
+
+ROOT = Path(__file__).parents[1]
 
 TITLES = {"reconstruction": "Reconstruction", "blob": "Tracking", "egomotion": "Egomotion"}
 
@@ -46,8 +53,8 @@ def presets(kind: type[Parameters]) -> list[str]:
     return lines
 
 
-def page() -> str:
-    """Return the page as Markdown."""
+def parameters_page() -> str:
+    """Return the page of all parameters of all methods as Markdown."""
     parts = [
         "# Parameters",
         "Numbers with a gradient can be named under "
@@ -67,13 +74,56 @@ def page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def measures_page() -> str:
+    """Return the page of all measures as Markdown."""
+    titles = {place: title for title, place, _, _ in COLUMNS}
+    lines = [
+        "# Measures",
+        "",
+        'Intensity is 0 at black and 1 at the frames\' white. A title with "x 1e-2" gives a number '
+        "times 100. Names are those of `results.json` and `errors.json`.",
+        "",
+        "| name | column | meaning |",
+        "|---|---|---|",
+    ]
+    for name, meaning in MEASURE_MEANINGS.items():
+        text = meaning.replace("|", r"\|")
+        lines.append(f"| `{name}` | {titles.get(name, '')} | {text} |")
+    return "\n".join(lines) + "\n"
+
+
+def methods_table(family: str) -> str:
+    """Return a table of a family's methods, with links to their parameters."""
+    lines = ["| method | | variance | gradient |", "|---|---|---|---|"]
+    for name in METHOD_HOMES[family]:
+        method = jaxevent.METHODS[name]
+        about = ". ".join(re.split(r"(?<!al)\. ", method.about)[:2]).rstrip(".")
+        yes = ["yes" if flag else "" for flag in (method.has_covariance, method.differentiable)]
+        lines.append(f"| [`{name}`](../parameters.md#{name}) | {about} | {' | '.join(yes)} |")
+    return "\n".join(lines)
+
+
 def on_files(files: Any, config: Any) -> Any:
-    """Add the page to the files that MkDocs builds."""
+    """Add the pages to the files that MkDocs builds."""
     from mkdocs.structure.files import File
 
-    files.append(File.generated(config, "parameters.md", content=page()))
+    pages = {
+        "parameters.md": parameters_page(),
+        "measures.md": measures_page(),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
+        "security.md": (ROOT / "SECURITY.md").read_text(),
+    }
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
     return files
 
 
+def on_page_markdown(markdown: str, **context: Any) -> str:
+    """Fill in the tables of methods."""
+    for family in METHOD_HOMES:
+        markdown = markdown.replace(f"<!-- methods: {family} -->", methods_table(family))
+    return markdown
+
+
 if __name__ == "__main__":
-    print(page(), end="")
+    print(parameters_page(), end="")
