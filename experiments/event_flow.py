@@ -15,6 +15,7 @@ import itertools
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, median_filter, zoom
@@ -166,14 +167,16 @@ def track_features(frames, first: int, last: int):
     """Return features of a frame and where they are in another, (n, 2) each, px, by OpenCV."""
     import cv2
 
+    follow: Any = cv2.calcOpticalFlowPyrLK  # takes None for points to start from
+
     images = [np.clip(image * 255, 0, 255).astype(np.uint8) for image in frames.intensity[
         first : last + 1]]  # fmt: skip
     images = [cv2.GaussianBlur(image, (0, 0), 0.7) for image in images]
     start = cv2.goodFeaturesToTrack(images[0], 300, 0.02, 5)
     now, kept = start, np.ones(len(start), bool)
     for before, after in itertools.pairwise(images):
-        new, found, _ = cv2.calcOpticalFlowPyrLK(before, after, now, None, winSize=(15, 15))
-        back, _, _ = cv2.calcOpticalFlowPyrLK(after, before, new, None, winSize=(15, 15))
+        new, found, _ = follow(before, after, now, None, winSize=(15, 15))
+        back, _, _ = follow(after, before, new, None, winSize=(15, 15))
         kept &= (found[:, 0] > 0) & (np.linalg.norm(back - now, axis=-1)[:, 0] < 0.15)
         now = new
     return start[kept, 0], now[kept, 0]
@@ -199,8 +202,10 @@ def measure_slider():
     xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     jacobian = np.linalg.inv(np.stack([np.gradient(xi, axis=1), np.gradient(xi, axis=0)], -1))
 
+    velocity = twists.T.T
+
     def direction(at):
-        T = np.array([np.interp(at, twists.t, c) for c in twists.T.T])
+        T = np.array([np.interp(at, twists.t, c) for c in velocity])
         d = np.stack([xi[..., 0] * T[2] - f * T[0], xi[..., 1] * T[2] - f * T[1]], -1)
         return (jacobian @ d[..., None])[..., 0]
 
