@@ -25,7 +25,7 @@ own motion, and other depths, are outliers of the fit:
 The covariance of a displacement is that of an estimate from the nodes within a Gaussian of reach r,
 which have the information I_r together, are n_r in effect, and differ by D_r in the mean square:
 
-    C = min_r  alpha I_r^-1 + (beta + gamma / n_r) D_r                                          (5)
+    C = min_r  I_r^-1 + beta D_r / n_r                                                          (5)
 
 The first term is the noise of events, the second what smoothness and unequal motion add.
 """
@@ -46,8 +46,8 @@ CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longe
 MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
 N_SWEEPS = 30  # of Gauss-Seidel
 N_SURFACE_FITS = 2  # in each step
-# 1/px^2, of the coefficients of (3) before alignment, in halves of the sensor's longer side.
-SURFACE_INFORMATION = (0.001, 30, 30, 0.001, 30, 30, 100, 100)
+# 1/px^2 and node, of the coefficients of (3) before alignment, in halves of the longer side.
+SURFACE_INFORMATION = (1e-6, 0.0435, 0.0435, 1e-6, 0.0435, 0.0435, 0.145, 0.145)
 N_BLURS = (1, 2, 2)  # of the sum of events, their number and their mean time
 NUMBER_FLOOR = 0.1  # events per cell, added to their number
 # The curvature of S is that of the image before it is blurred, which is sharper.
@@ -56,9 +56,8 @@ OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it i
 NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
 POOLING = (1, 2, 4)  # nodes, the reaches r of (5)
-MIN_INFORMATION = 0.1  # 1/px^2
-DATA_VARIANCE = 0.6  # alpha of (5)
-SCATTER = (0.3, 2.0)  # beta and gamma of (5)
+SCATTER = 9.0  # beta of (5)
+UNKNOWN_VARIANCE = 6.0  # px^2, without events
 FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 
@@ -324,6 +323,7 @@ class Displacement(NamedTuple):
     clock: Clock
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
     covariance: NDArray[np.float64]  # (rows, columns, 2, 2), px^2
+    roughness: NDArray[np.float64]  # (rows, columns), mean square difference of neighbours, px^2
     score: float  # per event
 
 
@@ -383,13 +383,12 @@ class Alignment:
         trace = np.maximum(information[..., 0] + information[..., 2], 0) + 1e-9
         for reach in POOLING:
             values, axes = _principal(information, reach)
-            C = _rotate(axes, DATA_VARIANCE / np.maximum(values, MIN_INFORMATION))
+            C = _rotate(axes, 1 / (np.maximum(values, 0) + 1 / UNKNOWN_VARIANCE))
             pooled, squares = (
                 gaussian_filter(one, reach, mode="constant") for one in (trace, trace**2)
             )
             n = 4 * np.pi * reach**2 * pooled**2 / squares
-            scatter = (SCATTER[0] + SCATTER[1] / n) * _mean_square_difference(u, reach)
-            C = C + scatter[..., None, None] * np.eye(2)
+            C = C + (SCATTER / n * _mean_square_difference(u, reach))[..., None, None] * np.eye(2)
             less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
             best = np.where(less[..., None, None], C, best)
         return best
@@ -429,10 +428,10 @@ class Alignment:
         gx, gy, xx, xy, yy = normal.reshape(-1, normal.shape[-1]).T[:5]
         ux, uy = u.reshape(-1, 2).T
         HB0, HB1 = xx * B0 + xy * B1, xy * B0 + yy * B1
-        surface = before
+        surface, prior = before, np.diag(SURFACE_INFORMATION) * len(ux)
         for _ in range(N_SURFACE_FITS):
             w = 1 / (1 + ((u - surface) ** 2).sum(-1).ravel() / self.edge**2)
-            A = (w * B0) @ HB0.T + (w * B1) @ HB1.T + np.diag(SURFACE_INFORMATION)
+            A = (w * B0) @ HB0.T + (w * B1) @ HB1.T + prior
             b = B0 @ (w * (xx * ux + xy * uy + gx)) + B1 @ (w * (xy * ux + yy * uy + gy))
             c = np.linalg.solve(A, b)
             surface = np.stack([c @ B0, c @ B1], -1).reshape(u.shape)
@@ -498,7 +497,11 @@ class Alignment:
                 if adapt:
                     ahead = self._turn(clock, at, ahead, turns)
         information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
-        covariance = self._covariance(u - surface, information)
         return Displacement(
-            u, Clock(clock.t, ahead), information, covariance, score / max(len(x), 1)
+            u,
+            Clock(clock.t, ahead),
+            information,
+            self._covariance(u - surface, information),
+            _mean_square_difference(u - surface, 1),
+            score / max(len(x), 1),
         )

@@ -9,6 +9,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from jaxevent.errors import InputError
 from jaxevent.event_flow import FlowParams, WindowPaths, flow_from_events
+from jaxevent.event_flow.alignment import Alignment
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Events, Recording
 
@@ -137,12 +138,19 @@ def still(kind: str) -> Recording:
     t = np.sort(rng.integers(0, 200_000, n))
     if kind == "pixel":
         return record(t, np.full(n, 7), np.full(n, 9), np.arange(n) % 2)
+    if kind == "burst":
+        t = np.sort(np.r_[t[::40], 90_000 + rng.integers(0, 1000, n - n // 40)])
+    if kind == "hot pixels":
+        x, y = (rng.integers(0, size, 40)[rng.integers(0, 40, n)] for size in (WIDTH, HEIGHT))
+        return record(t, x, y, rng.random(n) < 0.5)
     x, y = rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n)
     p = np.ones(n) if kind == "all ON" else rng.random(n) < 0.5
     return record(np.full(n, 7) if kind == "one time" else t, x, y, p)
 
 
-@pytest.mark.parametrize("kind", ["empty", "one", "pixel", "noise", "all ON", "one time"])
+@pytest.mark.parametrize(
+    "kind", ["empty", "one", "pixel", "noise", "all ON", "one time", "burst", "hot pixels"]
+)
 def test_what_shows_no_motion_is_finite_and_not_valid(kind):
     flow = flow_from_events(still(kind))
     mean, covariance, valid = flow([5_000, 100_000], extrapolate=True)
@@ -151,6 +159,36 @@ def test_what_shows_no_motion_is_finite_and_not_valid(kind):
     assert valid.mean() < 0.05
     x, y = flow.paths(0, 200_000, 50_000).carry([5.0], [6.0], [150_000])
     assert np.isfinite([x, y]).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (1, 24), (9, 8)])
+def test_tiny_sensors(size):
+    rng, n = np.random.default_rng(6), 300
+    x, y = (rng.integers(0, side, n).astype(np.uint16) for side in size)
+    events = Events(np.arange(n) * 200, x, y, rng.random(n) < 0.5)
+    flow = flow_from_events(Recording("tiny", *size, events))
+    mean, covariance, _ = flow([0.03])
+    assert mean.shape == (1, size[1], size[0], 2)
+    assert np.isfinite(mean).all() and np.isfinite(covariance).all()
+    assert np.isfinite(flow.paths(0, 50_000, 9_000).carry([0.0], [0.0], [30_000])).all()
+
+
+def test_surface_is_that_of_most_nodes():
+    align = Alignment((180, 240), FlowParams())
+    rows, columns = align.nodes
+    y, x = np.mgrid[:rows, :columns] / 15
+    y, x = y - y.mean(), x - x.mean()
+    a, A, c = np.array([3.0, -1.0]), np.array([[0.3, -2.0], [2.0, -0.4]]), np.array([0.6, -0.9])
+    at = np.stack([x, y], -1)
+    true = a + at @ A.T + (at @ c)[..., None] * at
+    u = true + np.random.default_rng(4).normal(0, 0.02, true.shape)
+    u[4:10, 5:14] += [4.0, 2.0]  # an object of its own motion
+    normal = np.zeros((rows, columns, 6))
+    normal[..., 2], normal[..., 3], normal[..., 4] = 40, 10, 30
+    surface = u
+    for _ in range(5):
+        surface = align._fit_surface(u, surface, normal)
+    assert np.abs(surface - true).max() < 0.1
 
 
 def test_the_component_along_an_edge_is_uncertain():
