@@ -75,7 +75,8 @@ def add(commands: Any) -> None:
         "--focal",
         metavar="PX",
         type=float,
-        help="focal length in px about the sensor's centre, of a recording that has none",
+        help="focal length in px where there is no calibration, about the sensor's centre; sigmas "
+        "of rotations count 5 %% of them for its error",
     )
     arguments.add_live(one, "rows of motion.csv, as with --causal,")
     arguments.add_reading(one)
