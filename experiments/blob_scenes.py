@@ -2,8 +2,9 @@
 
 `SCENES` has each kind of target once, on which the search was built, `VARIED` came later: other
 sensors, outlines, bars, pairs of edges, one polarity only, targets that come and go, flicker, a
-background that moves with the camera, very short and very long recordings, stars. Constants were
-chosen on seeds below 20. Each is called with a seed and gives the recording and its truth.
+background that moves with the camera, very short and very long recordings, stars; `OBJECTS` are
+rigid bodies, flocks, hands and targets that leave. Constants were chosen on seeds below 20, and of
+`OBJECTS` on seeds from 100 on. Each is called with a seed and gives the recording and its truth.
 """
 
 import dataclasses
@@ -782,4 +783,3 @@ OBJECTS: dict[str, Scene] = {
     "flock of 12, close": _close_flock,
     "dim tails": _dim_tails,
 }
-COMPACT = {"30 blobs, 346x260", "flock of 12, close", "dim tails"}

@@ -3,23 +3,29 @@
     python experiments/scaling.py --out scaling [--only akf aks mc events-only track find voting]
 
 CPU seconds of this process, the least of two turns after one that compiles. A slope is that of ln
-CPU seconds over ln size: 1 is linear, 0 no cost. The others stay as they are while one is changed:
-random events of `bench_images.stream`, scenes of `jaxevent.simulate` for motion and targets. What
-the busiest thread takes of all CPU seconds bounds the gain of two cores, whatever else runs.
+CPU seconds over ln size between the two largest sizes: 1 is linear, 0 no cost. All else stays as it
+is while one is changed: random events of `bench_images.stream`; for `mc` and `events-only` the
+packaged recording, with every second or fourth event, or side by side with itself; for motion and
+targets scenes of `jaxevent.simulate`. The busiest thread's part of all CPU seconds bounds the gain
+of more cores.
 """
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from bench_images import stream
+from bench_images import stream, tile
 from common import command_line, machine, markdown_table, write_text
 
 import jaxevent
 from jaxevent.blob import find, moment
 from jaxevent.egomotion import voting
+from jaxevent.io import load
+from jaxevent.recording import Events, Recording
+from jaxevent.runs.demo import RECORDING_FILE
 from jaxevent.simulate import LinearMotion, Target, motion_scene, simulate_blobs
 
 SEED = 100
@@ -58,6 +64,32 @@ def images_of(method: Any, events: int, images: int, factor: int) -> dict[str, d
     }  # fmt: skip
 
 
+def packaged_task(
+    method: Any, every: int = 1, tiles: tuple[int, int] = (1, 1), images: int = 4
+) -> tuple[Recording, Callable[[], object]]:
+    """Return a recording made of the packaged one, and the task of making images at 100 Hz."""
+    recording = load(str(RECORDING_FILE))
+    e = recording.events[:]
+    kept = Events(*(getattr(e, name)[::every] for name in "txyp"))
+    recording = tile(dataclasses.replace(recording, events=kept), *tiles)
+    times = recording.start + 300_000 + 10_000 * np.arange(images)
+    return recording, lambda: method.estimate(recording, method.Params(), progress=False)(times)
+
+
+def packaged_images_of(method: Any) -> dict[str, dict[Any, Callable]]:
+    """Return tasks by what is changed, of images of the packaged recording."""
+    found: dict[str, dict[Any, Callable]] = {"events": {}, "pixels": {}, "images": {}}
+    for every in (4, 2, 1):
+        recording, task = packaged_task(method, every)
+        found["events"][len(recording.events)] = task
+    for tiles in ((1, 1), (2, 1), (2, 2)):
+        recording, task = packaged_task(method, tiles=tiles)
+        found["pixels"][recording.width * recording.height] = task
+    for images in (2, 4, 8):
+        found["images"][images] = packaged_task(method, images=images)[1]
+    return found
+
+
 def blobs(targets: int, rate: float, size: tuple[int, int] = (240, 180)) -> tuple[Any, list[Any]]:
     """Return a recording of targets that go to the right, with events per second, and seeds."""
     y = (np.arange(targets) + 0.5) * size[1] / targets
@@ -68,7 +100,7 @@ def blobs(targets: int, rate: float, size: tuple[int, int] = (240, 180)) -> tupl
 
 def track_task(targets: int, rate: float) -> Callable[[], object]:
     recording, seeds = blobs(targets, rate)
-    return lambda: moment.estimate(recording, seeds=seeds)(recording.stop)
+    return lambda: moment.estimate(recording, seeds=seeds).filtered(recording.stop)
 
 
 def find_task(targets: int, rate: float, size: tuple[int, int] = (240, 180)) -> Callable:
@@ -85,8 +117,8 @@ def voting_task(particles: int, points: float, size: tuple[int, int]) -> Callabl
 FAMILIES: dict[str, Callable[[], dict[str, dict[Any, Callable[[], object]]]]] = {
     "akf": lambda: images_of(jaxevent.akf, 250_000, 10, 4),
     "aks": lambda: images_of(jaxevent.aks, 250_000, 10, 4),
-    "mc": lambda: images_of(jaxevent.mc, 50_000, 2, 2),
-    "events-only": lambda: images_of(jaxevent.events_only, 25_000, 2, 2),
+    "mc": lambda: packaged_images_of(jaxevent.mc),
+    "events-only": lambda: packaged_images_of(jaxevent.events_only),
     "track": lambda: {
         "events": {n: track_task(4, n / 0.4) for n in (10**5, 4 * 10**5, 16 * 10**5)},
         "targets": {n: track_task(n, 10**6) for n in (2, 8, 32)},
@@ -127,8 +159,9 @@ def measure(task: Callable[[], object]) -> tuple[float, float]:
 
 
 def slope(sizes: Iterable[float], seconds: Iterable[float]) -> float:
-    """Return the slope of ln seconds over ln size by least squares."""
-    return float(np.polyfit(np.log(list(sizes)), np.log(list(seconds)), 1)[0])
+    """Return the slope of ln seconds over ln size between the last two."""
+    (n, more), (few, many) = list(sizes)[-2:], list(seconds)[-2:]
+    return float(np.log(many / few) / np.log(more / n))
 
 
 def rows_of(family: str) -> list[list[Any]]:

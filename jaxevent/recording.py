@@ -113,6 +113,14 @@ class EventColumns(NamedTuple):
 class ColumnSource(EventSource, Protocol):
     """An `EventSource` that can be read without checks."""
 
+    def image_rows(self, rows: slice) -> NDArray[np.uint16] | None:
+        """Read the y of a range of rows; None where `columns` returns None.
+
+        Args:
+            rows: The rows, step 1.
+        """
+        ...
+
     def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
         """Read a range of rows as they are stored.
 

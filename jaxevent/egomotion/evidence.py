@@ -264,12 +264,12 @@ def tell_from_later(
     searching: NDArray[np.bool_],
     told: NDArray[np.bool_],
     diffusion: Callable[[NDArray], Any],
-) -> tuple[NDArray[np.bool_], NDArray[np.floating]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.floating], NDArray[np.floating]]:
     """Tell the estimates before a motion settled, too, as far as they agree with it.
 
-    A cloud that has just collapsed is too narrow, and its motion drifts on for up to `DRIFT_RATIO`
-    times as long as it took to settle. The square of the difference of estimates until then from
-    the motion there is to be added to their covariance.
+    A cloud that has just collapsed is too narrow, so how far they differ from it is added. The
+    motion drifts on for up to `DRIFT_RATIO` times as long as it took to settle. The square of the
+    difference of estimates until then from the motion there is to be added after smoothing.
 
     Args:
         t: (n,) times, us.
@@ -280,9 +280,9 @@ def tell_from_later(
         diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
 
     Returns:
-        (n,) booleans, and what is to be added to the covariances, (n, d, d).
+        (n,) booleans, the covariances, and what is to be added to them after smoothing, (n, d, d).
     """
-    told, added = told.copy(), np.zeros(covariance.shape)
+    told, covariance, added = told.copy(), covariance.copy(), np.zeros(covariance.shape)
     eye = np.eye(mean.shape[1])
     for first in np.flatnonzero(told & ~np.r_[False, told[:-1]]):
         rate = eye * np.asarray(diffusion(mean[first]), np.float64) ** 2
@@ -293,12 +293,13 @@ def tell_from_later(
             if float(far @ np.linalg.solve(C, far)) > MAX_DRIFT_SIGMAS**2 * len(far):
                 break
             told[k] = True
+            covariance[k] += np.outer(far, far)
         until = t[first] + DRIFT_RATIO * (t[first] - t[begin])
         rows = np.arange(begin, np.searchsorted(t, until, "right"))
         rows = rows[np.cumsum(searching[rows]) == 0]
         drift = np.asarray(mean[rows] - mean[rows[-1]], np.float64)
         added[rows] = drift[:, :, None] * drift[:, None, :]
-    return told, added
+    return told, covariance, added
 
 
 @njit_noalloc

@@ -447,7 +447,7 @@ class MotionEstimate(HtmlRepr):
 
     def _bend_between(
         self,
-        at: NDArray[np.floating],
+        at: NDArray,
         times: NDArray[np.int64],
         before: NDArray[np.integer],
         after: NDArray[np.integer],

@@ -254,6 +254,26 @@ class StoredEvents(EventsInFile):
             first, last = (self._times(row, row + 1)[0] for row in (0, len(self) - 1))
         return self._format.clock(int(first) + self._offset, int(last) + self._offset)
 
+    def image_rows(self, rows: slice) -> NDArray[np.uint16] | None:
+        """Read the y of a range of rows; see `recording.ColumnSource`.
+
+        Args:
+            rows: The rows, step 1.
+        """
+        if not self._has_plain_columns():
+            return None
+        with reading(f"{self._source}: events"):
+            return self._y[rows]
+
+    def _has_plain_columns(self) -> bool:
+        """Return whether columns are stored as `columns` reads them."""
+        stored: list[Any] = [self._t, self._x, self._y, self._p]
+        if not all(isinstance(column, h5py.Dataset) for column in stored):
+            return False
+        kinds = [column.dtype for column in stored]
+        known = [[t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)]
+        return kinds in known and self._format[:2] == MICROSECOND_FORMAT[:2]
+
     def columns(self, rows: slice, out: EventColumns | None = None) -> EventColumns | None:
         """Read a range of rows as they are stored; see `recording.ColumnSource`.
 
@@ -264,13 +284,9 @@ class StoredEvents(EventsInFile):
         Returns:
             The columns; None if they are stored as other types.
         """
+        if not self._has_plain_columns():
+            return None
         stored: list[Any] = [self._t, self._x, self._y, self._p]
-        if not all(isinstance(column, h5py.Dataset) for column in stored):
-            return None
-        kinds = [column.dtype for column in stored]
-        known = [[t, np.uint16, np.uint16, np.uint8] for t in (np.int64, np.uint32)]
-        if kinds not in known or self._format[:2] != MICROSECOND_FORMAT[:2]:
-            return None
         start, stop, _ = rows.indices(len(self))
         count, previous = max(stop - start, 0), np.iinfo(np.int64).min
         if out is None or len(out.t) < count:

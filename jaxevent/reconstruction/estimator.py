@@ -185,6 +185,28 @@ class ImageEstimator(Estimator[P]):
             InputError: The recording lacks what the method needs.
         """
 
+    def live(
+        self, size: tuple[int, int], params: P | None = None, *, frames: bool, **options: Any
+    ) -> LiveVideo:
+        """Make images of events that are still to come, which per-pixel methods alone can.
+
+        Args:
+            size: Width and height of the sensor, px.
+            params: Parameters; the defaults if None.
+            frames: Whether frames will come.
+            **options: Options of the method.
+
+        Returns:
+            The images, to which events are added.
+
+        Raises:
+            InputError: The method takes whole recordings.
+        """
+        raise InputError(
+            f"the method {self.name!r} takes whole recordings; use akf, cf or high-pass for events "
+            "that are still to come"
+        )
+
     def prepare_images(
         self,
         recording: Recording,

@@ -259,16 +259,37 @@ def test_what_passes_behind_something_goes_on():
     other = dataclasses.replace(
         other, t=t + 72_000, p=other.p + back[::-1, None] * [1, 0], C=C[::-1], n=30 * share[::-1]
     )
-    assert len(stitch_paths([one, other], (400, 100))) == 1
+    assert len(stitch_paths([one, other], (400, 100), 110)) == 1
     aside = dataclasses.replace(other, p=other.p + [0.0, 30.0])
-    assert len(stitch_paths([one, aside], (400, 100))) == 2
+    assert len(stitch_paths([one, aside], (400, 100), 110)) == 2
     # Never of its usual size and events at once.
     odd = np.arange(30) % 2 > 0
     C = np.where(odd[:, None, None], 1.0, 36.0) * np.eye(2)
     one = dataclasses.replace(_path(t, 20 + 2e-3 * t, 50.0, 6.0, 30), C=C, n=np.where(odd, 30.0, 1))
-    assert (
-        len(stitch_paths([one, _path(t + 31_000, 82 + 2e-3 * t, 50.0, 6.0, 30)], (400, 100))) == 1
-    )
+    later = _path(t + 31_000, 82 + 2e-3 * t, 50.0, 6.0, 30)
+    assert len(stitch_paths([one, later], (400, 100), 110)) == 1
+
+
+def test_what_leaves_does_not_go_on_as_another_that_was_there_before():
+    """A ball leaves by the lower edge beside an arm that is there all the time."""
+    t = np.arange(0, 60_000, 1000)
+    ball, arm = _path(t[:20], 60.0, 20 + 4e-3 * t[:20], 6.0, 30), _path(t, 62.0, 90.0, 6.0, 30)
+    assert len(stitch_paths([ball, arm], (120, 100), 60)) == 2
+    for gap, number in ((2, 1), (30, 2)):  # windows; silence beyond the edge is no evidence
+        other = _path(t[:20] + 20_000 + 1000 * gap, 60.0, 98.0, 6.0, 30)
+        assert len(stitch_paths([ball, other], (120, 100), 60)) == number
+
+
+def test_two_in_contact_that_go_their_own_ways_are_two():
+    t = np.arange(0, 60_000, 1000)
+    x, swing = 20 + 1.5e-3 * t, 5 * np.sin(t / 4e3)
+    one, other, rigid = (_path(t, x, 30 + y, 3.0, 10) for y in (swing, 8 - swing, 8 + swing))
+    moving = [
+        dataclasses.replace(path, v=np.gradient(path.p, t * 1e-6, axis=0))
+        for path in (one, other, rigid)
+    ]
+    assert len(merge_parts([moving[0], moving[1]])) == 2
+    assert len(merge_parts([moving[0], moving[2]])) == 1
 
 
 @pytest.mark.slow

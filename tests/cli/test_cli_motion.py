@@ -473,7 +473,6 @@ def test_without_matplotlib_the_tables_are_written(folder, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "argv",
     [
-        ["motion", "a", "--model", "planar"],
         ["motion", "a", "--model", "planar", "--out", "b", "--still", "1"],
         ["motion", "a", "--model", "planar", "--out", "b", "--seed", "x"],
         ["simulate", "--motion", "wall", "--scene", "lake", "--out", "b"],

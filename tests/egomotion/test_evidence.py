@@ -120,11 +120,12 @@ def test_a_search_and_a_pause_begin_anew():
 
 def test_earlier_estimates_are_told_where_they_agree():
     mean = np.array([[0.0], [9.0], [1.0], [1.1], [1.0]])
-    told, drift = tell_from_later(
+    told, covariance, drift = tell_from_later(
         np.arange(5) * 1000, mean, np.full((5, 1, 1), 0.1), np.zeros(5, bool),
         np.array([False, False, False, False, True]), lambda m: np.zeros(1),
     )  # fmt: skip
     assert told.tolist() == [False, False, True, True, True]
+    np.testing.assert_allclose(covariance[:, 0, 0], [0.1, 0.1, 0.1, 0.11, 0.1])
     np.testing.assert_allclose(drift[told, 0, 0], [0, 0.01, 0])
 
 
@@ -133,7 +134,7 @@ def test_a_motion_that_was_just_told_drifts_on():
     mean = np.array([9.0, 3, 3, 2.5, 2, 1.5, 1.2, 1, 1, 1])[:, None]
     searching = np.arange(10) == 0
     told = np.arange(10) >= 3
-    found, drift = tell_from_later(
+    found, _, drift = tell_from_later(
         np.arange(10) * 1000, mean, np.full((10, 1, 1), 0.1), searching, told,
         lambda m: np.full(1, 9.0),
     )  # fmt: skip

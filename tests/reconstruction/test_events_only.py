@@ -1,5 +1,6 @@
 """Video from events alone: by the contract, against its own JAX path, differences and truth."""
 
+import dataclasses
 import functools
 import pickle
 
@@ -12,7 +13,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import jaxevent
 from jaxevent.reconstruction.events_only.gradient import sample_variance, solve_equations
-from jaxevent.recording import Recording
+from jaxevent.recording import Frames, Recording
 
 events_only = jaxevent.events_only
 SIZE = (24, 32)  # height, width
@@ -80,6 +81,36 @@ def test_images_are_those_of_the_scene_up_to_scale():
     assert (causal(0.19).mean != video(0.19).mean).any()
 
 
+def with_frames(stamps: list[float], seen: list[float], gain: float = 1.0) -> Recording:
+    """Give the recording frames of what was seen at some times (s), F = 0.6 L - 1, and stamps."""
+    images = np.stack([gain * (np.exp(0.6 * log_image(t) - 1) - 0.02) for t in seen])
+    images = images.clip(0, 1).astype(np.float32)
+    frames = Frames(
+        np.rint(np.multiply(stamps, 1e6)).astype(np.int64), images, np.zeros_like(stamps, np.int64)
+    )
+    return dataclasses.replace(translated(), frames=frames)
+
+
+def test_one_frame_gives_the_scale_whatever_its_clock():
+    params = PLAIN.replace(c_on=C_ON, c_off=C_OFF, window=1.0, use_frames=True)
+    inner = np.s_[0, 3:-3, 3:-3]
+
+    def image(recording, **changes):
+        video = events_only.estimate(recording, params.replace(**changes), motion=EvenFlow())
+        return np.log(video(0.2).mean + float(params.I0))
+
+    truth = 0.6 * log_image(0.2)[None] - 1
+    for stamp in (0.15, 0.17, 0.13):
+        found = image(with_frames([stamp], [0.15]))
+        assert np.sqrt(np.mean((found - truth)[inner] ** 2)) < 0.16
+        assert correlation(found[0], truth[0]) > 0.97
+    # Frames without an unclipped pixel leave the image as it is.
+    clipped, none = with_frames([0.1, 0.2], [0.1, 0.2], 1e6), image(translated())
+    np.testing.assert_array_equal(image(clipped), none)
+    np.testing.assert_array_equal(image(with_frames([0.15], [0.15]), use_frames=False), none)
+    assert np.sqrt(np.mean((none - truth)[inner] ** 2)) > 0.5
+
+
 def test_images_do_not_depend_on_order_time_or_copies():
     times = np.array([80_000, 200_000, 140_000])
     video = events_only.estimate(translated())
@@ -93,12 +124,16 @@ def test_images_do_not_depend_on_order_time_or_copies():
 
 
 def test_jax_makes_the_images_of_the_host():
+    """For a batch of parameters at once."""
     host = events_only.estimate(translated())(0.15)
     with jax.enable_x64(False):
         images = events_only.prepare_images(translated(), [0.15])
-        made = jax.jit(lambda params, images: images(params))(events_only.Params(), images)
-    np.testing.assert_allclose(made.mean.reshape(SIZE), host.mean[0], rtol=2e-3)
-    assert 0.5 < np.median(made.covariance.reshape(SIZE) / host.covariance[0]) < 2
+        leaks = jnp.array([float(events_only.Params().leak), 0.1], jnp.float32)
+        made = jax.jit(jax.vmap(lambda v: images(events_only.Params(leak=v))))(leaks)
+    means = made.mean.reshape(2, *SIZE)
+    np.testing.assert_allclose(means[0], host.mean[0], rtol=2e-3)
+    assert np.log(means[1]).std() < 0.5 * np.log(means[0]).std()  # what leaks fades
+    assert 0.5 < np.median(made.covariance[0].reshape(SIZE) / host.covariance[0]) < 2
 
 
 def test_derivatives_are_differences():
@@ -161,3 +196,5 @@ def test_wrong_calls_end_in_a_sentence(tmp_path, capsys):
         events_only.prepare(translated(), [])
     with pytest.raises(jaxevent.InputError, match="has no option 'refine'"):
         events_only.estimate(translated(), refine=True)
+    with pytest.raises(jaxevent.InputError, match="'events-only' takes whole recordings"):
+        events_only.live((32, 24), frames=False)

@@ -73,6 +73,18 @@ class SearchConfig(NamedTuple):
     )
     min_noise_windows: int = 4  # windows from which the velocity noise is fitted
 
+    # Likelihoods of one target or two
+    stop_probability: float = 0.03  # of falling silent, per window
+    start_probability: float = 0.02  # of going on, per window
+    end_probability: float = 1e-3  # of an end inside the sensor, per window
+    new_target_volume: float = 90.0  # ln rate times ln area over which new targets spread
+    rate_change: float = 1.0  # standard deviation of ln rate from window to window
+    area_change: float = 0.5  # and of ln area
+    log_bayes_factor: float = 3.0  # nats from which one hypothesis is taken
+    slide_share: float = 0.15  # of its way, by which parts of an object slide along its edges
+    part_error_sizes: float = 0.15  # sizes; error of the middle of a part that is seen by turns
+    max_pair_rows: int = 64  # rows of paths on which one object or two is decided
+
     # Passes over the recording, and their paths
     max_passes: int = 4
     min_recording_events: int = 100
@@ -84,11 +96,7 @@ class SearchConfig(NamedTuple):
     persistent_share: float = 0.5  # share of a path's windows in which the target is seen
     velocity_windows: int = 8  # windows from which the velocity at an end of a path is measured
     max_leap_sizes: float = 6.0  # sizes from its fitted way at which a path's row is no beginning
-    stitch_distance: float = 1.5  # contact distance of one path's end and the next one's beginning
-    stitch_windows: int = 96  # windows between the two at most; or, for a target at rest,
-    stitch_lives: float = 2.0  # lives of the shorter path
     whole_share: float = 0.8  # share of its median size and events at which a target is seen whole
-    edge_sizes: float = 2.0  # sizes from the sensor's edge where targets enter and leave
     duplicate_share: float = 0.5  # share of a path near one of an earlier pass: a duplicate
 
     # Parts of one object

@@ -13,7 +13,7 @@ and if what is bright in that map is connected: birds that circle alike turn as 
 
 import copy
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,11 @@ from jaxevent.blob.search.background import (
     look_up,
 )
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import contact_distance, larger_variance
+from jaxevent.blob.search.detection import larger_variance
 from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
 from jaxevent.blob.search.scene import map_gain, measure_moving_background
 from jaxevent.blob.search.stream import Stream
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
 N_ANGLE_BINS, RING_WIDTH_PX = 256, FINE_CELL_PX  # bins of a turn, and px of a ring
 ANGLE_BLUR_BINS = 1.5
@@ -77,7 +78,70 @@ def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
     changed, way = np.ptp(np.quantile(apart, (0.02, 0.98))), CONFIG.common_way_sizes
     if not near:
         return bool(far > way * large and changed < CONFIG.rigid_change * far)
+    both = [_interpolate(path, t) for path in (one, other)]
+    if not edge and _separate_nats(both) > CONFIG.log_bayes_factor:
+        return False
     return bool(far > way * small and changed < max(large, far if edge else far / 2))
+
+
+@njit_noalloc
+def _rigid_nats(rows: Any) -> float:
+    """Compute nats for one rigid object against two that go their own ways.
+
+    The difference of its parts stays, or their distance where it turns, which is less likely
+    beforehand; they slide along edges by a share of the way. The velocity of two objects relative
+    to each other is as large as their own velocities, and changes as much.
+
+    Args:
+        rows: (n, 10) time, variance of the difference, both places, and both velocities.
+    """
+    slide = CONFIG.slide_share
+    moves = _log_ratio(rows, 0, slide) + _log_ratio(rows, 1, slide)
+    return max(moves, _log_ratio(rows, 2, slide / 3) - CONFIG.log_bayes_factor)
+
+
+@njit_noalloc_inlined
+def _log_ratio(rows: Any, axis: int, slide: float) -> float:
+    """Compute nats for a difference of places that stays: in x, y or the distance."""
+    return _log_likelihood(rows, axis, slide) - _log_likelihood(rows, axis, 1.0)
+
+
+@njit_noalloc_inlined
+def _difference(rows: Any, k: int, axis: int) -> float:
+    """Return the difference of both places in x or y, or their distance."""
+    x, y = rows[k, 4] - rows[k, 2], rows[k, 5] - rows[k, 3]
+    return x if axis == 0 else (y if axis == 1 else np.sqrt(x * x + y * y))
+
+
+@njit_noalloc_inlined
+def _log_likelihood(rows: Any, axis: int, share: float) -> float:
+    """Compute the log likelihood of a difference whose velocity is a share of both velocities."""
+    c = 0.0
+    for i in range(6, 10):
+        c += (share * rows[0, i]) ** 2 / 2
+    mean, rate, a, b, total = _difference(rows, 0, axis), 0.0, rows[0, 1], 0.0, 0.0
+    for k in range(1, len(rows)):
+        dt, R, change = rows[k, 0] - rows[k - 1, 0], rows[k, 1], 0.0
+        for i in range(6, 10):
+            change += (share * (rows[k, i] - rows[k - 1, i])) ** 2 / 2
+        mean += rate * dt
+        a, b = a + 2 * b * dt + c * dt * dt, b + c * dt
+        S = a + R
+        e = _difference(rows, k, axis) - mean
+        total -= 0.5 * (min(e * e / S, CONFIG.max_squared_innovation) + np.log(S))
+        mean, rate = mean + a / S * e, rate + b / S * e
+        c += change - b * b / S
+        a, b = a * R / S, b * R / S
+    return total
+
+
+def _separate_nats(rows: list[TargetPath]) -> float:
+    """Compute nats for two objects against a rigid one, of paths at the same times."""
+    rows = [path.take(slice(None, None, -(-len(path.t) // CONFIG.max_pair_rows))) for path in rows]
+    error = CONFIG.part_error_sizes**2
+    variance = sum(larger_variance(path.C) * (1 / np.maximum(path.n, 2) + error) for path in rows)
+    columns = [column for name in "pv" for path in rows for column in getattr(path, name).T]
+    return -_rigid_nats(np.stack([rows[0].t * 1e-6, variance, *columns], 1))
 
 
 def _is_edge(one: TargetPath, other: TargetPath) -> bool:
@@ -133,53 +197,74 @@ def _interpolate(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:
     )
 
 
-def stitch_paths(paths: list[TargetPath], size: tuple[int, int]) -> list[TargetPath]:
-    """Join each path to a later one that begins where it ended, at rest or carried on.
+def stitch_paths(
+    paths: list[TargetPath], size: tuple[int, int], windows: float | int
+) -> list[TargetPath]:
+    """Join each path to a later one that is likelier its continuation than a new target.
 
     Args:
         paths: Paths of targets.
         size: Width and height of the sensor, px.
+        windows: Windows of the recording.
     """
     paths, done = sorted(paths, key=lambda path: path.begin), []
     while paths:
         one = paths.pop(0)
         while True:
-            following = [(_stitch_distance(one, other, size), k) for k, other in enumerate(paths)]
-            distance, k = min(following, default=(np.inf, -1))
-            if distance >= CONFIG.stitch_distance:
+            nats = [
+                (_continuation_evidence(one, two, size, windows), k) for k, two in enumerate(paths)
+            ]
+            most, k = max(nats, default=(-np.inf, -1))
+            if most < CONFIG.log_bayes_factor:
                 break
-            one = one.followed_by(_without_overlap(one, paths.pop(k)))
+            one = one.followed_by(paths.pop(k))
         done.append(one)
     return done
 
 
-def _stitch_distance(one: TargetPath, other: TargetPath, size: tuple[int, int]) -> float:
-    """Return the contact distance of a path's beginning from another's end; inf: not in time."""
-    other = _without_overlap(one, other)
-    pause, longest = int(other.t[0] - one.t[-1]), CONFIG.stitch_windows * one.window
-    lives = CONFIG.stitch_lives * min(one.end - one.begin, other.end - other.begin)
-    if one.window != other.window or not 0 < pause <= max(min(longest, 2 * lives), lives):
-        return np.inf
-    margin = CONFIG.edge_sizes * max(one.size[-1, 0], other.size[0, 0])
-    at_edge = (one.p[-1] < margin) | (one.p[-1] > np.array(size) - 1 - margin)
-    if at_edge.any() and pause > 2 * one.window:
-        return np.inf
-    ends = [(one.p[-1], other.p[0])]
-    if pause <= longest:
-        rows = CONFIG.velocity_windows
-        # In the middle between both: so a bend does not matter.
-        half = pause * 0.5e-6
-        before, after = one.mean_velocity(slice(-rows, None)), other.mean_velocity(slice(0, rows))
-        ends += [(one.p[-1] + 2 * half * before, other.p[0])]
-        ends += [(one.p[-1] + half * before, other.p[0] - half * after)]
-        # Where it goes behind something and comes out it is seen in part.
-        last, first = _whole_rows(one)[-1], _whole_rows(other)[0]
-        half = (other.t[first] - one.t[last]) * 0.5e-6
+def _continuation_evidence(
+    one: TargetPath, other: TargetPath, size: tuple[int, int], windows: float | int
+) -> float:
+    """Compute nats for a path's beginning as another one's continuation, against a new target."""
+    pause = int(other.t[0] - one.t[-1])
+    if one.window != other.window or pause <= 0:
+        return -np.inf
+    rows, gap = CONFIG.velocity_windows, pause / one.window
+    square = float(np.mean([np.median(larger_variance(path.C)) for path in (one, other)]))
+    few = min(float(np.median(path.n)) for path in (one, other))
+    whole = [_whole_rows(path) for path in (one, other)]
+    nats = -np.inf
+    # At rest, or carried on to the middle of the pause, so that a bend does not matter. Where it
+    # goes behind something and comes out it is seen in part.
+    for last, first in ((len(one.t) - 1, 0), (whole[0][-1], whole[1][0])):
         before = one.mean_velocity(slice(max(last - rows, 0), last + 1))
         after = other.mean_velocity(slice(first, first + rows + 1))
-        ends += [(one.p[last] + half * before, other.p[first] - half * after)]
-    C = [np.median(path.C, 0) for path in (one, other)]
-    return min(float(contact_distance(p, C[0], q, C[1])) for p, q in ends)
+        half = (other.t[first] - one.t[last]) * 0.5e-6
+        e = other.p[first] - half * after - one.p[last] - half * before
+        # Velocities of both ends, each from means of so many windows.
+        wide = square * (1 + 6 * gap**2 / rows**3 * (1 / few + CONFIG.mean_error_sizes**2))
+        nats = max(nats, -e @ e / 2 / wide - np.log(2 * np.pi * wide))
+    e = other.p[0] - one.p[-1]
+    nats = max(nats, -e @ e / 2 / square - np.log(2 * np.pi * square))
+    for spread, values in (
+        (CONFIG.rate_change, [np.median(path.n) for path in (one, other)]),
+        (CONFIG.area_change, [np.median(path.size.prod(1)) for path in (one, other)]),
+    ):
+        change = np.log(values[1] / values[0])
+        nats -= change**2 / 2 / spread**2 + 0.5 * np.log(2 * np.pi * spread**2)
+    inside = min(
+        _inside_share(one.p[-1], one.C[-1], size), _inside_share(other.p[0], other.C[0], size)
+    )
+    nats += np.log(CONFIG.stop_probability)
+    nats += gap * np.log((1 - CONFIG.start_probability) * (1 - CONFIG.end_probability))
+    nats += (gap - 1) * np.log(max(inside, 1e-9))
+    return float(nats + np.log(size[0] * size[1] * windows * CONFIG.new_target_volume))
+
+
+def _inside_share(p: NDArray, C: NDArray, size: tuple[int, int]) -> float:
+    """Return about the share of a target inside the sensor."""
+    away = np.minimum(p + 0.5, np.array(size) - 0.5 - p) / np.sqrt(np.diagonal(C))
+    return float(np.clip(0.5 + 0.4 * away, 0, 1).prod())
 
 
 def _whole_rows(path: TargetPath) -> NDArray[np.int64]:
@@ -187,12 +272,6 @@ def _whole_rows(path: TargetPath) -> NDArray[np.int64]:
     size, share = path.size[:, 0], CONFIG.whole_share
     whole = (path.n >= share * np.median(path.n)) & (size >= share * np.median(size))
     return np.flatnonzero(whole) if whole.any() else np.arange(len(size))
-
-
-def _without_overlap(one: TargetPath, other: TargetPath) -> TargetPath:
-    """Drop rows of another path before one's end, if most rows stay."""
-    rest = other.t > one.t[-1]
-    return other if rest.mean() < CONFIG.persistent_share else other.take(rest)
 
 
 class Turn(NamedTuple):
@@ -227,7 +306,7 @@ def merge_turning(
         ]
         # An object is seen whole, not at many sides of the sensor.
         sides = sum(bool(s.any()) for s in (there[0], there[-1], there[:, 0], there[:, -1]))
-        if not pieces or sides >= CONFIG.min_sides:
+        if not pieces or sides >= CONFIG.min_sides or len(pieces) < 2:
             continue
         whole = _turning_path(pieces, _events_within(stream, there), background)
         if whole is not None:

@@ -296,8 +296,9 @@ def find(
         events += rate * stream.width * stream.height * one.stream.duration
         moves |= one.background.scene is not None
         full |= is_dense(one.background)
-    if len(sections) > 1:
-        found = stitch_paths(found, (stream.width, stream.height))
+    if len(sections) > 1 and found:
+        windows = 1e6 * stream.duration / found[0].window
+        found = stitch_paths(found, (stream.width, stream.height), windows)
     found, lamps = drop_lamps(found, recording, hot)
     found = prefer_sharper(found, recording, hot)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
@@ -372,7 +373,7 @@ def _search_section(
         if background.scene is not None:
             whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]
-        new = stitch_paths(lasting, size)
+        new = stitch_paths(lasting, size, stream.duration / selection.scale.window)
         new = [one for one in new if not _is_duplicate(one, found)]
         passes.append(SearchPass(selection, len(new)))
         found += new

@@ -471,11 +471,11 @@ class ChunkRunner:
         drift, longest = np.zeros_like(motion.covariance), float(self.params.tau_max)
         if self.lock is not None:
             searching = np.concatenate([info.searching for _, info, _ in parts])
-            valid, drift = tell_from_later(
+            valid, covariance, drift = tell_from_later(
                 motion.t, motion.mean, motion.covariance, searching, motion.valid,
                 self.lock.diffusion,
             )  # fmt: skip
-            motion = dataclasses.replace(motion, valid=valid)
+            motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
         drift = dataclasses.replace(motion, covariance=drift)._with_gaps(longest).covariance
         motion = motion._with_gaps(longest)
         span = 2 * motion.lag

@@ -7,6 +7,7 @@ All numbers of a pixel lie at the same place of arrays of `stride` numbers, one 
 
 import dataclasses
 import sys
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ NEVER_US = 1 << 45  # us, longer than any recording and within an event's bits
 # beside them the smaller bands are a tenth faster.
 BAND_STRIDES = (8208, 16400, 32784, 65488)
 BAND_STRIDES_WITH_DERIVATIVES = (4112, *BAND_STRIDES)
+N_BLOCK_EVENTS = 1 << 18  # of a file, read and divided at once
+N_ROWS = 1 << 16  # that a y of 16 bits can name
 MIN_BAND_ROWS = 6  # the two rows of a border are read for nothing
 MAX_WINDOW_FRAME_PIXELS = 1 << 26  # of a window's frames, as they are stored
 MAX_PASS_PIXELS = 1 << 22  # made in one pass, 9 bytes each
@@ -141,7 +144,8 @@ class BandLayout:
 
     def partition(
         self,
-        stored: EventColumns,
+        blocks: Iterable[EventColumns],
+        counts: NDArray[np.int64],
         weight: NDArray,
         width: int,
         origin_us: int,
@@ -152,7 +156,8 @@ class BandLayout:
         Every event is given to each band that it lies in or borders on.
 
         Args:
-            stored: The events, which are checked.
+            blocks: The events in order, which are checked.
+            counts: Number of events of each y.
             weight: Events that each one stands for; empty: one.
             width: Width of the sensor, px.
             origin_us: Time from which to count, us.
@@ -161,13 +166,7 @@ class BandLayout:
         Returns:
             The bands, or None if the events are not in order or not on the sensor.
         """
-        origin_us, height = origin_us - stored.offset, int(self.edges[-1])
-        if len(stored.t) and (
-            stored.t[0] < origin_us - NEVER_US or stored.t[-1] > origin_us + NEVER_US
-        ):
-            return None
-        counts = np.zeros(1 << 16, np.int64)
-        _count_rows(stored.y, counts)
+        height = int(self.edges[-1])
         if counts[height:].any():
             return None
         before = np.concatenate([[0], np.cumsum(counts[:height])])
@@ -177,10 +176,16 @@ class BandLayout:
         events = out_events if len(out_events) >= total else np.empty(total + total // 4, np.int64)
         weights = np.empty(total if len(weight) else 0, weight.dtype)
         bands = EventBands(events, weights, first, self.edges, width, self.stride)
-        in_order = _partition(
-            stored, weight, self._rows(width), origin_us, first.astype(np.uint64), bands
-        )
-        return bands if in_order else None
+        at, rows, done = first.astype(np.uint64), self._rows(width), 0
+        for stored in blocks:
+            t, since_us = stored.t, origin_us - stored.offset
+            if len(t) and (t[0] < since_us - NEVER_US or t[-1] > since_us + NEVER_US):
+                return None
+            weight_of_block = weight[done : done + len(t)]
+            if not _partition(stored, weight_of_block, rows, since_us, at, bands):
+                return None
+            done += len(t)
+        return bands
 
     def _rows(self, width: int) -> "_Rows":
         height, padded = int(self.edges[-1]), width + 2
@@ -333,8 +338,7 @@ class PartitionedRecording:
         weight = np.empty(0, self.dtype)
         plain = state.context_last is None and self._factors is None
         if plain and isinstance(source, ColumnSource):
-            self._stored = source.columns(slice(begin_row, end_row), self._stored)
-            bands = None if self._stored is None else self._bands_of(self._stored, weight)
+            bands = self._bands_of_source(source, begin_row, end_row)
             if bands is not None:
                 return bands, state
         events = source[begin_row:end_row]  # raises `InputError` for what is not valid
@@ -351,16 +355,43 @@ class PartitionedRecording:
             weight = (factors * weight if len(weight) else factors).astype(self.dtype)
         earliest = np.iinfo(np.int64).min
         checked = EventColumns(events.t, events.x, events.y, events.p.view(np.uint8), 0, earliest)
-        bands = self._bands_of(checked, weight)
+        counts = np.zeros(N_ROWS, np.int64)
+        _count_rows(events.y, counts)
+        bands = self._bands_of([checked], counts, weight)
         if bands is None:  # somebody changed arrays after they were checked
             name = self.recording.name
             events.check(self.recording.width, self.recording.height, name, begin_row)
             raise InputError(f"{name}: events changed while they were read; make a new recording")
         return bands, state
 
-    def _bands_of(self, stored: EventColumns, weight: NDArray) -> EventBands | None:
+    def _bands_of_source(
+        self, source: ColumnSource, begin_row: int, end_row: int
+    ) -> EventBands | None:
+        """Divide events block by block, each of which stays in the cache: 5 M would fill 65 MB."""
+        steps = range(begin_row, end_row, N_BLOCK_EVENTS)
+        blocks = [slice(row, min(row + N_BLOCK_EVENTS, end_row)) for row in steps]
+        counts = np.zeros(N_ROWS, np.int64)
+        for rows in blocks:
+            y = source.image_rows(rows)
+            if y is None:
+                return None
+            _count_rows(y, counts)
+
+        def read() -> Iterator[EventColumns]:
+            for rows in blocks:
+                stored = source.columns(rows, self._stored)
+                assert stored is not None
+                if self._stored is None or len(stored.t) > len(self._stored.t):
+                    self._stored = stored
+                yield stored
+
+        return self._bands_of(read(), counts, np.empty(0, self.dtype))
+
+    def _bands_of(
+        self, blocks: Iterable[EventColumns], counts: NDArray[np.int64], weight: NDArray
+    ) -> EventBands | None:
         width = self.recording.width
-        bands = self.layout.partition(stored, weight, width, self.origin, self._events)
+        bands = self.layout.partition(blocks, counts, weight, width, self.origin, self._events)
         if bands is not None:
             self._events = bands.events
         return bands
