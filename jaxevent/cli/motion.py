@@ -44,7 +44,7 @@ def add(commands: Any) -> None:
         "--params",
         metavar="FILE",
         type=Path,
-        help="TOML file of name = value lines, e.g. particles = 400, or params.toml of a fit",
+        help="TOML file, e.g. of particles = 400, or params.toml of a fit",
     )
     one.add_argument("--seed", metavar="N", type=int, default=0, help="seed of random numbers")
     _add_known(one)
@@ -75,8 +75,8 @@ def add(commands: Any) -> None:
         "--focal",
         metavar="PX",
         type=float,
-        help="focal length in px, for a recording without calibration; the principal point is "
-        "the sensor's centre, and sigmas of rotations count 5 %% of them for its error",
+        help="focal length in px where there is no calibration, about the sensor's centre; sigmas "
+        "of rotations count 5 %% of them for its error",
     )
     arguments.add_live(one, "rows of motion.csv, as with --causal,")
     arguments.add_reading(one)

@@ -112,7 +112,7 @@ def test_what_reconstruct_writes_scores_as_the_method_itself(folder, float32):
     row = subset(score(small(), METHODS["blend"]), [0, 1])  # the third is after the last frame
     base = ["reconstruct", str(folder / "given.h5"), "--method", "blend", "--rate", "1000"]
     assert cli.main([*base, "--out", str(folder / "small-images.h5")]) == 0
-    assert cli.main([*base, "--out", str(folder / "small")]) == 0
+    assert cli.main([*base, "--out", str(folder / "small"), "--tone", "linear"]) == 0
     config = write_config(
         folder,
         EXTERNAL.replace("e2vid/{recording}", "{recording}-images.h5")
