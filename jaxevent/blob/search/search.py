@@ -91,7 +91,7 @@ class TargetSearchResult:
 
     @property
     def compact(self) -> bool:
-        """Whether no ellipse of twice a target's sizes covers a quarter of the sensor."""
+        """True if no ellipse of twice a target's sizes covers a quarter of the sensor."""
         quarter = CONFIG.max_compact_share * self.recording.width * self.recording.height
         areas = [4 * np.pi * float(np.median(path.size.prod(1))) for path in self.paths]
         return max(areas, default=0.0) < quarter
