@@ -280,6 +280,15 @@ def test_what_leaves_does_not_go_on_as_another_that_was_there_before():
         assert len(stitch_paths([ball, other], (120, 100), 60)) == number
 
 
+def test_a_target_over_a_quarter_of_the_sensor_is_not_compact():
+    recording, _ = scene([Target(LinearMotion((60, 40)), 1e3)], 0.1)
+    for size, compact in ((10.0, True), (40.0, False)):
+        found = TargetSearchResult(
+            (_path(np.arange(3) * 1000, 60.0, 40.0, size, 9),), (), 0, 0.0, recording
+        )
+        assert found.compact == compact and found.score == 0
+
+
 def test_two_in_contact_that_go_their_own_ways_are_two():
     t = np.arange(0, 60_000, 1000)
     x, swing = 20 + 1.5e-3 * t, 5 * np.sin(t / 4e3)

@@ -86,6 +86,7 @@ class SearchConfig(NamedTuple):
     max_pair_rows: int = 64  # rows of paths on which one object or two is decided
 
     # Passes over the recording, and their paths
+    max_compact_share: float = 0.25  # share of the sensor that a compact target covers at most
     max_passes: int = 4
     min_recording_events: int = 100
     min_gain: float = 0.05  # nats per event from which a pass is made,

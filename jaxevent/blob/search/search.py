@@ -84,6 +84,18 @@ class TargetSearchResult:
     def __repr__(self) -> str:
         return f"<{self.summary()}>"
 
+    @property
+    def score(self) -> float:
+        """Largest gain of blobs over the background alone, in nats per event; 0 without any."""
+        return max((one.selection.score for one in self.passes), default=0.0)
+
+    @property
+    def compact(self) -> bool:
+        """True if no ellipse of twice a target's sizes covers a quarter of the sensor."""
+        quarter = CONFIG.max_compact_share * self.recording.width * self.recording.height
+        areas = [4 * np.pi * float(np.median(path.size.prod(1))) for path in self.paths]
+        return max(areas, default=0.0) < quarter
+
     def summary(self) -> str:
         """Summarise the result in one line."""
         text = f"{len(self)} {plural('target', len(self))}, "
