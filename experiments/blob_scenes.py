@@ -733,7 +733,7 @@ def _thirty(seed: int) -> tuple[Recording, BlobTruth]:
 def _hand(seed: int) -> tuple[Recording, BlobTruth]:
     """The outline of a hand of 100 px waves before the camera."""
     rng = np.random.default_rng([seed, 191])
-    points = [(-25, 45), (-28, 0)]
+    points: list[tuple[float, float]] = [(-25, 45), (-28, 0)]
     for k in range(4):
         x = -28 + 14 * k
         points += [(x, -rng.uniform(35, 55)), (x + 9, -rng.uniform(35, 55)), (x + 11, 0)]
