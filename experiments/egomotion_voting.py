@@ -472,10 +472,11 @@ def score_voting(
     runner, parts = voting.make_runner(recording, params, model=model, seed=seed), []
     while not runner.sampler.is_exhausted:
         parts.append(runner.run())
-    rows = {}
+    causal = runner.causal_motion(parts).with_recording(recording)
+    causal, rows = causal._with_gaps(float(params.tau_max)), {}
     for prefix, motion in (
         ("", runner.motion(parts)),
-        ("causal ", runner.causal_motion(parts).with_recording(recording)),
+        ("causal ", causal),
     ):
         told = doubt.include_doubt(motion) if doubt else motion
         if name == "focal 10 % wrong":

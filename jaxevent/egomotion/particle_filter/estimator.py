@@ -283,7 +283,7 @@ class VotingEstimator(MotionEstimator[Params]):
         lock = self._make_lock(recording, params, kind, sampler, camera)
         kernel = self._kernel(params, kind, compiler, events)
         camera = camera or recording.camera
-        return ChunkRunner(params, kind, sampler, kernel, lock, camera, seed)
+        return ChunkRunner(params, kind, sampler, kernel, lock, camera=camera, seed=seed)
 
     def live(
         self,
@@ -431,6 +431,7 @@ class ChunkRunner:
         sampler: CandidateSampler,
         kernel: CompiledFilter | None,
         lock: Lock | None,
+        *,
         camera: PinholeCamera | None,
         seed: int,
     ):
