@@ -61,6 +61,7 @@ def test_rows_are_divided_among_new_threads(monkeypatch):
         np.testing.assert_array_equal(out, np.arange(64))
 
 
+@pytest.mark.slow
 def test_tracks():
     recording = texture.moving()[0.0:0.08]
     times = np.linspace(10_000, 70_000, 5).astype(int)

@@ -101,6 +101,7 @@ def test_bad_input(path, recording, tmp_path, capsys):
     assert "not identifiable" in next(line for line in out.splitlines() if "clock_offset" in line)
 
 
+@pytest.mark.slow
 def test_reconstruct_calibrates(path, recording, tmp_path, capsys):
     out = tmp_path / "out.h5"
     words = ("reconstruct", path, "--method", "akf", "--at", "frames", "--out", out, "--force")
@@ -159,6 +160,7 @@ def test_faults_are_reported(path, tmp_path, capsys, monkeypatch):
     assert error.splitlines() == [f"jaxevent: warning: {path}: {fault}" for fault in faults]
 
 
+@pytest.mark.slow
 def test_evaluations_calibrate_by_the_frames_given(path, recording, tmp_path, capsys):
     config = tmp_path / "run.toml"
     config.write_text(

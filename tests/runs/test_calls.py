@@ -292,6 +292,7 @@ def dot() -> tuple[Recording, pd.DataFrame]:
     return recording[:0.05], pd.DataFrame({"t": t, "x": x, "y": y})
 
 
+@pytest.mark.slow
 def test_tracks_of_objects(dot, tmp_path):
     recording, table = dot
 
@@ -366,6 +367,7 @@ params = { c_off = 0.2 }
 """
 
 
+@pytest.mark.slow
 def test_fits_of_objects(tmp_path):
     edi = METHODS["edi"]
     jaxevent.save(small(), tmp_path / "small.h5")
