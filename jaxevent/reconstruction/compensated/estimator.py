@@ -196,7 +196,7 @@ def make_instant_schedule(
     return InstantSchedule(frames, (first, last), speed, motion_clock)
 
 
-class MotionEstimate(NamedTuple):
+class NodeMotion(NamedTuple):
     """The motion of a target's points."""
 
     instants: TargetInstants
@@ -215,7 +215,7 @@ class MotionEstimate(NamedTuple):
 class Anchor(NamedTuple):
     """A target whose motion was sought from nothing, and its image."""
 
-    motion: MotionEstimate  # at full resolution
+    motion: NodeMotion  # at full resolution
     L: NDArray[np.float32]  # (h, w), ln I
     P: NDArray[np.float32]  # (h, w), its variance
     is_steady: bool  # no smooth part was subtracted from L
@@ -360,7 +360,7 @@ class TrajectoryEstimator:
         beside = place + (1 if t >= times[place] else -1)
         return [times[n] for n in (place, beside) if 0 <= n < count]
 
-    def _seek_motion(self, at: int) -> MotionEstimate:
+    def _seek_motion(self, at: int) -> NodeMotion:
         """Seek the motion of the target at a time (us) from nothing, at half resolution."""
         instants = self.schedule(at)
         L, V, clear, _ = self._images(instants)
@@ -371,9 +371,9 @@ class TrajectoryEstimator:
         if other is not None:
             images, several = PackedImages.of(pyramid[1], instants.s), (p, other.carry(instants))
             p = choose_trajectories(images, several, self._cost, (1.0, doubt))
-        return self._improve(pyramid[1], MotionEstimate(instants, p))
+        return self._improve(pyramid[1], NodeMotion(instants, p))
 
-    def _motion_of_frames(self, t: int) -> MotionEstimate | None:
+    def _motion_of_frames(self, t: int) -> NodeMotion | None:
         """Return the motion halfway between two frames by frames alone, at half resolution."""
         frames = self.schedule.frames
         after = int(np.searchsorted(frames, t, "right"))
@@ -381,14 +381,14 @@ class TrajectoryEstimator:
             return None
         return self._frame_motion(int(frames[after - 1] + frames[after]) // 2)
 
-    def _seek_by_frames(self, at: int) -> MotionEstimate:
+    def _seek_by_frames(self, at: int) -> NodeMotion:
         """Seek the motion of the target at a time (us) from nothing, by frames alone."""
         instants = self.schedule(at)
         L, V, _, _ = self._images(instants)
         framed = np.isin(instants.t, self.schedule.frames)
         frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
         nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        return MotionEstimate(instants, self._seek(frames, instants.s[framed], nearest))
+        return NodeMotion(instants, self._seek(frames, instants.s[framed], nearest))
 
     def _seek(
         self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float
@@ -401,7 +401,7 @@ class TrajectoryEstimator:
         """Find the motion of the target at a time (us), and fuse its image."""
         return self._refine(self._sought_motion(at))
 
-    def _refine(self, motion: MotionEstimate) -> Anchor:
+    def _refine(self, motion: NodeMotion) -> Anchor:
         """Refine motion at half resolution with the image that it gives."""
         instants, p = motion
         L, V, clear, smooth = self._images(instants)
@@ -412,7 +412,7 @@ class TrajectoryEstimator:
         image, P = np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
         packed = self._pack(estimate, image, P)
         p = borrow_paths(packed, gauss_newton_step(packed, p, self._cost), self._cost)
-        return Anchor(MotionEstimate(instants, p), image, P, smooth is None)
+        return Anchor(NodeMotion(instants, p), image, P, smooth is None)
 
     def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
         """Pack the images of a target, its own replaced by one with less noise."""
@@ -421,7 +421,7 @@ class TrajectoryEstimator:
         V[target.instants.target] = FUSED_VARIANCE_FACTOR * P + self._cost.floor
         return PackedImages.of(pack_images(L, V), target.instants.s)
 
-    def _improve(self, pixels: NDArray[np.float32], motion: MotionEstimate) -> MotionEstimate:
+    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> NodeMotion:
         """Take a few steps at half resolution, on the clock on which frames agree better.
 
         Images from events have the faults of their clock, so that they do not judge it.
@@ -441,12 +441,12 @@ class TrajectoryEstimator:
 
         found = improved(instants, p)
         if not instants.clock.event_share:
-            return MotionEstimate(instants, found)
+            return NodeMotion(instants, found)
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
         if cost(instants, found) < cost(timed, other):
-            return MotionEstimate(instants, found)
-        return MotionEstimate(timed, other)
+            return NodeMotion(instants, found)
+        return NodeMotion(timed, other)
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
@@ -461,7 +461,7 @@ class TrajectoryEstimator:
         elif self.start is not None and self.start.refine:
             pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
             known = NodeTrajectories(known, 0).at_level(1, size).p
-            anchor = self._refine(self._improve(pyramid[1], MotionEstimate(instants, known)))
+            anchor = self._refine(self._improve(pyramid[1], NodeMotion(instants, known)))
         else:
             return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
         if not anchor.motion.instants.clock.event_share:
