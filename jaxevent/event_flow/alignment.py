@@ -323,7 +323,6 @@ class Displacement(NamedTuple):
     clock: Clock
     information: NDArray[np.float64]  # (rows, columns, 3), xx, xy and yy, 1/px^2
     covariance: NDArray[np.float64]  # (rows, columns, 2, 2), px^2
-    roughness: NDArray[np.float64]  # (rows, columns), mean square difference of neighbours, px^2
     score: float  # per event
 
 
@@ -502,6 +501,5 @@ class Alignment:
             Clock(clock.t, ahead),
             information,
             self._covariance(u - surface, information),
-            _mean_square_difference(u - surface, 1),
             score / max(len(x), 1),
         )

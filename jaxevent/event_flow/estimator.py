@@ -26,9 +26,6 @@ CHAIN_WINDOWS = 16  # half windows of a chain of anchors
 MAX_KNOTS = 16  # of paths, whose cost and memory they set
 N_CACHED_ANCHORS = 256
 UNKNOWN_VARIANCE = 1e8  # (px/s)^2, where there are no events
-# A path near a border of objects is the one's or the other's: part of the mean square difference of
-# neighbouring nodes that is added to the covariance of its velocity.
-PATH_ROUGHNESS = 1.0
 MIN_SCORE_RATIO = 0.9  # to the anchor before, below which motion is sought from nothing
 
 
@@ -185,12 +182,9 @@ class EventFlow:
         return found
 
     def _fields(
-        self, anchors: list[Anchor], knots: NDArray[np.int64], roughness: float = 0.0
+        self, anchors: list[Anchor], knots: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return velocity and covariance of all nodes at some times (us).
-
-        So much of the flow's roughness is added to the covariance.
-        """
+        """Return velocity and covariance of all nodes at some times (us)."""
         velocity = np.zeros((len(knots), *self._align.nodes, 2))
         covariance = np.zeros((*velocity.shape, 2))
         if not anchors:
@@ -198,8 +192,7 @@ class EventFlow:
         times, stamps = [anchor.t for anchor in anchors], knots.tolist()
         for anchor, one in zip(anchors, np.eye(len(anchors)), strict=True):
             weights = np.interp(stamps, times, one)
-            spread = roughness * anchor.aligned.roughness[..., None, None] * np.eye(2)
-            spread = (anchor.aligned.covariance + spread) * anchor.rate**2
+            spread = anchor.aligned.covariance * anchor.rate**2
             for n in np.flatnonzero(weights > 0).tolist():
                 velocity[n] += weights[n] * anchor.aligned.clock.rate(stamps[n]) * anchor.aligned.u
                 covariance[n] += weights[n] * spread
@@ -227,7 +220,7 @@ class EventFlow:
         knots = np.unique(np.concatenate(times).astype(np.int64))
         if len(knots) > MAX_KNOTS:
             knots = knots[np.linspace(0, len(knots) - 1, MAX_KNOTS).round().astype(int)]
-        velocity, covariance = self._fields(anchors, knots, PATH_ROUGHNESS)
+        velocity, covariance = self._fields(anchors, knots)
         spread = self._align.fill(covariance.mean(0))
         return WindowPaths(int(at), knots, velocity, spread[None], self._align.spacing)
 
