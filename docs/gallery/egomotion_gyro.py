@@ -71,7 +71,7 @@ axis.legend(ncols=2)
 
 # %%
 truth = egomotion.known_motion(recording, "rotation", "poses")
-figure = jaxevent.show.plot_motion(motion, times, truth)
+jaxevent.show.plot_motion(motion, times, truth)
 
 # %% [markdown]
 # On the command line `jaxevent motion recording.h5 --model rotation --truth` compares with the
