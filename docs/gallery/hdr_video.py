@@ -80,7 +80,8 @@ axis.legend(ncols=2)
 
 # %% [markdown]
 # `mc` has less error still ([results](../results/reconstruction.md#high-dynamic-range)), and is
-# called in the same way. It is left out here because its first call compiles for about half a minute.
+# called in the same way. It is left out here because its first call compiles for about half a
+# minute.
 #
 # To write a video, scale images for the display, all with the same limits:
 #
