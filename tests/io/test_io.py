@@ -708,6 +708,8 @@ def test_save_refuses_what_it_cannot_write(tmp_path):
     ):
         refuses(message, save, bad, path)
     refuses("compression 'zip' is unknown", save, good, path, "zip")
+    refuses("a.npz: recordings are stored as HDF5; end", save, good, tmp_path / "a.npz")
+    refuses("writes recordings, not an Events; write flow by", save, good.events, path)
     refuses(
         "the folder .*missing does not exist; create it", save, good, tmp_path / "missing" / "a.h5"
     )
@@ -720,7 +722,7 @@ def test_save_refuses_what_it_cannot_write(tmp_path):
 def test_content_tells_the_format_not_the_name(tmp_path):
     recording = random_recording(15, events=20, frames=1, name="a")
     for write in (
-        lambda path: save(recording, path),
+        lambda path: hdf5.write(recording, path),
         lambda path: zip_folder(write_text(tmp_path / "text", recording), path),
         lambda path: write_v73(path, mat_arrays(recording)),
         lambda path: scipy.io.savemat(path, mat_arrays(recording), appendmat=False),
