@@ -145,9 +145,10 @@ def plot_image(video: ImageSequence, time: Times, *, tone: Tone | None = None) -
         if label != what or tone not in TONES_BY_PLACE:
             bar = figure.colorbar(shown, ax=axis, fraction=0.046, pad=0.03)
             bar.outline.set_visible(False)
-            if tone == "display":  # ticks are close where it is bright
-                bar.locator = ticker.MaxNLocator(4)
-                bar.update_ticks()
+            if label == what and tone != "log":  # others than linear scales have ticks beyond
+                ends = norm.vmin, norm.vmax
+                inside = [t for t in ticker.MaxNLocator(4).tick_values(*ends) if t <= ends[1]]
+                bar.set_ticks([t for t in inside if t >= ends[0]])
     at = int(microseconds(np.ravel(np.asarray(time))[0])) * 1e-6
     name = video.recording.name
     figure.suptitle(f"{name} by {method.name} at {at:.6g} s", fontsize=10)
@@ -174,7 +175,8 @@ def _toned(
     if tone == "log":
         return image.clip(low), colors.LogNorm(low, high, clip=True)
     if tone == "changes":
-        return image.clip(low), colors.FuncNorm((np.log1p, np.expm1), low, high, clip=True)
+        scale = (lambda values: np.log1p(np.maximum(values, low)), np.expm1)
+        return image.clip(low), colors.FuncNorm(scale, low, high, clip=True)
     return image, colors.Normalize(low, high, clip=True)
 
 

@@ -102,7 +102,9 @@ def test_tones_of_an_image_are_those_of_the_commands():
     for tone in get_args(Tone):
         if tone == "clahe":  # of the places of pixels
             continue
-        drawn = show.plot_image(video, 0.02, tone=tone).axes[0].images[0]
+        figure = show.plot_image(video, 0.02, tone=tone)
+        figure.canvas.draw()
+        drawn = figure.axes[0].images[0]
         grey = drawn.to_rgba(drawn.get_array()[known])[:, 0] * 255
         said = tone_map(values, tone, variance=variance)[0].astype(float)
         np.testing.assert_allclose(grey, said, atol=12 if tone == "display" else 2)  # 2.2 or sRGB
