@@ -783,7 +783,8 @@ class Recording(HtmlRepr):
         if self.frames is not None:
             parts.append(_span("frame", len(self.frames), self.frames.t))
         parts += [n for n in ("camera", "poses", "imu", "triggers") if getattr(self, n) is not None]
-        return f"<{', '.join([*parts, *self.extra])}>"
+        extra = [f"{len(self.extra)} arrays in extra"] if len(self.extra) > 3 else self.extra
+        return f"<{', '.join([*parts, *extra])}>"
 
     @property
     def start(self) -> int:

@@ -362,7 +362,7 @@ def _(tracks: Tracks) -> str:
 def _(motion: MotionEstimate) -> str:
     lost = int((~motion.valid).sum())
     rows = [
-        ("motion", motion.model.title),
+        ("motion", motion.model.title + ", assumed" * motion.model_assumed),
         ("estimates", f"{len(motion):,}, {lost:,} of them lost"),
     ]
     for i, (name, unit) in enumerate(zip(motion.model.components, motion.model.units, strict=True)):

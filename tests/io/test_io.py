@@ -930,4 +930,6 @@ def test_a_recording_is_shown_in_a_line():
     extra = {"hdr": np.zeros(3)}
     shown = repr(Recording("two", 3, 4, two, extra=extra))
     assert shown == "<two: 3x4, 2 events from 5e-06 to 2 s, hdr>"
+    many = Recording("many", 3, 4, none, extra=dict.fromkeys("abcd", np.zeros(1)))
+    assert repr(many) == "<many: 3x4, 0 events, 4 arrays in extra>"
     assert repr(Recording("none", 3, 4, none)) == "<none: 3x4, 0 events>"
