@@ -14,9 +14,9 @@ at the true beginnings, with the truth's sizes, times and changes of velocity (Q
 acceleration times the median speed: squared, times the time in which it turns). Makes
 table.md and results.json.
 
-`one` counts the targets that are the longest nearest of exactly one track. NEES is that of positions
-of `moment`, 1 where covariances are right. The cost is that of `find`, CPU seconds per million
-events.
+`one` counts the targets that exactly one track follows: for most of its time it is nearer to them
+than to others. NEES is that of positions of `moment`, 1 where covariances are right. The cost is
+that of `find`, in CPU seconds per million events.
 
 Scores are those of `jaxevent.blob.scores` at 200 times: a track and a target are one where they are
 nearer than 2 sizes and 3 px.
