@@ -75,8 +75,8 @@ def test_objects_say_what_they_are_in_a_line():
     t = np.arange(1000) * 1000
     known = KnownMotion(egomotion.models.find_model("planar"), t, np.zeros((1000, 2)))
     assert repr(known) == "KnownMotion(planar, at 1000 times, 0 to 0.999 s)"
-    shown += [known, jaxevent.flow_from_events(recording)]
-    for one in [*shown, video(recording.frames.t[:1])]:
+    made = [known, jaxevent.flow_from_events(recording), video(recording.frames.t[:1])]
+    for one in [*shown, *made]:
         assert " object at " not in repr(one)
         assert "\n" not in repr(one) and len(repr(one)) < 160, repr(one)
 
