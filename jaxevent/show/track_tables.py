@@ -101,17 +101,17 @@ class LiveTable:
         if not self._count:
             self._first = int(events.t[0])
         times = self._times_until(int(events.t[-1]) - 1)
-        row, lines = 0, []
+        row, parts = 0, []
         for end in np.unique(ends := np.searchsorted(events.t, times, "right")):
             self._live.add(events[row:end])
-            lines.append(self._lines(times[ends == end]))
+            parts.append(self._read(times[ends == end]))
             row = end
         self._live.add(events[row:])
-        return "".join(lines)
+        return _csv_lines(parts)
 
     def finish(self) -> str:
-        """Return the line of the last event, if a time is there."""
-        return self._lines(self._times_until(self._live.stop)) if self._count else ""
+        """Return the lines of the last event's time, if that is one of the table."""
+        return _csv_lines([self._read(self._times_until(self._live.stop))] * bool(self._count))
 
     def _times_until(self, last: int) -> NDArray[np.int64]:
         """Return the next times (us) up to the last one, and count them."""
@@ -122,13 +122,24 @@ class LiveTable:
         self._count += len(times)
         return times
 
-    def _lines(self, times: NDArray[np.int64]) -> str:
-        """Return the lines of the tracks that are alive at some times."""
+    def _read(self, times: NDArray[np.int64]) -> list[NDArray]:
+        """Return times, numbers, means and covariances of the tracks alive at some times."""
         states = self._live(times)
         row, place = np.nonzero(states.valid)
-        own = states.mean[row, place], states.covariance[row, place]
-        table = pd.DataFrame(table_columns(times[row], states.id[place], *own))
-        return table.to_csv(index=False, header=False)
+        return [
+            times[row],
+            states.id[place],
+            states.mean[row, place],
+            states.covariance[row, place],
+        ]
+
+
+def _csv_lines(parts: list[list[NDArray]]) -> str:
+    """Return the rows of a table, in parts, as lines of CSV."""
+    if not parts:
+        return ""
+    columns = table_columns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return pd.DataFrame(columns).to_csv(index=False, header=False)
 
 
 @contextlib.contextmanager
