@@ -75,6 +75,8 @@ def find(name: str, family: str | None = None) -> Estimator:
         found = _load(name)
     else:
         known = {one: path for homes in METHOD_HOMES.values() for one, path in homes.items()}
+        if name not in known:  # Python's names have an underline for each hyphen
+            name = name.replace("_", "-") if name.replace("_", "-") in known else name
         if name not in known:
             raise UnknownMethod(f"there is no method {name!r}; {suggest_name(name, names(family))}")
         found = _load(known[name])

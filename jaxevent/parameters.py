@@ -92,8 +92,9 @@ class Number(Setting):
             return self
         if instance.is_gradient:
             raise InputError(
-                f"{self.name} of a gradient is no parameter; read gradient.raw[{self.name!r}], the "
-                "derivative by the stored number, or gradient.per_unit(params), by the parameter"
+                f"this is a gradient, without a value of {self.name}; read "
+                f"gradient.raw[{self.name!r}], the derivative by the stored number, or "
+                f"gradient.per_unit(params)[{self.name!r}], by the parameter"
             )
         raw = instance.raw[self.name]
         follows = self.gradient or self.name in instance.followed
@@ -385,8 +386,8 @@ class Parameters(_ParameterArrays):
             params: The parameters at which the gradient was taken.
 
         Returns:
-            By name, an array of the gradient's shape. NaN of a number whose stored number does not
-            move it, as of one that is 0 and is stored as -inf.
+            By name, an array of the gradient's shape. 0 of a number that no derivative passes
+            through, NaN of another that is 0 and is stored as -inf, which does not move it.
 
         Raises:
             InputError: This is no gradient, or `params` is none of parameters of the same class.
@@ -405,7 +406,8 @@ class Parameters(_ParameterArrays):
         for name, number in self.numbers.items():
             raw = jnp.asarray(params.raw[name])
             _, slope = jax.jvp(number.physical, (raw,), (jnp.ones_like(raw),))
-            found[name] = jnp.where(slope == 0, jnp.nan, self.raw[name] / slope)
+            unknown = jnp.nan if number.gradient or name in params.followed else 0.0
+            found[name] = jnp.where(slope == 0, unknown, self.raw[name] / slope)
         return found
 
     def __repr__(self) -> str:
@@ -725,7 +727,8 @@ def suggest_name(name: str, known: Iterable[str]) -> str:
     Returns:
         "did you mean 'x'?", or "known: x, y".
     """
-    close = difflib.get_close_matches(name, list(known), 1)
+    close = difflib.get_close_matches(name, list(known), 3)
+    close.sort(key=lambda one: sorted(one) != sorted(name))  # letters in another order come first
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
 
 

@@ -7,6 +7,7 @@ float means seconds, both on the recording's clock.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -16,13 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
 from jaxevent.display import HtmlRepr, plural
-from jaxevent.errors import InputError, OrderError
+from jaxevent.errors import InputError, InputWarning, OrderError
 
 if TYPE_CHECKING:
     import pandas
 
 Times = ArrayLike | int | float
 
+MAX_FRAME_GAP_US = 1_000_000  # between frames and all events, if no longer than these
 PER_FRAME_EXTRAS = ("gain", "rgb")  # names of `Recording.extra` that hold one entry per frame
 
 
@@ -81,6 +83,20 @@ def _span(what: str, number: int, t: Any) -> str:
     """Describe a number of things and their times, as in "2 events from 0.1 to 0.2 s"."""
     text = f"{number:,} {plural(what, number)}"
     return f"{text} from {t[0] / 1e6:g} to {t[-1] / 1e6:g} s" if number else text
+
+
+def _doubt_times(events: NDArray[np.int64], frames: "Frames") -> str | None:
+    """Return what shows that frames have another unit of time than events (us), or None."""
+    t = frames.t
+    if len(events) and len(t):
+        gap = max(t[0] - events[-1], events[0] - t[-1])
+        if gap > max(events[-1] - events[0], MAX_FRAME_GAP_US):
+            ends = [f"{at[0] / 1e6:g} to {at[-1] / 1e6:g} s" for at in (t, events)]
+            return f"frames are from {ends[0]}, events from {ends[1]}"
+    if len(t) > 1 and np.median(frames.exposure) > (spacing := np.median(np.diff(t))):
+        longest = np.median(frames.exposure) / 1e6
+        return f"exposures of {longest:g} s are longer than the {spacing / 1e6:g} s between frames"
+    return None
 
 
 @runtime_checkable
@@ -695,7 +711,8 @@ class Recording(HtmlRepr):
             extra: Further arrays by name; see `Recording`.
 
         Returns:
-            The recording, checked.
+            The recording, checked. An `InputWarning` tells of frames far from all events and of
+            exposures longer than the time between frames.
 
         Raises:
             InputError: An argument has another type, shape or length, a value is not finite, not
@@ -749,6 +766,14 @@ class Recording(HtmlRepr):
             further = {"rgb": colours, **further}
         recording = cls(name, *size, events, made, camera, poses, imu, further, triggers)
         recording.refuse_empty()
+        if made is not None and (doubt := _doubt_times(us, made)):
+            unit = "integers are us" if time_unit is None else f"time_unit={time_unit!r}"
+            warnings.warn(
+                f"{name}: {doubt}; frame_times and exposure have the unit of t, {unit}; correct "
+                "what has another",
+                InputWarning,
+                stacklevel=2,
+            )
         return recording
 
     def __repr__(self) -> str:
@@ -758,7 +783,8 @@ class Recording(HtmlRepr):
         if self.frames is not None:
             parts.append(_span("frame", len(self.frames), self.frames.t))
         parts += [n for n in ("camera", "poses", "imu", "triggers") if getattr(self, n) is not None]
-        return f"<{', '.join([*parts, *self.extra])}>"
+        extra = [f"{len(self.extra)} arrays in extra"] if len(self.extra) > 3 else self.extra
+        return f"<{', '.join([*parts, *extra])}>"
 
     @property
     def start(self) -> int:

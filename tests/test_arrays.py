@@ -12,7 +12,7 @@ from PIL import Image
 from refusals import refuses
 
 import jaxevent
-from jaxevent import Events, Frames, InputError, Recording
+from jaxevent import Events, Frames, InputError, InputWarning, Recording
 
 SIZE = WIDTH, HEIGHT = 64, 48
 KINDS = ("i1", "u1", ">i2", "<u2", ">i4", "u4", "i8", ">u8", "f4", ">f8")
@@ -154,6 +154,24 @@ def test_messages_name_the_argument_and_the_remedy():
         all_of = {**v, "width": WIDTH, "height": HEIGHT, **changes}
         columns = [all_of.pop(name) for name in "txyp"]
         refuses(message, Recording.from_arrays, *columns, **all_of)
+
+
+def test_frames_in_another_unit_than_events_are_told():
+    t = np.linspace(0.0, 1.0, 300)
+    where = {"width": WIDTH, "height": HEIGHT, "frames": np.zeros((2, HEIGHT, WIDTH))}
+
+    def made(frame_times, exposure=None):
+        columns = (t, *(arrays()[name] for name in "xyp"))
+        return Recording.from_arrays(
+            *columns, frame_times=frame_times, exposure=exposure, time_unit="s", **where
+        )
+
+    with pytest.warns(InputWarning, match="frames are from 100000 to 900000 s, events from 0 to 1"):
+        made([100_000, 900_000], 5000)
+    with pytest.warns(InputWarning, match="5000 s are longer than the 0.8 s .* time_unit='s'"):
+        made([0.1, 0.9], 5000)
+    made([-0.1, 1.9])
+    made([0.1, 0.9], 0.05)
 
 
 def test_what_fits_is_not_copied():

@@ -9,7 +9,7 @@ import pytest
 from noise import small
 
 import jaxevent
-from jaxevent import InputError
+from jaxevent import InputError, methods
 from jaxevent.estimator import Estimate
 
 METHODS = sorted(jaxevent.METHODS)
@@ -119,8 +119,9 @@ def test_an_estimate_is_the_tuple_of_its_fields():
 def test_methods_show_their_names_and_suggest_one():
     shown = repr(jaxevent.METHODS)
     assert "\nblob: moment, chi2" in shown and all(name in shown for name in METHODS)
-    with pytest.raises(KeyError, match=r"^there is no method 'afk'; did you mean 'aks'\?$"):
+    with pytest.raises(KeyError, match=r"^there is no method 'afk'; did you mean 'akf'\?$"):
         jaxevent.METHODS["afk"]
+    assert methods.find("last_frame") is jaxevent.METHODS["last-frame"]
     with pytest.raises(InputError, match="there is no method 3; known: akf"):
         jaxevent.METHODS[3]
     assert "afk" not in jaxevent.METHODS and jaxevent.METHODS.get("afk") is None

@@ -11,6 +11,8 @@ import pytest
 from noise import small
 
 import jaxevent
+from jaxevent import egomotion
+from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.parameters import Number
 
 METHODS = sorted(jaxevent.METHODS)
@@ -70,7 +72,12 @@ def test_objects_say_what_they_are_in_a_line():
     features, out = jaxevent.blend.prepare(recording, [0.02])
     trajectory, _ = jaxevent.blend.run(jaxevent.blend.Params(), features)
     shown = [recording, recording.events, recording.frames, video, features, out, trajectory]
-    for one in [*shown, video(recording.frames.t[:1])]:
+    t = np.arange(1000) * 1000
+    known = KnownMotion(egomotion.models.find_model("planar"), t, np.zeros((1000, 2)))
+    assert repr(known) == "KnownMotion(planar, at 1000 times, 0 to 0.999 s)"
+    made = [known, jaxevent.flow_from_events(recording), video(recording.frames.t[:1])]
+    for one in [*shown, *made]:
+        assert " object at " not in repr(one)
         assert "\n" not in repr(one) and len(repr(one)) < 160, repr(one)
 
 
@@ -79,6 +86,7 @@ def test_names_complete():
         assert name in dir(jaxevent) and getattr(jaxevent, name) is not None
     for name in ("voting", "batch", "contrast", "planes", "frames", "geometry", "truth", "flow"):
         assert name in dir(jaxevent.egomotion) and getattr(jaxevent.egomotion, name) is not None
+    assert "as_html" in dir(jaxevent.show) and callable(jaxevent.show.as_html)
     for name in ("moment", "chi2", "chi2_split", "constant_velocity", "moving_moments"):
         assert name in dir(jaxevent.blob) and getattr(jaxevent.blob, name).name == name
     assert callable(jaxevent.evaluate) and callable(jaxevent.fit) and callable(jaxevent.optimise)

@@ -6,6 +6,7 @@ import numpy as np
 import optax
 import pytest
 
+import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.parameters import Count, Number, Parameters, Positive, UnitInterval
 
@@ -144,7 +145,9 @@ def test_a_gradient_shows_itself_and_is_converted_to_units():
                 loss(params.replace(**{name: float(getattr(params, name)) + s})) for s in (-h, h)
             ]
             assert float(found[name]) == pytest.approx(float(ends[1] - ends[0]) / (2 * h), rel=1e-8)
-    with pytest.raises(InputError, match=r"sigma of a gradient .* gradient.per_unit\(params\)"):
+    with pytest.raises(
+        InputError, match=r"a value of sigma; .* gradient.per_unit\(params\)\[.sigma"
+    ):
         getattr(gradient, "sigma")  # noqa: B009
     for refused in (lambda: params.per_unit(params), lambda: gradient.per_unit(gradient)):
         with pytest.raises(InputError, match="per_unit"):
@@ -153,6 +156,10 @@ def test_a_gradient_shows_itself_and_is_converted_to_units():
     np.testing.assert_allclose(inside["sigma"], found["sigma"], rtol=1e-12)
     assert np.isnan(Given(sigma=0.0).raw["sigma"] * 0)  # stored as -inf
     assert np.isnan(jax.grad(lambda p: p.sigma)(p0 := Given(sigma=0.0)).per_unit(p0)["sigma"])
+    params = jaxevent.akf.Params(exposure=0.0)
+    gradient = jax.grad(lambda p: p.c_on**2)(params).per_unit(params)
+    prepared = [name for name, number in params.numbers.items() if not number.gradient]
+    assert "exposure" in prepared and all(gradient[name] == 0 for name in prepared)
 
 
 def test_a_step_is_no_parameters_and_its_sum_with_some_is():

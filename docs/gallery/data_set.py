@@ -2,27 +2,24 @@
 # # A data set in batch
 #
 # `jaxevent.evaluate` scores any number of methods on any number of recordings, with frames that no
-# method was given. A metric of your own is a function of two images. A Dask cluster shares out the
-# work.
+# method was given. A metric of your own is a function of two images.
 
 # %%
 from importlib.resources import files
-from pathlib import Path
-from tempfile import mkdtemp
 
 import matplotlib.pyplot as plt
 import numpy as np
-from distributed import Client
 
 import jaxevent
 from jaxevent import akf
 
-folder = Path(mkdtemp())
 packaged = jaxevent.load(files("jaxevent") / "data/slider_depth_crop.h5")
-for k, (left, top) in enumerate([(20, 20), (90, 20), (160, 20), (20, 110), (90, 110), (160, 110)]):
-    part = jaxevent.events.crop(packaged[0.6:0.9], left, top, 60, 50)
-    jaxevent.save(part, folder / f"part_{k}.h5")
-sorted(path.name for path in folder.glob("*.h5"))
+corners = [(20, 20), (90, 20), (160, 20), (20, 110), (90, 110), (160, 110)]
+recordings = {
+    f"part_{k}": jaxevent.events.crop(packaged[0.6:0.9], left, top, 60, 50)
+    for k, (left, top) in enumerate(corners)
+}
+list(recordings)
 
 
 # %%
@@ -31,24 +28,14 @@ def edge_error(estimate, truth):
     return np.abs(np.diff(estimate) - np.diff(truth)).mean()
 
 
-# %%
-with Client(processes=False, threads_per_worker=2, dashboard_address=":0") as client:
-    scores = jaxevent.evaluate(
-        str(folder / "*.h5"),
-        ["last-frame", "blend", akf],
-        metrics=["mse", edge_error],
-        cluster=client,
-        out=folder / "compared",
-    )
+scores = jaxevent.evaluate(recordings, ["last-frame", "blend", akf], metrics=["mse", edge_error])
 scores.means()
 
 # %% [markdown]
-# One row for each recording and method. What is finished is kept in the folder: an evaluation that
-# was stopped goes on where it was.
+# One row for each recording and method.
 
 # %%
 table = scores.to_dataframe()
-table["recording"] = [Path(name).stem for name in table["recording"]]
 table[["recording", "method", "mse", "edge_error"]].head()
 
 # %%
@@ -68,4 +55,15 @@ for axis, measure, label in zip(
     axis.legend()
 
 # %% [markdown]
-# The same from a file of settings, with many machines: [Fit and compare](../fitting.md#compare).
+# Files go in by their names, `"recordings/*.h5"`. With `out="compared"` what is finished is kept in
+# a folder, and an evaluation that was stopped goes on where it was. A Dask cluster shares out the
+# work:
+#
+# ```python
+# from distributed import Client
+#
+# with Client() as client:
+#     jaxevent.evaluate("recordings/*.h5", ["blend", akf], cluster=client, out="compared")
+# ```
+#
+# The same from a file of settings: [Fit and compare](../fitting.md#compare).

@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxevent
+from jaxevent import egomotion
 from jaxevent.recording import Imu
 
 recording, camera = jaxevent.simulate.motion_scene(
@@ -30,7 +31,7 @@ recording
 # accurate and are called in the same way.
 
 # %%
-motion = jaxevent.egomotion.planes.estimate(recording, model="rotation")
+motion = egomotion.planes.estimate(recording, model="rotation")
 times = np.arange(0.05, 0.25, 0.01)  # s
 omega, covariance, valid = motion(times)
 motion
@@ -63,6 +64,14 @@ axis.plot([], [], "grey", linewidth=0.5, label="gyro without its bias")
 axis.fill_between([], [], color="grey", alpha=0.25, label="2 standard deviations")
 axis.set(xlabel="time (s)", ylabel="angular velocity (rad/s)")
 axis.legend(ncols=2)
+
+# %% [markdown]
+# `known_motion` takes the truth from a recording's poses or gyro. `plot_motion` draws the errors
+# against it.
+
+# %%
+truth = egomotion.known_motion(recording, "rotation", "poses")
+jaxevent.show.plot_motion(motion, times, truth)
 
 # %% [markdown]
 # On the command line `jaxevent motion recording.h5 --model rotation --truth` compares with the

@@ -79,5 +79,20 @@ axis.set(xlabel="x (px)", ylabel="ln intensity")
 axis.legend(ncols=2)
 
 # %% [markdown]
+# `mc` has less error still ([results](../results/reconstruction.md#high-dynamic-range)), and is
+# called in the same way. It is left out here because its first call compiles for about half a
+# minute.
+#
+# To write a video, scale images for the display, all with the same limits:
+#
+# ```python
+# from jaxevent.show.images import tone_map, video_writer
+#
+# images = estimates["aks"].mean
+# with video_writer("video.mp4", fps=30) as write:
+#     for image in images:
+#         write(tone_map(image, "log", limits=(0.003, images.max())))
+# ```
+#
 # On the command line: `jaxevent reconstruct mine.h5 --rate 200 --tone log --out video.mp4`. Which
 # method suits which recording: [Which method when](../methods.md).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Many parameters at once
 #
-# `prepare` computes on the host what depends on the data alone. `run` and `read` are pure functions
-# of the parameters, so `jax.vmap` maps them over as many as you like.
+# `prepare_images` computes on the host what depends on the data alone. What it returns is a pure
+# function of the parameters, so `jax.vmap` maps it over as many as you like.
 
 # %%
 from importlib.resources import files
@@ -23,20 +23,19 @@ truth = hidden.intensity
 given, hidden
 
 # %% [markdown]
-# The error of each hidden image, as a function of the two contrast thresholds. The clock offset
-# acts both in `prepare` and in `run`, so both get it.
+# The error of each hidden image, as a function of the two contrast thresholds. Times are on the
+# events' clock: the frames' stamps plus the clock offset.
 
 # %%
 offset = jaxevent.calibrate(given).clock_offset.value  # s, of the frames' stamps
 times = hidden.t + round(1e6 * offset)
-features, out = akf.prepare(given, times, akf.Params(clock_offset=offset))
+params = akf.Params(clock_offset=offset)
+images = akf.prepare_images(given, times, params)
 
 
 def errors(c_on, c_off):
     """Compute the mean squared error of every hidden image."""
-    params = akf.Params(c_on=c_on, c_off=c_off, clock_offset=offset)
-    trajectory, _ = akf.run(params, features)
-    estimate = akf.read(params, trajectory, out)
+    estimate = images(params.replace(c_on=c_on, c_off=c_off))
     return jnp.mean((estimate.mean.reshape(truth.shape) - truth) ** 2, axis=(1, 2))
 
 

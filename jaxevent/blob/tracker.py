@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -29,7 +30,7 @@ from jaxevent.blob.smoother import (
 from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.blob.tracks import Tracks
 from jaxevent.codegen.module import choose_backend, make_kernel
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.estimator import Estimator, OptionKind, option_of_class
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -237,7 +238,7 @@ class Tracker(Estimator[P]):
             progress: Whether to show a progress bar; None: on a terminal.
 
         Returns:
-            The tracks, a function of time.
+            The tracks, a function of time. An `InputWarning` tells that no target was found.
 
         Raises:
             InputError: A seed is outside the sensor or the time, there is no time to track, the
@@ -253,6 +254,13 @@ class Tracker(Estimator[P]):
         smooth = self.filter.transition is not None if smooth is None else smooth
         if params is None and seeds is None and detect is None and found is None:
             found = find(recording, start, stop, progress=progress)
+            if not len(found):
+                warnings.warn(
+                    f"{recording.name}: no target was found; give seeds=, or params= to begin "
+                    "tracks wherever events gather",
+                    InputWarning,
+                    stacklevel=2,
+                )
         if params is None:
             params = self.Params(**found.settings()) if found is not None else self.Params()
         births = seeds is None and found is None if detect is None else detect

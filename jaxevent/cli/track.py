@@ -23,6 +23,7 @@ def add(commands: Any) -> None:
         "stars.h5 --out stars",
         "dot.h5 --seed 320,240,20 --rate 2000 --out dot.csv",
         "car.h5 --seed 400,300,15 --seed 460,300,15 --pair 0,1 --out car",
+        "- --live --size 240,180 --seed 120,90,8",
     )
     one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
     one.add_argument(
@@ -85,10 +86,14 @@ def add(commands: Any) -> None:
         default="events",
         help="background of the video; default: events",
     )
+    arguments.add_live(one, "rows of tracks.csv of --seed or --detect, as with --filtered,")
     arguments.add_reading(one)
     _add_quantities(one)
     arguments.add_output(
-        one, "--out", metavar="DIR_or_FILE", required=True, help="output folder or file"
+        one,
+        "--out",
+        metavar="DIR_or_FILE",
+        help="output folder or file; needed without --live",
     )
 
 
@@ -129,12 +134,13 @@ def run(
     start: float | int | None,
     stop: float | int | None,
     background: str,
+    live: bool,
     reading: dict[str, Any],
     pairs: list[tuple[int, int]] | None,
     extent: float | int | None,
     focal: float | int | None,
     size_factor: float | int | None,
-    out: Path,
+    out: Path | None,
 ) -> None:
     from jaxevent import methods
     from jaxevent.blob import find
@@ -144,6 +150,19 @@ def run(
 
     tracker = methods.find(method, "blob")
     given = None if params is None else tracker.Params.load(params, method)  # told before the work
+    if live:
+        options = {
+            "--accuracy": accuracy, "--at": at, "--start": start, "--stop": stop, "--pair": pairs,
+            "--extent": extent, "--focal": focal, "--size-factor": size_factor, "--out": out,
+        }  # fmt: skip
+        if wrong := [name for name, value in options.items() if value is not None]:
+            raise InputError(f"--live is not for {wrong[0]}; leave out one of the two")
+        if seeds is None and not detect:
+            raise InputError("--live cannot search all events for targets; add --seed or --detect")
+        _print_live(path, tracker, given, seeds, detect, float(rate), reading)
+        return
+    if out is None:
+        raise InputError("there is nowhere to write; give a folder or file, --out, or --live")
     each = None if at == "events" else rate
     output = Output(out, each, background, pairs or (), extent, focal, size_factor)
     recording = arguments.open_recording(path, reading)
@@ -190,6 +209,27 @@ def run(
         f"\n{how}: {len(tracks):,} {plural('track', len(tracks))}, {count:,} events in "
         f"{seconds:.2f} s, {count / seconds:,.0f} events/s{slow}"
     )
+
+
+def _print_live(
+    path: Path,
+    tracker: Any,
+    params: Any,
+    seeds: list[tuple[float, ...]] | None,
+    detect: bool,
+    rate: float,
+    reading: dict[str, Any],
+) -> None:
+    """Print rows of tracks.csv as events come, those of a time with the first event after it."""
+    from jaxevent.show.track_tables import LiveTable
+
+    recording, chunks = arguments.open_live(path, reading)
+    size = recording.width, recording.height
+    table = LiveTable(tracker.live(size, params, seeds=seeds, detect=detect), rate)
+    print(table.header, end="", flush=True)
+    for events in chunks:
+        print(table.add(events), end="", flush=True)
+    print(table.finish(), end="", flush=True)
 
 
 def _explain_no_tracks(found: Any) -> str:

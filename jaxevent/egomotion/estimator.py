@@ -383,4 +383,5 @@ class HostEstimator(MotionEstimator[P]):
         if params is None:
             start = self.initial_params(inputs.model)
             params = self.adapt_params(recording, start, camera=inputs.camera).params
-        return self.run(params, inputs)[0]
+        assumed = options.get("model") is None and sum(map(self.supports, MODELS.values())) > 1
+        return dataclasses.replace(self.run(params, inputs)[0], model_assumed=assumed)

@@ -137,6 +137,7 @@ class MotionEstimate(HtmlRepr):
         span: First and last time of the recording, us; None allows all times.
         n_extended: Number of estimates that `extended_to` has added at the ends.
         causal: Whether the motion is read as it is known at a time, without later events.
+        model_assumed: Whether the model is the method's first, as none was asked for.
     """
 
     model: type[Model]
@@ -153,6 +154,7 @@ class MotionEstimate(HtmlRepr):
     span: tuple[int, int] | None = None
     n_extended: int = 0
     causal: bool = False
+    model_assumed: bool = False
 
     @classmethod
     def from_arrays(
@@ -386,7 +388,8 @@ class MotionEstimate(HtmlRepr):
 
     def __repr__(self) -> str:
         lost = int((~self.valid).sum())
-        return f"MotionEstimate({self.model.name}, {len(self)} estimates, {lost} lost)"
+        model = f"{self.model.name}{' assumed' if self.model_assumed else ''}"
+        return f"MotionEstimate({model}, {len(self)} estimates, {lost} lost)"
 
     def __call__(
         self, times: Times, *, centred: bool | None = None, extrapolate: bool = False

@@ -259,7 +259,7 @@ def find_imu_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]
 
 
 @renamed_methods(within="covers")
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class KnownMotion:
     """A motion that is known at some times, a function of time: `values = truth(times)`.
 
@@ -286,6 +286,10 @@ class KnownMotion:
             if part.direction:
                 values[:, part.rows] = unit_vectors(values[:, part.rows])
         return values
+
+    def __repr__(self) -> str:
+        span = f"{self.t[0] * 1e-6:.6g} to {self.t[-1] * 1e-6:.6g} s" if len(self.t) else "never"
+        return f"KnownMotion({self.model.name}, at {len(self.t)} times, {span})"
 
     def covers(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return at which times (us) the motion is known."""

@@ -89,6 +89,10 @@ class EventFlow:
         self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
         self._lock = threading.RLock()
 
+    def __repr__(self) -> str:
+        causal = ", causal" if self.causal else ""
+        return f"EventFlow({self.recording.name}, {self.shape[1]}x{self.shape[0]}{causal})"
+
     def _events(self, row: int, half: int) -> tuple[int, Events]:
         """Return the time (us) of an event, and the events around it."""
         events = self.recording.events[max(row - half, 0) : row + half]

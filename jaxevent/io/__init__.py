@@ -20,6 +20,7 @@ from typing import Any
 from jaxevent import arrays
 from jaxevent.arrays import times
 from jaxevent.deprecated import renamed_names
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.io.checks import ReadOptions, naming, open_archive, reading
 from jaxevent.io.decoded import remember_call
@@ -185,11 +186,22 @@ def save(
             notebook.
 
     Raises:
-        InputError: The recording is not valid, or the file cannot be written.
+        InputError: This is no recording, or not a valid one, the suffix is none of HDF5, or the
+            file cannot be written.
     """
     from jaxevent.io import hdf5
+    from jaxevent.io.output import is_partial
 
-    hdf5.write(recording, Path(path), compression, progress)
+    path = Path(path)
+    if not isinstance(recording, Recording):
+        raise InputError(
+            f"{path}: save writes recordings, not {describe_type(recording)}; write flow by "
+            "jaxevent.show.flow.write_flow_hdf5, and images by `jaxevent reconstruct`, or as the "
+            "arrays that video(times) returns"
+        )
+    if path.suffix.lower() not in ("", ".h5", ".hdf5", ".hdf") and not is_partial(path):
+        raise InputError(f"{path}: recordings are stored as HDF5; end the name in .h5")
+    hdf5.write(recording, path, compression, progress)
 
 
 def _find_reader(path: Path, options: ReadOptions) -> Reader:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxevent.show.figures import (
+        as_html,
         plot_events,
         plot_events_3d,
         plot_image,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from jaxevent.show.viewer import view
 
 __all__ = [
+    "as_html",
     "plot_events",
     "plot_events_3d",
     "plot_image",

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.tracks import Tracks
-from jaxevent.display import plural
+from jaxevent.display import describe_type, plural
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError, require
 from jaxevent.events import event_image
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, EventSource, Recording, Times, microseconds
-from jaxevent.show.images import COLOURS, new_figure
+from jaxevent.show.images import COLOURS, Tone, display_limits, new_figure, tone_map
 from jaxevent.show.motion_figures import motion_figure
 from jaxevent.show.track_figures import draw_paths
 from jaxevent.tuning import FitResult
@@ -29,6 +29,7 @@ from jaxevent.tuning import FitResult
 ON_COLOUR, OFF_COLOUR = "#c8401e", "#3a78b5"
 WIDTH_INCHES = 7.0
 MAX_EVENTS_3D = 20_000  # events drawn in x, y and t
+TONES_BY_PLACE = ("relative", "clahe")  # in which equal intensities have different greys
 N_PATH_TIMES = 400  # at which a track's path is drawn
 MAX_HTML_EVENTS = 1_000_000  # events that notebooks process for a picture
 MAX_HTML_TRACKS = 12  # lines of a table of tracks
@@ -100,44 +101,99 @@ def plot_events_3d(
     return figure
 
 
-def plot_image(video: ImageSequence, time: Times) -> Any:
+def plot_image(video: ImageSequence, time: Times, *, tone: Tone | None = None) -> Any:
     """Draw the image of a reconstruction, and its uncertainty.
 
-    White is the image's brightest 0.5 %; black is the frames'. Greys are encoded for screens, with
-    a gamma of 2.2. The uncertainty, if the method
-    estimates it, is the standard deviation of ln(intensity + I0).
+    Pixels whose intensity is not known are hatched. The uncertainty, if the method estimates it, is
+    the standard deviation of ln(intensity + I0).
 
     Args:
         video: A reconstruction.
         time: Time of the image; an integer is us, a float s.
+        tone: Tone of `jaxevent.show.images.tone_map`. None: "display", whose white is the image's
+            brightest 0.5 %; "relative" or "changes" where intensity is known up to a factor only.
 
     Returns:
         A `matplotlib.figure.Figure`.
 
     Raises:
-        InputError: The extra "plot" is missing.
+        InputError: This is no reconstruction, the tone is unknown, or the extra "plot" is missing.
     """
+    _check_kind("plot_image", video, ImageSequence)
     estimate = video(time)
-    image = np.where(estimate.valid[0], estimate.mean[0], np.nan)
-    deviation = np.sqrt(np.where(estimate.valid[0], estimate.covariance[0], np.nan))
-    colors: Any = require("matplotlib.colors", "plot")
-    grey = {"cmap": "gray", "norm": colors.PowerNorm(1 / 2.2, 0.0, _bright(image, 1e-6), clip=True)}
-    panels = [(image, "intensity", grey)]
+    valid, method = estimate.valid[0], video.estimator
+    image, variance = (np.where(valid, part[0], np.nan) for part in estimate[:2])
+    deviation = np.sqrt(variance)
+    ticker: Any = require("matplotlib.ticker", "plot")
+    absolute = getattr(method, "is_absolute", True) and video.recording.frames is not None
+    if tone is None:
+        tone = "display" if absolute else "relative" if method.has_covariance else "changes"
+    values, norm = _toned(image, tone, variance)
+    what = "intensity" if absolute else "relative intensity"
+    panels = [(values, what, {"cmap": "gray", "norm": norm})]
     if np.isfinite(deviation).any():
         scale = {"cmap": "viridis", "vmin": 0.0, "vmax": _bright(deviation, 1e-6)}
-        panels.append((deviation, "standard deviation of ln I", scale))
+        panels.append((deviation, "standard deviation of ln(I + I0)", scale))
     height, width = image.shape
     figure = new_figure(WIDTH_INCHES * len(panels) / 1.4, WIDTH_INCHES / 1.4 * height / width + 0.6)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (values, label, scale) in zip(axes, panels, strict=True):
+        axis.patch.set(facecolor="white", edgecolor=ON_COLOUR, hatch="///")
         shown = axis.imshow(values, interpolation="nearest", **scale)
         axis.set(xticks=[], yticks=[])
         axis.set_title(label, fontsize=10)
-        figure.colorbar(shown, ax=axis, fraction=0.046, pad=0.03).outline.set_visible(False)
+        if label != what or tone not in TONES_BY_PLACE:
+            bar = figure.colorbar(shown, ax=axis, fraction=0.046, pad=0.03)
+            bar.outline.set_visible(False)
+            if label == what and tone != "log":  # others than linear scales have ticks beyond
+                ends = norm.vmin, norm.vmax
+                inside = [t for t in ticker.MaxNLocator(4).tick_values(*ends) if t <= ends[1]]
+                bar.set_ticks([t for t in inside if t >= ends[0]])
     at = int(microseconds(np.ravel(np.asarray(time))[0])) * 1e-6
     name = video.recording.name
-    figure.suptitle(f"{name} by {video.estimator.name} at {at:.6g} s", fontsize=10)
+    figure.suptitle(f"{name} by {method.name} at {at:.6g} s", fontsize=10)
     return figure
+
+
+def _toned(
+    image: NDArray[np.floating], tone: str, variance: NDArray[np.floating]
+) -> tuple[NDArray[np.floating], Any]:
+    """Return what an image (height, width) with NaN shows in a tone, and its scale of greys.
+
+    Of tones in which equal intensities have different greys, these are the greys themselves.
+    """
+    colors: Any = require("matplotlib.colors", "plot")
+    known = np.isfinite(image)
+    seen = image[known][None]
+    low, high = display_limits(seen, tone, variance[known][None])
+    if tone in TONES_BY_PLACE:
+        filled = np.where(known, image, seen.mean() if seen.size else low)
+        grey = tone_map(filled, tone, (low, high), variance)
+        return np.where(known, grey, np.nan), colors.Normalize(0, 255)
+    if tone == "display":
+        return image, colors.PowerNorm(1 / 2.2, low, high, clip=True)
+    if tone == "log":
+        return image.clip(low), colors.LogNorm(low, high, clip=True)
+    if tone == "changes":
+        scale = (lambda values: np.log1p(np.maximum(values, low)), np.expm1)
+        return image.clip(low), colors.FuncNorm(scale, low, high, clip=True)
+    return image, colors.Normalize(low, high, clip=True)
+
+
+def _check_kind(function: str, thing: Any, kind: type) -> None:
+    """Raise `InputError`, which names the function to use, unless a thing is of a kind."""
+    if isinstance(thing, kind):
+        return
+    others = {
+        ImageSequence: "plot_image(video, time)",
+        Tracks: "plot_tracks(tracks)",
+        MotionEstimate: "plot_motion(motion)",
+        Recording: "plot_events(recording)",
+        FitResult: "plot_losses(fitted)",
+    }
+    right = next((call for other, call in others.items() if isinstance(thing, other)), None)
+    remedy = f"give a {kind.__name__}" if right is None else f"use {right}"
+    raise InputError(f"{function} cannot draw {describe_type(thing)}; {remedy}")
 
 
 def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int = 40) -> Any:
@@ -155,8 +211,9 @@ def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int =
         A `matplotlib.figure.Figure`.
 
     Raises:
-        InputError: The extra "plot" is missing.
+        InputError: These are no tracks, or the extra "plot" is missing.
     """
+    _check_kind("plot_tracks", tracks, Tracks)
     recording = tracks.recording
     figure, axis = _image_figure(recording.width, recording.height)
     if ids is None:
@@ -191,8 +248,15 @@ def plot_motion(
         A `matplotlib.figure.Figure`.
 
     Raises:
-        InputError: The extra "plot" is missing, or there is no estimate and no time.
+        InputError: This is no motion, the truth is none, there is no estimate and no time, or the
+            extra "plot" is missing.
     """
+    _check_kind("plot_motion", motion, MotionEstimate)
+    if truth is not None and not isinstance(truth, KnownMotion):
+        raise InputError(
+            f"the truth is {describe_type(truth)}; give jaxevent.egomotion.known_motion(recording, "
+            f"{motion.model.name!r})"
+        )
     if times is None and not len(motion):
         raise InputError(f"{motion.recording}: the motion has no estimate; nothing to draw")
     if times is None:
@@ -298,7 +362,7 @@ def _(tracks: Tracks) -> str:
 def _(motion: MotionEstimate) -> str:
     lost = int((~motion.valid).sum())
     rows = [
-        ("motion", motion.model.title),
+        ("motion", motion.model.title + ", assumed" * motion.model_assumed),
         ("estimates", f"{len(motion):,}, {lost:,} of them lost"),
     ]
     for i, (name, unit) in enumerate(zip(motion.model.components, motion.model.units, strict=True)):

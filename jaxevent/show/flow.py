@@ -12,19 +12,20 @@ from jaxevent.errors import InputError
 from jaxevent.event_flow import EventFlow
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.progress import bar
+from jaxevent.recording import Times, microseconds
 from jaxevent.show.images import video_writer
 
 PNG_SCALE, PNG_ZERO = 128, 2**15  # of DSEC: the stored number of d px is d * 128 + 2^15
 SPEED_PERCENTILE = 98  # of valid pixels; the speed that has full colour
 N_LIMIT_TIMES = 8  # times at which that speed is measured
 
-FlowWriter = Callable[[EventFlow, NDArray[np.int64], Path, bool | None], None]
+FlowWriter = Callable[[EventFlow, Times, Path, bool | None], None]
 
 
 def flow_writer(out: Path) -> FlowWriter:
     """Return the function that writes flow to a file of some suffix.
 
-    It is called as `flow_writer(out)(flow, times, out, progress)`, with sorted times (us).
+    It is called as `flow_writer(out)(flow, times, out, progress)`, with sorted times, us or s.
 
     Args:
         out: File, or folder if it has no suffix.
@@ -49,18 +50,16 @@ def flow_writer(out: Path) -> FlowWriter:
     return kinds[out.suffix.lower()]
 
 
-def write_flow_hdf5(
-    flow: EventFlow, times: NDArray[np.int64], out: Path, progress: bool | None = None
-) -> None:
+def write_flow_hdf5(flow: EventFlow, times: Times, out: Path, progress: bool | None = None) -> None:
     """Write flow, its covariance and validity as HDF5.
 
     Args:
         flow: The flow.
-        times: (T,) us.
+        times: (T,) sorted times; integers are us, floats s.
         out: File to write.
         progress: Whether to show a progress bar; by default in a terminal.
     """
-    h, w = flow.shape
+    us, (h, w) = _stamps(times), flow.shape
     fields = {
         "flow": ((h, w, 2), "f4", "px/s, along x and y"),
         "covariance": ((h, w, 2, 2), "f4", "(px/s)^2"),
@@ -68,23 +67,23 @@ def write_flow_hdf5(
     }
     with complete_hdf5(out, "flow_from_events", flow.params) as (file, check):
         file.attrs["recording"] = flow.recording.name
-        file["t"] = times.astype("i8")
+        file["t"] = us
         file["t"].attrs["unit"] = CLOCK_UNIT
         for name, (shape, kind, unit) in fields.items():
             stored = file.create_dataset(
-                name, (len(times), *shape), kind, chunks=(1, *shape), compression="gzip",
+                name, (len(us), *shape), kind, chunks=(1, *shape), compression="gzip",
                 compression_opts=1, shuffle=True,
             )  # fmt: skip
             stored.attrs["unit"] = unit
-        for row in bar(range(len(times)), desc="flow", unit="image", progress=progress):
-            found = flow(times[row : row + 1], extrapolate=True)
+        for row in bar(range(len(us)), desc="flow", unit="image", progress=progress):
+            found = flow(us[row : row + 1], extrapolate=True)
             for name, values in zip(fields, found, strict=True):
                 file[name][row] = values[0]
             check()
 
 
 def write_flow_images(
-    flow: EventFlow, times: NDArray[np.int64], out: Path, progress: bool | None = None
+    flow: EventFlow, times: Times, out: Path, progress: bool | None = None
 ) -> None:
     """Write displacements between consecutive times as PNG images of the kind of DSEC.
 
@@ -94,26 +93,27 @@ def write_flow_images(
 
     Args:
         flow: The flow.
-        times: (T,) us.
+        times: (T,) sorted times; integers are us, floats s.
         out: Folder to write.
         progress: Whether to show a progress bar; by default in a terminal.
 
     Raises:
         InputError: There are fewer than two times.
     """
-    if len(times) < 2:
+    us = _stamps(times)
+    if len(us) < 2:
         raise InputError(
             f"{out}: images show displacements from one time to the next, of which there are "
-            f"{len(times)}; give two or more, or write .h5"
+            f"{len(us)}; give two or more, or write .h5"
         )
     y, x = (c.ravel() for c in np.mgrid[: flow.shape[0], : flow.shape[1]])
     with complete(out, directory=True) as partial:
         lines = ["# from_timestamp_us, to_timestamp_us\n"]
-        for row in bar(range(len(times) - 1), desc="flow", unit="image", progress=progress):
-            first, last = (int(t) for t in times[row : row + 2])
+        for row in bar(range(len(us) - 1), desc="flow", unit="image", progress=progress):
+            first, last = (int(t) for t in us[row : row + 2])
             there = flow.paths(first, last, last).carry(x, y, np.full(x.shape, first))
             d = np.stack([there[0] - x, there[1] - y], -1).reshape(*flow.shape, 2)
-            valid = flow(times[row : row + 1], extrapolate=True)[2][0]
+            valid = flow(us[row : row + 1], extrapolate=True)[2][0]
             (partial / f"{row:06d}.png").write_bytes(encode_flow(d, valid))
             lines.append(f"{first}, {last}\n")
         (partial / "forward_timestamps.txt").write_text("".join(lines))
@@ -154,27 +154,33 @@ def encode_flow(displacement: NDArray[np.floating], valid: NDArray[np.bool_]) ->
 
 
 def write_flow_video(
-    flow: EventFlow, times: NDArray[np.int64], out: Path, progress: bool | None = None
+    flow: EventFlow, times: Times, out: Path, progress: bool | None = None
 ) -> None:
     """Write flow as a video in colours, see `flow_colours`; what is not valid is black.
 
     Args:
         flow: The flow.
-        times: (T,) us.
+        times: (T,) sorted times; integers are us, floats s.
         out: File to write.
         progress: Whether to show a progress bar; by default in a terminal.
     """
-    some = times[np.unique(np.linspace(0, len(times) - 1, N_LIMIT_TIMES).round().astype(int))]
+    us = _stamps(times)
+    some = us[np.unique(np.linspace(0, len(us) - 1, N_LIMIT_TIMES).round().astype(int))]
     speeds = []
     for t in some:
         mean, _, valid = flow([t], extrapolate=True)
         speeds.append(np.linalg.norm(mean[valid], axis=-1))
     fastest = float(np.percentile(np.concatenate([*speeds, [0.0]]), SPEED_PERCENTILE))
-    spacing = np.median(np.diff(times)) if len(times) > 1 else 40_000
+    spacing = np.median(np.diff(us)) if len(us) > 1 else 40_000
     with video_writer(out, min(1e6 / float(spacing), 60.0)) as write:
-        for t in bar(times, desc="flow", unit="image", progress=progress):
+        for t in bar(us, desc="flow", unit="image", progress=progress):
             mean, _, valid = flow([t], extrapolate=True)
             write(np.where(valid[0][..., None], flow_colours(mean[0], fastest), 0))
+
+
+def _stamps(times: Times) -> NDArray[np.int64]:
+    """Convert times of any kind to a row of us."""
+    return np.atleast_1d(microseconds(times))
 
 
 def flow_colours(flow: NDArray[np.floating], fastest: float | int) -> NDArray[np.uint8]:

@@ -156,11 +156,9 @@ def _errors(
         if part.direction:
             errors.append((f"{part.name} error (deg)", spread(axis_error(*pair))))
             continue
-        far, unit = endpoint_error(*pair), part.unit
-        if unit.startswith("rad"):
-            far, unit = np.degrees(far), unit.replace("rad", "deg", 1)
+        far = endpoint_error(*pair)
         of = f" of {part.name}" if len(model.parts) > 1 else ""
-        errors.append((f"|error{of}| ({unit})", spread(far)))
+        errors.append((f"|error{of}| ({part.unit})", spread(far)))
     return errors
 
 

@@ -7,6 +7,7 @@ rad; valid (T, N), False where a track does not exist and its numbers may be any
 
 import contextlib
 import functools
+import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -15,11 +16,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from jaxevent.blob.live import LiveTracks
 from jaxevent.blob.tracks import STATE_COLUMNS, STATE_UNITS, TABLE_UNITS, table_columns
 from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.parameters import Parameters
-from jaxevent.recording import Times, microseconds
+from jaxevent.recording import Events, Times, microseconds
 
 QUANTITIES = (
     "t", "id", "other", "inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range"
@@ -74,6 +76,70 @@ def track_writer(
             append(t, number, m, P)
 
         yield write
+
+
+class LiveTable:
+    """Table of live tracks, row by row, as `track_writer` writes that of a recording.
+
+    Args:
+        live: The live tracks.
+        rate: Times per second, from the first event on.
+
+    Raises:
+        InputError: The rate is not possible.
+    """
+
+    def __init__(self, live: LiveTracks, rate: float):
+        check_rate(rate)
+        self._live, self._period, self._count, self._first = live, 1e6 / rate, 0, 0
+        self.header = ",".join(TABLE_UNITS) + "\n"
+
+    def add(self, events: Events) -> str:
+        """Add events and return the lines of CSV of the times before the last of them."""
+        if not len(events):
+            return ""
+        if not self._count:
+            self._first = int(events.t[0])
+        times = self._times_until(int(events.t[-1]) - 1)
+        row, parts = 0, []
+        for end in np.unique(ends := np.searchsorted(events.t, times, "right")):
+            self._live.add(events[row:end])
+            parts.append(self._read(times[ends == end]))
+            row = end
+        self._live.add(events[row:])
+        return _csv_lines(parts)
+
+    def finish(self) -> str:
+        """Return the lines of the last event's time, if that is one of the table."""
+        return _csv_lines([self._read(self._times_until(self._live.stop))] * bool(self._count))
+
+    def _times_until(self, last: int) -> NDArray[np.int64]:
+        """Return the next times (us) up to the last one, and count them."""
+        number = max(math.floor((last - self._first + 1) / self._period) + 1, self._count)
+        steps = np.arange(self._count, number)
+        times = self._first + np.rint(steps * self._period).astype(np.int64)
+        times = times[times <= last]
+        self._count += len(times)
+        return times
+
+    def _read(self, times: NDArray[np.int64]) -> list[NDArray]:
+        """Return times, numbers, means and covariances of the tracks alive at some times."""
+        states = self._live(times)
+        row, place = np.nonzero(states.valid)
+        return [
+            times[row],
+            states.id[place],
+            states.mean[row, place],
+            states.covariance[row, place],
+        ]
+
+
+def _csv_lines(parts: list[list[NDArray]]) -> str:
+    """Return the rows of a table, in parts, as lines of CSV."""
+    if not parts:
+        return ""
+    columns = table_columns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return pd.DataFrame(columns).to_csv(index=False, header=False)
 
 
 @contextlib.contextmanager
@@ -164,6 +230,12 @@ def write_states(path: str | Path, times: Times, states: ArrayLike, valid: Array
     columns = {"t": t[row] / 1e6, "id": ids[column]}
     columns |= {name: states[row, column, i] for i, name in enumerate(STATE_COLUMNS)}
     pd.DataFrame(columns).to_csv(path, index=False)
+
+
+def check_rate(rate: float | int) -> None:
+    """Raise `InputError` for a number of times per second that is not possible."""
+    if not 0 < rate <= 1e6:
+        raise InputError(f"--rate {rate:g} is not possible; give times per s, up to 1e6")
 
 
 def check_tracks(

@@ -24,7 +24,13 @@ from jaxevent.recording import Recording
 from jaxevent.show.images import video_writer
 from jaxevent.show.tables import align_cells
 from jaxevent.show.track_figures import draw_frames, write_track_plot
-from jaxevent.show.track_tables import QUANTITIES, empty_rows, quantity_writer, track_writer
+from jaxevent.show.track_tables import (
+    QUANTITIES,
+    check_rate,
+    empty_rows,
+    quantity_writer,
+    track_writer,
+)
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 _EXTRA_OF_SUFFIX = {".mp4": ("imageio_ffmpeg", "video")} | {
@@ -79,8 +85,8 @@ class Output:
                 f"{path}: tracks cannot be stored as {suffix}; end the name in .csv, .h5, .mp4 or "
                 ".png, or leave out the suffix for a folder of all of them"
             )
-        if self.rate is not None and not 0 < self.rate <= 1e6:
-            raise InputError(f"--rate {self.rate:g} is not possible; give times per s, up to 1e6")
+        if self.rate is not None:
+            check_rate(self.rate)
         if (self.extent is None) != (self.focal is None):
             raise InputError("a range needs both --extent (m) and --focal (px); give the other too")
         if self.size_factor is not None and self.extent is None:

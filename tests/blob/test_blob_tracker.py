@@ -14,7 +14,7 @@ from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.blob.run import XlaRunner
 from jaxevent.blob.track import canonical_ellipse
 from jaxevent.blob.tracks import Tracks
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Recording
 
 WIDTH, HEIGHT = 240, 180
@@ -329,7 +329,8 @@ def test_strange_streams():
             ).valid.any()
         assert len(tracks) == 2 and (tracks(rec.stop).valid.all() or name == "hour")
     none = Recording("none", WIDTH, HEIGHT, Events.empty())
-    tracks = blob.moment.estimate(none)
+    with pytest.warns(InputWarning, match="none: no target was found; give seeds"):
+        tracks = blob.moment.estimate(none)
     assert list(tracks.events()) == []
     assert len(tracks) == 0 and tracks([0, 1], extrapolate=True).mean.shape == (2, 0, 8)
 

@@ -37,7 +37,7 @@ from jaxevent.blob.search.search import (
 )
 from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.track import StepEvents, TrackBuffer, predict_and_gate
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.io import load
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate.blobs import CircularMotion, LinearMotion, Target, simulate_blobs
@@ -307,7 +307,8 @@ def test_recordings_of_few_events_have_no_targets():
         t, none = np.arange(count, dtype=np.int64), np.zeros(count, np.uint16)
         recording = Recording("few", *SMALL, Events(t, none, none, none.astype(bool)))
         assert len(blob.find(recording, progress=False)) == 0
-        assert len(blob.constant_velocity.estimate(recording, progress=False)) == 0
+        with pytest.warns(InputWarning, match="few: no target was found"):
+            assert len(blob.constant_velocity.estimate(recording, progress=False)) == 0
 
 
 class Stopping:

@@ -12,7 +12,7 @@ from commands import decoded, described, fails
 import jaxevent
 from jaxevent import cli
 from jaxevent.event_flow import FlowParams, flow_from_events
-from jaxevent.show.flow import encode_flow, flow_colours
+from jaxevent.show.flow import encode_flow, flow_colours, write_flow_hdf5
 from jaxevent.simulate import motion_scene
 
 
@@ -83,6 +83,16 @@ def test_files_hold_the_flow(stored, tmp_path, capsys):
     assert np.array_equal(known, found[2][0])
     expected = found[0][0][known] * (times[1] - times[0]) * 1e-6
     assert np.median(np.linalg.norm(d[known] - expected, axis=-1)) < 0.2
+
+
+def test_times_of_python_are_us_or_s(tmp_path):
+    events = jaxevent.Events(np.arange(4) * 20_000, *np.zeros((2, 4), np.uint16), np.ones(4, bool))
+    flow = flow_from_events(jaxevent.Recording("few", 16, 12, events))
+    for times in ([0.03, 0.05], np.array([30_000, 50_000], np.int32)):
+        write_flow_hdf5(flow, times, tmp_path / "a.h5")
+        with h5py.File(tmp_path / "a.h5") as file:
+            assert file["t"][:].tolist() == [30_000, 50_000]
+        (tmp_path / "a.h5").unlink()
 
 
 def test_video_has_the_colours_of_directions(stored, tmp_path):

@@ -397,7 +397,6 @@ def test_without_extras_the_tables_are_written(folder, capsys, monkeypatch):
     "argv",
     [
         ["track"],
-        ["track", "a"],
         ["track", "a", "--out", "b", "--seed", "1,2"],
         ["track", "a", "--out", "b", "--seed", "1,2,x"],
         ["track", "a", "--out", "b", "--pair", "1"],

@@ -462,6 +462,8 @@ def test_few_events_are_lost(method, number):
     few = recorded([5] * number, range(number), [3] * number, [1] * number, *SIZE)
     motion = method.estimate(few)
     assert not motion.valid.any() and len(motion) == (number > 0)
+    assert "planar assumed" in repr(motion) or method is contrast
+    assert "(planar, " in repr(method.estimate(few, model="planar"))
     assert np.isfinite(motion.mean).all() and np.isfinite(motion.covariance).all()
 
 

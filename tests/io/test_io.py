@@ -708,6 +708,8 @@ def test_save_refuses_what_it_cannot_write(tmp_path):
     ):
         refuses(message, save, bad, path)
     refuses("compression 'zip' is unknown", save, good, path, "zip")
+    refuses("a.npz: recordings are stored as HDF5; end", save, good, tmp_path / "a.npz")
+    refuses("writes recordings, not an Events; write flow by", save, good.events, path)
     refuses(
         "the folder .*missing does not exist; create it", save, good, tmp_path / "missing" / "a.h5"
     )
@@ -720,7 +722,7 @@ def test_save_refuses_what_it_cannot_write(tmp_path):
 def test_content_tells_the_format_not_the_name(tmp_path):
     recording = random_recording(15, events=20, frames=1, name="a")
     for write in (
-        lambda path: save(recording, path),
+        lambda path: hdf5.write(recording, path),
         lambda path: zip_folder(write_text(tmp_path / "text", recording), path),
         lambda path: write_v73(path, mat_arrays(recording)),
         lambda path: scipy.io.savemat(path, mat_arrays(recording), appendmat=False),
@@ -928,4 +930,6 @@ def test_a_recording_is_shown_in_a_line():
     extra = {"hdr": np.zeros(3)}
     shown = repr(Recording("two", 3, 4, two, extra=extra))
     assert shown == "<two: 3x4, 2 events from 5e-06 to 2 s, hdr>"
+    many = Recording("many", 3, 4, none, extra=dict.fromkeys("abcd", np.zeros(1)))
+    assert repr(many) == "<many: 3x4, 0 events, 4 arrays in extra>"
     assert repr(Recording("none", 3, 4, none)) == "<none: 3x4, 0 events>"

@@ -2,10 +2,12 @@
 
 import dataclasses
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 from noise import HEIGHT, WIDTH, small
+from refusals import refuses
 
 import jaxevent
 from jaxevent import events, show
@@ -16,6 +18,7 @@ from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events
 from jaxevent.show import figures
+from jaxevent.show.images import Tone, tone_map
 from jaxevent.tuning import FitResult
 
 
@@ -89,6 +92,37 @@ def test_an_image_and_its_uncertainty():
         video(0.02).valid[0], video(0.02).mean[0], np.nan))  # fmt: skip
     np.testing.assert_allclose(deviation.compressed(), 0.2)
     assert figure.get_suptitle() == "small by akf at 0.02 s"
+    assert all(axis.patch.get_hatch() for axis in figure.axes[:2])
+
+
+def test_tones_of_an_image_are_those_of_the_commands():
+    video = Video(jaxevent.akf, small(), jaxevent.akf.Params())
+    known = video(0.02).valid[0]
+    values, variance = (part[0][known][None] for part in video(0.02)[:2])
+    for tone in get_args(Tone):
+        if tone == "clahe":  # of the places of pixels
+            continue
+        figure = show.plot_image(video, 0.02, tone=tone)
+        figure.canvas.draw()
+        drawn = figure.axes[0].images[0]
+        grey = drawn.to_rgba(drawn.get_array()[known])[:, 0] * 255
+        said = tone_map(values, tone, variance=variance)[0].astype(float)
+        np.testing.assert_allclose(grey, said, atol=12 if tone == "display" else 2)  # 2.2 or sRGB
+    bare = Video(jaxevent.events_only, small(), jaxevent.events_only.Params())
+    assert show.plot_image(bare, 0.02).axes[0].get_title() == "relative intensity"
+
+
+def test_other_things_are_refused_with_the_function_that_draws_them():
+    video = Video(jaxevent.akf, small(), jaxevent.akf.Params())
+    refuses(r"cannot draw a Video; use plot_image\(video", show.plot_motion, video)
+    refuses(r"cannot draw a MotionEstimate; use plot_motion", show.plot_tracks, motion())
+    refuses("cannot draw a Tracks; use plot_tracks", show.plot_image, Tracks(), 0.02)
+    refuses(
+        "truth is a Video; .*known_motion.recording, 'planar'",
+        show.plot_motion,
+        motion(),
+        truth=video,
+    )
 
 
 def test_tracks_are_lines_over_events():
