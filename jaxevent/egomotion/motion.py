@@ -351,8 +351,8 @@ class MotionEstimate(HtmlRepr):
     def _change_rate(self) -> NDArray[np.float64]:
         """Return the mean square (d, d) of changes between successive estimates, per us^2."""
         found = np.flatnonzero(self.valid & np.isfinite(self.mean).all(1))
-        change, dt = np.diff(self.mean[found], axis=0), np.diff(self.t[found]).astype(float)
-        return change.T @ change / max(float(dt @ dt), 1.0)
+        change, dt = np.diff(self.mean[found].astype(float), axis=0), np.diff(self.t[found])
+        return change.T @ change / max(float(dt.astype(float) @ dt), 1.0)
 
     def to_dataframe(
         self, times: Times | None = None, *, centred: bool | None = None
@@ -458,18 +458,20 @@ class MotionEstimate(HtmlRepr):
         """Return the covariance (times, d, d) of a motion that bends between estimates.
 
         The error of the straight line is c (t - t_before) (t_after - t) / 2, with c the mean of the
-        second derivatives at both.
+        second derivatives at both. Those of causal estimates are of the two estimates before.
         """
         n, d = self.mean.shape
         c = np.zeros((n, d))
+        late = int(self.causal)
         if n > 2:
             # Of estimates very near to each other, whose differences are noise, the next farther.
-            step = maximum_filter1d(np.maximum(np.diff(at), 1.0), 3)[:, None]
+            step = maximum_filter1d(np.maximum(np.diff(at), 1.0), 3, origin=late)[:, None]
             slope = np.diff(np.nan_to_num(self.mean), axis=0) / step
             inner = np.diff(slope, axis=0) / np.maximum(step[1:], step[:-1])
             told = self.valid[2:] & self.valid[1:-1] & self.valid[:-2]
-            c[1:-1] = np.where(told[:, None], inner, 0)
-            c[0], c[-1] = c[1], c[-2]
+            c[1 + late : n - 1 + late] = np.where(told[:, None], inner, 0)
+            if not self.causal:
+                c[0], c[-1] = c[1], c[-2]
         reach = np.maximum(times - at[before], 0) * np.maximum(at[after] - times, 0) / 2
         off = reach[:, None] * (c[before] + c[after]) / 2
         return off[:, :, None] * off[:, None, :]
