@@ -30,7 +30,7 @@ def read_notebook(path: Path, execute: bool) -> Any:
         from nbclient import NotebookClient
 
         with tempfile.TemporaryDirectory() as folder:
-            options = {
+            options: dict[str, Any] = {
                 "timeout": TIMEOUT_S,
                 "resources": {"metadata": {"path": folder}},
                 "extra_arguments": ["--log-level=ERROR"],
