@@ -292,17 +292,21 @@ def _add_pixels(points, M, s, grad_M, scratch, sums):
 def _linearise(begin, end, inputs, scratch, M, out):
     """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each.
 
-    Samples of four rows of pixels are kept: memory does not grow with the image.
+    Samples of four rows of pixels are kept: memory does not grow with the image. Rows at the border
+    of two threads are sampled by both, so a row of M is written when its means are final.
     """
     h, w = M.shape
     samples, lines, recent = scratch
-    own, grad_M, sums = lines[begin, :10], lines[begin, 10:12], lines[begin, 12:]
+    own, grad_M, sums = lines[begin, :10], lines[begin, 10:12], lines[begin, 12:27]
+    means = lines[begin, 27]
     points, sampled = recent[begin], max(2 * begin - 2, 0)
     for i in range(begin, end):
         sums[:] = np.float32(0)
         below = min(2 * i + 2, h)
         while sampled < min(2 * i + 4, h):
-            _sample_row(sampled, begin, inputs, samples, points[sampled % 4], M[sampled])
+            _sample_row(sampled, begin, inputs, samples, points[sampled % 4], means)
+            for x in range(w):
+                M[sampled, x] = means[x]
             sampled += 1
         for y in range(2 * i, below):
             for x in range(w):
@@ -370,7 +374,7 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
     shape, (count, h, w, _) = p.shape[:2], images.pixels.shape
     entries, M = np.empty((*shape, 15), np.float32), np.empty((h, w), np.float32)
     samples = _SampleScratch.allocate(shape[0], count, w)
-    scratch = samples, row_scratch(shape[0], 12 + 15, w), row_scratch(shape[0], 4, 4, count, w)
+    scratch = samples, row_scratch(shape[0], 12 + 15 + 1, w), row_scratch(shape[0], 4, 4, count, w)
     run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
     blurred = np.empty((*shape, 14), np.float32)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
