@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import Response
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.locks import synchronized
@@ -329,5 +328,3 @@ flow = Flow(
     about="The frames before and after, each moved along the optical flow between them (dense "
     "inverse search), blended by time; no events. Needs the extra `vision`.",
 )
-
-__getattr__ = renamed_names(__name__)

@@ -30,7 +30,7 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.deprecated import renamed_methods
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
@@ -939,5 +939,3 @@ aks = Smoother(
     "frames and events, earlier and later ones, with its variance; an event's change is shared "
     "with the neighbours, and the frames' likelihood can be fitted.",
 )
-
-__getattr__ = renamed_names(__name__)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import dispatch
-from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import has_accelerator
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
@@ -540,6 +540,3 @@ class Video(ImageSequence[P]):
             if len(self._starts) > MAX_WINDOW_STARTS:  # first, last, half of the others
                 self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
         return FilteredWindow(window, window.reader(self._batch), trajectory), following
-
-
-__getattr__ = renamed_names(__name__)

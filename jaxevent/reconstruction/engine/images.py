@@ -26,7 +26,6 @@ from jaxevent import dispatch
 from jaxevent.codegen import run_over_rows
 from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.module import choose_backend, make_kernel
-from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
@@ -714,5 +713,3 @@ def _tangent_dtype(image: Any) -> Any:
 
 _images.defjvp(_images_jvp, symbolic_zeros=True)
 _with_derivatives.defjvp(_with_derivatives_jvp, symbolic_zeros=True)
-
-__getattr__ = renamed_names(__name__)
