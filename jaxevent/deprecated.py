@@ -110,7 +110,7 @@ RENAMED: dict[str, str] = {
     "jaxevent.simulate.motion.World": "jaxevent.simulate.motion.BoxWorld",
     "jaxevent.simulate.motion.frame_events": "jaxevent.simulate.motion.simulate_frame_events",
     "jaxevent.simulate.motion.texture_of": "jaxevent.simulate.motion.make_texture",
-    "jaxevent.simulate.objects.Objects": "jaxevent.simulate.objects.MovingObjects",
+    "jaxevent.simulate.objects.Objects": "jaxevent.simulate.scenes.MovingObjects",
     "jaxevent.simulate.scenes.FITTING": "jaxevent.simulate.scenes.FITTING_SCENES",
     "jaxevent.simulate.scenes.Source": "jaxevent.simulate.scenes.IntensitySource",
     "jaxevent.simulate.scenes.TESTING": "jaxevent.simulate.scenes.TESTING_SCENES",
@@ -120,6 +120,9 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.lenses": "jaxevent.camera",
+    "jaxevent.runs.published": "jaxevent.runs.external",
+    "jaxevent.simulate.objects": "jaxevent.simulate.scenes",
     "jaxevent.egomotion.choice": "jaxevent.egomotion.model_selection",
     "jaxevent.egomotion.field": "jaxevent.egomotion.flow",
     "jaxevent.egomotion.layers": "jaxevent.egomotion.patches",

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import arrays
-from jaxevent.camera import PinholeCamera
+from jaxevent.camera import LENS_MODELS, PinholeCamera, find_model
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Events, ImageSource
 
 GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
@@ -234,7 +233,7 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
     Args:
         values: fx fy cx cy in px, and the coefficients of the lens, as k1 k2 p1 p2 k3.
         source: Name of the file for messages.
-        model: Name of the lens model, see `jaxevent.lenses`.
+        model: Name of the lens model, see `jaxevent.camera`.
 
     Returns:
         The camera.

@@ -11,7 +11,7 @@
     /frames/exposure      (frames,) int64 us, 0 where unknown
     /frames/images        (frames, height, width) uint8, uint16 or floats in [0, 1]
     /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3; of another lens model
-                          (`jaxevent.lenses`), which the attribute model names, its numbers
+                          (`jaxevent.camera`), which the attribute model names, its numbers
     /poses/t, position, quaternion   (poses,) int64 us, (poses, 3) m, (poses, 4) x y z w
     /imu/t, gyro, acc     (samples,) int64 us, (samples, 3) rad/s, (samples, 3) m/s^2
     /triggers/t, edge, channel   (triggers,) int64 us, 1 rising 0 falling -1 unknown, number

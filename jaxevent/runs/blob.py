@@ -9,7 +9,7 @@ Settings of trackers in a configuration of `jaxevent.runs.fit`:
                                         # of the positions, or without any, tracks are born
     positions = "*.csv"                 # beside each recording, * being its name without suffix
 
-A method may have its own loss and events. PositionBatch are as in `jaxevent.runs.blob_positions`.
+A method may have its own loss and events. Positions are as in `jaxevent.runs.blob_scores`.
 
 A recording is cut into windows of `window` seconds. If neither validation nor test is given, they
 are shared out: with `split` = [2, 1, 1], of every 4 windows in turn 2 are to fit, 1 to validate and
@@ -47,18 +47,26 @@ from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
 from jaxevent.parameters import Parameters, suggest_name
 from jaxevent.recording import Recording
-from jaxevent.runs import blob_positions
-from jaxevent.runs.blob_positions import (
+from jaxevent.runs.blob_scores import (
+    TARGET_SETTINGS,
     KnownPositions,
     Targets,
+    TrackProtocol,
     event_time_span,
     seed_from_positions,
 )
-from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME_CHECK
-from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
+from jaxevent.runs.family import (
+    SPLIT_NAMES,
+    Family,
+    Goal,
+    LastBatches,
+    Shares,
+    Sources,
+    batches_by_split,
+    windows,
+)
 from jaxevent.show.tables import legend, results_table
-from jaxevent.splits import SPLIT_NAMES, windows
 from jaxevent.tuning import Batches
 
 LOSS_NAMES = ("likelihood", "positions")
@@ -340,7 +348,7 @@ class Blobs(Family):
     fit_settings = {
         "loss": NAME_CHECK,
         "events": (lambda value: value in EVENT_CHOICES, '"all" or "associated"'),
-        **blob_positions.TARGET_SETTINGS,
+        **TARGET_SETTINGS,
     }
     own = ("loss", "events")
 

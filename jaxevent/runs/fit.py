@@ -74,7 +74,7 @@ from jaxevent.runs.calls import (
     to_toml_table,
 )
 from jaxevent.runs.contents import digest
-from jaxevent.runs.family import Sources
+from jaxevent.runs.family import SPLIT_NAMES, Sources
 from jaxevent.runs.fit_config import Plan, Task, plan_of, read_plan
 from jaxevent.runs.results import (
     Fits,
@@ -90,7 +90,6 @@ from jaxevent.runs.results import (
     write_rows,
 )
 from jaxevent.show import plot_losses
-from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import FitResult, Run, optimise
 
 CHECKPOINT_FILE = "checkpoint"  # the name of the file in the folder

@@ -35,9 +35,8 @@ from jaxevent.runs.config import (
     is_texts,
     read_params,
 )
-from jaxevent.runs.family import MODULE_OF_FAMILY, Goal, Shares, family_of, find_family
+from jaxevent.runs.family import MODULE_OF_FAMILY, SPLIT_NAMES, Goal, Shares, family_of, find_family
 from jaxevent.runs.own import MethodFunction, find_method
-from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
 
 

@@ -34,7 +34,7 @@ from jaxevent.runs.config import (
     check_choice,
     is_number,
 )
-from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
+from jaxevent.runs.family import SPLIT_NAMES, Family, Goal, LastBatches, Shares, Sources, interleave
 from jaxevent.runs.protocols import (
     DEFAULT_GAP_FRAMES,
     GAP_DOMAIN,
@@ -46,7 +46,6 @@ from jaxevent.runs.protocols import (
 )
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
 from jaxevent.show.tables import legend, markdown_table, results_table
-from jaxevent.splits import SPLIT_NAMES, interleave
 from jaxevent.tuning import Batches
 
 ERROR_KINDS = ("linear", "log", "nll")

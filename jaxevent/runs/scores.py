@@ -39,7 +39,13 @@ from jaxevent.runs.config import (
     external_name,
     is_texts,
 )
-from jaxevent.runs.external import ExternalImages, Normalise, check_normalise, fit_brightness
+from jaxevent.runs.external import (
+    ExternalImages,
+    Normalise,
+    PublishedResults,
+    check_normalise,
+    fit_brightness,
+)
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 from jaxevent.runs.protocols import (
@@ -51,7 +57,6 @@ from jaxevent.runs.protocols import (
     frames_around,
     is_gap,
 )
-from jaxevent.runs.published import PublishedResults
 from jaxevent.show.page import spread_rows
 
 # Further measures of an image and the truth, each a number per image; the first two need an extra.

@@ -18,7 +18,7 @@ from jaxevent.blob import constant_velocity as tracker
 from jaxevent.blob import negative_log_likelihood, prepare_positions
 from jaxevent.recording import Recording
 from jaxevent.runs.blob import FAMILY
-from jaxevent.runs.blob_positions import read_positions
+from jaxevent.runs.blob_scores import read_positions
 from jaxevent.runs.fit import fit
 from jaxevent.simulate import CircularMotion, Target, simulate_blobs
 
