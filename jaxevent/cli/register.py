@@ -151,8 +151,9 @@ def run(
 ) -> None:
     from jaxevent import register as rig
     from jaxevent.io import save
-    from jaxevent.io.output import complete
+    from jaxevent.io.output import check_recording_name, complete
 
+    check_recording_name(out)
     given = {
         "homography": homography, "calibration": calibration, "depth": depth, "plane": plane,
         "offset": offset, "search": search, "channel": channel, "triggers": triggers,

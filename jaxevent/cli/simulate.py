@@ -125,9 +125,11 @@ def run(
     cut: float | int | None,
     max_size: int | None,
 ) -> None:
+    from jaxevent.io.output import check_recording_name
     from jaxevent.parameters import suggest_name
     from jaxevent.simulate import SENSORS
 
+    check_recording_name(out)
     if seed < 0:
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
     if duration is not None and not 0 < duration < math.inf:

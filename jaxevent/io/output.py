@@ -132,6 +132,12 @@ def is_partial(path: Path) -> bool:
     return re.fullmatch(r"\..+\.[0-9a-f]{12}\.(part|new)", path.name) is not None
 
 
+def check_recording_name(path: Path) -> None:
+    """Raise `InputError` unless a recording can be stored under this name: it is of HDF5."""
+    if path.suffix.lower() not in ("", ".h5", ".hdf5", ".hdf") and not is_partial(path):
+        raise InputError(f"{path}: recordings are stored as HDF5; end the name in .h5")
+
+
 def partials(path: Path) -> list[Path]:
     """List the siblings of `path` that hold writes of it which go on, or were broken off."""
     path = path.absolute()
