@@ -59,10 +59,9 @@ from jaxevent.runs.config import NAME_CHECK
 from jaxevent.runs.family import (
     SPLIT_NAMES,
     Family,
+    FitData,
     Goal,
     LastBatches,
-    Shares,
-    Sources,
     batches_by_split,
     windows,
 )
@@ -129,10 +128,8 @@ class TrackGoal(Goal):
     def files(self, recording: Path) -> list[Path]:
         return self.targets.files(recording)
 
-    def problem(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[TrackerParams], Batches]:
-        found = [part for part in self._windows(sources, split, window) if part.split < 2]
+    def problem(self, data: FitData) -> Callable[[TrackerParams], Batches]:
+        found = [part for part in self._windows(data) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
 
@@ -144,23 +141,16 @@ class TrackGoal(Goal):
         return LastBatches(packing_key, make)
 
     def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: TrackerParams,
-        progress: bool | None,
+        self, data: FitData, params: TrackerParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        found = self._windows(sources, split, window)
+        found = self._windows(data)
         packed = self._packed(found, params, "likelihood")
-        for place, (given, recording) in (
-            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
-        ):
+        for place, given, recording in data:
             errors = self.targets.errors(recording, self.tracker, params, progress)
             of_this = [
                 (part, batch)
                 for part, batch in zip(found, packed, strict=True)
-                if part.recording is recording and (split is not None or part.split == place)
+                if part.recording is recording and (data.split is not None or part.split == place)
             ]
             for k, name in enumerate(SPLIT_NAMES):
                 mine = [(part, batch) for part, batch in of_this if part.split == k]
@@ -195,17 +185,13 @@ class TrackGoal(Goal):
             columns[3:3] = [("covered", "covered", 1, 3)]
         return results_table(rows, columns) + legend(columns)
 
-    def _windows(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> list[TrackWindow]:
+    def _windows(self, data: FitData) -> list[TrackWindow]:
         """Cut all recordings into windows, and leave out those without events."""
         found = []
-        for place, (_, recording) in (
-            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
-        ):
+        for place, _, recording in data:
             known = self.targets.known(recording)
             first, stop = event_time_span(recording)
-            spans = windows(first, stop, window, split, place)
+            spans = windows(first, stop, data.window, data.split, place)
             cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
             for (begin, end, s), seeds in zip(spans, cuts, strict=True):
                 index = recording.events.index

@@ -87,11 +87,10 @@ from jaxevent.runs.config import (
 from jaxevent.runs.family import (
     SPLIT_NAMES,
     Family,
+    FitData,
     Goal,
     LastBatches,
     Protocol,
-    Shares,
-    Sources,
     batches_by_split,
     windows,
 )
@@ -373,10 +372,8 @@ class MotionGoal(Goal):
     def files(self, recording: Path) -> list[Path]:
         return truth_files_of(recording, {"truth": self.truth})
 
-    def problem(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[Any], Batches]:
-        found = [one for one in self._windows(sources, split, window) if one.split < 2]
+    def problem(self, data: FitData) -> Callable[[Any], Batches]:
+        found = [one for one in self._windows(data) if one.split < 2]
 
         def acting(params: Any) -> dict[str, float]:
             acts = params.without_gradient() if self.method.differentiable else params.numbers
@@ -389,17 +386,10 @@ class MotionGoal(Goal):
         return LastBatches(acting, make)
 
     def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: Parameters,
-        progress: bool | None,
+        self, data: FitData, params: Parameters, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        found = self._windows(sources, split, window)
-        for place, (given, recording) in (
-            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
-        ):
+        found = self._windows(data)
+        for place, given, recording in data:
             mine = [p for p in found if p.recording is recording]
             if not mine:
                 continue
@@ -411,7 +401,9 @@ class MotionGoal(Goal):
             mean, _, valid = told
             truth = known(t)
             for k, name in enumerate(SPLIT_NAMES):
-                chosen = [p for p in mine if p.split == k and (split is not None or k == place)]
+                chosen = [
+                    p for p in mine if p.split == k and (data.split is not None or k == place)
+                ]
                 inside = np.zeros(len(t), bool)
                 for p in chosen:
                     inside |= (p.start <= t) & (t < p.stop)
@@ -440,14 +432,10 @@ class MotionGoal(Goal):
         settings = {"model": self.model, "truth": self.truth, **self.of_truth}
         return true_motion(recording, settings)
 
-    def _windows(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> list[TrainingSegment]:
+    def _windows(self, data: FitData) -> list[TrainingSegment]:
         """Cut all recordings with known truth into windows that hold events."""
         found = []
-        for place, (_, recording) in (
-            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
-        ):
+        for place, _, recording in data:
             events, truth = recording.events, self.known(recording)
             if not len(events):
                 raise InputError(f"{recording.name}: holds no events; choose another recording")
@@ -458,7 +446,7 @@ class MotionGoal(Goal):
                     f"{recording.name}: its events and the true motion are not of one time; times "
                     "are seconds on the recording's clock"
                 )
-            for begin, end, s in windows(first, stop, window, split, place):
+            for begin, end, s in windows(first, stop, data.window, data.split, place):
                 if events.index(begin) < events.index(end):
                     found.append(TrainingSegment(recording, begin, end, truth, s))
         return found
