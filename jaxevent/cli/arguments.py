@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -137,6 +138,15 @@ def add_frames(one: Any, name: str, source: str) -> None:
     )
 
 
+def add_span(one: argparse.ArgumentParser) -> None:
+    """Add the options --start and --stop, a part of the recording."""
+    for name in ("start", "stop"):
+        end = "end" if name == "stop" else name
+        one.add_argument(
+            f"--{name}", metavar="S", type=float, help=f"{end} time, in s on the recording's clock"
+        )
+
+
 def add_no_calibrate(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--no-calibrate",
@@ -162,6 +172,12 @@ def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
     from jaxevent.io import load
 
     return load(path, in_memory=False, progress=show_progress(), **reading, **more)
+
+
+def open_named(path: Path, reading: dict[str, Any]) -> tuple[Any, str]:
+    """Open a recording as `open_recording`, named by its path for messages; return its name too."""
+    recording = open_recording(path, reading)
+    return dataclasses.replace(recording, name=str(path)), recording.name
 
 
 def add_output(

@@ -156,7 +156,6 @@ class Message(eqx.Module):
         return Message(self.h + other.h, self.J + other.J)
 
 
-@renamed_methods(before="apply", then="compose")
 class MessageMap(eqx.Module):
     """Map from the message after several frames to the one before them (Sarkka & Garcia-Fernandez
     2021).

@@ -434,11 +434,6 @@ class MovingSurface(NamedTuple):
         """Return x and y (px) at t seconds, (2,)."""
         return self.middle + self.swing * np.sin(self.rate * t + self.phase)
 
-    def place(self, t: float | int) -> NDArray[np.floating]:
-        """Return `position`; the old name of the method."""
-        warn_renamed("MovingSurface.place", "MovingSurface.position")
-        return self.position(t)
-
     def velocity(self, t: float | int) -> NDArray[np.floating]:
         """Return the velocity (px/s) at t seconds, (2,)."""
         return self.swing * self.rate * np.cos(self.rate * t + self.phase)
