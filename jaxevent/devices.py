@@ -39,8 +39,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxevent.dispatch import check_platform_available
 from jaxevent.errors import InputError
+from jaxevent.threads import check_platform_available
 
 DEVICE_AXIS = "devices"
 JOIN_TIMEOUT_S = 300  # s that processes wait for each other at the start

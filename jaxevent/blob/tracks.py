@@ -17,9 +17,9 @@ from jaxevent.blob.run import count_numbers
 from jaxevent.blob.track import TrackStates
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
-from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
+from jaxevent.threads import TurnLock
 
 if TYPE_CHECKING:
     import pandas

@@ -113,11 +113,11 @@ def add_live(one: argparse.ArgumentParser, printed: str) -> None:
 
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
-    from jaxevent.io import chunks
+    from jaxevent.events import live
 
     if str(path) != "-":
         recording = open_recording(path, reading)
-        return recording, chunks.divide(recording)
+        return recording, live.divide(recording)
     from jaxevent.io.calibration import read_camera
     from jaxevent.recording import Events, Recording
 
@@ -126,7 +126,7 @@ def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
     width, height = reading["size"]
     recording = Recording("standard input", width, height, Events.empty(), camera=lens)
-    return recording, chunks.read_lines(sys.stdin.buffer)
+    return recording, live.read_lines(sys.stdin.buffer)
 
 
 def add_frames(one: Any, name: str, source: str) -> None:

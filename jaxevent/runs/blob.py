@@ -45,7 +45,7 @@ from jaxevent.blob.losses import PositionBatch
 from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
-from jaxevent.parameters import Parameters, suggest_name
+from jaxevent.parameters import Parameters, check_choice
 from jaxevent.recording import Recording
 from jaxevent.runs.blob_scores import (
     TARGET_SETTINGS,
@@ -341,8 +341,7 @@ class Blobs(Family):
     def goal(self, method: Tracker, params: Parameters, settings: Mapping[str, Any]) -> TrackGoal:
         assert isinstance(params, TrackerParams)
         loss = settings.get("loss", "likelihood")
-        if loss not in LOSS_NAMES:
-            raise InputError(f"there is no loss {loss!r}; {suggest_name(loss, LOSS_NAMES)}")
+        check_choice(loss, "loss", LOSS_NAMES)
         if loss == "positions" and settings.get("positions") is None:
             raise InputError(
                 "the loss 'positions' needs tables of them; give their name beside the "

@@ -6,7 +6,7 @@ import glob
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from jaxevent import datasets
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
-from jaxevent.parameters import Parameters, read_toml, suggest_name
+from jaxevent.parameters import Parameters, check_choice, read_toml, suggest_name
 from jaxevent.recording import Recording
 
 Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
@@ -160,18 +160,10 @@ SIZE_CHECK: Check = (
 
 def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
     for name, value in table.items():
-        if name not in known:
-            raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
+        check_choice(name, "setting", known)
         accepts, text = known[name]
         if not accepts(value):
             raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
-
-
-def check_choice(value: str, what: str, known: Sequence[str]) -> str:
-    """Return the value; raise `InputError` unless it is one of those known."""
-    if value not in known:
-        raise InputError(f"there is no {what} {value!r}; {suggest_name(value, known)}")
-    return value
 
 
 def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recording]]:

@@ -50,8 +50,8 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io.images import TIMESTAMP_FILES, Scale, Series, read_series
-from jaxevent.parameters import suggest_name
-from jaxevent.runs.config import check, check_choice, is_number, is_texts
+from jaxevent.parameters import check_choice
+from jaxevent.runs.config import check, is_number, is_texts
 from jaxevent.runs.family import Source
 from jaxevent.show.tables import COLUMNS
 
@@ -83,8 +83,7 @@ class ExternalImages(Source):
     def of(cls, table: Mapping[str, Any], folder: Path) -> "ExternalImages":
         known = {field.name: field for field in dataclasses.fields(cls) if field.name != "folder"}
         for name, value in table.items():
-            if name not in known:
-                raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
+            check_choice(name, "setting", known)
             if name in ("images", "timestamps"):
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{name} is {value!r}; give a path")

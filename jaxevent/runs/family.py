@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaxevent.devices import partition_batches
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, import_object
-from jaxevent.parameters import Parameters, suggest_name
+from jaxevent.parameters import Parameters, check_choice, suggest_name
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Check
 from jaxevent.tuning import Batches, Loss
@@ -273,8 +273,7 @@ def find_protocol(name: Any) -> tuple[Protocol, str]:
         for family in MODULE_OF_FAMILY
         for protocol in find_family(family).protocols
     }
-    if name not in known:
-        raise InputError(f"there is no protocol {name!r}; {suggest_name(str(name), known)}")
+    check_choice(name, "protocol", known)
     return find_family(known[name]).protocols[name], known[name]
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from jaxevent.devices import REMOTE_BATCH
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters
+from jaxevent.parameters import Parameters, check_choice
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, make_pixel_mesh, shard_over_pixels
@@ -31,7 +31,6 @@ from jaxevent.runs.config import (
     NAME_CHECK,
     NOT_NEGATIVE_CHECK,
     POSITIVE_CHECK,
-    check_choice,
     is_number,
 )
 from jaxevent.runs.family import SPLIT_NAMES, Family, FitData, Goal, LastBatches, interleave

@@ -29,13 +29,13 @@ from jaxevent.metrics import (
     regions,
     ssim,
 )
+from jaxevent.parameters import check_choice
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import (
     CALIBRATE_CHECK,
     METRICS_CHECK,
-    check_choice,
     external_name,
     is_texts,
 )
