@@ -48,7 +48,7 @@ def test_a_command_says_so_in_a_line(tmp_path):
     crop = os.path.join(jaxevent.__path__[0], "data/slider_depth_crop.h5")
     words = ["reconstruct", crop, "--method", "akf", "--out", str(tmp_path / "a.h5")]
     done = subprocess.run(
-        [sys.executable, "-m", "jaxevent.cli", *words],
+        [sys.executable, "-m", "jaxevent", *words],
         env={**os.environ, "JAX_PLATFORMS": "abacus"},
         capture_output=True,
         text=True,

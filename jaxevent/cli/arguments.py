@@ -216,7 +216,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
         yield {**taken, "force": force}
     elif outputs:
         from jaxevent.io.calibration import split_name
-        from jaxevent.io.companions import companions
+        from jaxevent.io.checks import companions
         from jaxevent.io.output import Command, allow_writing_into_folders, check_outputs, running
 
         named = [path for name in outputs if (path := taken[name]) is not None]

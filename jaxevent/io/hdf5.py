@@ -40,13 +40,14 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import UNIT_NAMES, times, to_microseconds
 from jaxevent.errors import InputError, OrderError
-from jaxevent.io import companions
 from jaxevent.io.checks import (
     ReadOptions,
     check_events,
     check_unfolded,
+    images_folder,
     make_camera,
     reading,
+    rectify_map_file,
     sensor_size,
     whole_number,
     whole_size,
@@ -483,7 +484,7 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
 
 def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
     """Describe, for `Recording.left_out`, frames in the file, or those of DSEC beside it."""
-    images = companions.images(path)
+    images = images_folder(path)
     if images is None:
         return describe_images(file)
     return {
@@ -508,7 +509,7 @@ def _is_dsec(file: Any) -> bool:
 
 def _read_rectify_map(path: Path) -> NDArray | None:
     """Read the places of a DSEC camera's pixels in the rectified image, (height, width, 2)."""
-    beside = companions.rectify_map(path)
+    beside = rectify_map_file(path)
     if beside is None:
         return None
     with open_file(beside) as file:

@@ -79,7 +79,7 @@ from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io import toml
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
