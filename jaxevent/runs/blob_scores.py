@@ -35,7 +35,6 @@ lambda1 and ln lambda2; `theta` (degrees), where lambda1 is larger than 1.15 lam
 """
 
 import dataclasses
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,9 +53,12 @@ from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 from jaxevent.runs.config import (
+    FLAG_CHECK,
     METRICS_CHECK,
+    POSITIVE_CHECK,
     Check,
     TruthTables,
+    is_numbers,
     is_table,
     truth_files,
     truth_table,
@@ -64,18 +66,12 @@ from jaxevent.runs.config import (
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, find_metrics, own_names
 
-
-def _is_seed(value: Any) -> bool:
-    numbers = isinstance(value, list) and len(value) in (3, 4)
-    return numbers and all(type(n) in (int, float) and np.isfinite(n) for n in value)
-
-
 TARGET_SETTINGS: Mapping[str, Check] = {
     "seeds": (
         lambda value: (
             isinstance(value, list)
             and len(value) > 0
-            and all(_is_seed(one) and one[2] > 0 for one in value)
+            and all(is_numbers(one, 3, 4) and one[2] > 0 for one in value)
         ),
         "a list of [x, y, size], in px, or [x, y, size, t], t in s",
     ),
@@ -280,10 +276,6 @@ TRACK_BEGINNINGS = ("positions", "found", "born")
 MATCH_DISTANCE_PX = 10.0  # px
 
 
-def _above_0(value: Any) -> bool:
-    return type(value) in (int, float) and 0 < value < math.inf
-
-
 def _are_pairs(value: Any) -> bool:
     return isinstance(value, list) and all(
         isinstance(one, list) and len(one) == 2 and all(type(i) is int for i in one)
@@ -297,13 +289,10 @@ class TrackProtocol(Protocol):
     settings: Mapping[str, Check] = {
         **TARGET_SETTINGS,
         "begin": (lambda value: value in TRACK_BEGINNINGS, '"positions", "found" or "born"'),
-        "smooth": (lambda value: type(value) is bool, "true or false"),
+        "smooth": FLAG_CHECK,
         "metrics": METRICS_CHECK,
         "pairs": (_are_pairs, "a list of [id, id], two targets each"),
-        **{
-            name: (_above_0, "a number above 0")
-            for name in ("reach", "extent", "focal", "size_factor")
-        },
+        **dict.fromkeys(("reach", "extent", "focal", "size_factor"), POSITIVE_CHECK),
     }
 
     def check(self, options: Mapping[str, Any]) -> None:

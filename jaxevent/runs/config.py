@@ -125,12 +125,23 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value)
 
 
+def is_numbers(value: Any, *counts: int) -> bool:
+    """Return true for a list of finite numbers, as many as one of `counts`."""
+    return isinstance(value, list) and len(value) in counts and all(map(is_number, value))
+
+
+def is_flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
 def is_natural(value: Any) -> bool:
     return type(value) is int and value > 0
 
 
 POSITIVE_CHECK = (lambda value: is_number(value) and value > 0, "a positive number")
 NOT_NEGATIVE_CHECK = (lambda value: is_number(value) and value >= 0, "a number, 0 or more")
+FLAG_CHECK = (is_flag, "true or false")
+SEED_CHECK = (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more")
 NATURAL_CHECK = (is_natural, "a whole number, 1 or more")
 NAME_CHECK = (is_text, "text")
 PATHS_CHECK = (
@@ -148,7 +159,7 @@ def is_metrics(value: Any) -> bool:
 
 METRICS_CHECK = (is_metrics, 'a list of names, as ["lpips"], or of "package.module:function"')
 CALIBRATE_CHECK: Check = (
-    lambda value: isinstance(value, bool),
+    is_flag,
     "true, to take clock and thresholds that are not given from the recording, or false",
 )
 STREAM_CHECK = (is_text, 'the name of a camera, as "left"')

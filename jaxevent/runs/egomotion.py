@@ -75,11 +75,14 @@ from jaxevent.methods import find
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording, Times
 from jaxevent.runs.config import (
+    FLAG_CHECK,
     METRICS_CHECK,
     NATURAL_CHECK,
     NOT_NEGATIVE_CHECK,
     POSITIVE_CHECK,
+    SEED_CHECK,
     Check,
+    is_numbers,
     is_table,
     truth_files,
     truth_table,
@@ -98,36 +101,23 @@ from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 from jaxevent.show.tables import legend, results_table
 from jaxevent.tuning import Batches
 
-
-def _vector(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == 3
-        and all(type(n) in (int, float) and np.isfinite(n) for n in value)
-    )
-
-
-def _flag(value: Any) -> bool:
-    return isinstance(value, bool)
-
-
 MOTION_SETTINGS: dict[str, Check] = {
     "model": (lambda value: isinstance(value, str), 'a name, as "planar" or "rotation"'),
     "truth": (
         is_table,
         'the name of tables beside the recordings, as "*.csv", or "poses", "gyro"',
     ),
-    "gyro_bias": (_vector, "three numbers, rad/s"),
+    "gyro_bias": (lambda value: is_numbers(value, 3), "three numbers, rad/s"),
     "imu_rotation": (
         lambda value: isinstance(value, str),
         'the gyro\'s axes, as "camera", "y-up", or nine numbers, row by row, in a text',
     ),
     "depth": POSITIVE_CHECK,
     "settle": (NOT_NEGATIVE_CHECK[0], "a number of seconds, 0 or more"),
-    "centred": (_flag, "true or false"),
-    "smooth": (_flag, "true or false"),
-    "gyro": (_flag, "true or false"),
-    "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
+    "centred": FLAG_CHECK,
+    "smooth": FLAG_CHECK,
+    "gyro": FLAG_CHECK,
+    "seed": SEED_CHECK,
     "metrics": METRICS_CHECK,
 }
 # Measures that rows have in any case.

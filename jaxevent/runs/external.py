@@ -87,11 +87,8 @@ class ExternalImages(Source):
             if name in ("images", "timestamps"):
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{name} is {value!r}; give a path")
-            elif (
-                not isinstance(value, int | float)
-                or isinstance(value, bool)
-                or not math.isfinite(value)
-                or (value < 0 if name == "tolerance" else value <= 0 and name != "clock_offset")
+            elif not is_number(value) or (
+                value < 0 if name == "tolerance" else value <= 0 and name != "clock_offset"
             ):
                 raise InputError(f"{name} is {value!r}; give a positive number")
         if "images" not in table:

@@ -35,6 +35,7 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import (
     CALIBRATE_CHECK,
+    FLAG_CHECK,
     METRICS_CHECK,
     external_name,
     is_texts,
@@ -472,7 +473,7 @@ class HeldOut(ImageProtocol):
     settings = {
         **ImageProtocol.settings,
         "gap": (is_gap, GAP_DOMAIN),
-        "moving": (lambda value: isinstance(value, bool), "true or false"),
+        "moving": FLAG_CHECK,
     }
 
 
