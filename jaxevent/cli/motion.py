@@ -171,15 +171,7 @@ def run(
         raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
     turned = None if imu_rotation is None else rotation_of(imu_rotation)
     output = Output(out, rate, truth, flow=flow)
-    recording = arguments.open_recording(path, reading)
-    recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
-    if not len(recording.events):
-        raise InputError(f"{path}: holds no events; choose another recording")
-    if recording.imu is None and (imu or still is not None):
-        raise InputError(
-            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out "
-            f"{'--imu' if imu else '--still'} or choose another recording"
-        )
+    recording = _open(path, reading, focal, "--imu" if imu else "--still" if still else None)
     bias = None
     if recording.imu is not None and still is not None:
         bias = gyro_bias(recording.imu, *still)
@@ -222,6 +214,22 @@ def run(
         f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
         f"{count / seconds:,.0f} events/s"
     )
+
+
+def _open(
+    path: Path, reading: dict[str, Any], focal: float | int | None, imu_option: str | None
+) -> Any:
+    """Open a recording that holds events, and an IMU where an option needs one."""
+    recording = arguments.open_recording(path, reading)
+    recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events; choose another recording")
+    if recording.imu is None and imu_option is not None:
+        raise InputError(
+            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out {imu_option} or "
+            "choose another recording"
+        )
+    return recording
 
 
 def _print_live(
