@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxevent import cache
+from jaxevent.codegen import N_THREADS
 from jaxevent.devices import double_precision, local_devices
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, MissingExtra, require
@@ -320,7 +321,7 @@ def _in_processes(work: _Work, workers: int) -> Records:
     context = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
     waiting = collections.deque((number, 0) for number in range(len(tasks)))
     workers = min(workers, len(tasks))
-    threads = max(1, _cores() // max(workers, 1))
+    threads = max(1, N_THREADS // max(workers, 1))
     idle: list[tuple[Any, Any]] = []
     busy: dict[Any, tuple[Any, int, int]] = {}  # by connection: its process, task, earlier attempts
 
@@ -366,12 +367,6 @@ def _in_processes(work: _Work, workers: int) -> Records:
             process.join(EXIT_TIMEOUT_S)
             process.kill()
             process.join()
-
-
-def _cores() -> int:
-    with contextlib.suppress(AttributeError):  # not on every system
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _serve(connection: multiprocessing.connection.Connection, threads: int, number: int) -> None:
