@@ -171,9 +171,7 @@ def run(
         frames=images,
         progress=show_progress(),
     )
-    recording = arguments.open_recording(path, reading)
-    name = recording.name
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    recording, name = arguments.open_named(path, reading)
     seen, grid = (recording.width, recording.height), None
     if calibration is not None:
         sizes = (seen, (other.width, other.height))

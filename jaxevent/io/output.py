@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import toml
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.parameters import Parameters
 
 try:

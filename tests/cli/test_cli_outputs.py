@@ -17,7 +17,7 @@ from jaxevent.egomotion.truth import known_motion
 from jaxevent.io import output
 from jaxevent.register.geometry import read_homography
 from jaxevent.runs import results
-from jaxevent.runs.blob_positions import read_positions
+from jaxevent.runs.blob_scores import read_positions
 
 RECONSTRUCT = "reconstruct {source} --method blend --rate 5 --out {out}"
 COMMANDS = {

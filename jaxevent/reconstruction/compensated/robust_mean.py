@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
-from jaxevent.deprecated import renamed_names
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -524,6 +523,3 @@ def robust_mean(
     run_over_rows(_finish, h, inputs, scratch, residuals[0], out)
     excess, weight = blur_images(scratch.excess, SCATTER_SIGMA_PX)
     return out._replace(scatter=np.maximum(excess / weight, 0))
-
-
-__getattr__ = renamed_names(__name__)
