@@ -7,6 +7,7 @@ float means seconds, both on the recording's clock.
 """
 
 import dataclasses
+import os
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.display import HtmlRepr, plural
+from jaxevent.display import HtmlRepr, describe_type, plural
 from jaxevent.errors import InputError, InputWarning, OrderError
 
 if TYPE_CHECKING:
@@ -55,6 +56,26 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     if time.size and not -(2**63) <= scaled.min() <= scaled.max() < 2**63:
         raise InputError(f"{what} contain one that is too large for microseconds; correct the unit")
     return np.asarray(scaled).astype(np.int64)
+
+
+def check_recording(recording: Any, call: str, or_events: bool = False) -> None:
+    """Raise `InputError` unless an argument is a `Recording`, naming the remedy.
+
+    Args:
+        recording: The argument.
+        call: Name of the called function in the message.
+        or_events: Whether the function takes bare events, too.
+    """
+    if isinstance(recording, Recording) or (or_events and _is_source(recording)):
+        return
+    takes = f"{call} takes {'events or ' * or_events}a recording"
+    if isinstance(recording, str | os.PathLike):
+        raise InputError(f"{takes}, not a path; give jaxevent.load({str(recording)!r})")
+    held = "bare events" if _is_source(recording) else describe_type(recording)
+    raise InputError(
+        f"{takes}, not {held}; give jaxevent.load(path), or of arrays "
+        "jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...)"
+    )
 
 
 def check_times(times: Times, start_us: int, stop_us: int, name: str) -> None:
@@ -351,15 +372,18 @@ class CheckedEvents:
         )
 
 
+def _is_source(events: Any) -> bool:
+    """Return whether an object is events; types of Python have an `index` too."""
+    built_in = isinstance(events, type | str | bytes | list | tuple | range)
+    return not built_in and isinstance(events, EventSource) and callable(events.index)
+
+
 def _checked_source(events: Any, size: tuple[int, int], name: str) -> EventSource:
     """Check the events of a recording, or have them checked when they are read."""
     if isinstance(events, Events):
         events.check_places(*size, name)
         return events
-    built_in = isinstance(
-        events, type | str | bytes | list | tuple | range
-    )  # these have `index` too
-    if built_in or not (isinstance(events, EventSource) and callable(events.index)):
+    if not _is_source(events):
         raise InputError(
             f"{name}: events is a {type(events).__name__}, not jaxevent.Events; make the recording "
             "by jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...), or of a file by "

@@ -22,7 +22,7 @@ from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, Recording, check_recording
 
 MAX_HOT_SHARE = 0.01  # of the pixels
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
@@ -81,6 +81,7 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
     Returns:
         The faults, empty where nothing is wrong.
     """
+    check_recording(recording, "check_consistency")
     sample = take_sample(recording) if sample is None else sample
     return tuple(
         fault
