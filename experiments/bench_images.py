@@ -700,7 +700,7 @@ FIRST_PICTURE = (
 STARTS: dict[str, tuple[str, ...]] = {
     **{f"`{name}`": (*COMMAND, "--method", name, "--out") for name in ("akf", "aks")},
     "`mc`, one picture from Python": (sys.executable, "-c", FIRST_PICTURE),
-    "`jaxevent --help`": (sys.executable, "-m", "jaxevent.cli", "--help"),
+    "`jaxevent --help`": (sys.executable, "-m", "jaxevent", "--help"),
 }
 
 

@@ -13,7 +13,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, InputWarning
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -649,6 +648,3 @@ def check_image_values(images: Any, what: str) -> None:
                 f"{what}: frame {row} holds NaN or values outside [0, 1]; scale float frames to "
                 "[0, 1], dividing by 255 if these are levels of 8 bits, and remove broken ones"
             )
-
-
-__getattr__ = renamed_names(__name__)

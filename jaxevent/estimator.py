@@ -28,7 +28,6 @@ from jax.core import Tracer
 
 from jaxevent.arrays import shorten_value
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import renamed_names
 from jaxevent.display import with_article
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, phrase
@@ -483,6 +482,3 @@ def import_object(path: str, kind: type[T], what: str) -> T:
     if not isinstance(found, kind):
         raise InputError(f"{path!r} is {phrase(found)}, not {with_article(kind.__name__)}")
     return found
-
-
-__getattr__ = renamed_names(__name__)

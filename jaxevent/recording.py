@@ -602,6 +602,35 @@ class Triggers(_TimedRows):
             raise InputError("triggers need an edge, -1, 0 or 1, for each time; correct them")
 
 
+def _columns_given(t: Any, x: Any, y: Any, p: Any) -> dict[str, Any]:
+    """Return the columns of events by name, from each on its own or from `t` that holds all."""
+    given = dict(zip("txyp", (t, x, y, p), strict=True))
+    if x is None and y is None and p is None:
+        given = arrays.columns_of(t)
+    missing = [name for name in "txyp" if given[name] is None]
+    if missing:
+        raise InputError(
+            f"{missing[0]} is missing; give t, x, y and p, or one array with these fields"
+        )
+    return given
+
+
+def _events_of_columns(
+    t: NDArray[np.int64], given: Mapping[str, Any], size: tuple[int, int], name: str
+) -> Events:
+    """Check columns of a caller on a sensor (width, height), and make events of times (us)."""
+    x, y, p = (arrays.as_column(given[field], field) for field in "xyp")
+    arrays.check_lengths(t, x, y, p, name)
+    events = Events.of_checked(
+        t,
+        arrays.coordinates("x", x, size, name),
+        arrays.coordinates("y", y, size, name),
+        arrays.polarities(p, name),
+    )
+    events.check_order(name)
+    return events
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Recording(HtmlRepr):
     """One recording of one sensor; see the module for the conventions.
@@ -720,15 +749,8 @@ class Recording(HtmlRepr):
                 names the argument and the remedy.
         """
         arrays.check_unit(time_unit)
-        if x is None and y is None and p is None:
-            given = arrays.columns_of(t)
-            t, x, y, p = (given[field] for field in "txyp")
-        missing = [field for field, v in zip("txyp", (t, x, y, p), strict=True) if v is None]
-        if missing:
-            raise InputError(
-                f"{missing[0]} is missing; give t, x, y and p, or one array with these fields"
-            )
-        grey = colours = None
+        given = _columns_given(t, x, y, p)
+        grey = colours = made = None
         if frames is not None:
             grey, colours = arrays.as_images(frames)
             height = grey.shape[1] if height is None else height
@@ -742,17 +764,8 @@ class Recording(HtmlRepr):
                 "height=260 or what your camera has"
             )
         size = arrays.as_size(width, height, name)
-        columns = (arrays.as_column(v, field) for field, v in zip("xyp", (x, y, p), strict=True))
-        us, (x, y, p) = arrays.as_times(t, "t", time_unit), columns
-        arrays.check_lengths(us, x, y, p, name)
-        events = Events.of_checked(
-            us,
-            arrays.coordinates("x", x, size, name),
-            arrays.coordinates("y", y, size, name),
-            arrays.polarities(p, name),
-        )
-        events.check_order(name)
-        made = None
+        us = arrays.as_times(given["t"], "t", time_unit)
+        events = _events_of_columns(us, given, size, name)
         if grey is not None:
             if frame_times is None:
                 raise InputError("frame_times is missing; give the time of each of the frames")

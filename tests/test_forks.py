@@ -15,7 +15,7 @@ from jaxevent import codegen, progress
 from jaxevent.codegen import module as kernel_module
 from jaxevent.errors import InputError
 from jaxevent.io import decoded
-from jaxevent.locks import TurnLock
+from jaxevent.threads import TurnLock
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="there are no forks"),

@@ -14,7 +14,6 @@ from jaxevent.blob.prepare import ChunkPacker, Features
 from jaxevent.blob.run import run
 from jaxevent.blob.track import to_seconds
 from jaxevent.blob.tracker import Tracker
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording, Times, microseconds
 
@@ -127,6 +126,3 @@ def prepare_positions(
     known = np.asarray(np.isfinite(truth).all(-1))
     xi = np.where(known[..., None], truth, 0).astype(features.xi.dtype)
     return PositionBatch(features, out.chunk, out.step, out.time, xi, known)
-
-
-__getattr__ = renamed_names(__name__)

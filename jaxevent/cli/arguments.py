@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -112,11 +113,11 @@ def add_live(one: argparse.ArgumentParser, printed: str) -> None:
 
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
-    from jaxevent.io import chunks
+    from jaxevent.events import live
 
     if str(path) != "-":
         recording = open_recording(path, reading)
-        return recording, chunks.divide(recording)
+        return recording, live.divide(recording)
     from jaxevent.io.calibration import read_camera
     from jaxevent.recording import Events, Recording
 
@@ -125,7 +126,7 @@ def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
     width, height = reading["size"]
     recording = Recording("standard input", width, height, Events.empty(), camera=lens)
-    return recording, chunks.read_lines(sys.stdin.buffer)
+    return recording, live.read_lines(sys.stdin.buffer)
 
 
 def add_frames(one: Any, name: str, source: str) -> None:
@@ -135,6 +136,15 @@ def add_frames(one: Any, name: str, source: str) -> None:
         metavar="NAME",
         help=f"which images of {source} are the frames: a topic or a number; none: no frames",
     )
+
+
+def add_span(one: argparse.ArgumentParser) -> None:
+    """Add the options --start and --stop, a part of the recording."""
+    for name in ("start", "stop"):
+        end = "end" if name == "stop" else name
+        one.add_argument(
+            f"--{name}", metavar="S", type=float, help=f"{end} time, in s on the recording's clock"
+        )
 
 
 def add_no_calibrate(one: argparse.ArgumentParser) -> None:
@@ -162,6 +172,12 @@ def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
     from jaxevent.io import load
 
     return load(path, in_memory=False, progress=show_progress(), **reading, **more)
+
+
+def open_named(path: Path, reading: dict[str, Any]) -> tuple[Any, str]:
+    """Open a recording as `open_recording`, named by its path for messages; return its name too."""
+    recording = open_recording(path, reading)
+    return dataclasses.replace(recording, name=str(path)), recording.name
 
 
 def add_output(
@@ -200,7 +216,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
         yield {**taken, "force": force}
     elif outputs:
         from jaxevent.io.calibration import split_name
-        from jaxevent.io.companions import companions
+        from jaxevent.io.checks import companions
         from jaxevent.io.output import Command, allow_writing_into_folders, check_outputs, running
 
         named = [path for name in outputs if (path := taken[name]) is not None]

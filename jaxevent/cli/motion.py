@@ -62,12 +62,7 @@ def add(commands: Any) -> None:
         help="do not smooth, but date each estimate of voting to the middle of its events",
     )
     one.add_argument("--smooth", action="store_true", help="smooth by later events: the default")
-    one.add_argument(
-        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
-    )
-    one.add_argument(
-        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
-    )
+    arguments.add_span(one)
     one.add_argument(
         "--flow", action="store_true", help="also write the optical flow of each event: flow.h5"
     )

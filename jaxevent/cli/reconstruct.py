@@ -176,10 +176,8 @@ def run(
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
     estimator = find(method or "mc", "reconstruction")
     table = _read_table(params, estimator, method)
-    recording = arguments.open_recording(path, reading)
+    recording, name = arguments.open_named(path, reading)
     asked = None if times is None else read_times(times, (recording.start, recording.stop))
-    name = recording.name
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:
         missing = recording.describe_left_out("frames")
         raise InputError(f"{path}: holds no frames{missing}; give --rate instead of --at frames")

@@ -74,12 +74,7 @@ def add(commands: Any) -> None:
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
     )
     when.add_argument("--at", choices=["events"], help="one row for each event of a track")
-    one.add_argument(
-        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
-    )
-    one.add_argument(
-        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
-    )
+    arguments.add_span(one)
     one.add_argument(
         "--background",
         choices=["events", "high-pass"],

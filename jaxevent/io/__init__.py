@@ -190,7 +190,7 @@ def save(
             file cannot be written.
     """
     from jaxevent.io import hdf5
-    from jaxevent.io.output import is_partial
+    from jaxevent.io.output import check_recording_name
 
     path = Path(path)
     if not isinstance(recording, Recording):
@@ -199,8 +199,7 @@ def save(
             "jaxevent.show.flow.write_flow_hdf5, and images by `jaxevent reconstruct`, or as the "
             "arrays that video(times) returns"
         )
-    if path.suffix.lower() not in ("", ".h5", ".hdf5", ".hdf") and not is_partial(path):
-        raise InputError(f"{path}: recordings are stored as HDF5; end the name in .h5")
+    check_recording_name(path)
     hdf5.write(recording, path, compression, progress)
 
 

@@ -11,7 +11,7 @@
     /frames/exposure      (frames,) int64 us, 0 where unknown
     /frames/images        (frames, height, width) uint8, uint16 or floats in [0, 1]
     /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3; of another lens model
-                          (`jaxevent.lenses`), which the attribute model names, its numbers
+                          (`jaxevent.camera`), which the attribute model names, its numbers
     /poses/t, position, quaternion   (poses,) int64 us, (poses, 3) m, (poses, 4) x y z w
     /imu/t, gyro, acc     (samples,) int64 us, (samples, 3) rad/s, (samples, 3) m/s^2
     /triggers/t, edge, channel   (triggers,) int64 us, 1 rising 0 falling -1 unknown, number
@@ -40,13 +40,14 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import UNIT_NAMES, times, to_microseconds
 from jaxevent.errors import InputError, OrderError
-from jaxevent.io import companions
 from jaxevent.io.checks import (
     ReadOptions,
     check_events,
     check_unfolded,
+    images_folder,
     make_camera,
     reading,
+    rectify_map_file,
     sensor_size,
     whole_number,
     whole_size,
@@ -483,7 +484,7 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
 
 def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
     """Describe, for `Recording.left_out`, frames in the file, or those of DSEC beside it."""
-    images = companions.images(path)
+    images = images_folder(path)
     if images is None:
         return describe_images(file)
     return {
@@ -508,7 +509,7 @@ def _is_dsec(file: Any) -> bool:
 
 def _read_rectify_map(path: Path) -> NDArray | None:
     """Read the places of a DSEC camera's pixels in the rectified image, (height, width, 2)."""
-    beside = companions.rectify_map(path)
+    beside = rectify_map_file(path)
     if beside is None:
         return None
     with open_file(beside) as file:

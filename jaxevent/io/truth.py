@@ -33,8 +33,7 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import times
 from jaxevent.errors import InputError, require
-from jaxevent.io import companions
-from jaxevent.io.checks import reading
+from jaxevent.io.checks import reading, truth_files
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import StoredImages
 from jaxevent.io.hdf5_files import array, dataset, open_file
@@ -54,7 +53,7 @@ def read_poses(path: Path, camera: str) -> Poses | None:
     Raises:
         InputError: The file is damaged.
     """
-    for file in companions.truth(path):
+    for file in truth_files(path):
         with reading(file):
             if file.name.endswith("_gt.hdf5"):
                 return _read_poses_mvsec(file, camera)
@@ -77,7 +76,7 @@ def read_images(path: Path, side: str = "left") -> dict[str, Any]:
         InputError: A file is damaged.
     """
     found: dict[str, Any] = {}
-    for file in companions.truth(path):
+    for file in truth_files(path):
         with reading(file):
             if file.name.endswith("_gt.hdf5"):
                 found |= _open_images_mvsec(file, f"davis/{side}")

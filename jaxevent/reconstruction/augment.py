@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration import CalibratedValues, recall_calibration, recall_numbers
 from jaxevent.calibration.clipping import find_clipping
-from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
@@ -668,6 +667,3 @@ class FrameInterpolation(eqx.Module):
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         v = points.blend
         return (1 - v) * points.gather_frame(self.here) + v * points.gather_frame(self.there)
-
-
-__getattr__ = renamed_names(__name__)

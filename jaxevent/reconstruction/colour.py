@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.io.images import bayer_sites, demosaic
 from jaxevent.reconstruction.video import ImageSequence
@@ -271,6 +270,3 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     for name, (row, column) in places.items():
         mosaic[:, row::2, column::2] = channels[name]
     return demosaic(mosaic, pattern)
-
-
-__getattr__ = renamed_names(__name__)

@@ -12,13 +12,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent import dispatch
-from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent import threads
+from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import has_accelerator
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
-from jaxevent.locks import TurnLock, refuse_to_pickle
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
@@ -32,6 +31,7 @@ from jaxevent.reconstruction.windows import (
     WindowedRecording,
 )
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.threads import TurnLock, refuse_to_pickle
 
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
@@ -425,7 +425,7 @@ class Video(ImageSequence[P]):
 
     def _dispatch(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Yield batches of images that are being computed on the device."""
-        dispatch.check_not_forked()
+        threads.check_not_forked()
         done, mine = 0, object()
         while done < len(times):
             window, reader, trajectory = self._window_of(int(times[done]))
@@ -524,7 +524,7 @@ class Video(ImageSequence[P]):
 
     def _filter(self, begin: WindowStart) -> tuple[FilteredWindow, WindowStart]:
         """Prepare and filter the window that begins there; return it and the start of the next."""
-        dispatch.check_not_forked()
+        threads.check_not_forked()
         window, features = self._windows.prepare(begin.start, begin.before)
         features = self._put(features)
         state = begin.state
@@ -540,6 +540,3 @@ class Video(ImageSequence[P]):
             if len(self._starts) > MAX_WINDOW_STARTS:  # first, last, half of the others
                 self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
         return FilteredWindow(window, window.reader(self._batch), trajectory), following
-
-
-__getattr__ = renamed_names(__name__)

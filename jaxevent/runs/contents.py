@@ -16,7 +16,7 @@ import pandas as pd
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.io import load
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.io.output import complete
 from jaxevent.parameters import Parameters
 from jaxevent.progress import bar

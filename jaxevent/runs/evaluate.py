@@ -33,10 +33,10 @@ whole. A row's `params` are those that were used, and its `calibrated` names tho
 
 Each family of estimators has protocols of its own, with settings of their own beside it: images
 are asked for by "held-out" and "reference", described below, the others are described in
-`jaxevent.runs.egomotion_scores` ("motion") and `jaxevent.runs.blob_scores` ("tracks").
+`jaxevent.runs.egomotion` ("motion") and `jaxevent.runs.blob_scores` ("tracks").
 
 A method of the name "external" scores images of another program: `jaxevent.runs.external`; one of
-the name "published" shows numbers that were printed beside ours: `jaxevent.runs.published`. Paths
+the name "published" shows numbers that were printed beside ours: `jaxevent.runs.external`. Paths
 are relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4,
 ... and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
 `clock_offset`; with another `gap` g it gives frames 0, g, 2 g, ... and asks for all others. Images
@@ -79,7 +79,7 @@ from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io import toml
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording

@@ -30,7 +30,7 @@ from jaxevent.arrays import shorten_value
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator, import_object
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
 from jaxevent.recording import Recording
 
 # Keys of rows that are no measures: no metric may have their names.
@@ -87,8 +87,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
     found: dict[str, Metric] = {}
     for one in given:
         if isinstance(one, str) and ":" not in one:
-            if one not in known:
-                raise InputError(f"there is no metric {one!r}; {suggest_name(one, known)}")
+            check_choice(one, "metric", known)
             continue
         metric = one if isinstance(one, Metric) else _metric(one)
         if metric.name in known or metric.name in RESERVED_NAMES:

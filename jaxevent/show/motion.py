@@ -27,7 +27,7 @@ from jaxevent.egomotion.truth import (
 )
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
-from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5, finite
 from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
@@ -41,6 +41,7 @@ from jaxevent.show.motion_figures import (
     window_flow,
 )
 from jaxevent.show.tables import align_cells
+from jaxevent.show.track_tables import check_rate
 
 
 def write_motion_table(
@@ -59,12 +60,6 @@ def write_motion_table(
     _write_csv(path, table_columns(model, times, estimated))
 
 
-def _check_rate(rate: float | int) -> None:
-    """Raise `InputError` for a number of rows per second that is not possible."""
-    if not 0 < rate <= 1e6:
-        raise InputError(f"--rate {rate:g} is not possible; give times per s, up to 1e6")
-
-
 class LiveTable:
     """Table of a live motion, row by row, as `write_motion_table` writes that of a recording.
 
@@ -77,7 +72,7 @@ class LiveTable:
     """
 
     def __init__(self, live: LiveMotion, rate: float):
-        _check_rate(rate)
+        check_rate(rate)
         self._live, self._period, self._count, self._first = live, 1e6 / rate, 0, 0
 
     def rows(self) -> str:
@@ -174,17 +169,12 @@ def write_errors(folder: Path, errors: MotionScores) -> None:
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
     table = {
-        name: {"value": _plain(value), "unit": unit, "meaning": MEASURE_MEANINGS[name]}
+        name: {"value": finite(value), "unit": unit, "meaning": MEASURE_MEANINGS[name]}
         for name, value, unit in rows
     }
     about = {"times": errors.count, "truth": errors.truth}
     with complete(folder / "errors.json") as partial:
         partial.write_text(json.dumps({"figures": table, **about}, indent=2) + "\n")
-
-
-def _plain(value: float) -> float | None:
-    """Return a number for JSON, None if it is not finite."""
-    return value if math.isfinite(value) else None
 
 
 def fitted_velocity(
@@ -294,7 +284,7 @@ class Output:
             raise InputError(
                 f"{self.path}: is not a folder's name; the motion is written into a new folder"
             )
-        _check_rate(self.rate)
+        check_rate(self.rate)
         check_writable(self.path, directory=True)
 
     def known(

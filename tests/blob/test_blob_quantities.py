@@ -530,6 +530,7 @@ def test_what_comes_nearer_grows_along_both_axes():
         assert pictures._changes_scale(sizes[:, :1], variances, valid[:, :1]) == [clear]
 
 
+@pytest.mark.slow
 def test_panels_hold_the_tracks_that_are_seen_longest():
     valid = np.arange(10)[:, None] >= np.arange(8)
     shown = pictures._choose_longest(valid, [7])

@@ -166,6 +166,7 @@ def test_a_small_piece_that_goes_along_is_of_the_larger_one():
     assert len(merge_parts(list(stars))) == 2
 
 
+@pytest.mark.slow
 def test_two_that_begin_together_and_part_are_two():
     """Where cells are coarse, they are one blob until they are far apart."""
     starts = [((60.0, 40.0), (-90.0, 0.0)), ((70.0, 44.0), (90.0, 5.0))]

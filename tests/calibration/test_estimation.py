@@ -45,6 +45,7 @@ def moved(recording, us):
     )
 
 
+@pytest.mark.slow
 def test_simulated_truth(found):
     truth = {
         "clock_offset": SENSOR.clock_offset,

@@ -14,7 +14,7 @@ from jaxevent import cli
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.particle_filter.estimator import VotingEstimator
 from jaxevent.errors import InputError
-from jaxevent.io.chunks import read_lines
+from jaxevent.events.live import read_lines
 
 SETTINGS = "particles = 60\ncandidates = 24\nbatch = 32\ntau_max = 0.06\n"
 

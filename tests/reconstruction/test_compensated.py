@@ -141,6 +141,7 @@ def test_equations_are_solved():
     np.testing.assert_allclose(d.ravel(), expected, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_pixels_take_the_path_of_their_side():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     x = np.arange(56)

@@ -35,11 +35,11 @@ from jaxevent.parameters import Number, Parameters, Positive
 from jaxevent.reconstruction.estimator import PixelEstimator, ScannedImages
 from jaxevent.reconstruction.filtering import Filter
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.runs.family import interleave
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out
 from jaxevent.runs.reconstruction import ImageBatch, Objective, Problem, cut_windows
 from jaxevent.runs.scores import score
-from jaxevent.splits import interleave
 from jaxevent.tuning import Settings, begin, optimise
 
 pytestmark = pytest.mark.slow

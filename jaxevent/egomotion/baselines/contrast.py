@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.baselines.fits import Fit, motion_of_fits
 from jaxevent.egomotion.candidates import pixel_coordinates
@@ -594,7 +594,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     Returns:
         The estimate.
     """
-    dispatch.check_not_forked()
+    threads.check_not_forked()
     windows = WindowSequence(inputs.recording, params, inputs.model, inputs.camera, inputs.seed)
     if not len(windows):
         return MotionEstimate.empty(inputs.model)

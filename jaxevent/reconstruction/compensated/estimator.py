@@ -20,11 +20,10 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
-from jaxevent.locks import synchronized
 from jaxevent.reconstruction.compensated.event_noise import (
     EventNoise,
     IntervalNoise,
@@ -111,6 +110,7 @@ from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages,
 from jaxevent.reconstruction.video import FlowSource, ImageSequence
 from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.threads import synchronized
 
 N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
 PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
@@ -662,7 +662,7 @@ class CompensatedVideo(ImageSequence[Params]):
     @synchronized
     def _target(self, t: int) -> tuple[TrajectoryEstimate, FusedImage]:
         if self._latest is None or self._latest[0] != t:
-            dispatch.check_not_forked()
+            threads.check_not_forked()
             target = self.trajectories(t)
             self._latest = t, target, self._fuse(t, target)
         return self._latest[1:]

@@ -23,7 +23,6 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
-from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -730,6 +729,3 @@ def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
         lambda *data: normal_equation_residual(p, *data), (images, cost), tuple(changes_of_data)
     )
     return p, jax.lax.custom_linear_solve(times, dF, solve_all, solve_all)
-
-
-__getattr__ = renamed_names(__name__)

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
-from jaxevent.deprecated import renamed_names
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -511,6 +510,3 @@ def robust_mean(
         blur_image(part, SCATTER_SIGMA_PX) for part in (scratch.excess, scratch.weight)
     )
     return out._replace(scatter=np.maximum(excess / weight, 0))
-
-
-__getattr__ = renamed_names(__name__)

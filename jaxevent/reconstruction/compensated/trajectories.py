@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
-from jaxevent.deprecated import renamed_names
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
     PackedImages,
@@ -636,6 +635,3 @@ def borrow_paths(
     index = select_paths(images, interpolate_paths(p, size), cost, PATH_SEARCHES[:1])
     y, x = np.divmod(index[::2, ::2], size[1])
     return p[y // 2, x // 2]
-
-
-__getattr__ = renamed_names(__name__)
