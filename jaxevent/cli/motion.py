@@ -150,13 +150,12 @@ def run(
 
     kind = None if model == "auto" else find_model(model)
     if live:
-        options = {
+        given = {
             "--method": method not in (None, "voting"), "--truth": truth is not None, "--imu": imu,
             "--centred": centred, "--smooth": smooth, "--start": start is not None,
             "--stop": stop is not None, "--flow": flow, "--out": out is not None,
         }  # fmt: skip
-        if wrong := [name for name, given in options.items() if given]:
-            raise InputError(f"--live is not for {wrong[0]}; leave out one of the two")
+        arguments.refuse_with_live(given)
         if kind is None:
             raise InputError("--live cannot see all events to choose a model; name it by --model")
         _print_live(path, kind, params, seed, float(rate), focal, reading)
@@ -167,19 +166,10 @@ def run(
         _check(find_estimator(method or kind.best_method), kind, imu, causal, smooth)
     if causal and (centred or smooth):
         raise InputError("--causal uses no later events; leave out --centred and --smooth")
-    if seed < 0:
-        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    arguments.check_seed(seed)
     turned = None if imu_rotation is None else rotation_of(imu_rotation)
     output = Output(out, rate, truth, flow=flow)
-    recording = arguments.open_recording(path, reading)
-    recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
-    if not len(recording.events):
-        raise InputError(f"{path}: holds no events; choose another recording")
-    if recording.imu is None and (imu or still is not None):
-        raise InputError(
-            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out "
-            f"{'--imu' if imu else '--still'} or choose another recording"
-        )
+    recording = _open(path, reading, focal, "--imu" if imu else "--still" if still else None)
     bias = None
     if recording.imu is not None and still is not None:
         bias = gyro_bias(recording.imu, *still)
@@ -219,9 +209,25 @@ def run(
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)
     print(
-        f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
-        f"{count / seconds:,.0f} events/s"
+        f"\n{', '.join(written.files)} in {out}: {count:,} events in "
+        f"{arguments.describe_speed(count, seconds)}"
     )
+
+
+def _open(
+    path: Path, reading: dict[str, Any], focal: float | int | None, imu_option: str | None
+) -> Any:
+    """Open a recording that holds events, and an IMU where an option needs one."""
+    recording = arguments.open_recording(path, reading)
+    recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events; choose another recording")
+    if recording.imu is None and imu_option is not None:
+        raise InputError(
+            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out {imu_option} or "
+            "choose another recording"
+        )
+    return recording
 
 
 def _print_live(

@@ -221,6 +221,6 @@ def run(
     )
     seconds = time.perf_counter() - clock
     print(
-        f"{out}: {len(chosen):,} images{how}, {seconds:.2f} s, "
-        f"{len(recording.events) / seconds:,.0f} events/s"
+        f"{out}: {len(chosen):,} images{how}, "
+        f"{arguments.describe_speed(len(recording.events), seconds)}"
     )
