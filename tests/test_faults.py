@@ -90,6 +90,19 @@ def test_each_fault_is_found_alone(sound, fault):
     assert dict(describe(faulty))["fault"] == str(found[0])
 
 
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("polarity inverted", "frames 20 ms late"),
+        ("columns flipped", "frames flicker"),
+        ("axes swapped", "frames blurred"),
+    ],
+)
+def test_what_frames_show_is_told_beside_events_that_are_turned(sound, first, second):
+    faulty = faults.FAULTS[second](faults.FAULTS[first](sound, 0), 0)
+    assert names_of(faulty) == [NAMES[first], NAMES[second]]
+
+
 @pytest.mark.parametrize("number", range(1, len(TRANSFORMS)))
 def test_the_cause_of_a_mismatch_is_named(sound, number):
     """Every way to turn the frames is told from the others, with and without the polarity."""

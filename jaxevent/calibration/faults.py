@@ -16,6 +16,7 @@ from jaxevent.calibration.correspondence import (
     TRANSFORMS,
     Correspondence,
     measure_correspondence,
+    turn_events,
 )
 from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
@@ -67,7 +68,7 @@ class Fault(NamedTuple):
         )
 
 
-def check_consistency(recording: Recording) -> tuple[Fault, ...]:
+def check_consistency(recording: Recording, sample: Sample | None = None) -> tuple[Fault, ...]:
     """Check a recording for faults of events, frames and clocks.
 
     Hot pixels go out first; the other checks see the rest. What needs frames is left out without
@@ -75,11 +76,12 @@ def check_consistency(recording: Recording) -> tuple[Fault, ...]:
 
     Args:
         recording: The recording, in memory or in a file.
+        sample: A sample of it (`sampling.take_sample`); None: it is taken here.
 
     Returns:
         The faults, empty where nothing is wrong.
     """
-    sample = take_sample(recording)
+    sample = take_sample(recording) if sample is None else sample
     return tuple(
         fault
         for found in (
@@ -176,9 +178,13 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
             return
     if (correspondence := measure_correspondence(sample)) is None:
         return
-    relation = [] if one_sign else list(_check_relation(correspondence))
-    yield from relation
-    has_polarity = not (one_sign or relation)
+    turn, relation = (None, None) if one_sign else _check_relation(correspondence)
+    if relation is not None:
+        yield relation
+    if turn is not None:  # the other checks see what the remedy leaves
+        sample = turn_events(sample, *turn)
+        correspondence = measure_correspondence(sample) or correspondence
+    has_polarity = not one_sign and (relation is None or turn is not None)
     is_related = has_polarity and correspondence.significance[0].max() > SIGMAS
     yield from _check_brightness(sample, correspondence.offset if is_related else 0.0, has_polarity)
     if is_related:
@@ -198,8 +204,14 @@ def _mismatch(recording: Recording) -> tuple[float, float]:
     return lengths[1] / max(lengths[0], 1), 1 / MIN_SPAN_RATIO
 
 
-def _check_relation(correspondence: Correspondence) -> Iterator[Fault]:
-    """Check whether events belong to the frames, as they are or turned over."""
+def _check_relation(
+    correspondence: Correspondence,
+) -> tuple[tuple[str, bool] | None, Fault | None]:
+    """Check whether events belong to the frames, as they are or turned over.
+
+    Returns:
+        How events have to be turned, as of `turn_events`, and the fault.
+    """
     r, z = correspondence.correlation, correspondence.significance
     here = max(float(r[0].max()), 0.0)
     real = np.where(np.abs(z) > SIGMAS, r, 0)
@@ -209,27 +221,29 @@ def _check_relation(correspondence: Correspondence) -> Iterator[Fault]:
     if found and (kind or found < 0) and abs(found) > MIN_ADVANTAGE * here:
         inverse = "polarity inverted" if found < 0 else ""
         changed = " and ".join(part for part in (name, inverse) if part)
-        yield Fault(
+        return (name, found < 0), Fault(
             "flipped or swapped axes" if kind else "inverted polarity", significance, SIGMAS,
             f"events correlate with the changes of the frames by {here:.2f} at most, with "
             f"{changed} by {abs(found):.2f}",
             f"make the recording of events with {changed}",
         )  # fmt: skip
-    elif not found and correspondence.activity > SIGMAS:
-        yield Fault(
+    if not found and correspondence.activity > SIGMAS:
+        return None, Fault(
             "lost polarity", correspondence.activity, SIGMAS,
             f"events come where and when frames change, but their polarity says nothing about the "
             f"sign: the correlation is {float(np.abs(r[0]).max()):.2f} at most",
             "read the file again with the column or bit of its polarity; use methods without "
             "polarity, or frames alone",
         )  # fmt: skip
-    elif not found and correspondence.tiles > MIN_RELATED:
-        yield Fault(
+    if not found and correspondence.tiles > MIN_RELATED:
+        return None, Fault(
             "unrelated events", float(correspondence.tiles), MIN_RELATED,
             f"events and changes of the frames do not correlate within "
             f"{correspondence.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
-            "check that frames and events are of one recording, clock and camera",
+            "check that frames and events are of one recording, clock and camera, and that no axis "
+            "is flipped",
         )  # fmt: skip
+    return None, None
 
 
 def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
