@@ -10,13 +10,8 @@ from scipy import ndimage
 from scipy.signal import correlate
 
 from jaxevent.errors import InputError
-<<<<<<< HEAD
 from jaxevent.recording import Frames, Recording, check_recording
-from jaxevent.register.frames import event_span, log_image
-=======
-from jaxevent.recording import Frames, Recording
 from jaxevent.register.frames import log_image
->>>>>>> next
 from jaxevent.register.geometry import Registration
 from jaxevent.register.refinement import refine
 
