@@ -928,6 +928,29 @@ class Recording(HtmlRepr):
             )
         return part
 
+    def require_camera(self, camera: PinholeCamera | None, what: str) -> PinholeCamera:
+        """Return a camera that is given, or the recording's.
+
+        Args:
+            camera: The camera; None takes the recording's.
+            what: Name of what needs it, for the message.
+
+        Returns:
+            The camera.
+
+        Raises:
+            InputError: There is none; the message says how to give one.
+        """
+        camera = self.camera if camera is None else camera
+        if camera is None:
+            raise InputError(
+                f"{self.name}: has no calibration, which {what} needs"
+                f"{self.describe_left_out('camera')}; give "
+                "camera=jaxevent.camera.PinholeCamera(fx, fy, cx, cy) in px, here or to "
+                "jaxevent.load, which reads calibrations from YAML, too"
+            )
+        return camera
+
     def describe_left_out(self, field: str) -> str:
         """Return the end of a message that misses a field: the entry of `left_out`."""
         is_missing = getattr(self, field) is None

@@ -208,8 +208,8 @@ def undistort(recording: Recording) -> Recording:
     camera, width, height = recording.camera, recording.width, recording.height
     if camera is None:
         raise InputError(
-            f"{recording.name}: holds no calibration, which undistorting needs; give its camera"
-            f"{recording.describe_left_out('camera')}"
+            f"{recording.name}: holds no calibration, which undistorting needs"
+            f"{recording.describe_left_out('camera')}; give it to jaxevent.load(path, camera=...)"
         )
     y, x = (axis.ravel() for axis in np.mgrid[:height, :width])
     ideal = camera.undistorted

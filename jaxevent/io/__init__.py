@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxevent import arrays
 from jaxevent.arrays import times
+from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
@@ -79,7 +80,7 @@ def load(
     frames: str | None = None,
     time_unit: str | None = None,
     repair: str | None = None,
-    camera: str | os.PathLike[str] | None = None,
+    camera: str | os.PathLike[str] | PinholeCamera | None = None,
 ) -> Recording:
     """Read and check a recording; its format is inferred from its content, not from its name.
 
@@ -108,8 +109,9 @@ def load(
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message names the repairs that
             would help.
-        camera: A calibration instead of the recording's: camchain.yaml of Kalibr or camera_info of
-            ROS or OpenCV in YAML, or FILE:NAME, a camera of several; see `jaxevent.io.calibration`.
+        camera: A calibration instead of the recording's: a `PinholeCamera`, or camchain.yaml of
+            Kalibr or camera_info of ROS or OpenCV in YAML, or FILE:NAME, a camera of several; see
+            `jaxevent.io.calibration`.
 
     Returns:
         The recording.
@@ -157,14 +159,26 @@ def load(
     if isinstance(images, np.ndarray) and (doubt := arrays.doubt_levels(images)):
         warnings.warn(f"{path}: {doubt}", InputWarning, stacklevel=3)
     if camera is not None:
-        from jaxevent.io.calibration import read_camera
-
-        lens = read_camera(camera, (recording.width, recording.height))
+        lens = _as_camera(camera, recording)
         left_out = {name: why for name, why in recording.left_out.items() if name != "camera"}
         recording = dataclasses.replace(recording, camera=lens, left_out=left_out)
     if options.notes:
         recording = dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
     return recording
+
+
+def _as_camera(camera: Any, recording: Recording) -> PinholeCamera:
+    """Return a camera, as given or of a file; raise `InputError` for what is neither."""
+    if isinstance(camera, PinholeCamera):
+        return camera
+    if not isinstance(camera, str | os.PathLike):
+        raise InputError(
+            f"camera is {describe_type(camera)}; give the path of a calibration, or "
+            "jaxevent.camera.PinholeCamera(fx, fy, cx, cy), px"
+        )
+    from jaxevent.io.calibration import read_camera
+
+    return read_camera(camera, (recording.width, recording.height))
 
 
 def _drop_frames(recording: Recording) -> Recording:
