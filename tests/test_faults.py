@@ -228,6 +228,12 @@ def test_faulty_recordings_are_what_they_are_called(sound):
     assert (sound.events.t == before).all()
 
 
+def test_few_pixels_that_make_many_of_the_events_are_told(sound):
+    few = faults.add_hot_pixels(sound, 1, share=0.002, rate=50 * len(sound.events) / SIDE**2)
+    (told,) = (one for one in jaxevent.check_consistency(few) if one.name == "hot pixels")
+    assert told.limit < told.statistic < 0.15 and "of the events" in told.text
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.data())
 def test_odd_recordings_are_checked_without_errors(data):
