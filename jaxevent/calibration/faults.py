@@ -195,10 +195,9 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
 
 def _mismatch(recording: Recording) -> tuple[float, float]:
     """Return the statistic of a mismatch of clocks and its limit."""
-    frames, events = recording.frames, recording.events
+    frames = recording.frames
     assert frames is not None
-    spans = [(int(frames.t[0]), int(frames.t[-1]))]
-    spans.append((int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])))
+    spans = [(int(frames.t[0]), int(frames.t[-1])), recording.event_span()]
     lengths = sorted(end - begin for begin, end in spans)
     common = min(end for _, end in spans) - max(begin for begin, _ in spans)
     outside = 1 - max(common, 0) / max(lengths[0], 1)

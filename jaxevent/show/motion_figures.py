@@ -225,12 +225,6 @@ class Window:
     reference: int
 
 
-def motion_span(recording: Recording) -> tuple[int, int]:
-    """Return the times (us) of the first and the last event."""
-    first, last = (recording.events[i : i + 1].t[0] for i in (0, len(recording.events) - 1))
-    return int(first), int(last)
-
-
 def representative_window(recording: Recording, motion: MotionEstimate) -> Window:
     """Choose a window of 20 to 500 ms in the middle of the recording, or where motion is found.
 
@@ -238,7 +232,7 @@ def representative_window(recording: Recording, motion: MotionEstimate) -> Windo
     million are left out.
     """
     events = recording.events
-    middle = sum(motion_span(recording)) // 2
+    middle = sum(recording.event_span()) // 2
     good = motion.t[motion.valid]
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])

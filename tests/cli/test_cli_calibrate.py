@@ -13,7 +13,7 @@ from estimates import NAMES, made_up, make_up
 from PIL import Image
 
 import jaxevent
-from jaxevent import akf, aks, cli
+from jaxevent import akf, aks, cli, events
 from jaxevent.calibration import Fault
 from jaxevent.recording import Frames
 from jaxevent.runs.evaluate import evaluate
@@ -27,7 +27,7 @@ from jaxevent.runs.protocols import held_out
 def recording():
     """The middle of a real recording."""
     whole = jaxevent.load(files("jaxevent") / "data/slider_depth_crop.h5")[0.6:0.95]
-    return dataclasses.replace(whole, name="part")
+    return dataclasses.replace(events.crop(whole, 60, 45, 120, 90), name="part")
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def found(recording):
 
 
 @pytest.fixture(autouse=True)
-def made_up_values(monkeypatch):
+def made_up_values(monkeypatch, float32):
     make_up(monkeypatch)
     monkeypatch.setattr("jaxevent.cache.folder_for_calibrations", lambda: None)
 
