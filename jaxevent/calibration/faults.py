@@ -22,7 +22,7 @@ from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, Recording, check_recording
 
 MAX_HOT_SHARE = 0.01  # of the pixels
 MAX_HOT_EVENTS_SHARE = 0.05  # of the events
@@ -84,6 +84,7 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
     Returns:
         The faults, empty where nothing is wrong.
     """
+    check_recording(recording, "check_consistency")
     sample = take_sample(recording) if sample is None else sample
     return tuple(
         fault
@@ -325,12 +326,17 @@ def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iter
 
 def _check_white(recording: Recording) -> Iterator[Fault]:
     """Check the share of pixels whose frames are white."""
-    frames, white = recording.frames, find_clipping(recording).white
-    is_empty = frames is not None and white.level is None and white.share > MAX_CLIPPED_SHARE
+    white = find_clipping(recording).white
+    if white.level is None and white.share > MAX_CLIPPED_SHARE:
+        yield Fault(
+            "empty frames", white.share, MAX_CLIPPED_SHARE,
+            f"{100 * white.share:.3g} % of the frames' pixels have one grey value",
+            "read the frames again, or leave them out",
+        )  # fmt: skip
+        return
     yield Fault(
         "clipped frames", white.share, MIN_CLIPPED_SHARE,
-        f"{100 * white.share:.3g} % of the frames' pixels have "
-        + ("one grey value, so that frames show nothing" if is_empty
-           else "the value of white, where only events tell what happens"),
+        f"{100 * white.share:.3g} % of the frames' pixels are white, where only events tell what "
+        "happens",
         "shorten the exposure; methods with a variance take white for a lower bound",
     )  # fmt: skip

@@ -37,8 +37,8 @@ from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import check_unfolded, reading
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.output import complete
-from jaxevent.io.time_units import unit_of_name
 from jaxevent.recording import microseconds
+from jaxevent.time_units import unit_of_name
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
 TIMESTAMP_FILES = ("timestamps.txt", "images.txt", "timestamp.txt")

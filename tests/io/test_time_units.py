@@ -18,9 +18,8 @@ from refusals import refuses
 import jaxevent
 from jaxevent import cli
 from jaxevent.errors import InputWarning
-from jaxevent.io.checks import ReadOptions
 from jaxevent.io.images import read_times
-from jaxevent.io.time_units import infer_unit, numbers_of_dates, to_microseconds, unit_of_name
+from jaxevent.time_units import infer_unit, numbers_of_dates, to_microseconds, unit_of_name
 
 SIZE = (48, 32)
 COUNT = 600
@@ -471,7 +470,7 @@ def test_long_and_quiet_recordings_are_not_doubted(unit):
         sample = {"t": t / 1e6 if unit == "s" else t, "x": x, "y": y}
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            found = infer_unit(sample, count + 1, (240, 180), "a", ReadOptions())
+            found = infer_unit(sample, count + 1, (240, 180), "a")
         assert found == (unit, ())
 
 
