@@ -370,10 +370,11 @@ class Estimator(abc.ABC, Generic[P]):
         for name in options:
             if name not in self.options:
                 known = ", ".join(sorted(self.options)) or "none"
-                raise InputError(
-                    f"the method {self.name!r} has no option {name!r}; leave it out (known: "
-                    f"{known})"
-                )
+                remedy = f"leave it out (known: {known})"
+                if name in self.Params.numbers:
+                    remedy = f"it is a parameter, so give Params({name}=...), or keep what is "
+                    remedy += f"calibrated by Params.for_recording(recording, {name}=...)"
+                raise InputError(f"the method {self.name!r} has no option {name!r}; {remedy}")
 
     def check_options(self, **options: Any) -> None:
         """Raise `InputError` for an option outside its domain in `option_kinds`."""

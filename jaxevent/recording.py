@@ -293,9 +293,11 @@ class Events:
         """
         row = arrays.first_decrease(self.t)
         if row is not None:
+            late = int((self.t < np.maximum.accumulate(self.t)).sum())
             raise OrderError(
                 f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
-                f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
+                f"before it at {self.t[row - 1]} us, like {late:,} of {len(self):,} events "
+                "read; sort the events by time (stable), or leave out those whose times are false"
             )
 
     def check_places(self, width: int, height: int, source: str, first_row: int = 0) -> None:

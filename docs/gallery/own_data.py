@@ -56,6 +56,14 @@ again = jaxevent.Recording.from_arrays(table, width=disc.width, height=disc.heig
 np.array_equal(again.events.t, recording.events.t), table.head(3)
 
 # %% [markdown]
+# Is the content right, too? `check_consistency` looks for faults such as hot pixels, missing
+# events, inverted polarity and clocks that disagree. Each comes with its remedy; check again after
+# it.
+
+# %%
+jaxevent.check_consistency(recording)
+
+# %% [markdown]
 # Count the events of each pixel, and their rate over time with its standard deviation (Poisson).
 
 # %%

@@ -499,6 +499,12 @@ def test_what_was_written_is_read(tmp_path_factory, us, seconds, between, place,
     assert read_times(path).tolist() == us
 
 
+def test_a_list_in_place_of_a_file():
+    assert read_times(Path("0.65,.7")).tolist() == [650_000, 700_000]
+    assert read_times(Path("650000")).tolist() == [650_000]
+    refuses("times.csv", read_times, Path("times.csv"))
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
