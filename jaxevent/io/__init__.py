@@ -104,7 +104,7 @@ def load(
             topic of a bag, the number of a stream of AEDAT 4. "none" leaves frames out, in any
             format.
         time_unit: The unit of the event times, "s", "ms", "us" or "ns", of formats that do not
-            state it; None infers it (`time_units`), with an `InputWarning` in doubt.
+            state it; None infers it (`jaxevent.time_units`), with an `InputWarning` in doubt.
         repair: Repairs of event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message names the repairs that
@@ -120,11 +120,11 @@ def load(
         InputError: The file is missing, damaged or of another format, or what it holds is not a
             valid recording; the message names the place and the remedy.
     """
-    path = Path(path)
-    if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_SIDE_PX:
+    path = _as_path(path, "load")
+    if size is not None and not _is_size(size):
         raise InputError(
-            f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
-            f"{arrays.MAX_SIDE_PX}"
+            f"size = {arrays.shorten_value(size)} must be two positive whole numbers of pixels, "
+            f"(width, height), of at most {arrays.MAX_SIDE_PX}"
         )
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE
@@ -165,6 +165,23 @@ def load(
     if options.notes:
         recording = dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
     return recording
+
+
+def _as_path(path: Any, call: str) -> Path:
+    """Return a path; raise `InputError` for what is none."""
+    if not isinstance(path, str | os.PathLike):
+        order = {"load": "load(path)", "save": "save(recording, path)"}[call]
+        raise InputError(f"the path is {describe_type(path)}; call jaxevent.{order}")
+    return Path(path)
+
+
+def _is_size(size: Any) -> bool:
+    """Return whether an object is a width and a height that a sensor may have."""
+    if isinstance(size, str) or np.shape(size) != (2,):
+        return False
+    return all(
+        isinstance(side, int | np.integer) and 1 <= side <= arrays.MAX_SIDE_PX for side in size
+    )
 
 
 def _as_camera(camera: Any, recording: Recording) -> PinholeCamera:
@@ -212,7 +229,7 @@ def save(
     from jaxevent.io import hdf5
     from jaxevent.io.output import check_recording_name
 
-    path = Path(path)
+    path = _as_path(path, "save")
     if not isinstance(recording, Recording):
         raise InputError(
             f"{path}: save writes recordings, not {describe_type(recording)}; write flow by "
