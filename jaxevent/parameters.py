@@ -713,11 +713,11 @@ def _refuse_unknown(values: Mapping[str, Any], known: Mapping[str, Any]) -> None
         check_choice(name, "parameter", known)
 
 
-def check_choice(name: str, what: str, known: Collection[str]) -> str:
+def check_choice(name: Any, what: str, known: Collection[str]) -> str:
     """Check that a name is one of those known.
 
     Args:
-        name: The name.
+        name: The name, of any type as configurations hold it.
         what: Noun for it in the message.
         known: All names that exist.
 

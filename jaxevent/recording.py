@@ -811,6 +811,17 @@ class Recording(HtmlRepr):
         last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
         return max(last + ([int(self.frames.t[-1])] if self.frames else []))
 
+    def event_span(self) -> tuple[int, int]:
+        """Return the times of the first and the last event, us.
+
+        Raises:
+            InputError: There are no events.
+        """
+        count = len(self.events)
+        if not count:
+            raise InputError(f"{self.name}: holds no events; choose another recording")
+        return int(self.events[:1].t[0]), int(self.events[count - 1 :].t[0])
+
     @property
     def gain(self) -> NDArray[np.float64]:
         """Brightness of each frame relative to one in which intensity 1 is white: `extra["gain"]`.

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +109,13 @@ def add_live(one: argparse.ArgumentParser, printed: str) -> None:
         help=f"print {printed} as events come, instead of writing --out; PATH may be -, for "
         "lines t x y p on standard input, t in us, or in s with a decimal point; needs --size then",
     )
+
+
+def refuse_with_live(given: Mapping[str, bool]) -> None:
+    """Raise `InputError` for the first option that was given and is not for --live."""
+    for name, is_given in given.items():
+        if is_given:
+            raise InputError(f"--live is not for {name}; leave out one of the two")
 
 
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
@@ -296,6 +303,15 @@ def show_progress() -> bool:
 def print_written(out: Path, names: Sequence[str] = ()) -> None:
     """Print the files that were written: `out`, or those of these names in it, one line each."""
     print("", *(f"written: {path}" for path in [out / name for name in names] or [out]), sep="\n")
+
+
+def describe_speed(events: int, seconds: float) -> str:
+    return f"{seconds:.2f} s, {events / seconds:,.0f} events/s"
+
+
+def check_seed(number: int) -> None:
+    if number < 0:
+        raise InputError(f"--seed {number} is not possible; give a whole number from 0")
 
 
 def print_stored(recording: Any, path: Path) -> None:
