@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxevent.deprecated import renamed_names
-from jaxevent.display import with_article
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.threads import check_platform_available
 
@@ -654,15 +654,9 @@ def _chosen(setting: Choice | Count, value: Any) -> Any:
 
 def phrase(value: Any) -> str:
     """Return a value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
-    if value is None:
-        return "None"
     if isinstance(value, Parameters) and value.is_gradient:
         return "a gradient"
-    if isinstance(value, type):
-        return f"the class {value.__qualname__}"
-    if isinstance(value, np.ndarray | Array):
-        return "an array"
-    return with_article(type(value).__qualname__)
+    return describe_type(value)
 
 
 def _format_leaf(value: Array | np.ndarray, number: Number) -> str:

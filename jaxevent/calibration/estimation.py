@@ -32,7 +32,7 @@ from jaxevent.calibration.sampling import (
     log_changes,
     take_sample,
 )
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
@@ -132,6 +132,7 @@ def calibrate(recording: Recording, I0: float = 1.0, sample: Sample | None = Non
     Returns:
         The values found, each with its 95 % interval or the reason why there is none.
     """
+    check_recording(recording, "calibrate")
     sample = take_sample(recording) if sample is None else sample
     ratio, dead = estimate_ratio(sample), estimate_dead_time(sample)
     frames = 0 if recording.frames is None else len(recording.frames)

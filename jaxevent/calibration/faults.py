@@ -22,9 +22,10 @@ from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, Recording, check_recording
 
 MAX_HOT_SHARE = 0.01  # of the pixels
+MAX_HOT_EVENTS_SHARE = 0.05  # of the events
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
 MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
@@ -83,6 +84,7 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
     Returns:
         The faults, empty where nothing is wrong.
     """
+    check_recording(recording, "check_consistency")
     sample = take_sample(recording) if sample is None else sample
     return tuple(
         fault
@@ -98,15 +100,28 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
 
 
 def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
-    """Check the share of hot pixels."""
-    share = float(sample.hot.mean())
-    yield Fault(
-        "hot pixels", share, MAX_HOT_SHARE,
-        f"{100 * share:.3g} % of the pixels fire in all parts of the recording, unlike those "
-        "around them",
+    """Check the share of hot pixels, and that of their events."""
+    remedy = (
         "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
-        "calibrate(recording).hot_pixels",
-    )  # fmt: skip
+        "calibrate(recording).hot_pixels"
+    )
+    share = float(sample.hot.mean())
+    events = sample.counts.sum(0)
+    of_events = float(events[sample.hot].sum() / max(events.sum(), 1))
+    if share > MAX_HOT_SHARE:
+        yield Fault(
+            "hot pixels", share, MAX_HOT_SHARE,
+            f"{100 * share:.3g} % of the pixels fire in all parts of the recording, unlike those "
+            "around them",
+            remedy,
+        )  # fmt: skip
+    else:
+        number = int(sample.hot.sum())
+        yield Fault(
+            "hot pixels", of_events, MAX_HOT_EVENTS_SHARE,
+            f"{number} hot {plural('pixel', number)} made {100 * of_events:.3g} % of the events",
+            remedy,
+        )  # fmt: skip
 
 
 def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:
@@ -311,12 +326,17 @@ def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iter
 
 def _check_white(recording: Recording) -> Iterator[Fault]:
     """Check the share of pixels whose frames are white."""
-    frames, white = recording.frames, find_clipping(recording).white
-    is_empty = frames is not None and white.level is None and white.share > MAX_CLIPPED_SHARE
+    white = find_clipping(recording).white
+    if white.level is None and white.share > MAX_CLIPPED_SHARE:
+        yield Fault(
+            "empty frames", white.share, MAX_CLIPPED_SHARE,
+            f"{100 * white.share:.3g} % of the frames' pixels have one grey value",
+            "read the frames again, or leave them out",
+        )  # fmt: skip
+        return
     yield Fault(
         "clipped frames", white.share, MIN_CLIPPED_SHARE,
-        f"{100 * white.share:.3g} % of the frames' pixels have "
-        + ("one grey value, so that frames show nothing" if is_empty
-           else "the value of white, where only events tell what happens"),
+        f"{100 * white.share:.3g} % of the frames' pixels are white, where only events tell what "
+        "happens",
         "shorten the exposure; methods with a variance take white for a lower bound",
     )  # fmt: skip

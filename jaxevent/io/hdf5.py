@@ -64,7 +64,6 @@ from jaxevent.io.hdf5_files import (
     open_file,
 )
 from jaxevent.io.output import CLOCK_UNIT, complete_hdf5
-from jaxevent.io.time_units import Clock, unit_of_words
 from jaxevent.progress import bar
 from jaxevent.recording import (
     EventColumns,
@@ -77,6 +76,7 @@ from jaxevent.recording import (
     Recording,
     Triggers,
 )
+from jaxevent.time_units import Clock, unit_of_words
 
 FORMAT_VERSION = 1
 _LEVELS_UNIT = "levels: 0 black, {most} white"  # of images

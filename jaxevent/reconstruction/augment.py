@@ -24,7 +24,7 @@ from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.refinement import refine
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
 
@@ -77,6 +77,7 @@ class FrameParams(Parameters):
         Returns:
             The parameters; defaults where the recording does not determine a number.
         """
+        check_recording(recording, "Params.for_recording")
         params = cls(**explicit)
         values = calibrated_values(recording, params, cls.names_left_open(explicit))
         return params.replace(**values.found)

@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.signal import correlate
 
 from jaxevent.errors import InputError
-from jaxevent.recording import Frames, Recording
+from jaxevent.recording import Frames, Recording, check_recording
 from jaxevent.register.frames import log_image
 from jaxevent.register.geometry import Registration
 from jaxevent.register.refinement import refine
@@ -186,6 +186,7 @@ def trigger_times(
     Raises:
         InputError: There are no such triggers.
     """
+    check_recording(recording, "trigger_times")
     triggers = recording.triggers
     if triggers is None or not len(triggers):
         missing = recording.describe_left_out("triggers")

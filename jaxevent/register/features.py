@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from jaxevent.errors import InputError, require
 from jaxevent.progress import bar
-from jaxevent.recording import Events, Frames, Recording
+from jaxevent.recording import Events, Frames, Recording, check_recording
 from jaxevent.register.frames import ResampledImages, log_image
 from jaxevent.register.geometry import recording_grid, undistort
 
@@ -201,6 +201,7 @@ def register_still(
     Raises:
         InputError: The recording has no frames, the image cannot be used, or no frame matches.
     """
+    check_recording(recording, "register_still")
     cv2 = require("cv2", "vision")
     frames = recording.frames
     if frames is None:

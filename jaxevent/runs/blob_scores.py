@@ -290,7 +290,8 @@ class TrackProtocol(Protocol):
     def check(self, options: Mapping[str, Any]) -> None:
         if "positions" not in options:
             raise InputError(
-                'the positions are not given; add positions = "*.csv", tables beside the recordings'
+                "the positions are not given, which tracks are compared with; give tables, in a "
+                'configuration by positions = "*.csv" for those beside the recordings'
             )
         find_metrics(options.get("metrics", ()), MEASURE_NAMES)
         if "seeds" in options and options.get("begin", "positions") != "positions":
