@@ -130,9 +130,7 @@ class WindowTracker:
         self.rows: list[_WindowRows] = []
         # Of two tracks in contact: since when, their difference then, and the shorter travel.
         self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
-        self.min_sizes: dict[int, float] = {}
-        # Of a track whose blob has a gap: first and last distance of its halves, and windows.
-        self.gaps: dict[int, tuple[float, float, int]] = {}
+        self.evidence: dict[int, float] = {}  # nats for two targets, of some tracks
         self.confirmed: set[int] = set()
         self.parts: dict[int, int] = {}  # the track of the whole, by that of a part
         tests = stream.width * stream.height * stream.duration / scale.window
@@ -185,7 +183,8 @@ class WindowTracker:
         assignments = assign(gates, events, labels, blobs)
         if len(self.tracks.id):
             self._update(gates, clutter, assignments)
-            self._split_tracks(events, t, assignments.owner, labels)
+            if self.scale.compact:
+                self._split_tracks(events, gates, assignments)
             self._merge_parts(t)
             self._remove(self._find_ended())
         new = (assignments.free >= 3) & (assignments.free >= CONFIG.free_share * assignments.counts)
@@ -212,39 +211,29 @@ class WindowTracker:
         self.rows.append(_WindowRows._make(value[now] for value in columns))
 
     def _split_tracks(
-        self, events: WindowEvents, t: float | int, owner: NDArray, labels: NDArray
+        self, events: WindowEvents, gates: TrackGates, assigned: Assignments
     ) -> None:
-        """Split a track of which two halves go their own ways.
+        """Split each track whose events are likelier those of two targets than of one.
 
-        The distance of parts of one object, such as both sides of an outline, stays. The distance
-        is measured along the longer axis, since coarse cells see no gap.
+        The evidence of windows is summed while it is positive. A part has the history of the whole.
         """
-        tracks, square = self.tracks, larger_variance(self.tracks.C)
-        long = square > CONFIG.split_aspect**2 * np.linalg.det(tracks.C) / square
-        before, self.gaps, others = self.gaps, {}, []
-        for i in np.flatnonzero(long & tracks.confirmed & (tracks.misses == 0)):
-            key, size = int(tracks.id[i]), float(np.sqrt(square[i]))
-            self.min_sizes[key] = min(self.min_sizes.get(key, size), size)
-            if size < CONFIG.split_growth * self.min_sizes[key]:
-                continue
-            at = (owner == i) & (labels > 0)
-            two = split_blob(events.x[at], events.y[at], tracks.C[i])
-            if two is None or two.n[1] < CONFIG.split_min_share * at.sum():
-                continue
-            distance = float(np.hypot(*(two.p[0] - two.p[1])))
-            wide = float(np.sqrt(larger_variance(two.C)).sum())
-            first, last, windows = before.get(key, (distance, distance, 0))
-            if abs(distance - last) > 0.5 * wide:
-                first, windows = distance, 0
-            apart = max(first + wide, CONFIG.split_separation * first)
-            if windows < CONFIG.part_windows or distance < apart:
-                self.gaps[key] = first, distance, windows + 1
-                continue
-            tracks.p[i], tracks.C[i], tracks.n[i] = two.p[0], two.C[0], two.n[0]
-            del self.min_sizes[key]
-            others.append(Blobs(two.n[1:], two.p[1:], two.C[1:]))
-        for other in others:
-            self._start_tracks(t, other)
+        tracks, before, two = self.tracks, self.evidence, Blobs.empty(2)
+        self.evidence, parts = {}, []
+        for i in np.flatnonzero(tracks.confirmed & (tracks.misses == 0) & ~gates.shared):
+            nats = split_blob(events, assigned.owner, int(i), two)
+            key = int(tracks.id[i])
+            nats += before.get(key, 0.0)
+            if nats > self.log_threshold:
+                part = tracks.take(np.array([i]))
+                for k, one in enumerate((tracks, part)):
+                    at = i if k == 0 else 0
+                    one.p[at], one.C[at], one.n[at] = two.p[k], two.C[k], two.n[k]
+                part.id[0], self.next_id = self.next_id, self.next_id + 1
+                parts.append(part)
+            elif nats > 0:
+                self.evidence[key] = nats
+        for part in parts:
+            self._append_tracks(part, gates.t)
 
     def _merge_parts(self, t: float | int) -> None:
         """Merge two tracks that are in contact and move together."""
@@ -317,17 +306,19 @@ class WindowTracker:
             return
         over, self.tracks = self.tracks.take(ended), self.tracks.take(~ended)
         self.confirmed |= set(over.id[over.confirmed].tolist())
-        for one in over.id.tolist():
-            self.min_sizes.pop(one, None)
 
     def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
         """Start a track at each blob, at a time (s)."""
-        n, p, C = blobs
-        ids = np.arange(self.next_id, self.next_id + len(n))
-        self.next_id += len(n)
-        self.tracks = self.tracks.append(init_tracks(ids, t, blobs, self.scale.window))
-        R, at = larger_variance(C) / 2 / n, np.full(len(n), t)
-        self.rows.append(_WindowRows(at, ids, p, np.zeros_like(p), C, n, p, R))
+        ids = np.arange(self.next_id, self.next_id + len(blobs.n))
+        self.next_id += len(ids)
+        self._append_tracks(init_tracks(ids, t, blobs, self.scale.window), t)
+
+    def _append_tracks(self, new: TrackTable, t: float | int) -> None:
+        """Append tracks, and their states at a time (s) to the rows."""
+        self.tracks = self.tracks.append(new)
+        R, at = larger_variance(new.C) / 2 / new.n, np.full(len(new.n), t)
+        columns = at, new.id, new.p, new.v, new.C, new.n, new.p, R
+        self.rows.append(_WindowRows._make(value.copy() for value in columns))
 
 
 def init_tracks(ids: NDArray, t: float | int, blobs: Blobs, window: float | int) -> TrackTable:
