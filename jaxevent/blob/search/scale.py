@@ -66,7 +66,9 @@ def select_scale(
         return None
     trial.evaluate(np.setdiff1d(np.arange(number), first))
     raw, scores, ellipses = trial.scores()
-    compact = ellipses.max() >= (1 - CONFIG.free_shape_gain) * raw.max()
+    # Of free shapes at the same scale and at the best one.
+    free = np.maximum(raw + raw.max(), 1e-9) / 2
+    compact = bool((ellipses >= (1 - CONFIG.free_shape_gain) * free).any())
     if compact:
         scores = ellipses
     best = scores.max()
@@ -90,7 +92,7 @@ def select_scale(
             break
     else:
         i, j = np.unravel_index(scores.argmax(), scores.shape)
-    scale = dataclasses.replace(trial.scales[i][j], compact=bool(compact))
+    scale = dataclasses.replace(trial.scales[i][j], compact=compact)
     return ScaleSelection(scale, float(scores[i, j]))
 
 
