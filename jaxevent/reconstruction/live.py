@@ -19,7 +19,7 @@ from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.live import Tail
-from jaxevent.reconstruction.video import PixelMethod, Video
+from jaxevent.reconstruction.video import NEVER_US, PixelMethod, Video, note_first_events
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
 from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
@@ -84,6 +84,7 @@ class LiveVideo:
         self._expects_frames = frames
         self._turns = TurnLock("live images")
         self._recording = Recording("live", *size, Tail(*size), extra=extra or {})
+        self._first_events = np.full(size[::-1], NEVER_US)
         self._video: Video | None = None
         self._changed = False
 
@@ -118,6 +119,7 @@ class LiveVideo:
     def add(self, events: Events) -> None:
         """Add events that are not earlier than those before; raises `InputError` for bad ones."""
         self._events.add(events)
+        note_first_events(self._first_events, events)
         self._changed = True
         self._settle()
 
@@ -180,7 +182,7 @@ class LiveVideo:
         if self._video is None:
             self._video = Video(
                 self.estimator, self._recording, self.params,
-                window_events=self.window_events, progress=False,
+                window_events=self.window_events, progress=False, first_events=self._first_events,
             )  # fmt: skip
         elif self._changed:
             self._video.extend(self._recording)

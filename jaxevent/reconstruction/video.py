@@ -31,13 +31,14 @@ from jaxevent.reconstruction.windows import (
     ImageReader,
     WindowedRecording,
 )
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Events, Recording, Times, microseconds
 from jaxevent.threads import TurnLock, refuse_to_pickle
 
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
 
 MAX_WINDOW_STARTS = 32  # windows from which filtering can be taken up again
+NEVER_US = np.iinfo(np.int64).max  # us
 N_BATCH_IMAGES = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
 N_DEVICE_BATCH_IMAGES = 32  # on a GPU, where each call costs as much as several images
 
@@ -189,6 +190,17 @@ class FilteredWindow(NamedTuple):
         return (start is None or start <= time) and (stop is None or time < stop)
 
 
+def note_first_events(first: NDArray[np.int64], events: Events) -> None:
+    """Note the times of pixels that fire for the first time.
+
+    Args:
+        first: (H, W) times of each pixel's first event, us, `NEVER_US` before; changed in place.
+        events: Events after those noted before.
+    """
+    new = first[events.y, events.x] == NEVER_US
+    np.minimum.at(first, (events.y[new], events.x[new]), events.t[new])
+
+
 class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
@@ -218,7 +230,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         estimator.check_clocks(recording, params)
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
-        self._compared = not estimator.fuses
+        self._compared, self._is_live = not estimator.fuses, False
         self._turns = TurnLock(f"images of {recording.name}")
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -278,12 +290,12 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
 
     @property
     def _lacks_frames(self) -> bool:
-        """Whether the method fuses frames with events, and there are none."""
+        """True if the method fuses frames with events, and there are none."""
         return self.estimator.fuses and self.recording.frames is None
 
     def _doubt(self) -> str | None:
         """Return why images are doubtful, for a warning."""
-        if not self._lacks_frames:
+        if self._is_live or not self._lacks_frames:
             return events_contradict_frames(self.recording, self.params)
         return (
             f"{self.recording.name}: holds no frames, so images of {self.estimator.name} are "
@@ -293,12 +305,10 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     @functools.cached_property
     def _first_events(self) -> NDArray[np.int64]:
         """Times (H, W) of each pixel's first event, us."""
-        height, width = self.recording.height, self.recording.width
-        first = np.full(height * width, np.iinfo(np.int64).max)
+        first = np.full((self.recording.height, self.recording.width), NEVER_US)
         for events in read_blocks(self.recording.events):
-            place = events.y.astype(np.intp) * width + events.x
-            np.minimum.at(first, place, events.t)
-        return first.reshape(height, width)
+            note_first_events(first, events)
+        return first
 
     def carry(
         self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
@@ -396,6 +406,8 @@ class Video(ImageSequence[P]):
         devices: Devices of this process over which pixels are sharded.
         factors: (2, pixels) factors on the ON and OFF thresholds of single pixels, for methods that
             do not pass over single events.
+        first_events: (H, W) times of each pixel's first event, us, of a live recording, which
+            forgets events.
     """
 
     estimator: PixelMethod
@@ -410,8 +422,11 @@ class Video(ImageSequence[P]):
         progress: bool | None = None,
         devices: Sequence[Any] = (),
         factors: NDArray[np.floating] | None = None,
+        first_events: NDArray[np.int64] | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
+        if first_events is not None:
+            self._first_events, self._is_live = first_events, True
         self._devices, self._factors = devices, factors
         self._mesh = make_pixel_mesh(devices)
         self._batch = N_DEVICE_BATCH_IMAGES if has_accelerator() else N_BATCH_IMAGES

@@ -1,6 +1,7 @@
 """A live video is at every moment that of what has been added so far."""
 
 import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,10 @@ def so_far(recording: Recording, rows: int, frames: int) -> Recording:
 
 def compare(live, recording: Recording, params, times) -> None:
     whole = jaxevent.akf.estimate(recording, params, window_events=EVENTS)
-    for found, true in zip(live(times), whole(times), strict=True):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*holds no frames")
+        expected = whole(times)
+    for found, true in zip(live(times), expected, strict=True):
         np.testing.assert_allclose(found, true, rtol=1e-9, atol=1e-12)
 
 
