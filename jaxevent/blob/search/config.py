@@ -37,9 +37,6 @@ class SearchConfig(NamedTuple):
     dropped_sigmas: float = 2.0  # ... by so many standard deviations of the difference
     equal_score_loss: float = 0.03  # share of the best score that an equally good scale may lose,
     equal_window_loss: float = 0.005  # and among windows of one cell size
-    max_merged_share: float = 0.3  # share of events that smaller cells separate from a blob
-    sharp_score: float = 0.9  # share of a cell size's best score at which its blobs are sharp
-    max_gap_blobs: int = 200  # blobs of a window in which gaps are sought
 
     # Tracking from window to window
     gate_sigmas: float = 3.0  # standard deviations
