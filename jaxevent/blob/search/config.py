@@ -87,7 +87,6 @@ class SearchConfig(NamedTuple):
     erratic_sizes: float = 0.4  # sizes by which it leaves its way in a window
     persistent_share: float = 0.5  # share of a path's windows in which the target is seen
     velocity_windows: int = 8  # windows from which the velocity at an end of a path is measured
-    max_leap_sizes: float = 6.0  # sizes from its fitted way at which a path's row is no beginning
     whole_share: float = 0.8  # share of its median size and events at which a target is seen whole
     duplicate_share: float = 0.5  # share of a path near one of an earlier pass: a duplicate
 
