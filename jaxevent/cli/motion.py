@@ -197,8 +197,8 @@ def _write(options: Options, kind: Any) -> None:
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)
     print(
-        f"\n{', '.join(written.files)} in {options.out}: {count:,} events in {seconds:.2f} s, "
-        f"{count / seconds:,.0f} events/s"
+        f"\n{', '.join(written.files)} in {options.out}: {count:,} events in "
+        f"{arguments.describe_speed(count, seconds)}"
     )
 
 
@@ -212,8 +212,7 @@ def _check_options(options: Options, kind: Any) -> None:
         _check(find_estimator(options.method or kind.best_method), kind, options)
     if options.causal and (options.centred or options.smooth):
         raise InputError("--causal uses no later events; leave out --centred and --smooth")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed} is not possible; give a whole number from 0")
+    arguments.check_seed(options.seed)
 
 
 def _open(options: Options) -> Any:
@@ -274,8 +273,7 @@ def _print_live(options: Options, kind: Any) -> None:
         "--start": options.start is not None, "--stop": options.stop is not None,
         "--flow": options.flow, "--out": options.out is not None,
     }  # fmt: skip
-    if wrong := [name for name, is_given in excluded.items() if is_given]:
-        raise InputError(f"--live is not for {wrong[0]}; leave out one of the two")
+    arguments.refuse_with_live(excluded)
     if kind is None:
         raise InputError("--live cannot see all events to choose a model; name it by --model")
     recording, chunks = arguments.open_live(options.path, options.reading)

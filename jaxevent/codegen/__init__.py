@@ -3,10 +3,13 @@
 The other modules of the package compile functions that JAX traces (docs/codegen.md).
 """
 
+import ctypes
 import functools
 import inspect
+import math
 import os
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
@@ -110,12 +113,54 @@ N_THREADS = (
 )
 
 
+class _RecycledMemory:
+    """Blocks of memory that are used again once no array is left that uses them.
+
+    A page that a process writes for the first time costs more than to fill it.
+    """
+
+    def __init__(self, max_kept_bytes: int):
+        self._max, self._kept, self._lock = max_kept_bytes, 0, threading.Lock()
+        self._free: dict[int, list[NDArray[np.uint8]]] = {}
+
+    def __call__(self, n_bytes: int) -> Any:
+        """Return a block of at least so many bytes, in multiples of 1/8 of a power of two."""
+        step = max(1 << max(n_bytes.bit_length() - 4, 0), ALIGNMENT_BYTES)
+        size = -(-n_bytes // step) * step
+        with self._lock:
+            free = self._free.get(size)
+            memory = free.pop() if free else None
+            self._kept -= size if free is not None and memory is not None else 0
+        if memory is None:
+            memory = np.empty(size + ALIGNMENT_BYTES, np.uint8)
+        offset = -memory.ctypes.data % ALIGNMENT_BYTES
+        block = (ctypes.c_char * size).from_buffer(memory.data, offset)
+        weakref.finalize(block, self._release, size, memory).atexit = False
+        return block
+
+    def _release(self, size: int, memory: NDArray[np.uint8]) -> None:
+        with self._lock:
+            if self._kept + size <= self._max:
+                self._free.setdefault(size, []).append(memory)
+                self._kept += size
+
+
+ALIGNMENT_BYTES = 64
+_recycled_memory = _RecycledMemory(256 << 20)
+
+
+def empty(*shape: int) -> NDArray[np.float32]:
+    """Return an array (float32) of memory that other such arrays have used before."""
+    count = math.prod(shape)
+    return np.frombuffer(_recycled_memory(4 * max(count, 1)), np.float32, count).reshape(shape)
+
+
 def row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
     """Return scratch (rows, ...) for kernels of `run_over_rows`: parts use that of their first row.
 
     Memory is taken by what is written alone.
     """
-    return np.empty((n_rows, *shape), np.float32)
+    return empty(n_rows, *shape)
 
 
 @functools.cache

@@ -470,27 +470,6 @@ def test_without_matplotlib_the_tables_are_written(folder, capsys, monkeypatch):
     assert install_command("plot") in said and "planar motion by voting" in said
 
 
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["motion", "a", "--model", "planar", "--out", "b", "--still", "1"],
-        ["motion", "a", "--model", "planar", "--out", "b", "--seed", "x"],
-        ["simulate", "--motion", "wall", "--scene", "lake", "--out", "b"],
-    ],
-)
-def test_bad_arguments(argv, capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(argv)
-    assert stop.value.code == 2
-    assert capsys.readouterr().err.startswith("usage: jaxevent")
-
-
-def test_help(capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["motion", "--help"])
-    assert stop.value.code == 0 and "\nexamples:\n  jaxevent motion" in capsys.readouterr().out
-
-
 def test_simulated_motion_and_its_truth(folder, capsys):
     recording, source = motion_scene("planar", seed=1, **SEEN, duration=0.3)
     loaded = jaxevent.load(folder / "planar.h5")

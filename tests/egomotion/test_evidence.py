@@ -109,8 +109,9 @@ def test_a_search_and_a_pause_begin_anew():
 
     def update(t, searching):
         n = len(t)
-        return lock.update(None, np.full(n, 50), np.array(t), np.ones((n, 2)),
-                           np.tile(np.eye(2), (n, 1, 1)), np.array(searching)).tolist()  # fmt: skip
+        mean, cov = np.ones((n, 2)), np.tile(np.eye(2), (n, 1, 1))
+        locked = lock.update(None, np.full(n, 50), np.array(t), mean, cov, np.array(searching))
+        return locked.tolist()
 
     for k in range(4):
         last = update([10_000 * k], [False])

@@ -236,7 +236,7 @@ def test_robust_mean_is_that_of_jax():
     activity = ((3, 1, 0, 2), 0), ((3, 2, 0, 0), L[2] - L[1]), ((3, 0, 2, 2), L[1] - L[0])
     for numbers, change in activity:
         at = make_layout(*numbers)
-        one = robust_mean.robust_mean(Params(), L, along, at)
+        one = robust_mean.robust_mean(robust_mean.MeanParams.of(Params()), L, along, at)
         other = purely(Params(), L, along, at)
         for name, quick, pure in zip(robust_mean.RobustMean._fields, one, other, strict=True):
             np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)

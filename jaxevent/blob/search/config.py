@@ -26,6 +26,7 @@ class SearchConfig(NamedTuple):
 
     # Selection of the scale
     max_scored_events: int = 2000  # events of a window that are scored
+    free_shape_gain: float = 0.07  # share of the score that free shapes gain over ellipses at most
     split_loss: float = 0.2  # share of the score lost if all events are in touching blobs
     min_split_events: int = 3  # events of a blob that may be split
     min_windows: int = 8  # windows in a recording
@@ -61,13 +62,6 @@ class SearchConfig(NamedTuple):
     free_share: float = 0.7  # unassigned share of a blob where a track begins
     min_confirm_windows: int = 4  # windows with events until a track is confirmed,
     min_confirm_share: float = 0.5  # and their share of the track's windows
-    young_windows: int = 3  # windows of age in which contact may mean a part of an object
-    part_windows: int = 5  # windows of common motion that make two tracks one, or a blob two
-    split_aspect: float = 2.0  # aspect from which a blob is tested for a split
-    split_min_share: float = 0.15  # share of a blob's events in the smaller half
-    split_growth: float = 1.3  # size of a blob that splits, in its least size
-    split_separation: float = 1.5  # distance of its halves, in their first distance
-    split_valley: float = 0.05  # share of its events between the halves; of a disc it is over 0.2
     max_squared_innovation: float = (
         16.0  # variances; larger ones count so much for the velocity noise
     )

@@ -65,7 +65,12 @@ def select_scale(
     if min_gain is not None and most < min_gain:
         return None
     trial.evaluate(np.setdiff1d(np.arange(number), first))
-    raw, scores = trial.scores()
+    raw, scores, ellipses = trial.scores()
+    # Of free shapes at the same scale and at the best one.
+    free = np.maximum(raw + raw.max(), 1e-9) / 2
+    compact = bool((ellipses >= (1 - CONFIG.free_shape_gain) * free).any())
+    if compact:
+        scores = ellipses
     best = scores.max()
     if best <= 0:
         return None
@@ -78,15 +83,17 @@ def select_scale(
     gaps, some = _GapTest(stream, background), trial.begins[::2]
     for j in cells[::-1]:
         for i in np.flatnonzero(good[:, j]):
-            merged = gaps.merged_share(trial.scales[i][j], some[:, i], longest[:j])
-            good[i, j] = merged <= CONFIG.max_merged_share
+            if not compact:
+                merged = gaps.merged_share(trial.scales[i][j], some[:, i], longest[:j])
+                good[i, j] = merged <= CONFIG.max_merged_share
         if good[:, j].any():
             column = np.where(good[:, j], scores[:, j], -np.inf)
             i = np.flatnonzero(column >= column.max() - CONFIG.equal_window_loss * best).max()
             break
     else:
         i, j = np.unravel_index(scores.argmax(), scores.shape)
-    return ScaleSelection(trial.scales[i][j], float(scores[i, j]))
+    scale = dataclasses.replace(trial.scales[i][j], compact=compact)
+    return ScaleSelection(scale, float(scores[i, j]))
 
 
 class _ScaleTrial:
@@ -139,12 +146,12 @@ class _ScaleTrial:
                 self.tried[i, j] = one is best or excess >= 0
         return most
 
-    def scores(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Score the scales (windows, cells), without and with penalty; -inf for dropped ones."""
-        out = np.full((2, *self.tried.shape), -np.inf)
+    def scores(self) -> NDArray[np.float64]:
+        """Score the scales (windows, cells): raw, with penalty, by ellipses; -inf if dropped."""
+        out = np.full((3, *self.tried.shape), -np.inf)
         for i, j in zip(*np.nonzero(self.tried), strict=True):
-            out[:, i, j] = score(self.predictions[i][j])[:2]
-        return out[0], out[1]
+            out[:, i, j] = score(self.predictions[i][j])[:3]
+        return out
 
 
 def _upper_bound(parts: NDArray[np.float64]) -> float:

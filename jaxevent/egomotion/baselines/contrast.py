@@ -426,12 +426,12 @@ class WindowSequence:
     @functools.cached_property
     def _begins(self) -> NDArray[np.int64]:
         """Times (us) at which windows begin, or rows of events."""
-        events, n = self.recording.events, len(self.recording.events)
+        n = len(self.recording.events)
         if not n:
             return np.zeros(0, np.int64)
         if self.params.window == "events":
             return np.arange(0, max(n - self.params.events, 0) + 1, self._stride)
-        first, last = int(events[:1].t[0]), int(events[n - 1 :].t[0])
+        first, last = self.recording.event_span()
         return np.arange(first, max(last - self._length, first) + 1, self._step)
 
     def __iter__(self) -> Iterator[EventRange]:

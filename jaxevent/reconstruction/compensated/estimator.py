@@ -72,6 +72,7 @@ from jaxevent.reconstruction.compensated.normal_equations import (
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import (
     InstantLayout,
+    MeanParams,
     RobustMean,
     make_layout,
     robust_mean,
@@ -89,7 +90,6 @@ from jaxevent.reconstruction.compensated.trajectories import (
     estimate_trajectories,
     gauss_newton_step,
     node_shape,
-    pack_images,
     plan_stages,
     robust_cost,
     select_paths,
@@ -405,21 +405,26 @@ class TrajectoryEstimator:
         """Refine motion at half resolution with the image that it gives."""
         instants, p = motion
         L, V, clear, smooth = self._images(instants)
-        t, size = int(instants.t[instants.target]), self.images.image_shape
-        p = NodeTrajectories(p, 1).at_level(0, size).p
-        estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=self._noise(t))
+        t = int(instants.t[instants.target])
+        estimate = TrajectoryEstimate(
+            instants, L, V, clear, self._at_full_resolution(p), noise=self._noise(t)
+        )
         fused = fuse_target(self.params, estimate)
         image, P = np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
-        packed = self._pack(estimate, image, P)
-        p = borrow_paths(packed, gauss_newton_step(packed, p, self._cost), self._cost)
+        images = PackedImages.of(self._pyramid(estimate, image, P)[1], instants.s)
+        p = borrow_paths(images, gauss_newton_step(images, p, self._cost), self._cost)
         return Anchor(NodeMotion(instants, p), image, P, smooth is None)
 
-    def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
-        """Pack the images of a target, its own replaced by one with less noise."""
+    def _at_full_resolution(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Interpolate nodes at half resolution to those at full resolution."""
+        return NodeTrajectories(p, 1).at_level(0, self.images.image_shape).p
+
+    def _pyramid(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> ImagePyramid:
+        """Return the images of a target, its own replaced by one with less noise."""
         L, V = target.L.copy(), self._cautious(target.V, target.clear)
         L[target.instants.target] = image
         V[target.instants.target] = FUSED_VARIANCE_FACTOR * P + self._cost.floor
-        return PackedImages.of(pack_images(L, V), target.instants.s)
+        return ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)
 
     def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> NodeMotion:
         """Take a few steps at half resolution, on the clock on which frames agree better.
@@ -467,25 +472,19 @@ class TrajectoryEstimator:
         if not anchor.motion.instants.clock.event_share:
             instants = instants.with_clock(TIME_CLOCK)
         p = anchor.motion.carry(instants)
-        target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
-        packed = self._pack(target, *self._carry_image(anchor, target))
+        target = TrajectoryEstimate(
+            instants, L, V, clear, self._at_full_resolution(p), smooth=smooth, noise=noise
+        )
+        pyramid = self._pyramid(target, *self._carry_image(anchor, target))
+        images = PackedImages.of(pyramid[1], instants.s)
         for at in others:
-            p = self._choose(packed, p, self._sought_motion(at).carry(instants))
-        p = gauss_newton_step(packed, p, self._cost)
+            several = (p, self._sought_motion(at).carry(instants))
+            p = choose_trajectories(images, several, self._cost, (1.0, 1.0))
+        p = self._at_full_resolution(gauss_newton_step(images, p, self._cost))
         # Nodes of the anchor have taken paths from farther away.
-        path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
+        images = PackedImages.of(pyramid[0], instants.s)
+        path_index = select_paths(images, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
         return target._replace(p=p, path_index=path_index)
-
-    def _choose(
-        self, images: PackedImages, p: NDArray[np.float32], other: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Choose between trajectories and others at half resolution, where images agree better."""
-        size = self.images.image_shape
-        L, V = images.pixels[..., 0], images.pixels[..., 1]
-        half = PackedImages.of(ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)[1], images.s)
-        own = NodeTrajectories(p, 0).at_level(1, size).p
-        change = choose_trajectories(half, (own, other), self._cost, (1.0, 1.0)) - own
-        return p + NodeTrajectories(change, 1).at_level(0, size).p
 
     def _carry_image(
         self, anchor: Anchor, target: TrajectoryEstimate
@@ -534,7 +533,7 @@ def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
     paths = target.paths
     warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
     layout = make_layout(instants, clear, len(instants))
-    mean = robust_mean(params, L, warped, layout)
+    mean = robust_mean(MeanParams.of(params), L, warped, layout)
     # The images that it is compared with are few, and are all that is handed over.
     names = ("target", "before", "after", "other")
     rows = [int(getattr(layout, name)) for name in names]
@@ -670,10 +669,13 @@ class CompensatedVideo(ImageSequence[Params]):
     def _fuse(self, t: int, target: TrajectoryEstimate) -> FusedImage:
         """Fuse a target's images, and fit the result to the frames next to it."""
         fused, brightness = fuse_target(self.params, target), self.trajectories.brightness.prior(t)
-        if target.smooth is not None:  # frames of another brightness are no constraint
-            return add_smooth_part(target, fused, brightness)
         exposures = self.trajectories.exposures
-        if exposures.samples is not None:
+        samples = exposures.samples
+        if target.smooth is not None:
+            fused = add_smooth_part(target, fused, brightness)
+            # Frames of another brightness are no constraint, but for white.
+            samples = None if samples is None else 1
+        if samples is not None:
             adjacent = exposures(t, target.instants)
             low, high = int(adjacent.frame.min()), int(adjacent.frame.max()) + 1
             grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
@@ -682,7 +684,9 @@ class CompensatedVideo(ImageSequence[Params]):
                 grey[rows], intensity[rows], self._response, gain[rows], self._frames.white
             )
             model = ExposureModel(adjacent, frames, target.paths)
-            fused = constrain_image(self.params, fused, model, exposures.samples)
+            fused = constrain_image(self.params, fused, model, samples)
+        if target.smooth is not None:
+            return fused
         return dataclasses.replace(fused, P=fused.P + brightness.variance)
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
@@ -893,6 +897,10 @@ class MotionCompensation(ImageEstimator[Params]):
             paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
             warped = warp_images_jax(*images, layout.s, paths)
             fused = fuse(params, *images[:2], warped, layout, squared_reach(paths), noise=factor)
+            weight = after_weight(layout)
+            base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
+            base, added = (1 - steady) * base, (1 - steady) * variance
+            fused = dataclasses.replace(fused, L=fused.L + base, P=fused.P + added)
             if out.samples is not None:
                 at = exposures.frame
                 adjacent = AdjacentFrames(
@@ -902,13 +910,11 @@ class MotionCompensation(ImageEstimator[Params]):
                     frames.gain[at],
                     frames.white,
                 )
-                # Frames of another brightness are no constraint.
-                exposures = exposures._replace(present=exposures.present * steady)
+                # Frames of another brightness are no constraint, but for white.
+                exposures = exposures._replace(half=exposures.half * steady)
                 model = ExposureModel(exposures, adjacent, paths)
                 fused = constrain_image_jax(params, fused, model, out.samples)
-            weight = after_weight(layout)
-            base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
-            return fused.L + (1 - steady) * base, fused.P + variance
+            return fused.L, fused.P + steady * variance
 
         found, P = jax.lax.map(one, out.targets)
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)

@@ -22,7 +22,7 @@ from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
 from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -81,9 +81,9 @@ class NormalEquations(NamedTuple):
 
 
 class PackedImages(NamedTuple):
-    """Images at K instants with their gradients."""
+    """Images at K instants."""
 
-    pixels: NDArray[np.float32]  # (K, h, w, 4): log intensity, its variance, gradient along x, y
+    pixels: NDArray[np.float32]  # (K, h, w, 2): log intensity and its variance
     s: NDArray[np.float32]  # (K,), times relative to the target, -1..1
     near: NDArray[np.float32]  # (K,), weights with which a robust mean begins
 
@@ -92,7 +92,7 @@ class PackedImages(NamedTuple):
         """Add the weights, which fall with the distance from the target.
 
         Args:
-            pixels: (K, h, w, 4) packed images; see `trajectories.pack_images`.
+            pixels: (K, h, w, 2) log intensity and its variance, (ln I)^2.
             s: (K,) times relative to the target, -1..1.
 
         Returns:
@@ -106,14 +106,16 @@ def max_instant_distance(s: NDArray[np.float32]) -> np.float32:
     return np.float32(max(float(np.abs(s).max()), 1e-3))
 
 
-class TrajectorySamples(NamedTuple):
-    """Packed images read along the trajectories of pixels."""
+class TrajectorySums(NamedTuple):
+    """Sums over instants of what images show along the trajectories of pixels."""
 
-    points: NDArray[np.float32]  # (h, 4, K, w): log intensity, robust weight, gradient along x, y
-    M: NDArray[np.float32]  # (h, w), their robust mean
+    M: NDArray[np.float32]  # (h, w), the robust mean
+    # (h, 6, w): sums of R s'^2, R s' q', R q'^2, R e s, R e q and R e^2, of q = s^2, robust weights
+    # R and residuals e. s' and q' differ from s and q by the means that R gives.
+    moments: NDArray[np.float32]
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def fill_information(variances, inside, variance_floor, out_information):
     """Write the information of values.
 
@@ -130,7 +132,7 @@ def fill_information(variances, inside, variance_floor, out_information):
         )
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def robust_means(values, information, initial_weights, nu, out_means):
     """Write robust means of values.
 
@@ -164,66 +166,86 @@ def robust_means(values, information, initial_weights, nu, out_means):
             means[i] = mean[i] / total[i]
 
 
-@njit_noalloc_inlined
-def _read_channels(image, pixel, part, k, points):
-    """Write an image's channels at points, bilinear: (4, K, points)."""
+@njit_fastmath_inlined
+def read_image(image, pixel, part, out_level, out_variance):
+    """Write log intensity and variance of a packed image at points, bilinear.
+
+    Args:
+        image: (h, w, 2) the image.
+        pixel: (2, points) x and y of the pixels before the points.
+        part: (2, points) distance from those, px.
+        out_level: (points,) output, log intensity.
+        out_variance: (points,) output, its variance, (ln I)^2.
+    """
     h, w, _ = image.shape
-    for i in range(pixel.shape[1]):
+    for i in range(len(out_level)):
         x0, y0 = pixel[0, i], pixel[1, i]
         x1 = min(x0 + 1, w - 1)
         upper, lower = image[y0], image[min(y0 + 1, h - 1)]
         a, b, c, d = bilinear_weights(part[0, i], part[1, i])
-        for q in range(4):
-            points[q, k, i] = (
-                a * upper[x0, q] + b * upper[x1, q] + c * lower[x0, q] + d * lower[x1, q]
-            )
+        out_level[i] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
+        out_variance[i] = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
 
 
 class _SampleScratch(NamedTuple):
     """Scratch memory for each row that a kernel begins with."""
 
     rows: RowScratch
-    information: NDArray[np.float32]  # (rows, K, w)
-    sums: NDArray[np.float32]  # (rows, 2, w)
+    values: NDArray[np.float32]  # (rows, 3, K, w), log intensity, information, robust weight
+    sums: NDArray[np.float32]  # (rows, 7, w)
 
     @classmethod
     def allocate(cls, rows: int, instants: int, width: int) -> "_SampleScratch":
         """Allocate scratch memory for `run_over_rows`."""
-        shapes = (instants, width), (2, width)
+        shapes = (3, instants, width), (7, width)
         return cls(RowScratch.allocate(rows, width), *(row_scratch(rows, *s) for s in shapes))
 
 
-@njit_noalloc_inlined
-def _sample_row(y, begin, inputs, scratch, points, means):
-    """Write what images show along the trajectories of a row: (4, K, w), and their means (w,)."""
+@njit_fastmath
+def _sum_instants(begin, end, inputs, scratch, out):
+    """Write the `TrajectorySums` of some rows."""
     images, p, cost = inputs
     count, h, w, _ = images.pixels.shape
-    rows, info = scratch.rows, scratch.information[begin]
+    rows, half = scratch.rows, np.float32(0.5)
     path, at, pixel = rows.path[begin], rows.x[begin], rows.pixel[begin]
-    part, inside, half = rows.part[begin], rows.inside[begin], np.float32(0.5)
-    at_y = np.float32(y) * half - np.float32(0.25)
-    for x in range(w):
-        at[x] = np.float32(x)
-        interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
-    for k in range(count):
-        row = (path, at, pixel, part, inside)
-        locate_points(np.float32(y), images.s[k], (h, w), w, row)
-        _read_channels(images.pixels[k], pixel, part, k, points)
-        fill_information(points[1, k], inside, cost.floor, info[k])
-    found = (points[1], means, scratch.sums[begin])
-    robust_means(points[0], info, images.near, cost.robust, found)
-
-
-@njit_noalloc
-def _sample(begin, end, inputs, scratch, out):
+    row = (path, at, pixel, rows.part[begin], rows.inside[begin])
+    level, info, R = scratch.values[begin, 0], scratch.values[begin, 1], scratch.values[begin, 2]
+    total, r1, r2 = scratch.sums[begin, 2], scratch.sums[begin, 3], scratch.sums[begin, 4]
+    r3, r4 = scratch.sums[begin, 5], scratch.sums[begin, 6]
     for y in range(begin, end):
-        _sample_row(y, begin, inputs, scratch, out.points[y], out.M[y])
+        M, moments = out.M[y], out.moments[y]
+        at_y = np.float32(y) * half - np.float32(0.25)
+        for x in range(w):
+            at[x] = np.float32(x)
+            interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
+        for k in range(count):
+            locate_points(np.float32(y), images.s[k], (h, w), w, row)
+            read_image(images.pixels[k], pixel, row[3], level[k], info[k])
+            fill_information(info[k], row[4], cost.floor, info[k])
+        robust_means(level, info, images.near, cost.robust, (R, M, scratch.sums[begin, :2]))
+        total[:], r1[:], r2[:], r3[:], r4[:] = half * 0, half * 0, half * 0, half * 0, half * 0
+        moments[:] = np.float32(0)
+        for k in range(count):
+            s = images.s[k]
+            q = s * s
+            for x in range(w):
+                e = level[k, x] - M[x]
+                total[x] += R[k, x]
+                r1[x] += R[k, x] * s
+                r2[x] += R[k, x] * q
+                r3[x] += R[k, x] * (q * s)
+                r4[x] += R[k, x] * (q * q)
+                moments[3, x] += R[k, x] * s * e
+                moments[4, x] += R[k, x] * q * e
+                moments[5, x] += R[k, x] * e * e
+        for x in range(w):
+            moments[0, x] = r2[x] - r1[x] * r1[x] / total[x]
+            moments[1, x] = r3[x] - r1[x] * r2[x] / total[x]
+            moments[2, x] = r4[x] - r2[x] * r2[x] / total[x]
 
 
-def sample_trajectories(
-    images: PackedImages, p: NDArray[np.float32], cost: CostParams
-) -> TrajectorySamples:
-    """Read packed images along trajectories.
+def sum_instants(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> TrajectorySums:
+    """Sum what packed images show along trajectories.
 
     Args:
         images: The packed images.
@@ -231,97 +253,65 @@ def sample_trajectories(
         cost: Parameters of the cost, float32.
 
     Returns:
-        What the images show along the trajectories of pixels.
+        The sums of all pixels.
     """
     count, h, w, _ = images.pixels.shape
-    points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
-    samples = TrajectorySamples(points, M)
+    out = TrajectorySums(empty(h, w), empty(h, 6, w))
     scratch = _SampleScratch.allocate(h, count, w)
-    run_over_rows(_sample, h, (images, p, cost), scratch, samples)
-    return samples
+    run_over_rows(_sum_instants, h, (images, p, cost), scratch, out)
+    return out
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _add_product(a, b, out):
     for i in range(len(out)):
         out[i] += a[i] * b[i]
 
 
-@njit_noalloc_inlined
-def _add_pixels(points, M, s, grad_M, scratch, sums):
-    """Add the equations of each pixel of a row to sums (14, w): N (10) and b (4).
-
-    `points` are the row's, as of `TrajectorySamples`, and M (w,) are their means.
-
-    The derivative of values by a path's four numbers is J = g (s, s^2). The gradient g along
-    trajectories and that of the mean, `grad_M` (2, w), are both that of the scene; the mean of the
-    two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
-    """
-    J, total, means, r = scratch[:4], scratch[4], scratch[5:9], scratch[9]
-    total[:] = np.float32(0)
-    means[:] = np.float32(0)
-    for k in range(len(s)):
-        R = points[1, k]
-        for c in range(2):
-            for i in range(len(M)):
-                J[c, i] = (points[2 + c, k, i] + grad_M[c, i]) * np.float32(0.5) * s[k]
-            for i in range(len(M)):
-                J[2 + c, i] = J[c, i] * s[k]
-        for i in range(len(M)):
-            total[i] += R[i]
-        entry = 0
-        for c in range(4):
-            for i in range(len(M)):
-                r[i] = R[i] * J[c, i]
-                means[c, i] += r[i]
-                sums[10 + c, i] -= r[i] * (points[0, k, i] - M[i])
-            for e in range(c, 4):
-                _add_product(r, J[e], sums[entry])
-                entry += 1
-    entry = 0
-    for c in range(4):
-        for i in range(len(M)):
-            r[i] = -means[c, i] / total[i]
-        for e in range(c, 4):
-            _add_product(r, means[e], sums[entry])
-            entry += 1
-
-
-@njit_noalloc
-def _linearise(begin, end, inputs, scratch, M, out):
+@njit_fastmath
+def _fill_equations(begin, end, sums, scratch, out):
     """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each.
 
-    Samples of four rows of pixels are kept: memory does not grow with the image. Rows at the border
-    of two threads are sampled by both, so a row of M is written when its means are final.
+    The derivative of values by a path's four numbers is J = g (s, s^2), with the scene's gradient
+    g, for which that of the mean stands. M, the mean of the values by R, is eliminated exactly: J
+    is J - sum R J / sum R. So N is the product of g g^T with the moments of s and s^2.
     """
-    h, w = M.shape
-    samples, lines, recent = scratch
-    own, grad_M, sums = lines[begin, :10], lines[begin, 10:12], lines[begin, 12:27]
-    means = lines[begin, 27]
-    points, sampled = recent[begin], max(2 * begin - 2, 0)
+    h, w = sums.M.shape
+    rows = scratch[begin]
     for i in range(begin, end):
-        sums[:] = np.float32(0)
+        rows[:] = np.float32(0)
         below = min(2 * i + 2, h)
-        while sampled < min(2 * i + 4, h):
-            _sample_row(sampled, begin, inputs, samples, points[sampled % 4], means)
-            for x in range(w):
-                M[sampled, x] = means[x]
-            sampled += 1
         for y in range(2 * i, below):
+            moments = sums.moments[y]
             for x in range(w):
-                gx, gy = gradient_at_pixel(M, y, x)
-                grad_M[0, x], grad_M[1, x] = gx, gy
-                sums[14, x] += np.sqrt(gx * gx + gy * gy)
-            _add_pixels(points[y % 4], M[y], inputs[0].s, grad_M, own, sums)
+                gx, gy = gradient_at_pixel(sums.M, y, x)
+                xx, xy, yy = gx * gx, gx * gy, gy * gy
+                ss, sq, qq = moments[0, x], moments[1, x], moments[2, x]
+                rows[0, x] += xx * ss
+                rows[1, x] += xy * ss
+                rows[2, x] += xx * sq
+                rows[3, x] += xy * sq
+                rows[4, x] += yy * ss
+                rows[6, x] += yy * sq
+                rows[7, x] += xx * qq
+                rows[8, x] += xy * qq
+                rows[9, x] += yy * qq
+                rows[10, x] -= gx * moments[3, x]
+                rows[11, x] -= gy * moments[3, x]
+                rows[12, x] -= gx * moments[4, x]
+                rows[13, x] -= gy * moments[4, x]
+                rows[14, x] += np.sqrt(xx + yy)
+        for x in range(w):
+            rows[5, x] = rows[3, x]
         for j in range(out.shape[1]):
             left, right = 2 * j, min(2 * j + 1, w - 1)
             both = np.float32(right - left)  # 0 or 1
             share = np.float32(1) / (np.float32(below - 2 * i) * (np.float32(1) + both))
             for c in range(15):
-                out[i, j, c] = (sums[c, left] + both * sums[c, right]) * share
+                out[i, j, c] = (rows[c, left] + both * rows[c, right]) * share
 
 
-@njit_noalloc
+@njit_fastmath
 def _smooth_nodes(values, row, out):
     """Blur nodes by (1, 6, 1) / 8: by a Gaussian of 1 px."""
     rows, columns, channels = out.shape
@@ -340,7 +330,7 @@ def _smooth_nodes(values, row, out):
                 ) / np.float32(8)
 
 
-@njit_noalloc
+@njit_fastmath
 def _weigh_differences(p, edge, horizon, cost, out):
     """Write the weights of differences between neighbouring nodes, across and down."""
     rows, columns, _ = p.shape
@@ -370,12 +360,11 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
     Returns:
         The equations, N as the 10 entries of its upper triangle.
     """
-    shape, (count, h, w, _) = p.shape[:2], images.pixels.shape
-    entries, M = np.empty((*shape, 15), np.float32), np.empty((h, w), np.float32)
-    samples = _SampleScratch.allocate(shape[0], count, w)
-    scratch = samples, row_scratch(shape[0], 12 + 15 + 1, w), row_scratch(shape[0], 4, 4, count, w)
-    run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
-    blurred = np.empty((*shape, 14), np.float32)
+    sums, shape = sum_instants(images, p, cost), p.shape[:2]
+    entries = empty(*shape, 15)
+    scratch = row_scratch(shape[0], 15, sums.M.shape[1])
+    run_over_rows(_fill_equations, shape[0], sums, scratch, entries)
+    blurred = empty(*shape, 14)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
     horizon = max_instant_distance(images.s)
     weights = np.zeros((2, *shape), np.float32)
@@ -387,26 +376,26 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
     return NormalEquations(blurred[..., :10], blurred[..., 10:], *weights, smooth, ridge)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _add_difference(weight, a, b, out):
     for x in range(len(out)):
         out[x] += weight[x] * (a[x] - b[x])
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _scale_and_add(factor, a, out):
     """Write factor out + a."""
     for x in range(len(out)):
         out[x] = factor * out[x] + a[x]
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _add_scaled(factor, a, out):
     for x in range(len(out)):
         out[x] += factor * a[x]
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _multiply(N, i, q, out):
     """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors (4, columns)."""
     for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
@@ -417,7 +406,7 @@ def _multiply(N, i, q, out):
             _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _laplacian(q, across, down, i, out):
     """Write the weighted graph Laplacian (columns,) of a row; all are padded by a node."""
     width = len(out)
@@ -429,7 +418,7 @@ def _laplacian(q, across, down, i, out):
     _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _invert(N, added, scratch, out):
     """Write the inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
     # Cholesky, in double precision: nodes without texture are nearly singular.
@@ -504,7 +493,7 @@ def solve_normal_equations(
     return d
 
 
-@njit_noalloc
+@njit_fastmath
 def _solve(eq, p, iterations, scratch, d):
     # Channels come first here, and rows of nodes are what loops go over at once.
     rows, columns, channels = p.shape
@@ -622,8 +611,7 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
     count, h, w = L.shape
     Y, X = (one.astype(p.dtype) for one in path_positions(interpolate_paths_jax(p, h, w), s))
     inside = is_in_image(Y, X, h, w)
-    gx, gy = gradient_jax(L)
-    L, V, gx, gy = (sample_bilinear(image, Y, X) for image in (L, V, gx, gy))
+    L, V = sample_bilinear(L, Y, X), sample_bilinear(V, Y, X)
     W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
     s = s[:, None, None]
     R = W * jnp.exp(-2 * s**2)
@@ -632,7 +620,7 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
         R = W / (1 + (L - M) ** 2 * W / cost.robust)
         M = (R * L).sum(0) / R.sum(0)
     mx, my = gradient_jax(M)
-    J = jnp.stack([(gx + mx) / 2 * s, (gy + my) / 2 * s])
+    J = jnp.stack([mx * s, my * s])
     J = jnp.concatenate([J, J * s])
     J = J - (R * J).sum(1, keepdims=True) / R.sum(0)
     N = jnp.einsum("khw,akhw,bkhw->hwab", R, J, J)

@@ -26,29 +26,28 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
     PackedImages,
     fill_information,
     linearise,
     max_instant_distance,
+    read_image,
     robust_means,
-    sample_trajectories,
     solve_normal_equations,
+    sum_instants,
 )
 from jaxevent.reconstruction.compensated.robust_mean import (
     blur_along_x,
     blur_along_y,
-    blur_image,
-    gaussian_taps,
+    blur_images,
+    half_taps,
 )
 from jaxevent.reconstruction.compensated.warp import (
     RowScratch,
     bilinear_cell,
-    bilinear_weights,
     blend_nodes,
-    gradient_at_pixel,
     interpolate_paths,
     locate_points,
     resize_nodes,
@@ -78,35 +77,17 @@ class PathSearch(NamedTuple):
 CHOICE_SIGMA = 2.0  # of the Gaussian over which costs of trajectories are compared, in nodes
 # Set on objects of seeds that are not scored, and on the first half of slider_depth.
 PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
+BORROWING = (PathSearch(1, 4, 1.0),)
 
 
 def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
-    """Pack images with their gradients.
-
-    Args:
-        L: (K, h, w) log intensity.
-        V: (K, h, w) its variance, (ln I)^2.
-
-    Returns:
-        (K, h, w, 4) L, V, and the gradient of L along x and y, 1/px.
-    """
-    out = np.empty((*L.shape, 4), np.float32)
-    run_over_rows(_pack, L.shape[1], np.asarray(L, np.float32), np.asarray(V, np.float32), out)
+    """Pack images and their variances, each (K, h, w): (K, h, w, 2)."""
+    out = empty(*L.shape, 2)
+    out[..., 0], out[..., 1] = L, V
     return out
 
 
-@njit_noalloc
-def _pack(begin, end, L, V, out):
-    count, h, w = L.shape
-    for k in range(count):
-        for y in range(begin, end):
-            for x in range(w):
-                out[k, y, x, 0] = L[k, y, x]
-                out[k, y, x, 1] = V[k, y, x]
-                out[k, y, x, 2], out[k, y, x, 3] = gradient_at_pixel(L[k], y, x)
-
-
-@njit_noalloc
+@njit_fastmath
 def _halve(begin, end, images, scratch, out):
     count, h, w = images.shape
     column = scratch[begin]
@@ -127,7 +108,7 @@ def _halve(begin, end, images, scratch, out):
 def halve_resolution(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur images (K, h, w) and keep every second pixel: half the resolution, rounded up."""
     count, h, w = images.shape
-    out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
+    out = empty(count, (h + 1) // 2, (w + 1) // 2)
     run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out)
     return out
 
@@ -157,12 +138,12 @@ class ImagePyramid:
         return self._packed[level]
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _median(a, b, c):
     return max(min(a, b), min(max(a, b), c))
 
 
-@njit_noalloc
+@njit_fastmath
 def _move(p, d, longest, scratch, out):
     """Write p + d, each channel of d cut to `longest`, then the median of 3 x 3 nodes.
 
@@ -232,8 +213,7 @@ def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) 
     Returns:
         The mean over pixels and instants.
     """
-    points, M = sample_trajectories(images, p, cost)
-    return float(((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).mean())
+    return float(sum_instants(images, p, cost).moments[:, 5].mean()) / len(images.s)
 
 
 def choose_trajectories(
@@ -255,13 +235,12 @@ def choose_trajectories(
     """
     costs = []
     for p, share in zip(several, shares, strict=True):
-        points, M = sample_trajectories(images, p, cost)
-        squares = ((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).sum(1)
+        squares = sum_instants(images, p, cost).moments[:, 5]
         rows, columns = p.shape[:2]
         unpaired = [(0, 2 * rows - len(squares)), (0, 2 * columns - squares.shape[1])]
         padded = np.pad(squares, unpaired, mode="edge")
         nodes = padded.reshape(rows, 2, columns, 2).mean((1, 3))
-        costs.append(blur_image(nodes, CHOICE_SIGMA) / np.float32(share))
+        costs.append(blur_images(nodes[None], CHOICE_SIGMA)[0] / np.float32(share))
     best = np.argmin(costs, 0)
     return np.take_along_axis(np.stack(several), best[None, ..., None], 0)[0]
 
@@ -383,7 +362,7 @@ def estimate_trajectories(
     return found
 
 
-@njit_noalloc
+@njit_fastmath
 def _advect(begin, end, p, s, out):
     rows, columns, _ = p.shape
     half = np.float32(0.5)  # nodes per px
@@ -422,10 +401,10 @@ class _SearchScratch(NamedTuple):
     lines: NDArray[np.float32]  # (rows, 6, w), sums (2), means, costs of points, of pixels (2)
     logs: NDArray[np.float64]  # (rows, 2, w), sums of logarithms, and products to take them of
     chosen: NDArray[np.int32]  # (rows, w), pixels of a row
-    padded: NDArray[np.float32]  # (rows, w + taps)
+    padded: NDArray[np.float32]  # (rows, w + 12)
 
     @classmethod
-    def allocate(cls, shape: tuple[int, int], instants: int, taps: int) -> "_SearchScratch":
+    def allocate(cls, shape: tuple[int, int], instants: int) -> "_SearchScratch":
         """Allocate scratch memory for `run_over_rows`."""
         rows, columns = shape
         return cls(
@@ -434,7 +413,7 @@ class _SearchScratch(NamedTuple):
             row_scratch(rows, 6, columns),
             np.empty((rows, 2, columns)),
             np.empty((rows, columns), np.int32),
-            row_scratch(rows, columns + taps),
+            row_scratch(rows, columns + 12),
         )
 
 
@@ -450,20 +429,7 @@ class _SearchInputs(NamedTuple):
     min_gain: np.float32
 
 
-@njit_noalloc_inlined
-def _read_levels(image, pixel, part, level, V):
-    """Write log intensity and variance of a packed image at points, bilinear."""
-    h, w, _ = image.shape
-    for i in range(len(level)):
-        x0, y0 = pixel[0, i], pixel[1, i]
-        x1 = min(x0 + 1, w - 1)
-        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
-        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
-        level[i] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
-        V[i] = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
-
-
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _evaluate_cost(count, begin, y, inputs, scratch):
     """Write the robust costs of a row's first points into `scratch.lines[begin, 3]`.
 
@@ -479,7 +445,7 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
     total, product = scratch.logs[begin, 0], scratch.logs[begin, 1]
     for k in range(len(s)):
         locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside))
-        _read_levels(images.pixels[k], pixel, part, level[k, :count], W[k])
+        read_image(images.pixels[k], pixel, part, level[k, :count], W[k])
         fill_information(W[k, :count], inside, inputs.cost.floor, W[k])
     robust_means(level, W, images.near, nu, (R, means, lines[:2]))
     for i in range(count):
@@ -497,14 +463,14 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
         costs[i] = nu * np.float32(total[i])
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _path_difference(own, other):
     """Return an upper bound (px) of the difference of two paths at the farthest instant."""
     x = abs(other[0] - own[0]) + abs(other[2] - own[2])
     return max(x, abs(other[1] - own[1]) + abs(other[3] - own[3]))
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _paths_are_alike(paths, y, x, offsets):
     """Return whether no path nearby differs from a pixel's own."""
     h, w, _ = paths.shape
@@ -516,7 +482,7 @@ def _paths_are_alike(paths, y, x, offsets):
     return True
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _list_pixels(y, n, inputs, begin, scratch):
     """Write the pixels of a row to compare along the `n`th path, with it; return their number."""
     paths, offsets, rows = inputs.paths, inputs.offsets, scratch.rows
@@ -539,7 +505,7 @@ def _list_pixels(y, n, inputs, begin, scratch):
     return count
 
 
-@njit_noalloc
+@njit_fastmath
 def _evaluate_paths(begin, end, inputs, scratch, out):
     """Write the costs (n, h, w) of the paths at all offsets, blurred along x; the first is its own.
 
@@ -562,7 +528,7 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
             blur_along_x(other, inputs.taps, padded, out[n, y])
 
 
-@njit_noalloc
+@njit_fastmath
 def _select(begin, end, inputs, found, scratch, out):
     """Write the paths that pixels take, by costs that are blurred along x, and the present ones."""
     costs, path_index = found
@@ -605,12 +571,12 @@ def select_paths(
     path_index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     for spacing, distance, sigma in searches:
         some = paths.reshape(-1, 4)[path_index[::spacing, ::spacing]]
-        taps, shape = gaussian_taps(sigma), some.shape[:2]
+        taps, shape = half_taps(sigma), some.shape[:2]
         inputs = _SearchInputs(
             images, some, spacing, NEIGHBOUR_OFFSETS * distance, cost, taps, min_gain
         )
-        costs = np.empty((len(NEIGHBOUR_OFFSETS), *shape), np.float32)
-        scratch = _SearchScratch.allocate(shape, len(images.s), len(taps))
+        costs = empty(len(NEIGHBOUR_OFFSETS), *shape)
+        scratch = _SearchScratch.allocate(shape, len(images.s))
         run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
         out = np.empty_like(path_index)
         run_over_rows(_select, shape[0], inputs, (costs, path_index), scratch, out)
@@ -632,6 +598,6 @@ def borrow_paths(
         (rows, columns, 4) the trajectories, px.
     """
     size = images.pixels.shape[1:3]
-    index = select_paths(images, interpolate_paths(p, size), cost, PATH_SEARCHES[:1])
+    index = select_paths(images, interpolate_paths(p, size), cost, BORROWING)
     y, x = np.divmod(index[::2, ::2], size[1])
     return p[y // 2, x // 2]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
@@ -46,7 +46,7 @@ class RowScratch(NamedTuple):
         return cls(path, x, np.empty((rows, 2, points), np.int32), part, inside)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def gradient_at_pixel(image, y, x):
     """Return the gradient along x and y at a pixel; five taps, exact up to degree 4."""
     h, w = image.shape
@@ -76,7 +76,7 @@ def gradient_jax(images: Array) -> tuple[Array, Array]:
     return along(images.ndim - 1), along(images.ndim - 2)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def bilinear_cell(X, Y, h, w):
     """Return the four pixels around a point, or at the border: x0, y0, x1, y1, and fx, fy in it."""
     zero = np.float32(0)
@@ -87,14 +87,14 @@ def bilinear_cell(X, Y, h, w):
     return x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def bilinear_weights(fx, fy):
     """Return the weights of the pixels (y0, x0), (y0, x1), (y1, x0) and (y1, x1) of a cell."""
     one = np.float32(1)
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def blend_nodes(p, cell, out_path):
     """Write the four numbers of a path between the nodes (rows, columns, 4) of a cell."""
     j, i, j1, i1, fx, fy = cell
@@ -104,7 +104,7 @@ def blend_nodes(p, cell, out_path):
         out_path[c] = top + fy * (bottom - top)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def interpolate_path(p, node_y, node_x, out_path):
     """Write the path at a place between nodes, which is given in units of nodes."""
     rows, columns, _ = p.shape
@@ -115,7 +115,7 @@ def interpolate_path(p, node_y, node_x, out_path):
     blend_nodes(p, (j, i, j1, i1, node_x - np.float32(j), node_y - np.float32(i)), out_path)
 
 
-@njit_noalloc
+@njit_fastmath
 def _resample(begin, end, p, scale, factor, out):
     ratio, half = np.float32(1) / scale, np.float32(0.5)
     for i in range(begin, end):
@@ -136,7 +136,7 @@ def interpolate_paths(p: NDArray[np.float32], image_shape: tuple[int, int]) -> N
     Returns:
         (h, w, 4) paths of pixels, px.
     """
-    out = np.empty((*image_shape, 4), np.float32)
+    out = empty(*image_shape, 4)
     run_over_rows(_resample, image_shape[0], p, np.float32(2), np.float32(1), out)
     return out
 
@@ -154,7 +154,7 @@ def resize_nodes(
     Returns:
         (*shape, 4) paths, in pixels of the new resolution.
     """
-    out, scale = np.empty((*shape, 4), np.float32), np.float32(2 if finer else 0.5)
+    out, scale = empty(*shape, 4), np.float32(2 if finer else 0.5)
     run_over_rows(_resample, shape[0], p, scale, scale, out)
     return out
 
@@ -166,7 +166,7 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
     return jnp.moveaxis(sample_bilinear(jnp.moveaxis(p, -1, 0), Y, X), 0, -1)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def locate_points(y, s, image_shape, n_points, scratch_row):
     """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
 
@@ -190,7 +190,7 @@ def locate_points(y, s, image_shape, n_points, scratch_row):
         part[0, i], part[1, i] = X - np.float32(x0), Y - np.float32(y0)
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _cubic_weights(part, out):
     """Write the weights (4, points) of the four pixels around each point along an axis."""
     a, one, two, three = np.float32(CUBIC_SLOPE), np.float32(1), np.float32(2), np.float32(3)
@@ -204,7 +204,7 @@ def _cubic_weights(part, out):
         out[3, i] = one - out[0, i] - out[1, i] - out[2, i]
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _read_bilinear(image, pixel, part, out):
     h, w = image.shape
     for i in range(len(out)):
@@ -215,7 +215,7 @@ def _read_bilinear(image, pixel, part, out):
         out[i] = a * upper[x0] + b * upper[x1] + c * lower[x0] + d * lower[x1]
 
 
-@njit_noalloc_inlined
+@njit_fastmath_inlined
 def _read_bicubic(image, pixel, weights, out):
     h, w = image.shape
     for i in range(len(out)):
@@ -235,7 +235,7 @@ def _read_bicubic(image, pixel, weights, out):
         out[i] = total
 
 
-@njit_noalloc
+@njit_fastmath
 def _warp(begin, end, inputs, scratch, cubic, out):
     L, V, clear, shown, s, paths = inputs
     count, h, w = L.shape
@@ -274,7 +274,7 @@ def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArr
         The images at the target's points.
     """
     _, h, w = L.shape
-    out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
+    out = WarpedImages(*(empty(*L.shape) for _ in range(4)))
     inputs = (L, V, clear, clear.any((1, 2)), s, paths)
     run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
