@@ -10,7 +10,7 @@ Nothing is downloaded. A recording is found in any folder below, at the places t
 
     name     files                                  ground truth
     ijrr     folders with events.txt, *.zip         poses, IMU
-    dsec     events/left/events.h5, events_left     `disparity`, `flow` (extra `vision`)
+    dsec     events/left/events.h5, events_left     `disparity`, `flow`
     mvsec    *_data.hdf5                            poses, IMU, `depth`, `flow`
     m3ed     *_data.h5                              poses, `depth`
     hdr      *.mat of the AKF's authors             `HDR_mat`, where it is there

@@ -31,7 +31,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.display import with_article
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, phrase
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, check_recording, microseconds
 
 P = TypeVar("P", bound=Parameters)
 T = TypeVar("T")
@@ -322,25 +322,6 @@ class Estimator(abc.ABC, Generic[P]):
             "differentiate read(params, run(params, features)[0], out)"
         )
 
-    def check_recording(self, recording: Any, call: str) -> None:
-        """Raise `InputError` unless an argument is a `Recording`, naming the remedy.
-
-        Args:
-            recording: The argument.
-            call: Name of the called function in the message.
-        """
-        if isinstance(recording, Recording):
-            return
-        if isinstance(recording, str | Path):
-            raise InputError(
-                f"{call} takes a recording, not a path; give jaxevent.load({str(recording)!r})"
-            )
-        held = "bare events" if isinstance(recording, Events) else phrase(recording)
-        raise InputError(
-            f"{call} takes a recording, not {held}; give jaxevent.load(path), or of arrays "
-            "jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...)"
-        )
-
     def check_params(self, params: Any, call: str) -> None:
         """Raise `InputError` unless an argument holds parameters of this method, naming the remedy.
 
@@ -389,10 +370,11 @@ class Estimator(abc.ABC, Generic[P]):
         for name in options:
             if name not in self.options:
                 known = ", ".join(sorted(self.options)) or "none"
-                raise InputError(
-                    f"the method {self.name!r} has no option {name!r}; leave it out (known: "
-                    f"{known})"
-                )
+                remedy = f"leave it out (known: {known})"
+                if name in self.Params.numbers:
+                    remedy = f"it is a parameter, so give Params({name}=...), or keep what is "
+                    remedy += f"calibrated by Params.for_recording(recording, {name}=...)"
+                raise InputError(f"the method {self.name!r} has no option {name!r}; {remedy}")
 
     def check_options(self, **options: Any) -> None:
         """Raise `InputError` for an option outside its domain in `option_kinds`."""
@@ -422,7 +404,7 @@ def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
         except TypeError as error:
             raise InputError(f"{call}: {error}; see help({self.spelled})") from None
         if "recording" in given:
-            self.check_recording(given["recording"], call)
+            check_recording(given["recording"], call)
         if "params" in given:
             self.check_params(given["params"], call)
             if step != "run" or not self.differentiable:

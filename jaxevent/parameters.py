@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxevent.deprecated import renamed_names
-from jaxevent.display import with_article
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.threads import check_platform_available
 
@@ -654,15 +654,9 @@ def _chosen(setting: Choice | Count, value: Any) -> Any:
 
 def phrase(value: Any) -> str:
     """Return a value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
-    if value is None:
-        return "None"
     if isinstance(value, Parameters) and value.is_gradient:
         return "a gradient"
-    if isinstance(value, type):
-        return f"the class {value.__qualname__}"
-    if isinstance(value, np.ndarray | Array):
-        return "an array"
-    return with_article(type(value).__qualname__)
+    return describe_type(value)
 
 
 def _format_leaf(value: Array | np.ndarray, number: Number) -> str:
@@ -713,11 +707,11 @@ def _refuse_unknown(values: Mapping[str, Any], known: Mapping[str, Any]) -> None
         check_choice(name, "parameter", known)
 
 
-def check_choice(name: str, what: str, known: Collection[str]) -> str:
+def check_choice(name: Any, what: str, known: Collection[str]) -> str:
     """Check that a name is one of those known.
 
     Args:
-        name: The name.
+        name: The name, of any type as configurations hold it.
         what: Noun for it in the message.
         known: All names that exist.
 

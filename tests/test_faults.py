@@ -90,6 +90,33 @@ def test_each_fault_is_found_alone(sound, fault):
     assert dict(describe(faulty))["fault"] == str(found[0])
 
 
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("polarity inverted", "frames 20 ms late"),
+        ("columns flipped", "frames flicker"),
+        ("axes swapped", "frames blurred"),
+    ],
+)
+def test_what_frames_show_is_told_beside_events_that_are_turned(sound, first, second):
+    faulty = faults.FAULTS[second](faults.FAULTS[first](sound, 0), 0)
+    assert names_of(faulty) == [NAMES[first], NAMES[second]]
+
+
+def test_frames_that_show_nothing_new_are_told(sound):
+    images = sound.frames.images
+    twice = np.repeat(images[::2], 2, 0)[: len(images)]
+    black = np.zeros_like(images)
+    told = [
+        jaxevent.check_consistency(
+            dataclasses.replace(sound, frames=dataclasses.replace(sound.frames, images=one))
+        )[0]
+        for one in (twice, black)
+    ]
+    assert [one.name for one in told] == ["repeated frames", "empty frames"]
+    assert told[0].statistic == pytest.approx(0.5, abs=0.05)
+
+
 @pytest.mark.parametrize("number", range(1, len(TRANSFORMS)))
 def test_the_cause_of_a_mismatch_is_named(sound, number):
     """Every way to turn the frames is told from the others, with and without the polarity."""
@@ -198,6 +225,12 @@ def test_faulty_recordings_are_what_they_are_called(sound):
         one, two = (make_faulty(sound, 7).check().events[:].to_structured() for _ in range(2))
         assert (one == two).all()
     assert (sound.events.t == before).all()
+
+
+def test_few_pixels_that_make_many_of_the_events_are_told(sound):
+    few = faults.add_hot_pixels(sound, 1, share=0.002, rate=50 * len(sound.events) / SIDE**2)
+    (told,) = (one for one in jaxevent.check_consistency(few) if one.name == "hot pixels")
+    assert told.limit < told.statistic < 0.15 and "of the events" in told.text
 
 
 @settings(max_examples=20, deadline=None)

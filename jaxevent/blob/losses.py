@@ -15,7 +15,7 @@ from jaxevent.blob.run import run
 from jaxevent.blob.track import to_seconds
 from jaxevent.blob.tracker import Tracker
 from jaxevent.errors import InputError
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, check_recording, microseconds
 
 
 def negative_log_likelihood(
@@ -107,6 +107,7 @@ def prepare_positions(
     Raises:
         InputError: Positions of another shape, times outside the part that is tracked.
     """
+    check_recording(recording, "blob.prepare_positions")
     packer = ChunkPacker(recording, params, seeds, start, stop, False)
     features = packer.pack_all()
     us = np.atleast_1d(microseconds(times))

@@ -16,6 +16,7 @@ from jaxevent.calibration.model import (
     CURVATURE,
     DEGREES_OF_FREEDOM,
     GAUSSIAN_SCALE,
+    MAX_EXPOSURE_INTERVALS,
     SHORTEST_US,
     Fit,
     Model,
@@ -31,7 +32,7 @@ from jaxevent.calibration.sampling import (
     log_changes,
     take_sample,
 )
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
@@ -120,17 +121,19 @@ def _first_fit(model: Model, clock: Clock, is_unknown: bool) -> Fit | None:
     return model.fit(best.physics, (True, True, True, True, is_unknown)) or best
 
 
-def calibrate(recording: Recording, I0: float = 1.0) -> Calibration:
+def calibrate(recording: Recording, I0: float = 1.0, sample: Sample | None = None) -> Calibration:
     """Calibrate a recording from its own events and frames.
 
     Args:
         recording: The recording.
         I0: Offset inside the logarithm, L = ln(I + I0), for which thresholds hold.
+        sample: A sample of it (`sampling.take_sample`); None: it is taken here.
 
     Returns:
         The values found, each with its 95 % interval or the reason why there is none.
     """
-    sample = take_sample(recording)
+    check_recording(recording, "calibrate")
+    sample = take_sample(recording) if sample is None else sample
     ratio, dead = estimate_ratio(sample), estimate_dead_time(sample)
     frames = 0 if recording.frames is None else len(recording.frames)
     if frames < 2 or not len(recording.events):
@@ -261,7 +264,7 @@ def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     square += BLUR_OF_GAPS * blur
     error = math.hypot(error, BLUR_ERROR * blur, 2 * EXPOSURE_ERROR * square)
     low, high = (math.sqrt(max(square + sign * CONFIDENCE_Z * error, 0)) for sign in (-1, 1))
-    if not high < 1.5 * model.interval_s:
+    if not high < 1.5 * MAX_EXPOSURE_INTERVALS * model.interval_s:
         return not_identifiable("s", "little of the scene moves fast enough")
     least = max(low, SHORTEST_US * 1e-6)
     if low == 0:

@@ -3,10 +3,12 @@
 import argparse
 import contextlib
 import dataclasses
+import difflib
+import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from jaxevent.errors import InputError
 
@@ -39,6 +41,34 @@ def _metavars(action: argparse.Action) -> tuple[str, ...]:
     if action.nargs == 0 or action.metavar is None:
         return ()
     return action.metavar if isinstance(action.metavar, tuple) else (action.metavar,)
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors suggest names, and show the usage of the command that was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and error, and exit with 2; a wrong choice comes with the nearest one."""
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong is not None:
+            from jaxevent.parameters import suggest_name
+
+            known = [name.strip(" '") for name in wrong[2].split(",")]
+            name = message[: wrong.start()] + f"{wrong[1]!r} is not possible"
+            message = f"{name}; {suggest_name(wrong[1], known)}"
+        super().error(message)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as argparse does; a command refuses what it does not know itself."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown and self._subparsers is None:
+            options = [name for name in self._option_string_actions if name.startswith("--")]
+            name = unknown[0].partition("=")[0]
+            near = difflib.get_close_matches(name, options, 1)
+            self.error(
+                f"unrecognized arguments: {' '.join(unknown)}"
+                + (f"; did you mean {near[0]}?" if name.startswith("-") and near else "")
+            )
+        return found, unknown
 
 
 def command(
@@ -109,6 +139,13 @@ def add_live(one: argparse.ArgumentParser, printed: str) -> None:
         help=f"print {printed} as events come, instead of writing --out; PATH may be -, for "
         "lines t x y p on standard input, t in us, or in s with a decimal point; needs --size then",
     )
+
+
+def refuse_with_live(given: Mapping[str, bool]) -> None:
+    """Raise `InputError` for the first option that was given and is not for --live."""
+    for name, is_given in given.items():
+        if is_given:
+            raise InputError(f"--live is not for {name}; leave out one of the two")
 
 
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
@@ -296,6 +333,15 @@ def show_progress() -> bool:
 def print_written(out: Path, names: Sequence[str] = ()) -> None:
     """Print the files that were written: `out`, or those of these names in it, one line each."""
     print("", *(f"written: {path}" for path in [out / name for name in names] or [out]), sep="\n")
+
+
+def describe_speed(events: int, seconds: float) -> str:
+    return f"{seconds:.2f} s, {events / seconds:,.0f} events/s"
+
+
+def check_seed(number: int) -> None:
+    if number < 0:
+        raise InputError(f"--seed {number} is not possible; give a whole number from 0")
 
 
 def print_stored(recording: Any, path: Path) -> None:

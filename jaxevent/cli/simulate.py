@@ -130,8 +130,7 @@ def run(
     from jaxevent.simulate import SENSORS
 
     check_recording_name(out)
-    if seed < 0:
-        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    arguments.check_seed(seed)
     if duration is not None and not 0 < duration < math.inf:
         raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
     if size is not None and min(size) < 1:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.models import Model, find_model, in_words, unit_vectors
 from jaxevent.errors import InputError
-from jaxevent.recording import Imu, Poses, Recording, Times, microseconds
+from jaxevent.recording import Imu, Poses, Recording, Times, check_recording, microseconds
 
 # Rotations from the axes of an IMU to the camera's, x to the right, y down, z forward, by name.
 IMU_AXES = {
@@ -324,6 +324,7 @@ def known_motion(
         InputError: The model is unknown, the recording holds no such truth, or the table cannot be
             read.
     """
+    check_recording(recording, "known_motion")
     model = find_model(model)
     if isinstance(source, pd.DataFrame):
         return motion_from_table(source, model, f"{recording.name}: the true motion")

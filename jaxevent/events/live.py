@@ -1,6 +1,7 @@
 """Events that are still coming: by chunks, as lines of a pipe, and the last ones of a stream."""
 
 from collections.abc import Iterator
+from io import BufferedIOBase
 from typing import BinaryIO
 
 import numpy as np
@@ -89,7 +90,7 @@ class Tail:
         self.dropped = max(row, self.dropped)
 
 
-def read_lines(file: BinaryIO, name: str = "standard input") -> Iterator[Events]:
+def read_lines(file: BinaryIO | BufferedIOBase, name: str = "standard input") -> Iterator[Events]:
     """Read events from lines `t x y p`, a chunk as soon as it has come.
 
     The first line tells the unit of all times: seconds where its t has a decimal point, else

@@ -19,7 +19,7 @@ from jaxevent.events.blocks import (
     size_of,
 )
 from jaxevent.events.filters import LONG_AGO_US
-from jaxevent.recording import Events, ImageSource, Recording
+from jaxevent.recording import Events, ImageSource, Recording, check_recording
 
 Change = Callable[[NDArray], NDArray]  # of images (n, H, W) or (n, H, W, 3)
 
@@ -204,6 +204,7 @@ def undistort(recording: Recording) -> Recording:
     Raises:
         InputError: The recording has no calibration.
     """
+    check_recording(recording, "undistort")
     camera, width, height = recording.camera, recording.width, recording.height
     if camera is None:
         raise InputError(

@@ -13,15 +13,18 @@ import contextlib
 import dataclasses
 import os
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from jaxevent import arrays
 from jaxevent.arrays import times
 from jaxevent.deprecated import renamed_names
 from jaxevent.display import describe_type
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import ReadOptions, naming, open_archive, reading
 from jaxevent.io.decoded import remember_call
 from jaxevent.recording import PER_FRAME_EXTRAS, Events, Recording
@@ -100,7 +103,7 @@ def load(
             topic of a bag, the number of a stream of AEDAT 4. "none" leaves frames out, in any
             format.
         time_unit: The unit of the event times, "s", "ms", "us" or "ns", of formats that do not
-            state it; None infers it (`jaxevent.io.time_units`), with an `InputWarning` in doubt.
+            state it; None infers it (`time_units`), with an `InputWarning` in doubt.
         repair: Repairs of event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message names the repairs that
@@ -150,6 +153,9 @@ def load(
     if without_events:
         recording = dataclasses.replace(recording, events=Events.empty())
     recording.refuse_empty(str(path))
+    images = None if recording.frames is None else recording.frames.images
+    if isinstance(images, np.ndarray) and (doubt := arrays.doubt_levels(images)):
+        warnings.warn(f"{path}: {doubt}", InputWarning, stacklevel=3)
     if camera is not None:
         from jaxevent.io.calibration import read_camera
 

@@ -86,8 +86,8 @@ from jaxevent.io.checks import (
 from jaxevent.io.columns import ColumnFormat, Fields, find_fields, infer_format, read_columns
 from jaxevent.io.decoded import Columns, DecodedImages, read_events
 from jaxevent.io.images import IMAGE_SUFFIXES, read_files
-from jaxevent.io.time_units import SAMPLE_EVENTS
 from jaxevent.recording import Frames, Imu, Poses, Recording
+from jaxevent.time_units import SAMPLE_EVENTS
 
 _TIMELENS_FOLDERS = (("events", "images"), ("events_aligned", "images_corrected"))
 _IMAGE_TIME_FILES = ("timestamp.txt", "timestamps.txt")

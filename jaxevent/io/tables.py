@@ -67,8 +67,8 @@ from jaxevent.io.columns import (
     split_rows,
 )
 from jaxevent.io.decoded import Columns, read_events
-from jaxevent.io.time_units import SAMPLE_EVENTS, numbers_of_dates, split_unit
 from jaxevent.recording import Frames, Imu, Recording
+from jaxevent.time_units import SAMPLE_EVENTS, numbers_of_dates, split_unit
 
 NUMPY_MAGIC = b"\x93NUMPY"
 _TEXT_BLOCK_BYTES = 1 << 24  # of text parsed together: about a million events

@@ -52,7 +52,6 @@ from jaxevent.runs.blob_scores import (
     KnownPositions,
     Targets,
     TrackProtocol,
-    event_time_span,
     seed_from_positions,
 )
 from jaxevent.runs.config import NAME_CHECK
@@ -190,8 +189,8 @@ class TrackGoal(Goal):
         found = []
         for place, _, recording in data:
             known = self.targets.known(recording)
-            first, stop = event_time_span(recording)
-            spans = windows(first, stop, data.window, data.split, place)
+            first, last = recording.event_span()
+            spans = windows(first, last + 1, data.window, data.split, place)
             cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
             for (begin, end, s), seeds in zip(spans, cuts, strict=True):
                 index = recording.events.index

@@ -204,11 +204,11 @@ class Targets:
                 f"{path}: holds {targets} targets, but there are {len(self.seeds)} seeds; "
                 "give one for each, by rising id, or leave out the seeds"
             )
-        first, stop = event_time_span(recording)
-        inside = (first <= known.t) & (known.t < stop)
+        first, last = recording.event_span()
+        inside = (first <= known.t) & (known.t <= last)
         if not inside.any():
             raise InputError(
-                f"{path}: no position is within {first * 1e-6:g} to {stop * 1e-6:g} s, the "
+                f"{path}: no position is within {first * 1e-6:g} to {(last + 1) * 1e-6:g} s, the "
                 f"events' time in {recording.name}; times are seconds on its clock"
             )
         more = {name: value[inside] for name, value in known.more.items()}
@@ -244,14 +244,6 @@ class Targets:
         distance = np.linalg.norm(np.concatenate(found) - known.xi, axis=2)
         given = np.isfinite(known.xi).all(2)
         return np.broadcast_to(known.t[:, None], given.shape)[given], distance[given]
-
-
-def event_time_span(recording: Recording) -> tuple[int, int]:
-    """Return the time of the first event and the time after the last, us."""
-    events, count = recording.events, len(recording.events)
-    if not count:
-        raise InputError(f"{recording.name}: holds no events; choose another recording")
-    return int(events[:1].t[0]), int(events[count - 1 : count].t[0]) + 1
 
 
 def seed_from_positions(
@@ -298,7 +290,8 @@ class TrackProtocol(Protocol):
     def check(self, options: Mapping[str, Any]) -> None:
         if "positions" not in options:
             raise InputError(
-                'the positions are not given; add positions = "*.csv", tables beside the recordings'
+                "the positions are not given, which tracks are compared with; give tables, in a "
+                'configuration by positions = "*.csv" for those beside the recordings'
             )
         find_metrics(options.get("metrics", ()), MEASURE_NAMES)
         if "seeds" in options and options.get("begin", "positions") != "positions":

@@ -138,7 +138,7 @@ def _run_part(
     if video is not None:
         return _video(recording, video)
     name = label.removesuffix(NOT_CALIBRATED)
-    method = find(name)
+    method: Any = find(name)
     params = None if name == label else method.Params()
     kept: list[Estimate] = []
 

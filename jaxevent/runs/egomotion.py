@@ -204,11 +204,9 @@ class MotionProtocol(Protocol):
     ) -> dict[str, Any]:
         """Raises `InputError` where there is no truth or no events."""
         model, bias = model_of(options), _bias(options)
-        if not len(recording.events):
-            raise InputError(f"{recording.name}: holds no events; choose another recording")
+        first, last = recording.event_span()
         truth = true_motion(recording, options)
         metrics = find_metrics(options.get("metrics", ()), MEASURE_NAMES)
-        first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
         begin = first + round(options.get("settle", 0.0) * 1e6)
         times = np.arange(begin, last + 1, round(1e6 / SCORE_RATE_HZ))
         times = times[truth.covers(times)]
@@ -427,10 +425,8 @@ class MotionGoal(Goal):
         found = []
         for place, _, recording in data:
             events, truth = recording.events, self.known(recording)
-            if not len(events):
-                raise InputError(f"{recording.name}: holds no events; choose another recording")
-            first, stop = int(events[:1].t[0]), int(events[-1:].t[0]) + 1
-            first, stop = max(first, int(truth.t[0])), min(stop, int(truth.t[-1]) + 1)
+            first, last = recording.event_span()
+            first, stop = max(first, int(truth.t[0])), min(last, int(truth.t[-1])) + 1
             if first >= stop:
                 raise InputError(
                     f"{recording.name}: its events and the true motion are not of one time; times "

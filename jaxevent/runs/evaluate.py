@@ -19,7 +19,8 @@
     name = "akf"                                    # a key of jaxevent.METHODS, or of your own:
                                                     # "package.module:object", an Estimator or
                                                     # a function: see jaxevent.runs.own
-    params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
+    params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted:
+                                                    # calibrated, else defaults
                                                     # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
     grid = { c_on = [0.05, 0.1], kappa = [1, 2] }   # each combination, added to params and label
@@ -593,7 +594,10 @@ def _methods(
     given: Any, folder: Path, protocol: Protocol, family: str, options: Mapping[str, Any]
 ) -> list[Entry]:
     if not (isinstance(given, list) and given and all(isinstance(one, dict) for one in given)):
-        raise InputError('no method is given; add [[method]] with name = "akf"')
+        raise InputError(
+            'no method is given; give one such as "akf", in a configuration by [[method]] with '
+            'name = "akf"'
+        )
     entries: list[Entry] = []
     for number, table in enumerate(given, 1):
         try:

@@ -26,7 +26,8 @@ describes it:
     [[method]]
     name = "akf"                        # a key of jaxevent.METHODS, or "package.module:object"
     label = "akf, mine"                 # in the results; omitted: the name
-    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted: defaults
+    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted:
+                                        # calibrated, else defaults
     fit = ["c_on", "c_off"]             # by gradient
     search = { clock_offset = [-0.02, 0.02, 9] }  # from, to, number of points
     prior = { c_on = [0.1, 0.5] }       # what is believed, standard deviation of its logarithm

@@ -237,7 +237,10 @@ def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: b
     if apart and "split" in table:
         raise InputError("split is for configurations without validation and test; omit it")
     if not table.get("method"):
-        raise InputError('no method is given; add [[method]] with name = "akf"')
+        raise InputError(
+            'no method is given; give one such as "akf", in a configuration by [[method]] with '
+            'name = "akf"'
+        )
     tasks: list[Task] = []
     for number, entry in enumerate(table["method"], 1):
         try:

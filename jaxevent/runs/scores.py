@@ -600,7 +600,7 @@ def _estimates(
 
 def _of_function(given: Recording, hidden: Frames, method: MethodFunction) -> Estimates:
     shape = (given.height, given.width)
-    found = method.estimate(given, hidden.t, [shape])
+    found = method.estimate(given, hidden.t, [shape], intensity=True)
     variance = found.covariance
     if variance is None:
         variance = np.full(found.mean.shape, np.nan)

@@ -34,7 +34,6 @@ from jaxevent.recording import Recording
 from jaxevent.show.images import save_figure
 from jaxevent.show.motion_figures import (
     motion_figure,
-    motion_span,
     plot_flow,
     plot_warped,
     representative_window,
@@ -353,9 +352,7 @@ class Output:
             method: Name of the method that estimated the motion.
             params: Parameters of the method.
         """
-        if not len(recording.events):
-            raise InputError(f"{recording.name}: holds no events; choose another recording")
-        start, stop = motion_span(recording)
+        start, stop = recording.event_span()
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
         estimated = motion(times, centred=self.centred)

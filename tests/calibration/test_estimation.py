@@ -9,7 +9,9 @@ import jaxevent
 from jaxevent.calibration.brightness import interpolate, read_positions, sort_by_pixel
 from jaxevent.calibration.sampling import SampledSegment, choose_pixels, correlate, take_sample
 from jaxevent.recording import Frames, Recording
+from jaxevent.runs.protocols import held_out
 from jaxevent.simulate import MovingObjects, Sensor, simulate
+from jaxevent.simulate.faults import blur_frames
 
 SENSOR = Sensor(
     c_on=0.15, c_off=0.2, mismatch=0.02, dark_offset=0.02, refractory=5e-4, background_rate=0.1,
@@ -61,6 +63,16 @@ def test_simulated_truth(found):
         assert wide < (2.5 if name == "exposure" else 0.25) * abs(true), name
     noise = np.hypot(SENSOR.read_noise, 12**-0.5) / 255
     assert found.frame_noise.value == pytest.approx(noise, rel=0.4)
+
+
+def test_exposures_longer_than_the_interval_are_found(recording):
+    given, _ = held_out(blur_frames(recording))
+    interval = float(np.diff(recording.frames.t).mean()) * 1e-6
+    # As wide as the exposure and the three frames that were averaged, by the second moment.
+    width = (SENSOR.exposure**2 + 8 * interval**2) ** 0.5
+    exposure = jaxevent.calibrate(given, SENSOR.dark_offset).exposure
+    assert exposure.low < width < exposure.high
+    assert exposure.low > interval
 
 
 def test_hot_pixels_are_found(recording, found):

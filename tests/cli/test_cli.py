@@ -204,6 +204,22 @@ def test_bad_arguments(argv, capsys):
     assert capsys.readouterr().err.startswith("usage: jaxevent")
 
 
+@pytest.mark.parametrize(
+    ("argv", "usage", "said"),
+    [
+        ("reconstuct a.h5", "jaxevent [options] COMMAND", "did you mean 'reconstruct'?"),
+        ("camera mrge", "jaxevent camera [options]", "did you mean 'merge'?"),
+        ("track a.h5 --modl x", "jaxevent track [options]", "did you mean --method?"),
+        ("track a.h5 b.h5", "jaxevent track [options]", "unrecognized arguments: b.h5\n"),
+    ],
+)
+def test_wrong_names_are_told_by_the_command_that_was_meant(argv, usage, said, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(argv.split())
+    told = capsys.readouterr().err
+    assert usage in told and said in told
+
+
 def test_help_and_version(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "500")  # names are not broken at their hyphens
     with pytest.raises(SystemExit) as stop:

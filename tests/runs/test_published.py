@@ -19,6 +19,13 @@ from jaxevent.camera import SCurve
 from jaxevent.runs.evaluate import evaluate
 
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def precision(float32):
+    """As users have it."""
+
+
 SCRIPT = runpy.run_path(str(ROOT / "experiments" / "published.py"))
 
 

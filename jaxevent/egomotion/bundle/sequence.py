@@ -47,7 +47,7 @@ def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
     if not len(recording.events):
         return MotionEstimate.empty(given.model)
     windows = WindowFitter(recording, params, camera, gyro, given.seed)
-    first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
+    first, last = recording.event_span()
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
     centres = np.arange(first + half, last - half + 1, step)
     if not len(centres):

@@ -527,7 +527,8 @@ class ChunkRunner:
         t, told = sample.t[:used], ~info.searching
         if self.lock is not None:
             events = self.sampler.recording.events
-            told = self.lock.update(events, t, info.mean, info.covariance, info.searching)
+            count = np.diff(sample.row[:used].max(1), prepend=self.row - 1)
+            told = self.lock.update(events, count, t, info.mean, info.covariance, info.searching)
         self._number += 1
         self.row = int(sample.row.max(initial=self.row - 1)) + 1
         return t, info, told

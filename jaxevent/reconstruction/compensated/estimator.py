@@ -665,10 +665,13 @@ class CompensatedVideo(ImageSequence[Params]):
     def _fuse(self, t: int, target: TrajectoryEstimate) -> FusedImage:
         """Fuse a target's images, and fit the result to the frames next to it."""
         fused, brightness = self.trajectories.fuse(target), self.trajectories.brightness.prior(t)
-        if target.smooth is not None:  # frames of another brightness are no constraint
-            return add_smooth_part(target, fused, brightness)
         exposures = self.trajectories.exposures
-        if exposures.samples is not None:
+        samples = exposures.samples
+        if target.smooth is not None:
+            fused = add_smooth_part(target, fused, brightness)
+            # Frames of another brightness are no constraint, but for white.
+            samples = None if samples is None else 1
+        if samples is not None:
             adjacent = exposures(t, target.instants)
             low, high = int(adjacent.frame.min()), int(adjacent.frame.max()) + 1
             grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
@@ -677,7 +680,9 @@ class CompensatedVideo(ImageSequence[Params]):
                 grey[rows], intensity[rows], self._response, gain[rows], self._frames.white
             )
             model = ExposureModel(adjacent, frames, target.paths)
-            fused = constrain_image(self.params, fused, model, exposures.samples)
+            fused = constrain_image(self.params, fused, model, samples)
+        if target.smooth is not None:
+            return fused
         return dataclasses.replace(fused, P=fused.P + brightness.variance)
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
@@ -888,6 +893,10 @@ class MotionCompensation(ImageEstimator[Params]):
             paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
             warped = warp_images_jax(*images, layout.s, paths)
             fused = fuse(params, *images[:2], warped, layout, squared_reach(paths), noise=factor)
+            weight = after_weight(layout)
+            base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
+            base, added = (1 - steady) * base, (1 - steady) * variance
+            fused = dataclasses.replace(fused, L=fused.L + base, P=fused.P + added)
             if out.samples is not None:
                 at = exposures.frame
                 adjacent = AdjacentFrames(
@@ -897,13 +906,11 @@ class MotionCompensation(ImageEstimator[Params]):
                     frames.gain[at],
                     frames.white,
                 )
-                # Frames of another brightness are no constraint.
-                exposures = exposures._replace(present=exposures.present * steady)
+                # Frames of another brightness are no constraint, but for white.
+                exposures = exposures._replace(half=exposures.half * steady)
                 model = ExposureModel(exposures, adjacent, paths)
                 fused = constrain_image_jax(params, fused, model, out.samples)
-            weight = after_weight(layout)
-            base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
-            return fused.L + (1 - steady) * base, fused.P + variance
+            return fused.L, fused.P + steady * variance
 
         found, P = jax.lax.map(one, out.targets)
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
