@@ -79,6 +79,7 @@ from jaxevent.reconstruction.compensated.robust_mean import (
 )
 from jaxevent.reconstruction.compensated.thresholds import learn_thresholds
 from jaxevent.reconstruction.compensated.trajectories import (
+    SEARCH_CURVATURE,
     ImagePyramid,
     NodeTrajectories,
     advect_nodes,
@@ -438,7 +439,8 @@ class TrajectoryEstimator:
 
         def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
             for _ in range(N_ANCHOR_STEPS):
-                p = gauss_newton_step(InstantStack.of(L, V, clock.s), p, self._cost)
+                images = InstantStack.of(L, V, clock.s)
+                p = gauss_newton_step(images, p, self._cost, SEARCH_CURVATURE)
             return p
 
         def cost(clock: TargetInstants, p: NDArray[np.float32]) -> float:
@@ -482,8 +484,8 @@ class TrajectoryEstimator:
         for at in others:
             several = (p, self._sought_motion(at).carry(instants))
             p = choose_trajectories(images, several, self._cost, (1.0, 1.0))
-        p = self._at_full_resolution(gauss_newton_step(images, p, self._cost))
         images = InstantStack.of(*pyramid[0], instants.s)
+        p = gauss_newton_step(images, self._at_full_resolution(p), self._cost)
         path_index = select_paths(images, interpolate_paths(p, size), self._cost)
         return dataclasses.replace(target, p=p, path_index=path_index)
 
