@@ -134,7 +134,9 @@ def _is_rotation(R: NDArray[np.float64]) -> bool:
 
 
 def from_gyro(
-    imu: Imu, bias: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | str | None = None
+    imu: Imu,
+    bias: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+    rotation: ArrayLike | str | None = None,
 ) -> Twists:
     """Convert a gyro's rates to twists without T: Omega = rotation (gyro - bias).
 
@@ -305,7 +307,7 @@ def known_motion(
     recording: Recording,
     model: str | type[Model],
     source: "str | Path | pd.DataFrame" = "auto",
-    bias: ArrayLike = (0.0, 0.0, 0.0),
+    bias: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
     span: float | int = 0.02,
     *,
     rotation: ArrayLike | str | None = None,

@@ -340,13 +340,13 @@ def test_comparisons_tell_of_a_gyro_in_other_axes(name):
         np.ones(50, bool),
         *np.zeros((3, 50)),
     )
-    known = truth.known_motion(recording, "rotation", bias=zeros[0])
+    known = truth.known_motion(recording, "rotation")
     if name == "camera":
         assert scores.score_motion(motion, known, t).figures["AME"] < 1e-9
     else:
         with pytest.warns(InputWarning, match=f"in other axes; give .* rotation='{name}'"):
             scores.score_motion(motion, known, t)
-    known = truth.known_motion(recording, "rotation", bias=zeros[0], rotation=name)
+    known = truth.known_motion(recording, "rotation", rotation=name)
     assert scores.score_motion(motion, known, t).figures["vector_error"] < 1e-9
 
 
