@@ -123,8 +123,8 @@ def load(
     path = _as_path(path, "load")
     if size is not None and not _is_size(size):
         raise InputError(
-            f"size = {arrays.shorten_value(size)} must be two positive whole numbers of pixels, "
-            f"(width, height), of at most {arrays.MAX_SIDE_PX}"
+            f"size = {arrays.shorten_value(size)} must be two positive numbers of pixels, "
+            f"(width, height), whole and at most {arrays.MAX_SIDE_PX}"
         )
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE
