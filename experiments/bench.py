@@ -4,12 +4,13 @@
 
 Parts: images (the complete path from a file to images, losses, gradients), xla (the scan, where
 there is no kernel), calibration, smoother, mc, tracker (bench_blob.py), voting and motion
-(bench_motion.py), events-only (events_only.py), memory (streaming.py). Without any, all but
-motion, which takes minutes.
+(bench_motion.py), events-only (events_only.py), memory (streaming.py), start (a short `jaxevent
+reconstruct`, one picture of `mc` and help in fresh processes), scaling (scaling.py). Without any,
+all but motion, which takes minutes.
 CPU seconds of this process are compared, so other programs on the machine change little: `--gate`
 compares the ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance;
-`--bless` writes those of the parts that ran. Two parts have no gate: `gpu` times a GPU against the
-CPU's kernels, by the clock, and `start` a short `jaxevent reconstruct` in a fresh process.
+`--bless` writes those of the parts that ran. One part has no gate: `gpu` times a GPU against the
+CPU's kernels, by the clock.
 """
 
 import importlib
@@ -53,6 +54,17 @@ GATED = {
     "mc: single image / optical flow": ("lower", 0.3),
     "mc: single image, pixel of 1200x720 / of 240x180": ("lower", 0.4),
     "peak memory of 10 M events, GB": ("lower", 0.25),
+    "start: akf, cold / imports": ("lower", 0.4),
+    "start: akf, warm / imports": ("lower", 0.4),
+    "start: aks, cold / imports": ("lower", 0.4),
+    "start: aks, warm / imports": ("lower", 0.4),
+    "start: picture of mc, cold / imports": ("lower", 0.4),
+    "start: picture of mc, warm / imports": ("lower", 0.4),
+    "start: help, warm / imports": ("lower", 0.6),
+    "scaling: akf, slope by events": ("lower", 0.25),
+    "scaling: mc, slope by pixels": ("lower", 0.25),
+    "scaling: track, slope by targets": ("lower", 0.25),
+    "scaling: find, slope by events": ("lower", 0.6),
 }
 
 
@@ -68,8 +80,10 @@ PARTS = {
     "motion": "bench_motion.motion_bench",
     "events-only": "events_only.events_only_bench",
     "memory": "streaming.memory_bench",
+    "start": "bench_images.start_bench",
+    "scaling": "scaling.scaling_bench",
 }
-TABLES = {"gpu": "bench_images.gpu_bench", "start": "bench_images.start_bench"}  # no gate
+TABLES = {"gpu": "bench_images.gpu_bench"}  # no gate
 USUAL = [name for name in PARTS if name != "motion"]
 
 

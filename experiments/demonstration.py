@@ -28,6 +28,7 @@ from jaxevent.egomotion.models import Planar
 from jaxevent.egomotion.patches import measure_image_speed
 from jaxevent.egomotion.truth import KnownMotion, known_motion
 from jaxevent.runs.egomotion import MotionLoss
+from jaxevent.runs.family import FitData
 from jaxevent.runs.fit_config import Task, read_plan
 from jaxevent.runs.reconstruction import Objective, Problem, cut_windows
 from jaxevent.tuning import PROBE_STEPS, FitResult, Settings, evaluate_loss, optimise
@@ -99,7 +100,7 @@ def simulated(folder: Path, part: str) -> tuple[list[dict[str, Any]], Any]:
         given = [(name, jaxevent.load(path)) for name, path in paths]
         named = [(n, dataclasses.replace(one, name=n)) for n, one in given]
         sources: Any = {"fit": named, "validation": [], "test": []}
-        batches[split] = task.goal.problem(sources, None, None)(task.params)[0]
+        batches[split] = task.goal.problem(FitData(sources))(task.params)[0]
     rough = [row["parameter"] for row in fits.found if row["gradient_skill"] is not None]
     count = count_evaluations(task.settings, task.names, rough)
     begun = time.perf_counter()
@@ -237,7 +238,7 @@ def real_r_t(data: Path) -> list[dict[str, Any]]:
             named = dataclasses.replace(part, name="0")
             goal = SimulatedGoal(voting, MotionLoss(), model, "", 2, window / 4, {}, (truth,))
             sources: Any = {"fit": [("0", named)], "validation": [], "test": []}
-            parts.append(goal.problem(sources, (1, 0, 0), window)(start)[0])
+            parts.append(goal.problem(FitData(sources, (1, 0, 0), window))(start)[0])
         settings = Settings(iterations=8, learning_rate=0.2, rounds=1, patience=1000, forward=True)
         fit: FitResult = optimise(goal.loss, start, ["r_t"], parts[0], settings=settings)
         for label, params in (("default", start), ("by speed", adapted), ("fit", fit.params)):

@@ -47,7 +47,7 @@ from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.scores import axis_error, relative_error, relative_magnitude_error
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.io.chunks import EVENTS_PER_CHUNK
+from jaxevent.events.live import EVENTS_PER_CHUNK
 from jaxevent.recording import Events, Recording
 from jaxevent.simulate import SENSORS, motion_scene, simulate
 from jaxevent.simulate.motion import simulate_frame_events, simulate_motion

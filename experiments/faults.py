@@ -41,8 +41,12 @@ from jaxevent.simulate.faults import FAULTS
 
 RECORDINGS = ("slider_depth.zip", "davis346_street.npz", "evbench_seq3_calibrated.npz")
 METHODS = ("last-frame", "blend", "flow", "akf", "aks", "mc")
-# Files whose times of frames are wrong, as their own descriptions say.
-FAULTY_FILES = ("evbench_seq3.npz", "public_cases/g10_clock")
+# Files whose times of frames are wrong, as their own descriptions say, or whose frames are empty.
+FAULTY_FILES = (
+    "evbench_seq3.npz", "public_cases/g10_clock", "public_cases/f08b_v2e_frames.h5",
+    "public_cases/f13_timelens", "public_cases/g09_imgns", "public_cases/m12_evreal",
+    "public_cases/r03_esim.bag", "public_cases/r04_bayer.bag", "public_cases/r05_jpeg.bag",
+)  # fmt: skip
 N_SCENES, FIRST_SEED = 40, 8_000
 N_IMAGES = 8
 

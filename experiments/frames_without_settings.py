@@ -3,7 +3,7 @@
     python experiments/frames_without_settings.py --out hidden [--data DIR]
 
 DIR holds the recordings, by default $JAXEVENT_DATA/data. Of each every 2nd, 4th or 8th
-frame is given, as `jaxevent evaluate` does it; methods have their default parameters. A few of the
+frame is given, as `jaxevent evaluate` does it; methods calibrate themselves by these. A few of the
 hidden frames are scored, evenly chosen: those between given frames, and apart from these those
 after the last one. MSE; MSE after the brightness of each image is fitted to the hidden frame
 (a I + b), since the frames of evbench_seq3 are not equally bright; SSIM; z2, and z2 of the images
@@ -11,10 +11,10 @@ whose brightness is fitted, with the variances that were told. The last column o
 part of the least of its ingredients, `aks` and `blend`. Makes table.md; rows that the folder holds
 are kept.
 
-With --strata z2 is told by strata of pixels, with default parameters and with those of
-`Params.for_recording`: no event in the 3x3 pixels around between the two frames given, events of
-neighbours alone, events of the pixel's own, the tenth of the pixels where the hidden frame is
-steepest, and the quarters of the gap at its ends and in its middle. Makes strata.md.
+With --strata z2 is told by strata of pixels: no event in the 3x3 pixels around between the two
+frames given, events of neighbours alone, events of the pixel's own, the tenth of the pixels where
+the hidden frame is steepest, and the quarters of the gap at its ends and in its middle. Makes
+strata.md.
 
 With --beyond frames of the second half are scored that lie 1, 2 and 4 frames after the last one
 given, and as far before the first: the recording is cut there at three places, its events are not.
@@ -82,10 +82,9 @@ def strata_of(given: Recording, truth: Frames, times: NDArray) -> dict[str, NDAr
     }  # fmt: skip
 
 
-def score_strata(method: Any, params: Any, given: Recording, truth: Frames, noise: float) -> Row:
+def score_strata(method: Any, _: Any, given: Recording, truth: Frames, noise: float) -> Row:
     """Score the variances of a method's images of hidden frames, stratum by stratum."""
-    if isinstance(params, type):
-        params = params.for_recording(given)
+    params = method.usual_params(given)
     times, I0 = frame_times(truth, params), float(params.I0)
     images, P, _ = method.estimate(given, params, progress=False)(times, extrapolate=True)
     true = truth.intensity
@@ -96,7 +95,8 @@ def score_strata(method: Any, params: Any, given: Recording, truth: Frames, nois
     return {**means, "images": len(true)}
 
 
-def score(method: Any, params: Any, given: Recording, truth: Frames, noise: float) -> Row:
+def score(method: Any, _: Any, given: Recording, truth: Frames, noise: float) -> Row:
+    params = method.usual_params(given)
     made = method.estimate(given, params, progress=False)
     images, P, _ = made(frame_times(truth, params), extrapolate=True)
     images, true = images.clip(0, 1).astype(np.float32), truth.intensity
@@ -154,11 +154,9 @@ def main() -> None:
     kind, cells = ("beyond", beyond) if arguments.beyond else ("table", between_and_after)
     kind = "strata" if arguments.strata else kind
     store = Store(out / ("rows.json" if kind == "table" else f"{kind}.json"))
-    methods = {n: (jaxevent.METHODS[n], jaxevent.METHODS[n].Params()) for n in arguments.methods}
+    methods: dict[str, Any] = {n: (jaxevent.METHODS[n], None) for n in arguments.methods}
     if arguments.strata:
-        telling = {n: pair for n, pair in methods.items() if pair[0].has_covariance}
-        calibrated = {f"{n}, calibrated": (m, m.Params) for n, (m, _) in telling.items()}
-        methods = {**telling, **calibrated}
+        methods = {n: pair for n, pair in methods.items() if pair[0].has_covariance}
     for name in arguments.recordings:
         recording = jaxevent.load(arguments.data / name)
         assert recording.frames is not None

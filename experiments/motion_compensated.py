@@ -70,7 +70,7 @@ params = {{ c_on = 0.2, c_off = 0.18, rho_ref = 5e-4, I0 = 0.1, w_min = 0.6 }}
 fit = ["c_on", "c_off", "sigma_event", "sigma_bg", "sigma_frame", "sigma_floor", "share"]
 """
 
-Chosen = Mapping[str, tuple[Any, Parameters]]  # method and parameters by name
+Chosen = Mapping[str, tuple[Any, Any]]  # method and parameters by name
 Row = dict[str, Any]
 
 

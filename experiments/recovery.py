@@ -26,6 +26,7 @@ from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.blob import FAMILY as BLOBS
 from jaxevent.runs.egomotion import MotionGoal, MotionLoss
+from jaxevent.runs.family import FitData
 from jaxevent.runs.reconstruction import Objective, Problem, RecordingWindow, cut_windows
 from jaxevent.simulate import Pan, Sensor, blob_scene, scene, simulate
 from jaxevent.tuning import Settings, optimise
@@ -191,7 +192,7 @@ def blob_recovery(seed: int) -> Recovered:
         goal = BLOBS.goal(method, start, settings)
         named = dataclasses.replace(recording, name=f"walk {k}")
         one = {**sources, "fit": [(named.name, named)]}
-        batches += goal.problem(one, None, None)(start)[0]
+        batches += goal.problem(FitData(one))(start)[0]
     settings = Settings(
         iterations=40, learning_rate=0.3, rounds=1, every=10, patience=1000, forward=True
     )
@@ -256,7 +257,7 @@ def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> R
     goal = SimulatedGoal(voting, loss, "planar", "", RUNS, SETTLE, {}, truths)
     start = voting.Params(particles=100, batch=32, noise=0.2)
     sources: Any = {"fit": [(one.name, one) for one in named], "validation": [], "test": []}
-    batches, _ = goal.problem(sources, None, None)(start)
+    batches, _ = goal.problem(FitData(sources))(start)
     settings = Settings(
         iterations=30, learning_rate=0.2, rounds=1, every=10, patience=1000, forward=True
     )

@@ -177,6 +177,20 @@ def rows_of(family: str) -> list[list[Any]]:
     return rows
 
 
+# Costs that are to grow no faster than what is changed.
+LINEAR = (("akf", "events"), ("mc", "pixels"), ("track", "targets"), ("find", "events"))
+
+
+def scaling_bench() -> tuple[dict[str, float], dict[str, float]]:
+    """Measure the slopes of `LINEAR`, for `bench.py`."""
+    ratios = {}
+    for family, changed in LINEAR:
+        tasks = FAMILIES[family]()[changed]
+        slopes = slope(tasks, [measure(task)[0] for task in tasks.values()])
+        ratios[f"scaling: {family}, slope by {changed}"] = slopes
+    return {}, ratios
+
+
 def main() -> None:
     options = command_line(__doc__, out=True, parts=FAMILIES).parse_args()
     rows = [row for family in options.only for row in rows_of(family)]

@@ -114,7 +114,7 @@ def try_commands() -> None:
             ["fit", str(fit), "--out", f"{folder}/fitted"],
             ["evaluate", str(compare), "--out", f"{folder}/results"],
         ):
-            command = [sys.executable, "-m", "jaxevent.cli", *words]
+            command = [sys.executable, "-m", "jaxevent", *words]
             done = subprocess.run(command, capture_output=True, text=True)
             assert done.returncode == 0, done.stderr[-REASON:]
         assert out.stat().st_size > 0

@@ -141,7 +141,7 @@ def measure(count: int, disk: Path | None = None) -> dict[str, Any]:
         made = time.perf_counter() - clock
         seconds, cpu, peak = run_process(
             [
-                *(sys.executable, "-m", "jaxevent.cli", "reconstruct", str(source)),
+                *(sys.executable, "-m", "jaxevent", "reconstruct", str(source)),
                 *("--method", "akf", "--rate", "100", "--out", str(images)),
             ]
         )

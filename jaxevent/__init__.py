@@ -11,7 +11,7 @@ programs are kept in the user's cache folder: `jaxevent.cache` says how to chang
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxevent import cache, deprecated, dispatch, display
+from jaxevent import cache, deprecated, display, threads
 
 if TYPE_CHECKING:
     from jaxevent import (
@@ -127,7 +127,7 @@ __all__ = [
 
 cache.keep_compiled()
 deprecated.install()
-dispatch.use_synchronous_dispatch()
+threads.use_synchronous_dispatch()
 
 
 def _as_html(thing: Any) -> str:

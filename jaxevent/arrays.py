@@ -13,7 +13,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, InputWarning
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -26,12 +25,15 @@ FIELD_ALIASES = {
 }
 LUMA_WEIGHTS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R 601
 MAX_SIDE_PX = 1 << 16  # of a side: coordinates are uint16
+MAX_LEVEL = 65535  # white of images of uint16
 MAX_TIME_US = 1 << 62  # 146,000 years: sums and differences of two times stay in int64
 UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 US_PER_UNIT: dict[str, float] = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}  # us in one unit
 _LUMA_WEIGHTS_2_16 = (19595, 38470, 7471)  # times 2^-16, as Pillow computes grey
 _MAX_STEP_US = 1000.0  # between neighbouring numbers of a type, from which it is refused
 _MIN_TIME_STEPS = 64  # of a type within the span of the events
+_USUAL_BITS = (8, 10, 12)  # of a camera whose levels are stored as uint16
+_JUDGED_IMAGES = 64  # whose largest level is compared with these
 _MIN_JUDGED_EVENTS = 300  # from which events must span `_MIN_TIME_STEPS`
 _BLOCK_VALUES = 1 << 20  # values compared together, so that a check needs no memory to speak of
 _REMEDY_OF_KIND = {
@@ -579,6 +581,56 @@ def as_images(frames: Any, what: str = "frames") -> tuple[NDArray, NDArray[np.ui
     return plain_images(grey), np.stack([_in_8_bits(one) for one in images]) if differ else None
 
 
+def scale_levels(frames: Any, white: Any, what: str = "frames") -> NDArray:
+    """Scale images whose white is not the largest number of their type.
+
+    Args:
+        frames: (n, ...) images of any integers, or floats.
+        white: Level that is white; black is 0.
+        what: Name of the argument for messages.
+
+    Returns:
+        Of integers uint16, 65535 white; of floats those in [0, 1].
+
+    Raises:
+        InputError: White is no positive number, or a level is negative or beyond white.
+    """
+    images = as_array(frames, what)
+    is_number = isinstance(white, int | float | np.number) and not isinstance(white, bool)
+    if not is_number or not 0 < white < np.inf:
+        raise InputError(f"white is {shorten_value(white)}; give the level that is white, above 0")
+    least, most = (images.min(), images.max()) if images.size else (0, 0)
+    if not (least >= 0 and most <= white):  # NaN fails it too
+        raise InputError(
+            f"{what} hold levels from {least} to {most}, but white = {white}; give their white, "
+            "4095 for 12 bits"
+        )
+    if images.dtype.kind == "f":
+        return images / images.dtype.type(white)
+    return np.rint(images * np.float32(MAX_LEVEL / white)).astype(np.uint16)
+
+
+def doubt_levels(images: NDArray) -> str | None:
+    """Return what shows that images of uint16 hold fewer bits, and the remedy; None of others.
+
+    Args:
+        images: (n, height, width) images, of which at most `_JUDGED_IMAGES` are looked at.
+    """
+    if images.dtype != np.uint16 or not images.size:
+        return None
+    some = np.unique(np.linspace(0, len(images) - 1, _JUDGED_IMAGES).astype(int))
+    most = max(int(images[row].max()) for row in some)
+    bits = next((bits for bits in _USUAL_BITS if most < 1 << bits), None)
+    if not most or bits is None:
+        return None
+    white = (1 << bits) - 1
+    return (
+        f"frames are uint16, whose white is {MAX_LEVEL}, but no level exceeds {most}, as of "
+        f"{bits} bits; if white is {white}, give white={white} to Recording.from_arrays, or store "
+        f"frames * {MAX_LEVEL / white:g} as uint16"
+    )
+
+
 def to_grey(image: NDArray) -> NDArray:
     """Convert an image to grey of its own type, rounded as Pillow does.
 
@@ -649,6 +701,3 @@ def check_image_values(images: Any, what: str) -> None:
                 f"{what}: frame {row} holds NaN or values outside [0, 1]; scale float frames to "
                 "[0, 1], dividing by 255 if these are levels of 8 bits, and remove broken ones"
             )
-
-
-__getattr__ = renamed_names(__name__)

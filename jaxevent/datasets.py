@@ -10,7 +10,7 @@ Nothing is downloaded. A recording is found in any folder below, at the places t
 
     name     files                                  ground truth
     ijrr     folders with events.txt, *.zip         poses, IMU
-    dsec     events/left/events.h5, events_left     `disparity`, `flow` (extra `vision`)
+    dsec     events/left/events.h5, events_left     `disparity`, `flow`
     mvsec    *_data.hdf5                            poses, IMU, `depth`, `flow`
     m3ed     *_data.h5                              poses, `depth`
     hdr      *.mat of the AKF's authors             `HDR_mat`, where it is there
@@ -30,7 +30,7 @@ from pathlib import Path
 from jaxevent.errors import InputError
 from jaxevent.io import load, truth
 from jaxevent.io.checks import reading
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
 from jaxevent.recording import Recording
 
 
@@ -105,8 +105,7 @@ class Dataset:
         """Load a recording by its name, or by its number in `names`."""
         if isinstance(which, int):
             which = self.names[which]
-        if which not in self.paths:
-            raise InputError(f"there is no recording {which!r}; {suggest_name(which, self.paths)}")
+        check_choice(which, "recording", self.paths)
         path, stream = self.paths[which], self.side if self.has_sides else None
         recording = load(path, self.size, self.in_memory, stream=stream)
         extra = {**recording.extra, **truth.read_images(path, self.side)}
@@ -137,8 +136,7 @@ def open(
         InputError: There is no such data set, or none of its recordings below the folder.
     """
     folder = Path(folder)
-    if name not in LAYOUTS:
-        raise InputError(f"there is no data set {name!r}; {suggest_name(name, LAYOUTS)}")
+    check_choice(name, "data set", LAYOUTS)
     if side not in ("left", "right"):
         raise InputError(f"side is {side!r}; give left or right")
     found: dict[str, Path] = {}

@@ -39,9 +39,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxevent.deprecated import renamed_names
-from jaxevent.dispatch import check_platform_available
 from jaxevent.errors import InputError
+from jaxevent.threads import check_platform_available
 
 DEVICE_AXIS = "devices"
 JOIN_TIMEOUT_S = 300  # s that processes wait for each other at the start
@@ -351,6 +350,3 @@ def _put(batch: Any, devices: Sequence[Any], number: int, apart: bool) -> Any:
     if not apart and hasattr(batch, "over"):
         return batch.over(devices)
     return jax.device_put(batch, devices[number % len(devices)])
-
-
-__getattr__ = renamed_names(__name__)

@@ -14,8 +14,13 @@ class HtmlRepr:
 
 
 def describe_type(thing: Any) -> str:
-    """Return the type of an object with its article: a Filter, an int."""
-    return "None" if thing is None else with_article(type(thing).__name__)
+    """Return the type of an object in words: "a Filter", "an array", "the class Filter", "None"."""
+    if isinstance(thing, type):
+        return f"the class {thing.__qualname__}"
+    name = type(thing).__name__
+    return {"NoneType": "None", "ndarray": "an array", "ArrayImpl": "an array"}.get(
+        name, with_article(name)
+    )
 
 
 def with_article(name: str) -> str:

@@ -28,11 +28,10 @@ from jax.core import Tracer
 
 from jaxevent.arrays import shorten_value
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import renamed_names
 from jaxevent.display import with_article
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, phrase
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, check_recording, microseconds
 
 P = TypeVar("P", bound=Parameters)
 T = TypeVar("T")
@@ -323,25 +322,6 @@ class Estimator(abc.ABC, Generic[P]):
             "differentiate read(params, run(params, features)[0], out)"
         )
 
-    def check_recording(self, recording: Any, call: str) -> None:
-        """Raise `InputError` unless an argument is a `Recording`, naming the remedy.
-
-        Args:
-            recording: The argument.
-            call: Name of the called function in the message.
-        """
-        if isinstance(recording, Recording):
-            return
-        if isinstance(recording, str | Path):
-            raise InputError(
-                f"{call} takes a recording, not a path; give jaxevent.load({str(recording)!r})"
-            )
-        held = "bare events" if isinstance(recording, Events) else phrase(recording)
-        raise InputError(
-            f"{call} takes a recording, not {held}; give jaxevent.load(path), or of arrays "
-            "jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...)"
-        )
-
     def check_params(self, params: Any, call: str) -> None:
         """Raise `InputError` unless an argument holds parameters of this method, naming the remedy.
 
@@ -390,10 +370,11 @@ class Estimator(abc.ABC, Generic[P]):
         for name in options:
             if name not in self.options:
                 known = ", ".join(sorted(self.options)) or "none"
-                raise InputError(
-                    f"the method {self.name!r} has no option {name!r}; leave it out (known: "
-                    f"{known})"
-                )
+                remedy = f"leave it out (known: {known})"
+                if name in self.Params.numbers:
+                    remedy = f"it is a parameter, so give Params({name}=...), or keep what is "
+                    remedy += f"calibrated by Params.for_recording(recording, {name}=...)"
+                raise InputError(f"the method {self.name!r} has no option {name!r}; {remedy}")
 
     def check_options(self, **options: Any) -> None:
         """Raise `InputError` for an option outside its domain in `option_kinds`."""
@@ -423,7 +404,7 @@ def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
         except TypeError as error:
             raise InputError(f"{call}: {error}; see help({self.spelled})") from None
         if "recording" in given:
-            self.check_recording(given["recording"], call)
+            check_recording(given["recording"], call)
         if "params" in given:
             self.check_params(given["params"], call)
             if step != "run" or not self.differentiable:
@@ -431,8 +412,8 @@ def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
         if step == "estimate":
             others = given.get(rest, {})
             self.refuse_unknown({name: v for name, v in others.items() if name != "progress"})
-        if "times" in given and np.ndim(us := microseconds(given["times"])) > 1:
-            raise InputError(f"{call}: times have the shape {us.shape}; give a list of times")
+        if "times" in given:
+            microseconds(given["times"], f"{call}: times")
         return method(self, *args, **kwargs)
 
     return checked
@@ -483,6 +464,3 @@ def import_object(path: str, kind: type[T], what: str) -> T:
     if not isinstance(found, kind):
         raise InputError(f"{path!r} is {phrase(found)}, not {with_article(kind.__name__)}")
     return found
-
-
-__getattr__ = renamed_names(__name__)

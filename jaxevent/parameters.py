@@ -5,7 +5,7 @@ import inspect
 import math
 import tomllib
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform, overload
 
@@ -17,9 +17,9 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxevent.deprecated import renamed_names
-from jaxevent.dispatch import check_platform_available
-from jaxevent.display import with_article
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
+from jaxevent.threads import check_platform_available
 
 Numeric = float | Array | np.ndarray | np.number  # a number, or a traced one
 T = TypeVar("T", bound="Parameters")
@@ -331,10 +331,7 @@ class Parameters(_ParameterArrays):
         check_platform_available()  # the first arrays that JAX makes
         _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
-            if preset not in self.presets:
-                raise InputError(
-                    f"there is no preset {preset!r}; {suggest_name(preset, self.presets)}"
-                )
+            check_choice(preset, "preset", self.presets)
             values = {**self.presets[preset], **values}
         self.raw = {
             name: _stored(number, values.get(name, number.default))
@@ -657,15 +654,9 @@ def _chosen(setting: Choice | Count, value: Any) -> Any:
 
 def phrase(value: Any) -> str:
     """Return a value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
-    if value is None:
-        return "None"
     if isinstance(value, Parameters) and value.is_gradient:
         return "a gradient"
-    if isinstance(value, type):
-        return f"the class {value.__qualname__}"
-    if isinstance(value, np.ndarray | Array):
-        return "an array"
-    return with_article(type(value).__qualname__)
+    return describe_type(value)
 
 
 def _format_leaf(value: Array | np.ndarray, number: Number) -> str:
@@ -713,8 +704,26 @@ def _describe_settings(kind: type[Parameters]) -> list[str]:
 
 def _refuse_unknown(values: Mapping[str, Any], known: Mapping[str, Any]) -> None:
     for name in values:
-        if name not in known:
-            raise InputError(f"there is no parameter {name!r}; {suggest_name(name, known)}")
+        check_choice(name, "parameter", known)
+
+
+def check_choice(name: Any, what: str, known: Collection[str]) -> str:
+    """Check that a name is one of those known.
+
+    Args:
+        name: The name, of any type as configurations hold it.
+        what: Noun for it in the message.
+        known: All names that exist.
+
+    Returns:
+        The name.
+
+    Raises:
+        InputError: There is no such name; the message suggests one.
+    """
+    if name not in known:
+        raise InputError(f"there is no {what} {name!r}; {suggest_name(str(name), known)}")
+    return name
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:

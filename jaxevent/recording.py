@@ -7,6 +7,7 @@ float means seconds, both on the recording's clock.
 """
 
 import dataclasses
+import os
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
@@ -16,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.display import HtmlRepr, plural
+from jaxevent.display import HtmlRepr, describe_type, plural
 from jaxevent.errors import InputError, InputWarning, OrderError
+from jaxevent.time_units import doubt_given_unit
 
 if TYPE_CHECKING:
     import pandas
@@ -32,14 +34,14 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     """Convert times to microseconds: integers are microseconds already, floats are seconds.
 
     Args:
-        time: Times of any shape.
+        time: One time, or a list of them.
         what: Name of the times for messages.
 
     Returns:
         Times as int64 us, of the same shape.
 
     Raises:
-        InputError: The times are of another type, not finite, or too large for int64.
+        InputError: The times are of another type or shape, not finite, or too large for int64.
     """
     try:
         time = np.asarray(time)
@@ -49,12 +51,34 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
         raise InputError(
             f"{what} are {time.dtype}; give integers (microseconds) or floats (seconds)"
         )
+    if time.ndim > 1:
+        raise InputError(f"{what} have the shape {time.shape}; give a list of times")
     if not np.all(np.isfinite(time)):
         raise InputError(f"{what} contain a value that is not finite; remove it")
     scaled = np.rint(time.astype(np.float64) * 1e6) if time.dtype.kind == "f" else time
     if time.size and not -(2**63) <= scaled.min() <= scaled.max() < 2**63:
         raise InputError(f"{what} contain one that is too large for microseconds; correct the unit")
     return np.asarray(scaled).astype(np.int64)
+
+
+def check_recording(recording: Any, call: str, or_events: bool = False) -> None:
+    """Raise `InputError` unless an argument is a `Recording`, naming the remedy.
+
+    Args:
+        recording: The argument.
+        call: Name of the called function in the message.
+        or_events: Whether the function takes bare events, too.
+    """
+    if isinstance(recording, Recording) or (or_events and _is_source(recording)):
+        return
+    takes = f"{call} takes {'events or ' * or_events}a recording"
+    if isinstance(recording, str | os.PathLike):
+        raise InputError(f"{takes}, not a path; give jaxevent.load({str(recording)!r})")
+    held = "bare events" if _is_source(recording) else describe_type(recording)
+    raise InputError(
+        f"{takes}, not {held}; give jaxevent.load(path), or of arrays "
+        "jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...)"
+    )
 
 
 def check_times(times: Times, start_us: int, stop_us: int, name: str) -> None:
@@ -271,9 +295,11 @@ class Events:
         """
         row = arrays.first_decrease(self.t)
         if row is not None:
+            late = int((self.t < np.maximum.accumulate(self.t)).sum())
             raise OrderError(
                 f"{source}: event {first_row + row} is at {self.t[row]} us, earlier than the one "
-                f"before it at {self.t[row - 1]} us; sort the events by time (stable)"
+                f"before it at {self.t[row - 1]} us, like {late:,} of {len(self):,} events "
+                "read; sort the events by time (stable), or leave out those whose times are false"
             )
 
     def check_places(self, width: int, height: int, source: str, first_row: int = 0) -> None:
@@ -351,15 +377,18 @@ class CheckedEvents:
         )
 
 
+def _is_source(events: Any) -> bool:
+    """Return whether an object is events; types of Python have an `index` too."""
+    built_in = isinstance(events, type | str | bytes | list | tuple | range)
+    return not built_in and isinstance(events, EventSource) and callable(events.index)
+
+
 def _checked_source(events: Any, size: tuple[int, int], name: str) -> EventSource:
     """Check the events of a recording, or have them checked when they are read."""
     if isinstance(events, Events):
         events.check_places(*size, name)
         return events
-    built_in = isinstance(
-        events, type | str | bytes | list | tuple | range
-    )  # these have `index` too
-    if built_in or not (isinstance(events, EventSource) and callable(events.index)):
+    if not _is_source(events):
         raise InputError(
             f"{name}: events is a {type(events).__name__}, not jaxevent.Events; make the recording "
             "by jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...), or of a file by "
@@ -602,6 +631,35 @@ class Triggers(_TimedRows):
             raise InputError("triggers need an edge, -1, 0 or 1, for each time; correct them")
 
 
+def _columns_given(t: Any, x: Any, y: Any, p: Any) -> dict[str, Any]:
+    """Return the columns of events by name, from each on its own or from `t` that holds all."""
+    given = dict(zip("txyp", (t, x, y, p), strict=True))
+    if x is None and y is None and p is None:
+        given = arrays.columns_of(t)
+    missing = [name for name in "txyp" if given[name] is None]
+    if missing:
+        raise InputError(
+            f"{missing[0]} is missing; give t, x, y and p, or one array with these fields"
+        )
+    return given
+
+
+def _events_of_columns(
+    t: NDArray[np.int64], given: Mapping[str, Any], size: tuple[int, int], name: str
+) -> Events:
+    """Check columns of a caller on a sensor (width, height), and make events of times (us)."""
+    x, y, p = (arrays.as_column(given[field], field) for field in "xyp")
+    arrays.check_lengths(t, x, y, p, name)
+    events = Events.of_checked(
+        t,
+        arrays.coordinates("x", x, size, name),
+        arrays.coordinates("y", y, size, name),
+        arrays.polarities(p, name),
+    )
+    events.check_order(name)
+    return events
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Recording(HtmlRepr):
     """One recording of one sensor; see the module for the conventions.
@@ -678,6 +736,7 @@ class Recording(HtmlRepr):
         imu: Imu | None = None,
         triggers: Triggers | None = None,
         extra: Mapping[str, Any] | None = None,
+        white: float | int | None = None,
     ) -> "Recording":
         """Make a recording of arrays in memory.
 
@@ -696,8 +755,8 @@ class Recording(HtmlRepr):
             width: Pixels of a row of the sensor; by default those of the frames.
             height: Pixels of a column of the sensor; by default those of the frames.
             frames: Images (m, height, width), or in colour (m, height, width, 3), red first: uint8,
-                uint16 or floats in [0, 1]. Colours become grey (ITU-R 601 luma) and are kept in
-                `extra["rgb"]`, uint8.
+                white is 255; uint16, white is 65535; or floats, white is 1; see `white`. Colours
+                become grey (ITU-R 601 luma) and are kept in `extra["rgb"]`, uint8.
             frame_times: Times (m,) of the middle of each exposure, which rise; units are as of `t`.
             exposure: Length of the exposures, one number or (m,), of the same unit; by default
                 unknown.
@@ -709,10 +768,13 @@ class Recording(HtmlRepr):
             imu: Inertial measurements.
             triggers: Signals from outside.
             extra: Further arrays by name; see `Recording`.
+            white: Level of the frames that is white, where it is another: 4095 for 12 bits in
+                uint16, 255 for floats up to 255. Integers become uint16.
 
         Returns:
-            The recording, checked. An `InputWarning` tells of frames far from all events and of
-            exposures longer than the time between frames.
+            The recording, checked. An `InputWarning` tells of frames far from all events, of
+            exposures longer than the time between frames, of uint16 frames that hold 12 bits or
+            fewer, and of times that look like those of another unit.
 
         Raises:
             InputError: An argument has another type, shape or length, a value is not finite, not
@@ -720,21 +782,16 @@ class Recording(HtmlRepr):
                 names the argument and the remedy.
         """
         arrays.check_unit(time_unit)
-        if x is None and y is None and p is None:
-            given = arrays.columns_of(t)
-            t, x, y, p = (given[field] for field in "txyp")
-        missing = [field for field, v in zip("txyp", (t, x, y, p), strict=True) if v is None]
-        if missing:
-            raise InputError(
-                f"{missing[0]} is missing; give t, x, y and p, or one array with these fields"
-            )
-        grey = colours = None
+        given = _columns_given(t, x, y, p)
+        grey = colours = made = None
         if frames is not None:
+            frames = frames if white is None else arrays.scale_levels(frames, white)
             grey, colours = arrays.as_images(frames)
             height = grey.shape[1] if height is None else height
             width = grey.shape[2] if width is None else width
-        elif frame_times is not None or exposure is not None:
-            what = "exposure" if frame_times is None else "frame_times"
+        elif any(one is not None for one in (frame_times, exposure, white)):
+            what = "frame_times" if frame_times is not None else "exposure"
+            what = "white" if frame_times is None and exposure is None else what
             raise InputError(f"{what} is given without frames; give frames, (m, height, width)")
         if width is None or height is None:
             raise InputError(
@@ -742,17 +799,13 @@ class Recording(HtmlRepr):
                 "height=260 or what your camera has"
             )
         size = arrays.as_size(width, height, name)
-        columns = (arrays.as_column(v, field) for field, v in zip("xyp", (x, y, p), strict=True))
-        us, (x, y, p) = arrays.as_times(t, "t", time_unit), columns
-        arrays.check_lengths(us, x, y, p, name)
-        events = Events.of_checked(
-            us,
-            arrays.coordinates("x", x, size, name),
-            arrays.coordinates("y", y, size, name),
-            arrays.polarities(p, name),
-        )
-        events.check_order(name)
-        made = None
+        us = arrays.as_times(given["t"], "t", time_unit)
+        events = _events_of_columns(us, given, size, name)
+        stored = arrays.as_column(given["t"], "t")
+        if doubt := doubt_given_unit(stored, events.x, events.y, size, time_unit):
+            warnings.warn(f"{name}: {doubt}", InputWarning, stacklevel=2)
+        if grey is not None and (doubt := arrays.doubt_levels(grey)):
+            warnings.warn(f"{name}: {doubt}", InputWarning, stacklevel=2)
         if grey is not None:
             if frame_times is None:
                 raise InputError("frame_times is missing; give the time of each of the frames")
@@ -797,6 +850,17 @@ class Recording(HtmlRepr):
         """Time of the last event or frame in us."""
         last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
         return max(last + ([int(self.frames.t[-1])] if self.frames else []))
+
+    def event_span(self) -> tuple[int, int]:
+        """Return the times of the first and the last event, us.
+
+        Raises:
+            InputError: There are no events.
+        """
+        count = len(self.events)
+        if not count:
+            raise InputError(f"{self.name}: holds no events; choose another recording")
+        return int(self.events[:1].t[0]), int(self.events[count - 1 :].t[0])
 
     @property
     def gain(self) -> NDArray[np.float64]:
@@ -843,6 +907,12 @@ class Recording(HtmlRepr):
         t0 = self.start if span.start is None else int(microseconds(span.start))
         t1 = self.stop + 1 if span.stop is None else int(microseconds(span.stop))
 
+        if t1 < t0 and span.start is not None and span.stop is not None:
+            raise InputError(
+                f"{self.name}: the part from {t0} to {t1} us ends before it begins; give the "
+                "earlier time first"
+            )
+
         def cut(part):
             if part is None:
                 return None
@@ -867,6 +937,29 @@ class Recording(HtmlRepr):
                 f"reaches from {self.start} to {self.stop} us"
             )
         return part
+
+    def require_camera(self, camera: PinholeCamera | None, what: str) -> PinholeCamera:
+        """Return a camera that is given, or the recording's.
+
+        Args:
+            camera: The camera; None takes the recording's.
+            what: Name of what needs it, for the message.
+
+        Returns:
+            The camera.
+
+        Raises:
+            InputError: There is none; the message says how to give one.
+        """
+        camera = self.camera if camera is None else camera
+        if camera is None:
+            raise InputError(
+                f"{self.name}: has no calibration, which {what} needs"
+                f"{self.describe_left_out('camera')}; give "
+                "camera=jaxevent.camera.PinholeCamera(fx, fy, cx, cy) in px, here or to "
+                "jaxevent.load, which reads calibrations from YAML, too"
+            )
+        return camera
 
     def describe_left_out(self, field: str) -> str:
         """Return the end of a message that misses a field: the entry of `left_out`."""

@@ -26,7 +26,14 @@ from tqdm import tqdm
 from jaxevent import devices
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.parameters import Number, Parameters, Positive, UnitInterval, suggest_name
+from jaxevent.parameters import (
+    Number,
+    Parameters,
+    Positive,
+    UnitInterval,
+    check_choice,
+    suggest_name,
+)
 from jaxevent.progress import bar
 
 P = TypeVar("P", bound=Parameters)
@@ -268,8 +275,7 @@ def begin(
     """
     search = search or {}
     for name in [*names, *search]:
-        if name not in params.raw:
-            raise InputError(f"there is no parameter {name!r}; {suggest_name(name, params.raw)}")
+        check_choice(name, "parameter", params.raw)
     stuck = params.without_gradient()
     for name in names:
         if name in stuck:

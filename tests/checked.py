@@ -24,10 +24,7 @@ def jaxtyped(one: Any = None, *, typechecker: Any) -> Any:
         return one if writes_its_init(one) else usual(one, typechecker=typechecker)
     # beartype writes a checking function for each that it is given, in a millisecond; what is
     # defined inside a function is defined at every call.
-    if "<locals>" in one.__qualname__:
-        return one
-    checked = beartype(one)
-    return with_axes(checked) if names_arrays(one) else checked
+    return one if "<locals>" in one.__qualname__ else checked_when_called(one)
 
 
 def writes_its_init(one: Any) -> bool:
@@ -42,10 +39,25 @@ def names_arrays(one: Callable[..., Any]) -> bool:
     )
 
 
-def with_axes(checked: Callable[..., Any]) -> Callable[..., Any]:
-    """Names of axes mean one size in all of a call."""
+def checked_when_called(one: Callable[..., Any]) -> Callable[..., Any]:
+    """Check each call; the checking function is written at the first.
 
-    @functools.wraps(checked)
+    Names of axes mean one size in all of a call.
+    """
+    checked: Callable[..., Any] | None = None
+
+    @functools.wraps(one)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        nonlocal checked
+        if checked is None:
+            made = beartype(one)
+            checked = with_axes(made) if names_arrays(one) else made
+        return checked(*args, **kwargs)
+
+    return call
+
+
+def with_axes(checked: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any, **kwargs: Any) -> Any:
         with usual("context"):
             return checked(*args, **kwargs)

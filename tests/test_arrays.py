@@ -222,3 +222,48 @@ def test_files_stay_unread(tmp_path):
     with pytest.raises(InputError, match="on the 20x48 sensor"):
         smaller.events[:]
     assert_events(stored.events[:], v)
+
+
+@pytest.mark.parametrize("white, told", [(4095, 12), (1023, 10), (255, 8)])
+def test_frames_of_fewer_bits_in_16(white, told):
+    v, floats = arrays(), np.linspace(0, 1, WIDTH * HEIGHT * 2).reshape(2, HEIGHT, WIDTH)
+    rest = [*v.values()], {"frame_times": [100, 200]}
+    levels = np.rint(floats * white).astype(np.uint16)
+    with pytest.warns(InputWarning, match=f"as of {told} bits; .* give white={white}"):
+        Recording.from_arrays(*rest[0], frames=levels, **rest[1])
+    for values in (levels, levels.astype("i4"), levels.astype("f8")):
+        made = Recording.from_arrays(*rest[0], frames=values, white=white, **rest[1])
+        np.testing.assert_allclose(made.frames.intensity, levels / white, atol=1e-5)
+
+
+def test_files_with_frames_of_fewer_bits(tmp_path):
+    frames = Frames(np.array([100]), np.full((1, 4, 5), 4095, np.uint16), np.zeros(1, int))
+    jaxevent.save(Recording("a", 5, 4, Events.empty(), frames), path := tmp_path / "a.h5")
+    with pytest.warns(InputWarning, match="a.h5: frames are uint16, .* as of 12 bits"):
+        jaxevent.load(path)
+
+
+@pytest.mark.parametrize("white", [0, -1, np.nan, "12 bits", True, 1000])
+def test_white_that_cannot_be(white):
+    v, levels = arrays(), np.full((1, HEIGHT, WIDTH), 1001, np.uint16)
+    refuses(
+        "white", Recording.from_arrays, *v.values(), frames=levels, frame_times=[5], white=white
+    )
+
+
+def test_white_needs_frames():
+    refuses(
+        "^white is given without frames", Recording.from_arrays, *arrays().values(), white=255,
+        width=WIDTH, height=HEIGHT,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "scale, unit, told", [(1, "s", "seconds .* time_unit='us'"), (1000, None, "time_unit='ns'")]
+)
+def test_times_that_look_like_another_unit(scale, unit, told):
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 2_000_000, 4000)) * scale
+    x, y, p = rng.integers(0, 32, 4000), rng.integers(0, 24, 4000), rng.integers(0, 2, 4000)
+    with pytest.warns(InputWarning, match=told):
+        Recording.from_arrays(t, x, y, p, width=32, height=24, time_unit=unit)

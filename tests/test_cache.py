@@ -35,16 +35,21 @@ def test_programs_are_kept_in_the_users_folder(tmp_path):
     assert told("import jax, jaxevent" + LOOK, XDG_CACHE_HOME=tmp_path, HOME=tmp_path) == folder
 
 
-def test_the_user_decides(tmp_path):
-    first, later = "import jaxevent" + LOOK, "import jax, jaxevent" + LOOK
-    assert told(later, JAXEVENT_CACHE=0) == "None"
-    assert told(first, JAXEVENT_CACHE=tmp_path / "mine").startswith(str(tmp_path / "mine"))
-    for code in (first, later):
-        assert told(code, JAX_COMPILATION_CACHE_DIR=tmp_path / "jax") == str(tmp_path / "jax")
+def test_the_user_decides(tmp_path, monkeypatch):
+    def kept(**variables: object) -> object:
+        """The folder of a process that begins with these variables, before it imports JAX."""
+        with monkeypatch.context() as begun:
+            begun.setattr(os, "environ", {k: str(v) for k, v in variables.items()})
+            begun.delitem(sys.modules, "jax")
+            return cache.keep_compiled()
 
-
-def test_without_a_place_everything_works():
-    assert told("import jaxevent" + LOOK, JAXEVENT_CACHE="/dev/null/no") == "None"
+    assert kept(JAXEVENT_CACHE=0) is None
+    assert tmp_path / "mine" in kept(JAXEVENT_CACHE=tmp_path / "mine").parents
+    for name in THEIRS:
+        assert kept(JAXEVENT_CACHE=tmp_path / "mine", **{name: tmp_path / "jax"}) is None
+    assert kept(JAXEVENT_CACHE="/dev/null/no") is None  # without a place everything works
+    later = told("import jax, jaxevent" + LOOK, JAX_COMPILATION_CACHE_DIR=tmp_path / "jax")
+    assert later == str(tmp_path / "jax")
 
 
 def test_what_was_compiled_is_found_again(tmp_path):

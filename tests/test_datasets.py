@@ -155,7 +155,6 @@ def test_a_folder_iterates_as_recordings_with_truth(name, in_memory, tmp_path):
 
 
 def test_flow_of_dsec_is_in_pixels(tmp_path):
-    pytest.importorskip("cv2")
     flow = FLOW.copy()
     flow[:, :, 3:5] = np.nan
     dsec(tmp_path / "set")
@@ -169,7 +168,6 @@ def test_flow_of_dsec_is_in_pixels(tmp_path):
 
 
 def test_disparity_of_dsec_is_in_pixels(tmp_path):
-    pytest.importorskip("cv2")
     unknown = DISPARITY.copy()
     unknown[:, 3:5] = np.nan
     dsec(tmp_path / "set")
@@ -183,7 +181,7 @@ def test_disparity_of_dsec_is_in_pixels(tmp_path):
     np.testing.assert_array_equal(np.asarray(extra["disparity"]), unknown)
     np.testing.assert_array_equal(extra["disparity_t"], [7, 8, 9])
     folder = tmp_path / "train_events/thun_00_a/disparity"
-    (folder / "event/000002.png").write_bytes(formats.png16(DISPARITY[:1, :4].astype(np.uint16)))
+    (folder / "event/000002.png").write_bytes(formats.png16(DISPARITY[0, :4].astype(np.uint16)))
     refuses(
         r"000002.png: is no such image; store 40x30 pixels of 16",
         np.asarray,
@@ -192,15 +190,6 @@ def test_disparity_of_dsec_is_in_pixels(tmp_path):
     (folder / "timestamps.txt").write_text("1\n2\n")
     with pytest.raises(InputError, match=r"timestamps.txt: holds times of shape \(2,\)"):
         found["thun_00_a"]
-
-
-def test_flow_without_opencv_names_the_extra(tmp_path, monkeypatch):
-    import sys
-
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    dsec(tmp_path / "set")
-    recording = datasets.open("dsec", tmp_path / "set", size=SIZE)["thun_00_a"]
-    refuses("vision", np.asarray, recording.extra["flow"])
 
 
 def test_poses_are_read_beside_a_file_of_any_command(tmp_path):

@@ -45,7 +45,7 @@ def test_unknown_names_are_refused_as_ever():
 
 
 @pytest.mark.slow
-def test_a_filter_with_old_names_gives_the_same_images():
+def test_a_filter_with_old_names_gives_the_same_images(float32):
     """A method of a user's own, written for the release before: its classes, fields and methods."""
     crop = jaxevent.load(files("jaxevent") / "data/slider_depth_crop.h5")[0.6:0.65]
     time = 0.63

@@ -25,6 +25,7 @@ from jaxevent.errors import InputError
 from jaxevent.methods import METHODS
 from jaxevent.runs import egomotion
 from jaxevent.runs.evaluate import evaluate
+from jaxevent.runs.family import FitData
 from jaxevent.runs.fit import fit
 from jaxevent.runs.reconstruction import Objective, Problem, cut_windows
 
@@ -117,7 +118,7 @@ def motions(folder: Path) -> dict[str, Any]:
     goal = egomotion.FAMILY.goal(
         METHODS["voting"], params, {"truth": "*.csv", "runs": 4, "settle": 0.02}
     )
-    problem = goal.problem({"fit": [("", recording)], "validation": [], "test": []}, None, None)
+    problem = goal.problem(FitData({"fit": [("", recording)], "validation": [], "test": []}))
     four = problem(params)[0][0]
     three = dataclasses.replace(four, noise=jax.tree.map(lambda leaf: leaf[:3], four.noise))
     if not devices.is_single_device():

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 import jaxevent
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.errors import InputError
 
 AFTER = "import jax.numpy; jax.numpy.ones(3); import jaxevent; jaxevent.akf"
@@ -34,7 +34,7 @@ def test_a_platform_that_is_not_there_is_refused(error, monkeypatch):
         raise error
 
     monkeypatch.setattr(jax, "default_backend", absent)
-    dispatch.check_platform_available.cache_clear()
+    threads.check_platform_available.cache_clear()
     with pytest.raises(InputError, match="JAX_PLATFORMS is .*; unset it") as refused:
         jaxevent.akf.Params()
     assert str(error).removesuffix(".") in str(refused.value)
@@ -48,7 +48,7 @@ def test_a_command_says_so_in_a_line(tmp_path):
     crop = os.path.join(jaxevent.__path__[0], "data/slider_depth_crop.h5")
     words = ["reconstruct", crop, "--method", "akf", "--out", str(tmp_path / "a.h5")]
     done = subprocess.run(
-        [sys.executable, "-m", "jaxevent.cli", *words],
+        [sys.executable, "-m", "jaxevent", *words],
         env={**os.environ, "JAX_PLATFORMS": "abacus"},
         capture_output=True,
         text=True,

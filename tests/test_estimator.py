@@ -89,10 +89,13 @@ def test_other_arguments_are_refused_by_every_method(name, recording):
             method.estimate, recording, windows=3)  # fmt: skip
     refuses("missing a required argument: 'recording'", method.estimate)
     refuses("too many positional arguments", method.estimate, recording, None, 3)
+    if "c_on" in method.Params.numbers:
+        refuses("give Params.c_on=", method.estimate, recording, c_on=0.1)
     for times in (None, "now", [[0, 1], [2]], [[0.01, 0.02]], [True], [np.nan], 1j):
         refuses("times", method.prepare, recording, times)
 
 
+@pytest.mark.slow
 def test_second_derivatives_through_a_kernel_name_the_compiler_that_has_them(recording):
     with jax.enable_x64(False):
         params = jaxevent.akf.Params()

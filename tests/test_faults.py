@@ -1,12 +1,14 @@
 """Checks of recordings find each fault that is put into a sound recording, and none in that."""
 
 import dataclasses
+import functools
+import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 import jaxevent
 from jaxevent.calibration.correspondence import TRANSFORMS
@@ -38,13 +40,23 @@ NAMES = {
 
 def passing_texture(seed: int = 0, late_us: int = 0, c: float = 0.25) -> Recording:
     """A texture that passes: events where ln I has moved by a threshold, frames each 40 ms."""
+    recording = passing_on_time(seed, c)
+    assert recording.frames is not None
+    late = dataclasses.replace(recording.frames, t=recording.frames.t + late_us)
+    return dataclasses.replace(recording, frames=late)
+
+
+@functools.cache
+def passing_on_time(seed: int, c: float) -> Recording:
     rng = np.random.default_rng(seed)
     wide = gaussian_filter(rng.normal(size=(SIDE, 4 * SIDE)), 2, mode="wrap")
     wide = 0.16 * np.exp(0.7 * wide / wide.std()).clip(None, 5.5)
-    y, x = np.mgrid[:SIDE, :SIDE]
 
     def image(t_us: int) -> np.ndarray:
-        return map_coordinates(wide, [y, x + 60e-6 * t_us], order=1, mode="grid-wrap")
+        part, x = math.modf(60e-6 * t_us)
+        left, right = (np.arange(SIDE) + int(x) + k for k in (0, 1))
+        columns = wide.take(left, 1, mode="wrap"), wide.take(right, 1, mode="wrap")
+        return (1 - part) * columns[0] + part * columns[1]
 
     at = np.log(image(0)) + c * rng.uniform(-1, 1, (SIDE, SIDE))
     parts = []
@@ -62,7 +74,7 @@ def passing_texture(seed: int = 0, late_us: int = 0, c: float = 0.25) -> Recordi
     events = Events(*(column[order] for column in (t, x_of, y_of, p)))
     stamps = np.arange(20_000, int(SECONDS * 1e6), 40_000)
     grey = np.rint(255 * np.stack([image(one) for one in stamps.tolist()]).clip(0, 1))
-    frames = Frames(stamps + late_us, grey.astype(np.uint8), np.zeros(len(stamps), int))
+    frames = Frames(stamps, grey.astype(np.uint8), np.zeros(len(stamps), int))
     return Recording("passing", SIDE, SIDE, events, frames)
 
 
@@ -88,6 +100,33 @@ def test_each_fault_is_found_alone(sound, fault):
     assert [one.name for one in found] == [NAMES[fault]]
     assert found[0].statistic > found[0].limit > 0
     assert dict(describe(faulty))["fault"] == str(found[0])
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("polarity inverted", "frames 20 ms late"),
+        ("columns flipped", "frames flicker"),
+        ("axes swapped", "frames blurred"),
+    ],
+)
+def test_what_frames_show_is_told_beside_events_that_are_turned(sound, first, second):
+    faulty = faults.FAULTS[second](faults.FAULTS[first](sound, 0), 0)
+    assert names_of(faulty) == [NAMES[first], NAMES[second]]
+
+
+def test_frames_that_show_nothing_new_are_told(sound):
+    images = sound.frames.images
+    twice = np.repeat(images[::2], 2, 0)[: len(images)]
+    black = np.zeros_like(images)
+    told = [
+        jaxevent.check_consistency(
+            dataclasses.replace(sound, frames=dataclasses.replace(sound.frames, images=one))
+        )[0]
+        for one in (twice, black)
+    ]
+    assert [one.name for one in told] == ["repeated frames", "empty frames"]
+    assert told[0].statistic == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.parametrize("number", range(1, len(TRANSFORMS)))
@@ -198,6 +237,12 @@ def test_faulty_recordings_are_what_they_are_called(sound):
         one, two = (make_faulty(sound, 7).check().events[:].to_structured() for _ in range(2))
         assert (one == two).all()
     assert (sound.events.t == before).all()
+
+
+def test_few_pixels_that_make_many_of_the_events_are_told(sound):
+    few = faults.add_hot_pixels(sound, 1, share=0.002, rate=50 * len(sound.events) / SIDE**2)
+    (told,) = (one for one in jaxevent.check_consistency(few) if one.name == "hot pixels")
+    assert told.limit < told.statistic < 0.15 and "of the events" in told.text
 
 
 @settings(max_examples=20, deadline=None)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import jaxevent
-from jaxevent.camera import PinholeCamera
+from jaxevent.camera import LENS_MODELS, PinholeCamera, find_model
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Events, Recording
 
 SIZE = (64, 48)

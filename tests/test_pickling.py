@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import os
 import pickle
 import subprocess
@@ -14,6 +15,7 @@ import own_filter
 import points
 import pytest
 import texture
+from together import assert_equal
 
 import jaxevent
 from jaxevent.errors import InputError
@@ -37,11 +39,6 @@ COPIES = {
 def again(request, float32):
     """A function that makes a thing anew."""
     return COPIES[request.param]
-
-
-def assert_equal(found, true):
-    for one, other in zip(found, true, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def assert_same(one, other):
@@ -74,6 +71,14 @@ def test_methods_of_others(again):
         assert again(other) is other
 
 
+@functools.cache
+def read_video(name, *options):
+    recording, method = texture.moving(), jaxevent.METHODS[name]
+    times = recording.frames.t[[5, 1]] + 3000
+    video = method.estimate(recording, method.Params(clock_offset=1e-3), **dict(options))
+    return video, times, video(times)
+
+
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -87,25 +92,29 @@ def test_methods_of_others(again):
 def test_videos(name, options, again):
     if name == "flow":
         pytest.importorskip("cv2")
-    recording, method = texture.moving(), jaxevent.METHODS[name]
-    times = recording.frames.t[[5, 1]] + 3000
-    video = method.estimate(recording, method.Params(clock_offset=1e-3), **options)
-    images = video(times)
+    video, times, images = read_video(name, *options.items())
     other = again(video)
-    assert type(other) is type(video) and other.estimator is method
+    assert type(other) is type(video) and other.estimator is jaxevent.METHODS[name]
     assert_equal(other(times), images)
     assert isinstance(images, Estimate)
     assert_equal(again(images), images)
 
 
+@functools.cache
+def prepared(name):
+    recording, method = texture.moving()[0.0:0.1], jaxevent.METHODS[name]
+    images, params = (
+        method.prepare_images(recording, recording.frames.t[:3]),
+        method.Params(c_on=0.013),
+    )
+    true = [np.asarray(part)[[2, 0]] for part in images(params)]
+    return images.take(np.array([2, 0])), params, true
+
+
 @pytest.mark.parametrize("name", ["akf", "aks"])
 def test_images_as_functions_of_parameters(name, again):
-    recording, method = texture.moving()[0.0:0.1], jaxevent.METHODS[name]
-    images = method.prepare_images(recording, recording.frames.t[:3])
-    other, params = again(images.take(np.array([2, 0]))), method.Params(c_on=0.013)
-    true = [np.asarray(part)[[2, 0]] for part in images(params)]
-    del images
-    assert_equal(other(params), true)
+    images, params, true = prepared(name)
+    assert_equal(again(images)(params), true)
 
 
 def test_tracks(again):
@@ -121,10 +130,14 @@ def test_tracks(again):
     assert_equal(vars(again(states)).values(), vars(states).values())
 
 
+@functools.cache
+def found_targets():
+    return jaxevent.blob.find(texture.moving())
+
+
 @pytest.mark.slow
 def test_what_was_found(again):
-    recording = texture.moving()
-    found = jaxevent.blob.find(recording)
+    found = found_targets()
     assert again(found).summary() == found.summary()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import points
 import pytest
 import texture
-from together import THREADS, at_once
+from together import THREADS, assert_equal, at_once
 
 import jaxevent
 from jaxevent.codegen import module as kernel_module
@@ -28,9 +28,9 @@ WINDOWS = {"window_events": 3000}  # of 8,000
 RESULTS = [
     ("akf", WINDOWS),
     ("aks", WINDOWS),
-    pytest.param("cf", {"compiler": "xla", **WINDOWS}, marks=pytest.mark.slow),
-    pytest.param("flow", {}, marks=pytest.mark.slow),
-    pytest.param("mc", {}, marks=pytest.mark.slow),
+    ("cf", {"compiler": "xla", **WINDOWS}),
+    ("flow", {}),
+    ("mc", {}),
 ]
 
 
@@ -39,11 +39,7 @@ def precision(float32):
     """As users have it."""
 
 
-def assert_equal(found, true):
-    for one, other in zip(found, true, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), RESULTS)
 def test_images_of_a_shared_video(name, options):
     if name == "flow":
@@ -85,6 +81,7 @@ def test_readings_of_one_video_may_alternate():
             assert_equal(images, [part[rows] for part in whole])
 
 
+@pytest.mark.slow
 def test_own_videos_translate_a_method_once(monkeypatch):
     for module in (filter_program, smoother_program):
         monkeypatch.setattr(module._kernels, "_programs", {})
@@ -129,6 +126,7 @@ def test_shared_images_as_functions_of_parameters(name):
     at_once(read)
 
 
+@pytest.mark.slow
 def test_shared_tracks():
     recording = texture.moving()[0.0:0.08]
     seeds, times = [(5, 5, 2), (12, 9, 3)], np.linspace(10_000, 70_000, 16).astype(int)

@@ -17,6 +17,7 @@ t[:3], x[:3], y[:3], p[:3]  # us, column, row, ON
 
 # %% [markdown]
 # Integer times are microseconds. Floats need a unit, because seconds and milliseconds look alike.
+# A unit that does not suit the events brings a warning.
 
 # %%
 recording = jaxevent.Recording.from_arrays(
@@ -37,12 +38,30 @@ for changed in ({"x": x + 1000}, {"t": t[::-1]}, {"p": np.where(p, 255, 0)}):
         print("InputError:", error)
 
 # %% [markdown]
+# Frames are uint8, whose white is 255, uint16, whose white is 65535, or floats, whose white is 1.
+# Cameras of 10 or 12 bits store lower levels as uint16: give `white=1023` or `white=4095`. Without
+# it a warning says so.
+
+# %%
+levels = np.full((2, disc.height, disc.width), 2048, np.uint16)  # of 12 bits
+grey = jaxevent.Recording.from_arrays(t, x, y, p, frames=levels, frame_times=t[[0, -1]], white=4095)
+grey.frames.intensity.mean()
+
+# %% [markdown]
 # A structured array, a DataFrame or a dictionary of the four columns does as well.
 
 # %%
 table = recording.events.to_dataframe()
 again = jaxevent.Recording.from_arrays(table, width=disc.width, height=disc.height, time_unit="us")
 np.array_equal(again.events.t, recording.events.t), table.head(3)
+
+# %% [markdown]
+# Is the content right, too? `check_consistency` looks for faults such as hot pixels, missing
+# events, inverted polarity and clocks that disagree. Each comes with its remedy; check again after
+# it.
+
+# %%
+jaxevent.check_consistency(recording)
 
 # %% [markdown]
 # Count the events of each pixel, and their rate over time with its standard deviation (Poisson).

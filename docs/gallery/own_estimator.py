@@ -2,8 +2,8 @@
 # # An estimator of your own
 #
 # Any function of a recording and times is a method for `evaluate`. Times are (T,), int64 us on the
-# events' clock. It returns images (T, height, width), or a tuple of images and their variance
-# of the same shape. This one adds the events since the last frame to it.
+# events' clock. It returns images (T, height, width) of intensity, 0 black and 1 white, or a tuple
+# of them and their variance of the same shape. This one adds the events since the last frame to it.
 
 # %%
 import dataclasses

@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxevent.blob.params import TrackerParams
-from jaxevent.deprecated import renamed_fields, renamed_names
+from jaxevent.deprecated import renamed_fields
 
 T = TypeVar("T")
 
@@ -193,6 +193,3 @@ class Filter:
     gate: Callable[[Any, PredictedMeasurement, Array, Array], Array] = is_in_gate
     log_likelihood: Callable[[Any, PredictedMeasurement, Array], Array] = log_likelihood
     association_weights: Callable[[Any, Array, Array], Array] = association_weights
-
-
-__getattr__ = renamed_names(__name__)

@@ -28,9 +28,9 @@ from jaxevent.blob.prepare import NEVER_US, ChunkPacker, Features, Numeric
 from jaxevent.blob.seeds import Seeds, read_seeds
 from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.errors import InputError
-from jaxevent.events.tail import Tail
-from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
+from jaxevent.events.live import Tail
 from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
 STEPS_PER_CHUNK, CHUNKS_PER_RUN = 64, 8
 FIRST_DETECTED_ID = 1 << 20  # serial number of the first detected target; seeds have lower ones

@@ -14,9 +14,8 @@ from jaxevent.blob.prepare import ChunkPacker, Features
 from jaxevent.blob.run import run
 from jaxevent.blob.track import to_seconds
 from jaxevent.blob.tracker import Tracker
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, check_recording, microseconds
 
 
 def negative_log_likelihood(
@@ -108,6 +107,7 @@ def prepare_positions(
     Raises:
         InputError: Positions of another shape, times outside the part that is tracked.
     """
+    check_recording(recording, "blob.prepare_positions")
     packer = ChunkPacker(recording, params, seeds, start, stop, False)
     features = packer.pack_all()
     us = np.atleast_1d(microseconds(times))
@@ -127,6 +127,3 @@ def prepare_positions(
     known = np.asarray(np.isfinite(truth).all(-1))
     xi = np.where(known[..., None], truth, 0).astype(features.xi.dtype)
     return PositionBatch(features, out.chunk, out.step, out.time, xi, known)
-
-
-__getattr__ = renamed_names(__name__)

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.blob.filter import Filter
 from jaxevent.blob.lifecycle import (
     LifecycleLog,
@@ -169,7 +169,7 @@ class XlaRunner:
 
     @property
     def _parts(self) -> tuple[Filter, TrackerParams]:
-        dispatch.check_not_forked()
+        threads.check_not_forked()
         return self._arguments
 
     def init(self, features: Features) -> TrackerState:

@@ -15,12 +15,11 @@ from jaxevent.blob.lifecycle import END_REASONS, LifecycleLog
 from jaxevent.blob.prepare import ChunkPacker, PackingCursor, Segment
 from jaxevent.blob.run import count_numbers
 from jaxevent.blob.track import TrackStates
-from jaxevent.deprecated import renamed_names
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
-from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
+from jaxevent.threads import TurnLock
 
 if TYPE_CHECKING:
     import pandas
@@ -524,6 +523,3 @@ class Tracks(HtmlRepr):
         self.ended = tuple(END_REASONS[reason] for _, reason in ends)
         self._id_of = np.full(max([-1, *history.birth]) + 2, -1)  # its last serves the serial -1
         self._id_of[self._serial] = self.id
-
-
-__getattr__ = renamed_names(__name__)

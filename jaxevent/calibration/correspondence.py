@@ -181,6 +181,30 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
     )  # fmt: skip
 
 
+def turn_events(sample: Sample, name: str, inverted: bool) -> Sample:
+    """Bring the events of a sample to the frames' pixels.
+
+    Args:
+        sample: Sample of a recording.
+        name: What brings them there, of `TRANSFORMS`.
+        inverted: Whether the polarity is inverted, too.
+
+    Returns:
+        The sample, without events that come to pixels outside of it.
+    """
+    width, height = sample.size
+    index = np.full(width * height, -1, np.int32)
+    index[sample.places] = np.arange(len(sample.places))
+    place = np.arange(width * height).reshape(height, width)
+    to = index[TRANSFORMS[name](place).ravel()[sample.places]]
+    turned = []
+    for one in sample.stretches:
+        pixel = to[one.pixel]
+        keep = pixel >= 0
+        turned.append(one._replace(t=one.t[keep], pixel=pixel[keep], p=one.p[keep] ^ inverted))
+    return sample._replace(stretches=tuple(turned))
+
+
 def _pair(stretch: SampledSegment, row: int) -> SampledSegment:
     """Return a stretch with two frames."""
     two = slice(row, row + 2)

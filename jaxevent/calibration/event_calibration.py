@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration.events_alone import CONFIDENCE_Z
 from jaxevent.calibration.hot import find_hot_pixels
 from jaxevent.calibration.result import CalibrationValue, not_identifiable
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 N_PARTS = 8
 MAX_PART_EVENTS = 2_000_000
@@ -93,6 +93,7 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     Returns:
         Thresholds and hot pixels.
     """
+    check_recording(recording, "calibrate_events")
     parts = count_parts(recording)
     hot = find_hot_pixels(parts.sum(1))
     ratio = _estimate_ratio(parts.sum(0), hot)

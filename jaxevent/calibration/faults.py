@@ -10,20 +10,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.clipping import MIN_CLIPPED_SHARE, find_clipping
+from jaxevent.calibration.clipping import MAX_CLIPPED_SHARE, MIN_CLIPPED_SHARE, find_clipping
 from jaxevent.calibration.correspondence import (
     I0,
     TRANSFORMS,
     Correspondence,
     measure_correspondence,
+    turn_events,
 )
 from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
-from jaxevent.recording import Events, Recording
+from jaxevent.recording import Events, Recording, check_recording
 
 MAX_HOT_SHARE = 0.01  # of the pixels
+MAX_HOT_EVENTS_SHARE = 0.05  # of the events
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
 MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
@@ -39,6 +41,8 @@ MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half t
 MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
 MAX_DILUTION = 1.25  # of the change per event; slow scenes without blur reach 1.1
 MAX_UNDONE_SHARE = 0.5  # of the events
+# Between frames that are equal, of pixels that change by several thresholds.
+MAX_REPEATED_SHARE, MIN_NET_EVENTS, MIN_CHANGING = 0.05, 2, 50
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 
@@ -67,7 +71,7 @@ class Fault(NamedTuple):
         )
 
 
-def check_consistency(recording: Recording) -> tuple[Fault, ...]:
+def check_consistency(recording: Recording, sample: Sample | None = None) -> tuple[Fault, ...]:
     """Check a recording for faults of events, frames and clocks.
 
     Hot pixels go out first; the other checks see the rest. What needs frames is left out without
@@ -75,11 +79,13 @@ def check_consistency(recording: Recording) -> tuple[Fault, ...]:
 
     Args:
         recording: The recording, in memory or in a file.
+        sample: A sample of it (`sampling.take_sample`); None: it is taken here.
 
     Returns:
         The faults, empty where nothing is wrong.
     """
-    sample = take_sample(recording)
+    check_recording(recording, "check_consistency")
+    sample = take_sample(recording) if sample is None else sample
     return tuple(
         fault
         for found in (
@@ -94,15 +100,28 @@ def check_consistency(recording: Recording) -> tuple[Fault, ...]:
 
 
 def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
-    """Check the share of hot pixels."""
-    share = float(sample.hot.mean())
-    yield Fault(
-        "hot pixels", share, MAX_HOT_SHARE,
-        f"{100 * share:.2g} % of the pixels fire in all parts of the recording, unlike those "
-        "around them",
+    """Check the share of hot pixels, and that of their events."""
+    remedy = (
         "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
-        "calibrate(recording).hot_pixels",
-    )  # fmt: skip
+        "calibrate(recording).hot_pixels"
+    )
+    share = float(sample.hot.mean())
+    events = sample.counts.sum(0)
+    of_events = float(events[sample.hot].sum() / max(events.sum(), 1))
+    if share > MAX_HOT_SHARE:
+        yield Fault(
+            "hot pixels", share, MAX_HOT_SHARE,
+            f"{100 * share:.3g} % of the pixels fire in all parts of the recording, unlike those "
+            "around them",
+            remedy,
+        )  # fmt: skip
+    else:
+        number = int(sample.hot.sum())
+        yield Fault(
+            "hot pixels", of_events, MAX_HOT_EVENTS_SHARE,
+            f"{number} hot {plural('pixel', number)} made {100 * of_events:.3g} % of the events",
+            remedy,
+        )  # fmt: skip
 
 
 def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:
@@ -136,7 +155,7 @@ def _check_times(recording: Recording, sample: Sample) -> Iterator[Fault]:
     share = in_bursts / max(total, 1)
     yield Fault(
         "event bursts", share, MAX_BURST_SHARE,
-        f"{100 * share:.2g} % of the events come in milliseconds with over {BURST_RATIO} times as "
+        f"{100 * share:.3g} % of the events come in milliseconds with over {BURST_RATIO} times as "
         "many as around them",
         "look for flashes of light, and for stamps that a buffer gave many events together",
     )  # fmt: skip
@@ -176,9 +195,13 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
             return
     if (correspondence := measure_correspondence(sample)) is None:
         return
-    relation = [] if one_sign else list(_check_relation(correspondence))
-    yield from relation
-    has_polarity = not (one_sign or relation)
+    turn, relation = (None, None) if one_sign else _check_relation(correspondence)
+    if relation is not None:
+        yield relation
+    if turn is not None:  # the other checks see what the remedy leaves
+        sample = turn_events(sample, *turn)
+        correspondence = measure_correspondence(sample) or correspondence
+    has_polarity = not one_sign and (relation is None or turn is not None)
     is_related = has_polarity and correspondence.significance[0].max() > SIGMAS
     yield from _check_brightness(sample, correspondence.offset if is_related else 0.0, has_polarity)
     if is_related:
@@ -187,10 +210,9 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
 
 def _mismatch(recording: Recording) -> tuple[float, float]:
     """Return the statistic of a mismatch of clocks and its limit."""
-    frames, events = recording.frames, recording.events
+    frames = recording.frames
     assert frames is not None
-    spans = [(int(frames.t[0]), int(frames.t[-1]))]
-    spans.append((int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])))
+    spans = [(int(frames.t[0]), int(frames.t[-1])), recording.event_span()]
     lengths = sorted(end - begin for begin, end in spans)
     common = min(end for _, end in spans) - max(begin for begin, _ in spans)
     outside = 1 - max(common, 0) / max(lengths[0], 1)
@@ -199,8 +221,14 @@ def _mismatch(recording: Recording) -> tuple[float, float]:
     return lengths[1] / max(lengths[0], 1), 1 / MIN_SPAN_RATIO
 
 
-def _check_relation(correspondence: Correspondence) -> Iterator[Fault]:
-    """Check whether events belong to the frames, as they are or turned over."""
+def _check_relation(
+    correspondence: Correspondence,
+) -> tuple[tuple[str, bool] | None, Fault | None]:
+    """Check whether events belong to the frames, as they are or turned over.
+
+    Returns:
+        How events have to be turned, as of `turn_events`, and the fault.
+    """
     r, z = correspondence.correlation, correspondence.significance
     here = max(float(r[0].max()), 0.0)
     real = np.where(np.abs(z) > SIGMAS, r, 0)
@@ -210,27 +238,29 @@ def _check_relation(correspondence: Correspondence) -> Iterator[Fault]:
     if found and (kind or found < 0) and abs(found) > MIN_ADVANTAGE * here:
         inverse = "polarity inverted" if found < 0 else ""
         changed = " and ".join(part for part in (name, inverse) if part)
-        yield Fault(
+        return (name, found < 0), Fault(
             "flipped or swapped axes" if kind else "inverted polarity", significance, SIGMAS,
             f"events correlate with the changes of the frames by {here:.2f} at most, with "
             f"{changed} by {abs(found):.2f}",
             f"make the recording of events with {changed}",
         )  # fmt: skip
-    elif not found and correspondence.activity > SIGMAS:
-        yield Fault(
+    if not found and correspondence.activity > SIGMAS:
+        return None, Fault(
             "lost polarity", correspondence.activity, SIGMAS,
             f"events come where and when frames change, but their polarity says nothing about the "
             f"sign: the correlation is {float(np.abs(r[0]).max()):.2f} at most",
             "read the file again with the column or bit of its polarity; use methods without "
             "polarity, or frames alone",
         )  # fmt: skip
-    elif not found and correspondence.tiles > MIN_RELATED:
-        yield Fault(
+    if not found and correspondence.tiles > MIN_RELATED:
+        return None, Fault(
             "unrelated events", float(correspondence.tiles), MIN_RELATED,
             f"events and changes of the frames do not correlate within "
             f"{correspondence.lags[-1] / 1e3:.0f} ms: by {float(np.abs(r[0]).max()):.2f} at most",
-            "check that frames and events are of one recording, clock and camera",
+            "check that frames and events are of one recording, clock and camera, and that no axis "
+            "is flipped",
         )  # fmt: skip
+    return None, None
 
 
 def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
@@ -259,20 +289,28 @@ def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
 
 def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iterator[Fault]:
     """Check that frames change brightness as events do, and, where these have polarity, often."""
-    steps, net, total = [], 0, 0
+    steps, net, total, repeated, intervals = [], 0, 0, 0, 0
     for stretch in sample.stretches:
         changes, clear = log_changes(stretch, I0)
         counts = count_between(stretch, 0 if np.isnan(offset) else int(offset))
         for d, used, (on, off) in zip(changes, clear, counts, strict=True):
             quiet = used & (on + off == 0)
+            repeated += not d.any() and (np.abs(on - off) >= MIN_NET_EVENTS).sum() >= MIN_CHANGING
+            intervals += 1
             net += int(np.abs(on - off).sum())
             total += int((on + off).sum())
             if quiet.any():
                 steps.append(float(np.median(d[quiet])))
+    share = repeated / max(intervals, 1)
+    yield Fault(
+        "repeated frames", share, MAX_REPEATED_SHARE,
+        f"{100 * share:.3g} % of the frames equal the one before them, while events report changes",
+        "leave out the repeated frames, with the stamps of those that were exposed",
+    )  # fmt: skip
     flicker = float(np.median(np.abs(steps))) if steps else 0.0
     yield Fault(
         "flickering frames", flicker, MAX_FLICKER,
-        f"from frame to frame pixels without an event change by {100 * flicker:.2g} % in the "
+        f"from frame to frame pixels without an event change by {100 * flicker:.3g} % in the "
         "median",
         'give the brightness of each frame as extra["gain"], or record with constant exposure '
         "and gain",
@@ -280,7 +318,7 @@ def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iter
     undone = 1 - net / total if total and has_polarity else 0.0
     yield Fault(
         "sparse frames", undone, MAX_UNDONE_SHARE,
-        f"of the change that events report, {100 * undone:.2g} % is undone before the next frame",
+        f"of the change that events report, {100 * undone:.3g} % is undone before the next frame",
         "record more frames per second; events must bridge the time between them, for which their "
         "thresholds must be known well",
     )  # fmt: skip
@@ -288,9 +326,17 @@ def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iter
 
 def _check_white(recording: Recording) -> Iterator[Fault]:
     """Check the share of pixels whose frames are white."""
-    share = find_clipping(recording).white.share
+    white = find_clipping(recording).white
+    if white.level is None and white.share > MAX_CLIPPED_SHARE:
+        yield Fault(
+            "empty frames", white.share, MAX_CLIPPED_SHARE,
+            f"{100 * white.share:.3g} % of the frames' pixels have one grey value",
+            "read the frames again, or leave them out",
+        )  # fmt: skip
+        return
     yield Fault(
-        "clipped frames", share, MIN_CLIPPED_SHARE,
-        f"{100 * share:.2g} % of the frames' pixels are white, where only events tell what happens",
+        "clipped frames", white.share, MIN_CLIPPED_SHARE,
+        f"{100 * white.share:.3g} % of the frames' pixels are white, where only events tell what "
+        "happens",
         "shorten the exposure; methods with a variance take white for a lower bound",
     )  # fmt: skip

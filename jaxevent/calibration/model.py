@@ -36,6 +36,8 @@ DEGREES_OF_FREEDOM = 4.0  # of Student's t
 # Curvature of the likelihood by the mean, as part of the mean of weights.
 CURVATURE = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + 3)
 SHORTEST_US = 50.0  # exposure, below which it is a point in time
+# Of the time between frames: means of several frames are exposed for longer than that.
+MAX_EXPOSURE_INTERVALS = 2.0
 MAX_RELATIVE_NOISE = 0.15  # of a frame's I + I0, beyond which logarithms of noise are biased
 MIN_CHANGES = 60
 MAX_CHANGES = 60_000
@@ -283,7 +285,8 @@ class Model:
         new = theta + move
         new[:2] = np.clip(new[:2], theta[:2] / 2, theta[:2] * 2)
         new[3] = np.clip(new[3], 0, self.interval_s / 4)
-        new[4] = np.clip(new[4], (1e-6 * SHORTEST_US) ** 2, self.interval_s**2)
+        longest = MAX_EXPOSURE_INTERVALS * self.interval_s
+        new[4] = np.clip(new[4], (1e-6 * SHORTEST_US) ** 2, longest**2)
         return new
 
 

@@ -25,6 +25,7 @@ import jaxevent
 from jaxevent import cache
 from jaxevent.calibration.estimation import calibrate
 from jaxevent.calibration.result import Calibration, CalibrationValue
+from jaxevent.calibration.sampling import Sample
 from jaxevent.io import toml
 from jaxevent.parameters import CALIBRATION_TABLE
 from jaxevent.recording import Recording
@@ -39,18 +40,21 @@ _FIELDS = "fields"  # name of the array that holds the JSON of all fields
 _memory: collections.OrderedDict[str, Any] = collections.OrderedDict()
 
 
-def recall_calibration(recording: Recording, I0: float = 1.0) -> Calibration:
+def recall_calibration(
+    recording: Recording, I0: float = 1.0, sample: Sample | None = None
+) -> Calibration:
     """Return the calibration of a recording, which is computed once for its content.
 
     Args:
         recording: The recording.
         I0: Offset inside the logarithm, L = ln(I + I0), for which thresholds hold.
+        sample: A sample of it (`sampling.take_sample`); None: it is taken where it is needed.
 
     Returns:
         The same as `jaxevent.calibrate` returns.
     """
     key = hash_content(recording, I0)
-    return _recall(key, lambda: calibrate(recording, I0), encode, decode)
+    return _recall(key, lambda: calibrate(recording, I0, sample), encode, decode)
 
 
 def recall_numbers(

@@ -35,7 +35,7 @@ from jaxevent.cli import (
     track,
     view,
 )
-from jaxevent.cli.arguments import HelpFormatter, guarded
+from jaxevent.cli.arguments import CommandParser, HelpFormatter, guarded
 from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
@@ -302,7 +302,7 @@ def _complete_files(parser: argparse.ArgumentParser, how: Any) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="jaxevent",
         description="Video of high rate and dynamic range, tracks, and motion, from event cameras.",
         epilog="examples:\n  jaxevent demo\n  jaxevent reconstruct --help",

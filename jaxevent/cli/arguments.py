@@ -2,10 +2,13 @@
 
 import argparse
 import contextlib
+import dataclasses
+import difflib
+import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from jaxevent.errors import InputError
 
@@ -38,6 +41,34 @@ def _metavars(action: argparse.Action) -> tuple[str, ...]:
     if action.nargs == 0 or action.metavar is None:
         return ()
     return action.metavar if isinstance(action.metavar, tuple) else (action.metavar,)
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors suggest names, and show the usage of the command that was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and error, and exit with 2; a wrong choice comes with the nearest one."""
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong is not None:
+            from jaxevent.parameters import suggest_name
+
+            known = [name.strip(" '") for name in wrong[2].split(",")]
+            name = message[: wrong.start()] + f"{wrong[1]!r} is not possible"
+            message = f"{name}; {suggest_name(wrong[1], known)}"
+        super().error(message)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as argparse does; a command refuses what it does not know itself."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown and self._subparsers is None:
+            options = [name for name in self._option_string_actions if name.startswith("--")]
+            name = unknown[0].partition("=")[0]
+            near = difflib.get_close_matches(name, options, 1)
+            self.error(
+                f"unrecognized arguments: {' '.join(unknown)}"
+                + (f"; did you mean {near[0]}?" if name.startswith("-") and near else "")
+            )
+        return found, unknown
 
 
 def command(
@@ -110,13 +141,20 @@ def add_live(one: argparse.ArgumentParser, printed: str) -> None:
     )
 
 
+def refuse_with_live(given: Mapping[str, bool]) -> None:
+    """Raise `InputError` for the first option that was given and is not for --live."""
+    for name, is_given in given.items():
+        if is_given:
+            raise InputError(f"--live is not for {name}; leave out one of the two")
+
+
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
-    from jaxevent.io import chunks
+    from jaxevent.events import live
 
     if str(path) != "-":
         recording = open_recording(path, reading)
-        return recording, chunks.divide(recording)
+        return recording, live.divide(recording)
     from jaxevent.io.calibration import read_camera
     from jaxevent.recording import Events, Recording
 
@@ -125,7 +163,7 @@ def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
     lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
     width, height = reading["size"]
     recording = Recording("standard input", width, height, Events.empty(), camera=lens)
-    return recording, chunks.read_lines(sys.stdin.buffer)
+    return recording, live.read_lines(sys.stdin.buffer)
 
 
 def add_frames(one: Any, name: str, source: str) -> None:
@@ -135,6 +173,15 @@ def add_frames(one: Any, name: str, source: str) -> None:
         metavar="NAME",
         help=f"which images of {source} are the frames: a topic or a number; none: no frames",
     )
+
+
+def add_span(one: argparse.ArgumentParser) -> None:
+    """Add the options --start and --stop, a part of the recording."""
+    for name in ("start", "stop"):
+        end = "end" if name == "stop" else name
+        one.add_argument(
+            f"--{name}", metavar="S", type=float, help=f"{end} time, in s on the recording's clock"
+        )
 
 
 def add_no_calibrate(one: argparse.ArgumentParser) -> None:
@@ -162,6 +209,12 @@ def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
     from jaxevent.io import load
 
     return load(path, in_memory=False, progress=show_progress(), **reading, **more)
+
+
+def open_named(path: Path, reading: dict[str, Any]) -> tuple[Any, str]:
+    """Open a recording as `open_recording`, named by its path for messages; return its name too."""
+    recording = open_recording(path, reading)
+    return dataclasses.replace(recording, name=str(path)), recording.name
 
 
 def add_output(
@@ -200,7 +253,7 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
         yield {**taken, "force": force}
     elif outputs:
         from jaxevent.io.calibration import split_name
-        from jaxevent.io.companions import companions
+        from jaxevent.io.checks import companions
         from jaxevent.io.output import Command, allow_writing_into_folders, check_outputs, running
 
         named = [path for name in outputs if (path := taken[name]) is not None]
@@ -280,6 +333,15 @@ def show_progress() -> bool:
 def print_written(out: Path, names: Sequence[str] = ()) -> None:
     """Print the files that were written: `out`, or those of these names in it, one line each."""
     print("", *(f"written: {path}" for path in [out / name for name in names] or [out]), sep="\n")
+
+
+def describe_speed(events: int, seconds: float) -> str:
+    return f"{seconds:.2f} s, {events / seconds:,.0f} events/s"
+
+
+def check_seed(number: int) -> None:
+    if number < 0:
+        raise InputError(f"--seed {number} is not possible; give a whole number from 0")
 
 
 def print_stored(recording: Any, path: Path) -> None:

@@ -1,6 +1,5 @@
 """The command `jaxevent calibrate`."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +45,7 @@ def run(*, path: Path, I0: float | int, reading: dict[str, Any], out: Path | Non
     if out is not None and out.suffix not in ("", *FILE_SUFFIXES):
         raise InputError(f"{out}: is neither .toml nor .png; give one of these, or a folder")
     FrameParams(I0=I0)  # checks it
-    recording = arguments.open_recording(path, reading)
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    recording, _ = arguments.open_named(path, reading)
     recording.refuse_empty()
     calibration = calibrate(recording, I0)
     print(calibration_table(calibration), end="")

@@ -202,9 +202,7 @@ def reference(
     from jaxevent.register import register_still
 
     scene = read_intensity(image)
-    recording = arguments.open_recording(path, reading)
-    name = recording.name
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    recording, name = arguments.open_named(path, reading)
     found, homographies, factor = register_still(
         recording, scene, scale=scale, progress=show_progress()
     )

@@ -89,9 +89,7 @@ def run(
     from jaxevent.io import save
     from jaxevent.recording import Recording
 
-    recording = arguments.open_recording(source, reading)
-    name = recording.name
-    recording = dataclasses.replace(recording, name=str(source))  # for messages
+    recording, name = arguments.open_named(source, reading)
     steps: list[tuple[str, Callable[[Recording], Recording]]] = []
     if start is not None or stop is not None:
         steps.append(("cut in time", lambda r: r[start:stop]))

@@ -27,10 +27,10 @@ def add(commands: Any) -> None:
     )
     when.add_argument(
         "--times",
-        metavar="FILE",
+        metavar="FILE_or_LIST",
         type=Path,
-        help="flow at each time of a text or CSV file: one in each line, or its column t; whole "
-        "numbers are microseconds, others seconds",
+        help="flow at each time of a list 0.5,0.6 or of a text or CSV file: one in each "
+        "line, or its column t; whole numbers are microseconds, others seconds",
     )
     one.add_argument(
         "--start", metavar="S", type=float, help="first time, in s on the recording's clock"

@@ -62,12 +62,7 @@ def add(commands: Any) -> None:
         help="do not smooth, but date each estimate of voting to the middle of its events",
     )
     one.add_argument("--smooth", action="store_true", help="smooth by later events: the default")
-    one.add_argument(
-        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
-    )
-    one.add_argument(
-        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
-    )
+    arguments.add_span(one)
     one.add_argument(
         "--flow", action="store_true", help="also write the optical flow of each event: flow.h5"
     )
@@ -122,92 +117,141 @@ def _add_known(one: Any) -> None:
     )
 
 
-def run(
-    *,
-    path: Path,
-    model: str,
-    method: str | None,
-    params: Path | None,
-    seed: int,
-    truth: Path | str | None,
-    depth: float | int | None,
-    imu: bool,
-    imu_rotation: str | None,
-    still: tuple[float, float] | None,
-    rate: float | int,
-    causal: bool,
-    centred: bool,
-    smooth: bool,
-    start: float | int | None,
-    stop: float | int | None,
-    flow: bool,
-    focal: float | int | None,
-    live: bool,
-    reading: dict[str, Any],
-    out: Path | None,
-) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """The parsed options."""
+
+    path: Path
+    model: str
+    method: str | None
+    params: Path | None
+    seed: int
+    truth: Path | str | None
+    depth: float | int | None
+    imu: bool
+    imu_rotation: str | None
+    still: tuple[float, float] | None
+    rate: float | int
+    causal: bool
+    centred: bool
+    smooth: bool
+    start: float | int | None
+    stop: float | int | None
+    flow: bool
+    focal: float | int | None
+    live: bool
+    reading: dict[str, Any]
+    out: Path | None
+
+
+def run(**given: Any) -> None:
     from jaxevent.egomotion import find_model
-    from jaxevent.egomotion.model_selection import select_model
-    from jaxevent.egomotion.truth import gyro_bias
+
+    options = Options(**given)
+    kind = None if options.model == "auto" else find_model(options.model)
+    if options.live:
+        _print_live(options, kind)
+    else:
+        _write(options, kind)
+
+
+def _write(options: Options, kind: Any) -> None:
+    """Write the motion of a recording; without a `kind` its model is chosen."""
     from jaxevent.egomotion.truth import imu_rotation as rotation_of
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
-    kind = None if model == "auto" else find_model(model)
-    if live:
-        options = {
-            "--method": method not in (None, "voting"), "--truth": truth is not None, "--imu": imu,
-            "--centred": centred, "--smooth": smooth, "--start": start is not None,
-            "--stop": stop is not None, "--flow": flow, "--out": out is not None,
-        }  # fmt: skip
-        if wrong := [name for name, given in options.items() if given]:
-            raise InputError(f"--live is not for {wrong[0]}; leave out one of the two")
-        if kind is None:
-            raise InputError("--live cannot see all events to choose a model; name it by --model")
-        _print_live(path, kind, params, seed, float(rate), focal, reading)
-        return
-    if out is None:
-        raise InputError("there is nowhere to write; give a folder, --out DIR, or --live")
-    if kind is not None:
-        _check(find_estimator(method or kind.best_method), kind, imu, causal, smooth)
-    if causal and (centred or smooth):
-        raise InputError("--causal uses no later events; leave out --centred and --smooth")
-    if seed < 0:
-        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
-    turned = None if imu_rotation is None else rotation_of(imu_rotation)
-    output = Output(out, rate, truth, flow=flow)
-    recording = arguments.open_recording(path, reading)
-    recording = _with_camera(dataclasses.replace(recording, name=str(path)), focal)
-    if not len(recording.events):
-        raise InputError(f"{path}: holds no events; choose another recording")
-    if recording.imu is None and (imu or still is not None):
-        raise InputError(
-            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out "
-            f"{'--imu' if imu else '--still'} or choose another recording"
-        )
-    bias = None
-    if recording.imu is not None and still is not None:
-        bias = gyro_bias(recording.imu, *still)
-    whole, recording = recording, _stretch(recording, start, stop)
+    _check_options(options, kind)
+    assert options.out is not None
+    turned = None if options.imu_rotation is None else rotation_of(options.imu_rotation)
+    output = Output(options.out, options.rate, options.truth, flow=options.flow)
+    whole = _open(options)
+    bias = _gyro_bias(options, whole)
+    recording = _stretch(whole, options.start, options.stop)
     choice = None
     if kind is None:
-        choice = select_model(recording)
-        print("\n".join(choice.lines))
-        kind = choice.model
-        if choice.camera is not None:
-            recording = dataclasses.replace(recording, camera=choice.camera)
-    estimator = find_estimator(method or kind.best_method)
-    _check(estimator, kind, imu, causal, smooth)
+        kind, recording, choice = _choose(recording)
+    estimator = find_estimator(options.method or kind.best_method)
+    _check(estimator, kind, options)
     _need_camera(recording, kind)
-    true = output.known(whole, kind, bias, turned, depth)
+    true = output.known(whole, kind, bias, turned, options.depth)
     clock = time.perf_counter()
-    settings: dict[str, Any] = {"model": kind, "seed": seed, "progress": show_progress()}
-    if causal:
+    settings: dict[str, Any] = {"model": kind, "seed": options.seed, "progress": show_progress()}
+    if options.causal:
         settings["causal"] = True
     elif "smooth" in estimator.options:
-        settings["smooth"] = smooth or not centred
-    gyro, other = (imu, bias, turned), not (method or params or causal or smooth)
-    estimator, told, values = estimated(estimator, recording, params, settings, gyro, other)
+        settings["smooth"] = options.smooth or not options.centred
+    is_default = not (options.method or options.params or options.causal or options.smooth)
+    estimator, told, values = estimated(
+        estimator, recording, options.params, settings, (options.imu, bias, turned), is_default
+    )
+    told = _with_doubt(told, recording, choice, options.focal)
+    seconds = time.perf_counter() - clock
+    about = {
+        "seed": options.seed, "smooth": settings.get("smooth", False), "gyro": options.imu,
+        "causal": options.causal,
+    }  # fmt: skip
+    made = {"method": estimator.name, "params": values}
+    written = output.write(recording, told, about, true, progress=show_progress(), **made)
+    hint = _truth_there(whole, kind) if options.truth is None else []
+    print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
+    count = len(recording.events)
+    print(
+        f"\n{', '.join(written.files)} in {options.out}: {count:,} events in "
+        f"{arguments.describe_speed(count, seconds)}"
+    )
+
+
+def _check_options(options: Options, kind: Any) -> None:
+    """Raise `InputError` for options that exclude each other, before anything is read."""
+    from jaxevent.runs.egomotion import find_estimator
+
+    if options.out is None:
+        raise InputError("there is nowhere to write; give a folder, --out DIR, or --live")
+    if kind is not None:
+        _check(find_estimator(options.method or kind.best_method), kind, options)
+    if options.causal and (options.centred or options.smooth):
+        raise InputError("--causal uses no later events; leave out --centred and --smooth")
+    arguments.check_seed(options.seed)
+
+
+def _open(options: Options) -> Any:
+    """The recording, with its camera; it must hold events, and the IMU that options need."""
+    path = options.path
+    recording = arguments.open_recording(path, options.reading)
+    recording = _with_camera(dataclasses.replace(recording, name=str(path)), options.focal)
+    if not len(recording.events):
+        raise InputError(f"{path}: holds no events; choose another recording")
+    if recording.imu is None and (options.imu or options.still is not None):
+        raise InputError(
+            f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out "
+            f"{'--imu' if options.imu else '--still'} or choose another recording"
+        )
+    return recording
+
+
+def _gyro_bias(options: Options, recording: Any) -> Any:
+    """The gyro's rates while the camera is still, or None."""
+    from jaxevent.egomotion.truth import gyro_bias
+
+    if recording.imu is None or options.still is None:
+        return None
+    return gyro_bias(recording.imu, *options.still)
+
+
+def _choose(recording: Any) -> tuple[Any, Any, Any]:
+    """The model that the recording suggests, the recording with the lens found, the choice."""
+    from jaxevent.egomotion.model_selection import select_model
+
+    choice = select_model(recording)
+    print("\n".join(choice.lines))
+    if choice.camera is not None:
+        recording = dataclasses.replace(recording, camera=choice.camera)
+    return choice.model, recording, choice
+
+
+def _with_doubt(told: Any, recording: Any, choice: Any, focal: float | None) -> Any:
+    """The motion with the doubt of the model, the focal length and parts of the image."""
     if choice is not None:
         told = choice.include_doubt(told)
     if focal is not None:
@@ -215,40 +259,30 @@ def run(
     told, warning = told.with_flow_consistency(recording)
     if warning:
         print(warning)
-    seconds = time.perf_counter() - clock
-    smoothed = settings.get("smooth", False)
-    about = {"seed": seed, "smooth": smoothed, "gyro": imu, "causal": causal}
-    made = {"method": estimator.name, "params": values}
-    written = output.write(recording, told, about, true, progress=show_progress(), **made)
-    hint = _truth_there(whole, kind) if truth is None else []
-    print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
-    count = len(recording.events)
-    print(
-        f"\n{', '.join(written.files)} in {out}: {count:,} events in {seconds:.2f} s, "
-        f"{count / seconds:,.0f} events/s"
-    )
+    return told
 
 
-def _print_live(
-    path: Path,
-    kind: Any,
-    params: Path | None,
-    seed: int,
-    rate: float,
-    focal: float | None,
-    reading: dict[str, Any],
-) -> None:
+def _print_live(options: Options, kind: Any) -> None:
     """Print rows of motion.csv as events come, each as soon as an estimate after it is there."""
     from jaxevent.egomotion import voting
     from jaxevent.show.motion import LiveTable
 
-    recording, chunks = arguments.open_live(path, reading)
-    recording = _with_camera(recording, focal)
+    excluded = {
+        "--method": options.method not in (None, "voting"), "--truth": options.truth is not None,
+        "--imu": options.imu, "--centred": options.centred, "--smooth": options.smooth,
+        "--start": options.start is not None, "--stop": options.stop is not None,
+        "--flow": options.flow, "--out": options.out is not None,
+    }  # fmt: skip
+    arguments.refuse_with_live(excluded)
+    if kind is None:
+        raise InputError("--live cannot see all events to choose a model; name it by --model")
+    recording, chunks = arguments.open_live(options.path, options.reading)
+    recording = _with_camera(recording, options.focal)
     _need_camera(recording, kind)
-    values, _ = _parameters(voting, kind, params)
+    values, _ = _parameters(voting, kind, options.params)
     size = recording.width, recording.height
-    live = voting.live(size, values, model=kind, camera=recording.camera, seed=seed)
-    table = LiveTable(live, rate)
+    live = voting.live(size, values, model=kind, camera=recording.camera, seed=options.seed)
+    table = LiveTable(live, float(options.rate))
     for events in chunks:
         live.add(events)
         print(table.rows(), end="", flush=True)
@@ -256,15 +290,14 @@ def _print_live(
     print(table.rows(), end="", flush=True)
 
 
-def _check(estimator: Any, kind: Any, imu: bool, causal: bool, smooth: bool) -> None:
+def _check(estimator: Any, kind: Any, options: Options) -> None:
     """Raise `InputError` for a model or an option that the method does not know."""
     from jaxevent.methods import names
     from jaxevent.runs.egomotion import find_estimator
 
     estimator.find_model(kind)
-    wanted = (("gyro", "imu", imu), ("causal", "causal", causal), ("smooth", "smooth", smooth))
-    for option, name, used in wanted:
-        if used and option not in estimator.options:
+    for option, name in (("gyro", "imu"), ("causal", "causal"), ("smooth", "smooth")):
+        if getattr(options, name) and option not in estimator.options:
             others = [one for one in names("egomotion") if option in find_estimator(one).options]
             raise InputError(
                 f"--{name} is not for the method {estimator.name}; leave it out or use "

@@ -38,10 +38,10 @@ def add(commands: Any) -> None:
     when.add_argument("--at", choices=["frames"], help="one image where each frame is")
     when.add_argument(
         "--times",
-        metavar="FILE",
+        metavar="FILE_or_LIST",
         type=Path,
-        help="one image at each time of a text or CSV file: one in each line, or its column t; "
-        "whole numbers are microseconds, others seconds",
+        help="one image at each time of a list 0.5,0.6 or of a text or CSV file: one in each "
+        "line, or its column t; whole numbers are microseconds, others seconds",
     )
     one.add_argument(
         "--start",
@@ -140,11 +140,11 @@ def _default_times(
     return evenly_spaced_times(spanned, 100.0 if rate is None else rate, start)
 
 
-def _warn_of_faults(recording: Any) -> None:
+def _warn_of_faults(recording: Any, sample: Any) -> None:
     """Warn of each fault of events, frames and clocks, with its statistic and the remedy."""
     from jaxevent.calibration import check_consistency
 
-    for fault in check_consistency(recording):
+    for fault in check_consistency(recording, sample):
         if fault.name != "disjoint clocks":  # which `check_clocks` judges at the offset used
             warnings.warn(f"{recording.name}: {fault}", InputWarning, stacklevel=2)
 
@@ -165,6 +165,7 @@ def run(
     colour: bool,
     out: Path,
 ) -> None:
+    from jaxevent.calibration.sampling import take_sample
     from jaxevent.events.clocks import check_clocks
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
@@ -176,10 +177,8 @@ def run(
         raise InputError(f"{out}: --tone is for images to look at; HDF5 holds linear intensity")
     estimator = find(method or "mc", "reconstruction")
     table = _read_table(params, estimator, method)
-    recording = arguments.open_recording(path, reading)
+    recording, name = arguments.open_named(path, reading)
     asked = None if times is None else read_times(times, (recording.start, recording.stop))
-    name = recording.name
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
     if at == "frames" and recording.frames is None:
         missing = recording.describe_left_out("frames")
         raise InputError(f"{path}: holds no frames{missing}; give --rate instead of --at frames")
@@ -202,8 +201,10 @@ def run(
     names = estimator.names_left_open(table) if calibrate else ()
     if names:
         check_clocks(recording, values.clock_offset)
-    _warn_of_faults(recording)
-    found = calibrated_values(recording, values, names)
+    sample = take_sample(recording)
+    _warn_of_faults(recording, sample)
+    found = calibrated_values(recording, values, names, sample)
+    del sample  # before images need the memory
     if found.found or found.missing:
         print(arguments.describe_calibration(found))
     values = values.replace(**found.found)
@@ -220,6 +221,6 @@ def run(
     )
     seconds = time.perf_counter() - clock
     print(
-        f"{out}: {len(chosen):,} images{how}, {seconds:.2f} s, "
-        f"{len(recording.events) / seconds:,.0f} events/s"
+        f"{out}: {len(chosen):,} images{how}, "
+        f"{arguments.describe_speed(len(recording.events), seconds)}"
     )

@@ -151,8 +151,9 @@ def run(
 ) -> None:
     from jaxevent import register as rig
     from jaxevent.io import save
-    from jaxevent.io.output import complete
+    from jaxevent.io.output import check_recording_name, complete
 
+    check_recording_name(out)
     given = {
         "homography": homography, "calibration": calibration, "depth": depth, "plane": plane,
         "offset": offset, "search": search, "channel": channel, "triggers": triggers,
@@ -170,9 +171,7 @@ def run(
         frames=images,
         progress=show_progress(),
     )
-    recording = arguments.open_recording(path, reading)
-    name = recording.name
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    recording, name = arguments.open_named(path, reading)
     seen, grid = (recording.width, recording.height), None
     if calibration is not None:
         sizes = (seen, (other.width, other.height))

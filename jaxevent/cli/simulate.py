@@ -125,17 +125,18 @@ def run(
     cut: float | int | None,
     max_size: int | None,
 ) -> None:
-    from jaxevent.parameters import suggest_name
+    from jaxevent.io.output import check_recording_name
+    from jaxevent.parameters import check_choice
     from jaxevent.simulate import SENSORS
 
-    if seed < 0:
-        raise InputError(f"--seed {seed} is not possible; give a whole number from 0")
+    check_recording_name(out)
+    arguments.check_seed(seed)
     if duration is not None and not 0 < duration < math.inf:
         raise InputError(f"--duration {duration:g} is not possible; give seconds above 0")
     if size is not None and min(size) < 1:
         raise InputError(f"--size {size[0]},{size[1]} is not possible; give it in pixels")
-    if sensor is not None and sensor not in SENSORS:
-        raise InputError(f"there is no sensor {sensor!r}; {suggest_name(sensor, SENSORS)}")
+    if sensor is not None:
+        check_choice(sensor, "sensor", SENSORS)
     of_video = {"start": start, "cut": cut, "max-size": max_size}
     if blobs is not None:
         own = {"sensor": sensor, "speed": speed, "size": size, "change": change}

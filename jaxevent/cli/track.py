@@ -74,12 +74,7 @@ def add(commands: Any) -> None:
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
     )
     when.add_argument("--at", choices=["events"], help="one row for each event of a track")
-    one.add_argument(
-        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
-    )
-    one.add_argument(
-        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
-    )
+    arguments.add_span(one)
     one.add_argument(
         "--background",
         choices=["events", "high-pass"],
@@ -155,8 +150,7 @@ def run(
             "--accuracy": accuracy, "--at": at, "--start": start, "--stop": stop, "--pair": pairs,
             "--extent": extent, "--focal": focal, "--size-factor": size_factor, "--out": out,
         }  # fmt: skip
-        if wrong := [name for name, value in options.items() if value is not None]:
-            raise InputError(f"--live is not for {wrong[0]}; leave out one of the two")
+        arguments.refuse_with_live({name: value is not None for name, value in options.items()})
         if seeds is None and not detect:
             raise InputError("--live cannot search all events for targets; add --seed or --detect")
         _print_live(path, tracker, given, seeds, detect, float(rate), reading)
@@ -207,7 +201,7 @@ def run(
     slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
     print(
         f"\n{how}: {len(tracks):,} {plural('track', len(tracks))}, {count:,} events in "
-        f"{seconds:.2f} s, {count / seconds:,.0f} events/s{slow}"
+        f"{arguments.describe_speed(count, seconds)}{slow}"
     )
 
 

@@ -27,12 +27,7 @@ def add(commands: Any) -> None:
         help="images with times, as reconstruct writes in HDF5, or the folder or table of track or "
         "motion",
     )
-    one.add_argument(
-        "--start", metavar="S", type=float, help="start time, in s on the recording's clock"
-    )
-    one.add_argument(
-        "--stop", metavar="S", type=float, help="end time, in s on the recording's clock"
-    )
+    arguments.add_span(one)
     one.add_argument(
         "--window",
         metavar="MS",

@@ -97,24 +97,28 @@ def _content(path: str) -> str:
 class SignatureFiles:
     """Files of one function's signatures, in a folder of the user's own.
 
-    Their names hold the function's and those of its file and of Python's version, so that
-    installations beside each other do not replace each other's.
+    Their names hold the function's and a hash of Python's version and of all that it is compiled
+    from. So installations beside each other share what is the same in both, and do not replace each
+    other's.
     """
 
     def __init__(self, folder: Path, function: Any):
         self.folder, self._function = folder, function
-        code = function.__code__
-        about = f"{code.co_filename} {sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
-        place = hashlib.blake2b(about.encode(), digest_size=6).hexdigest()
-        self.name = f"{code.co_name.strip('<>')}-{code.co_firstlineno}.{place}"
 
     @functools.cached_property
     def _about(self) -> str:
         return repr((numba.__version__, hash_source(self._function)))
 
+    @functools.cached_property
+    def _name(self) -> str:
+        code = self._function.__code__
+        about = f"{self._about} {sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
+        content = hashlib.blake2b(about.encode(), digest_size=6).hexdigest()
+        return f"{code.co_name.strip('<>')}-{code.co_firstlineno}.{content}"
+
     def flush(self) -> None:
         """Forget all signatures."""
-        for path in self.folder.glob(f"{self.name}.*.nbc"):
+        for path in self.folder.glob(f"{self._name}.*.nbc"):
             path.unlink(missing_ok=True)
 
     def save(self, key: Any, data: Any) -> None:
@@ -155,7 +159,7 @@ class SignatureFiles:
         if " at 0x" in text:
             return None
         named = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-        return self.folder / f"{self.name}.{named}.nbc"
+        return self.folder / f"{self._name}.{named}.nbc"
 
     def _hash(self, key: Any, payload: bytes) -> bytes:
         secret = cache.secret_key(self.folder)

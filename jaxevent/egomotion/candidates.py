@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
-from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.deprecated import renamed_methods
 from jaxevent.egomotion.geometry import undistort
 from jaxevent.recording import Recording
 
@@ -373,6 +373,3 @@ def _fill_batches(stream, rules, recent, out, cursor, clock):
         ring[sign, line, column, at] = now
     cursor[0], cursor[1], cursor[2], cursor[3] = batch, fill, first, until
     return len(t_in), False
-
-
-__getattr__ = renamed_names(__name__)

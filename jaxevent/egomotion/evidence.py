@@ -50,6 +50,8 @@ BLOCKS_WEIGHT = 0.2  # of a window in the mean number of blocks
 MAX_DRIFT_SIGMAS = 2.0  # of a motion since it was found
 MAX_DRIFT_WINDOWS = 2.0  # over which the drift is measured
 DRIFT_RATIO = 2.0  # time for which a motion that is told drifts on, per time until it was told
+MIN_DENSITY_RATIO = 0.35  # of events per px of the motion, relative to what they were
+DENSITY_DISPLACEMENTS = 2.0  # of a window, stretch of the motion over which they are averaged
 
 
 class Evidence(NamedTuple):
@@ -81,6 +83,7 @@ class EvidenceTest:
     def __init__(self, model: Model, xi: NDArray[np.floating]):
         self.xi = xi - np.floor(xi.min((0, 1)))
         self.basis = np.asarray(model.basis(xi), np.float64)
+        self._sparse_basis = self.basis[::8, ::8].reshape(-1, self.basis.shape[-1])
         self._unit = 1 / np.sqrt((self.basis**2).sum(2).mean((0, 1)))  # of components, for 1 px/s
         columns, rows = (self.xi.max((0, 1)) // IMAGE_PIXEL_PX).astype(int) + 2 * MARGIN_PIXELS + 2
         self._images = np.zeros((2, rows, columns))
@@ -92,6 +95,11 @@ class EvidenceTest:
             N_BLOCKS * np.minimum(((row + 0.5) * cell / side[0]).astype(int), N_BLOCKS - 1)
             + np.minimum(((column + 0.5) * cell / side[1]).astype(int), N_BLOCKS - 1)
         ).ravel()
+
+    def speed(self, motion: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the root mean square flows (n,) of motions (n, d), px/s."""
+        flow = np.asarray(motion, np.float64) @ self._sparse_basis.T
+        return np.sqrt((flow**2).reshape(len(flow), -1, 2).sum(2).mean(1))
 
     def measure(
         self,
@@ -117,8 +125,7 @@ class EvidenceTest:
         """
         m = np.asarray(motion, np.float64) / self._unit
         size = float(np.linalg.norm(m))
-        flow = self.basis[::8, ::8].reshape(-1, 2, len(m)) @ (m * self._unit)
-        length = min(displacement / max(float(np.sqrt((flow**2).sum(1).mean())), 1e-9), longest)
+        length = min(displacement / max(float(self.speed(motion[None])[0]), 1e-9), longest)
         part = events[events.index(round(time - 1e6 * length)) : events.index(time)]
         if len(part) < MIN_WINDOW_EVENTS or not size:
             return None
@@ -178,6 +185,7 @@ class Lock:
         self._test, self._displacement, self._longest = test, displacement, longest
         self.diffusion, self._camera_moves = diffusion, camera_moves
         self._end: int | None = None
+        self._density = np.nan  # mean number of events in a stretch of the motion
         self._restart()
 
     def _restart(self) -> None:
@@ -188,6 +196,7 @@ class Lock:
     def update(
         self,
         events: Any,
+        count: NDArray[np.int64],
         t: NDArray[np.int64],
         mean: NDArray[np.floating],
         covariance: NDArray[np.floating],
@@ -197,6 +206,7 @@ class Lock:
 
         Args:
             events: Events of the recording up to the last time or further.
+            count: (n,) number of events of each batch.
             t: (n,) times, us.
             mean: (n, d) motions.
             covariance: (n, d, d) covariances.
@@ -210,16 +220,37 @@ class Lock:
             return told
         if self._end is not None and t[0] - self._end > 1e6 * self._longest:
             self._restart()
+        ends = searching | self._find_sparse(count, t, mean, searching)
         self._end = int(t[-1])
-        if searching.any():
-            told[: searching.argmax()] = self._is_settled
+        if ends.any():
+            told[: ends.argmax()] = self._is_settled
             self._restart()
-        if searching[-1]:
+        if ends[-1]:
             return told
         self._weigh(events, int(t[-1]), mean[-1], covariance[-1])
-        first = len(t) - int(searching[::-1].argmax()) if searching.any() else 0
+        first = len(t) - int(ends[::-1].argmax()) if ends.any() else 0
         told[first:] = self._is_settled
         return told
+
+    def _find_sparse(
+        self, count: NDArray, t: NDArray, mean: NDArray, searching: NDArray
+    ) -> NDArray[np.bool_]:
+        """Return (n,) whether batches hold far fewer events than the motion made before.
+
+        As long as a motion lasts, each px of it makes about as many events.
+        """
+        path = 1e-6 * np.diff(t, prepend=t[0] if self._end is None else self._end)
+        path = path * self._test.speed(mean) / (DENSITY_DISPLACEMENTS * self._displacement)
+        sparse = np.zeros(len(t), bool)
+        for k in range(len(t)):
+            least = MIN_DENSITY_RATIO * self._density * path[k]
+            sparse[k] = count[k] + 3 * np.sqrt(count[k]) < least
+            if searching[k] or sparse[k]:
+                self._density = np.nan
+            elif path[k] > 0:
+                old = self._density if np.isfinite(self._density) else count[k] / path[k]
+                self._density = old + (count[k] - old * path[k]) / max(path[k], 1)
+        return sparse & ~searching
 
     def _weigh(self, events: Any, t: int, mean: NDArray, covariance: NDArray) -> None:
         """Update the decision by the window before a time."""

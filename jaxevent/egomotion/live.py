@@ -20,9 +20,9 @@ from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.events.tail import Tail
-from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
+from jaxevent.events.live import Tail
 from jaxevent.recording import Events, Recording, Times
+from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
 HELD_ESTIMATES = 4096  # the latest ones, which are read
 DROPPED_EVENTS = 1 << 15  # from so many on they are dropped

@@ -41,7 +41,7 @@ from jaxevent.egomotion.patches import (
     z_score,
 )
 from jaxevent.errors import InputError
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 MIN_SELECTION_Z = 3.0  # from which one model explains more than another
 # Half-lines fit an edge's ambiguity too, on both halves: simulated rotation and planar motion reach
@@ -112,6 +112,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     Raises:
         InputError: Nothing is seen to move.
     """
+    check_recording(recording, "select_model")
     camera = camera or recording.camera
     speed = measure_image_speed(recording, camera)
     windows = [] if speed is None else measure_windows(recording, speed, camera)

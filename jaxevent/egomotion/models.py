@@ -39,7 +39,7 @@ from jaxevent.devices import full_precision
 from jaxevent.egomotion.geometry import A, rotation_basis, rotation_exp, unit
 from jaxevent.errors import InputError
 from jaxevent.estimator import import_object
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
 
 if TYPE_CHECKING:
     from jaxevent.egomotion.truth import Twists
@@ -589,8 +589,7 @@ def find_model(model: str | type[Model]) -> type[Model]:
         return model
     if ":" in model:
         return _load(model)
-    if model not in MODELS:
-        raise InputError(f"there is no motion model {model!r}; {suggest_name(model, MODELS)}")
+    check_choice(model, "motion model", MODELS)
     return MODELS[model]
 
 

@@ -372,13 +372,13 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
         The median over some frames, or None. It is None where nothing is seen to move, and where no
         frame has events before and after it while it moves by `FRAME_WINDOW_DISPLACEMENT_PX`.
     """
-    frames, events, n = recording.frames, recording.events, len(recording.events)
+    frames, events = recording.frames, recording.events
     if frames and speed is None:
         speed = measure_image_speed(recording)
     if frames is None or speed is None:
         return None
     half = round(5e5 * FRAME_WINDOW_DISPLACEMENT_PX / speed.median)
-    first, last = int(events[:1].t[0]), int(events[n - 1 :].t[0])
+    first, last = recording.event_span()
     rows = np.flatnonzero((frames.t - half >= first) & (frames.t + half <= last))
     if not len(rows):
         return None

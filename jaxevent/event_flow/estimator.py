@@ -17,7 +17,7 @@ from jaxevent.event_flow.alignment import (
 )
 from jaxevent.event_flow.paths import WindowPaths
 from jaxevent.parameters import Count, Parameters, Positive
-from jaxevent.recording import Events, Recording, Times, check_times, microseconds
+from jaxevent.recording import Events, Recording, Times, check_recording, check_times, microseconds
 
 CELLS = (4, 2, 1)  # px, for motion sought from nothing
 LAST_CELLS = (2, 1)  # px, for motion that starts from the one before
@@ -290,8 +290,11 @@ def flow_from_events(
         The flow: `mean, covariance, valid = flow(times)`.
 
     Raises:
-        InputError: The parameters are of another method.
+        InputError: There are no events, or the parameters are of another method.
     """
+    check_recording(recording, "flow_from_events")
+    if not len(recording.events):
+        raise InputError(f"{recording.name}: holds no events; give a recording with some")
     params = FlowParams() if params is None else params
     if not isinstance(params, FlowParams):
         raise InputError(f"params are {type(params).__name__}; give FlowParams")

@@ -2,14 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
-from jaxevent.recording import Events, EventSource, Recording, microseconds
+from jaxevent.recording import Events, EventSource, Recording, check_recording, microseconds
 
 Part = TypeVar("Part", Events, Recording)
 Size = tuple[int, int]
@@ -17,12 +17,13 @@ Size = tuple[int, int]
 BLOCK_EVENTS = 1 << 20  # read from a file together
 
 
-def source_of(part: Events | Recording) -> EventSource:
-    """Return the source of the events."""
+def source_of(part: Any) -> EventSource:
+    """Return the source of the events; raise `InputError` for what holds none."""
+    check_recording(part, "a function of jaxevent.events", or_events=True)
     return part.events if isinstance(part, Recording) else part
 
 
-def size_of(part: Events | Recording, size: Size | None) -> Size:
+def size_of(part: Any, size: Size | None) -> Size:
     """Return width and height of the sensor: of the recording, or as given.
 
     Args:
@@ -38,6 +39,7 @@ def size_of(part: Events | Recording, size: Size | None) -> Size:
     if isinstance(part, Recording):
         part.check_events()
         return part.width, part.height
+    source_of(part)
     if size is None:
         raise InputError("events alone have no sensor; give size=(width, height)")
     if min(size) < 1:

@@ -55,7 +55,7 @@ def compare_clocks(recording: Recording, clock_offset: Any = 0.0) -> ClockMismat
     late = round(float(clock_offset) * 1e6)
     first = int(frames.t[0]) - int(frames.exposure[0]) // 2 + late
     last = int(frames.t[-1]) + int(frames.exposure[-1]) // 2 + late
-    begin, end = int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])
+    begin, end = recording.event_span()
     shifted = f" with clock_offset = {float(clock_offset):g} s" if late else ""
     spans = (
         f"the frames last from {first / 1e6:.6f} to {last / 1e6:.6f} s{shifted}, the events from "

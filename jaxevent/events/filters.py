@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit
 from jaxevent.errors import InputError
-from jaxevent.events.blocks import Part, Size, parse_duration, select_events, size_of
+from jaxevent.events.blocks import Part, Size, parse_duration, select_events, size_of, source_of
 from jaxevent.events.images import count_events
 from jaxevent.recording import Events, Recording, Times, microseconds
 
@@ -32,8 +32,9 @@ def crop_time(part: Part, start: Times | None = None, stop: Times | None = None)
     """
     if isinstance(part, Recording):
         return part[start:stop]
+    source = source_of(part)
     ends = [None if time is None else int(microseconds(time)) for time in (start, stop)]
-    return part[slice(*(None if us is None else part.index(us) for us in ends))]
+    return part[slice(*(None if us is None else source.index(us) for us in ends))]
 
 
 def select_polarity(part: Part, on: bool = True) -> Part:

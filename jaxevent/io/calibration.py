@@ -5,7 +5,7 @@ Kalibr (camchain-NAME.yaml) lists cam0, cam1 and on, each with
     camera_model          pinhole
     intrinsics            fx, fy, cx, cy in px
     distortion_model      radtan, equidistant or none
-    distortion_coeffs     its numbers, see `jaxevent.lenses`
+    distortion_coeffs     its numbers, see `jaxevent.camera`
     resolution            width, height in px
     T_cn_cnm1             4 x 4, takes places (m) from the axes of the camera before to its own
 

@@ -1,4 +1,4 @@
-"""Choices of a caller and checks of what a file holds, which all readers share.
+"""Choices of a caller, checks of what a file holds, and files beside it, for all readers.
 
 The readers turn raw numbers of a file into fields of a recording by these functions, so that all
 accept the same values and word their errors alike.
@@ -6,6 +6,7 @@ accept the same values and word their errors alike.
 
 import contextlib
 import dataclasses
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent import arrays
-from jaxevent.camera import PinholeCamera
+from jaxevent.camera import LENS_MODELS, PinholeCamera, find_model
 from jaxevent.errors import InputError
-from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Events, ImageSource
 
 GRAVITY_M_S2 = 9.80665  # m/s^2, standard gravity
 _ALLOWED_UNFOLDED_BYTES = 1 << 27  # of arrays that every file may unfold to
 _MAX_COMPRESSION_RATIO = 100  # times its own bytes that a larger file may unfold to
+_TRUTH_ENDINGS = {"_data.hdf5": ("_gt.hdf5",), "_data.h5": ("_pose_gt.h5", "_depth_gt.h5")}
 _COUNT_WORDS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a camera
 
 
@@ -234,7 +235,7 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
     Args:
         values: fx fy cx cy in px, and the coefficients of the lens, as k1 k2 p1 p2 k3.
         source: Name of the file for messages.
-        model: Name of the lens model, see `jaxevent.lenses`.
+        model: Name of the lens model, see `jaxevent.camera`.
 
     Returns:
         The camera.
@@ -362,3 +363,65 @@ def sensor_size(otherwise: str, *sizes: tuple[int, int] | None) -> tuple[int, in
         if size is not None:
             return size
     raise InputError(f"{otherwise}; give size=(width, height) or --size")
+
+
+def companions(path: Path) -> list[Path]:
+    """Find the files beside a recording's: ground truth, triggers, and DSEC's rectifying map."""
+    found = truth_files(path)
+    for other in (trigger_file(path), rectify_map_file(path)):
+        found += [] if other is None else [other]
+    return found
+
+
+def truth_files(path: Path) -> list[Path]:
+    """Find the files of ground truth that exist."""
+    found = []
+    for end, others in _TRUTH_ENDINGS.items():
+        if path.name.endswith(end):
+            found += [path.with_name(path.name.removesuffix(end) + other) for other in others]
+    found += [folder / stamps for folder, stamps in _truth_folders(path)]
+    return [file for file in found if file.is_file()]
+
+
+def _truth_folders(path: Path) -> list[tuple[Path, str]]:
+    """Find the folders of ground truth of DSEC's left camera, and the names of their times."""
+    if path.name != "events.h5":
+        return []
+    if path.parts[-3:-1] == ("events", "left"):
+        sequence = path.parents[2]
+    elif path.parent.name == "events_left":
+        sequence = path.parents[1]
+    else:
+        return []
+    found = []
+    for kind, apart, stamps in (
+        ("flow", "train_optical_flow", "forward_timestamps.txt"),
+        ("disparity", "train_disparity", "timestamps.txt"),
+    ):
+        places = [place / kind for place in (sequence, sequence.parents[1] / apart / sequence.name)]
+        found += [(place, stamps) for place in places if place.is_dir()][:1]
+    return found
+
+
+def trigger_file(path: Path) -> Path | None:
+    """Find the triggers NAME_trigger.dat of Prophesee's events NAME_cd.dat or NAME_td.dat."""
+    name = re.sub(r"_(cd|td)(\.dat)$", r"_trigger\2", path.name, flags=re.IGNORECASE)
+    return _existing(path, name)
+
+
+def rectify_map_file(path: Path) -> Path | None:
+    """Find the file of the places of a DSEC camera's pixels in the rectified image."""
+    return _existing(path, "rectify_map.h5") if path.suffix in (".h5", ".hdf5") else None
+
+
+def images_folder(path: Path) -> Path | None:
+    """Find the folder of the images of DSEC's frame camera beside the events in `path`."""
+    if path.name != "events.h5" or path.parts[-3:-2] != ("events",):
+        return None
+    folder = path.parents[2] / "images" / path.parent.name
+    return next((one for one in (folder / "rectified", folder) if one.is_dir()), None)
+
+
+def _existing(path: Path, name: str) -> Path | None:
+    other = path.with_name(name)
+    return other if name != path.name and other.is_file() else None

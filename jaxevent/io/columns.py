@@ -32,7 +32,8 @@ from jaxevent.errors import InputError
 from jaxevent.io import decoded
 from jaxevent.io.checks import ReadOptions
 from jaxevent.io.decoded import Columns, read_events
-from jaxevent.io.time_units import (
+from jaxevent.recording import EventSource
+from jaxevent.time_units import (
     SAMPLE_EVENTS,
     Clock,
     InferredUnit,
@@ -40,7 +41,6 @@ from jaxevent.io.time_units import (
     numbers_of_dates,
     unit_of_name,
 )
-from jaxevent.recording import EventSource
 
 _MAX_FALLING_SHARE = 0.1  # share of events before which times may fall, in an order of columns
 _COLUMN_ORDERS = ("txyp", "xypt", "xytp", "ptxy")
@@ -281,7 +281,9 @@ def infer_format(
     if stated is None and (unit := unit_of_name(name)) is not None:
         stated = unit, f"the name {name.strip()!r}"
     sample = {**sample, "t": t}
-    found = infer_unit(sample, n_events, size, source, options, stated=stated, usual=usual)
+    found = infer_unit(
+        sample, n_events, size, source, options.time_unit, stated=stated, usual=usual
+    )
     return ColumnFormat(found, _unsigned_off(sample["p"]), t.dtype.kind == "f")
 
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from jaxevent.errors import InputError, OrderError
 from jaxevent.io import disorder
 from jaxevent.io.checks import ReadOptions, check_events, reading
-from jaxevent.locks import TurnLock, synchronized
 from jaxevent.progress import bar
 from jaxevent.recording import Events, EventSource, Recording, Triggers
+from jaxevent.threads import TurnLock, synchronized
 
 BLOCK_EVENTS = 1 << 20  # events decoded together: 13 MB
 

@@ -70,7 +70,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.arrays import times, to_grey
-from jaxevent.camera import PinholeCamera
+from jaxevent.camera import LENS_MODELS, PinholeCamera, find_model
 from jaxevent.errors import InputError
 from jaxevent.io.checks import (
     ReadOptions,
@@ -86,9 +86,8 @@ from jaxevent.io.checks import (
 from jaxevent.io.columns import ColumnFormat, Fields, find_fields, infer_format, read_columns
 from jaxevent.io.decoded import Columns, DecodedImages, read_events
 from jaxevent.io.images import IMAGE_SUFFIXES, read_files
-from jaxevent.io.time_units import SAMPLE_EVENTS
-from jaxevent.lenses import LENS_MODELS, find_model
 from jaxevent.recording import Frames, Imu, Poses, Recording
+from jaxevent.time_units import SAMPLE_EVENTS
 
 _TIMELENS_FOLDERS = (("events", "images"), ("events_aligned", "images_corrected"))
 _IMAGE_TIME_FILES = ("timestamp.txt", "timestamps.txt")

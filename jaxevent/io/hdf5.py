@@ -11,7 +11,7 @@
     /frames/exposure      (frames,) int64 us, 0 where unknown
     /frames/images        (frames, height, width) uint8, uint16 or floats in [0, 1]
     /camera               (9,) float64: fx fy cx cy k1 k2 p1 p2 k3; of another lens model
-                          (`jaxevent.lenses`), which the attribute model names, its numbers
+                          (`jaxevent.camera`), which the attribute model names, its numbers
     /poses/t, position, quaternion   (poses,) int64 us, (poses, 3) m, (poses, 4) x y z w
     /imu/t, gyro, acc     (samples,) int64 us, (samples, 3) rad/s, (samples, 3) m/s^2
     /triggers/t, edge, channel   (triggers,) int64 us, 1 rising 0 falling -1 unknown, number
@@ -40,13 +40,14 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import UNIT_NAMES, times, to_microseconds
 from jaxevent.errors import InputError, OrderError
-from jaxevent.io import companions
 from jaxevent.io.checks import (
     ReadOptions,
     check_events,
     check_unfolded,
+    images_folder,
     make_camera,
     reading,
+    rectify_map_file,
     sensor_size,
     whole_number,
     whole_size,
@@ -63,7 +64,6 @@ from jaxevent.io.hdf5_files import (
     open_file,
 )
 from jaxevent.io.output import CLOCK_UNIT, complete_hdf5
-from jaxevent.io.time_units import Clock, unit_of_words
 from jaxevent.progress import bar
 from jaxevent.recording import (
     EventColumns,
@@ -76,6 +76,7 @@ from jaxevent.recording import (
     Recording,
     Triggers,
 )
+from jaxevent.time_units import Clock, unit_of_words
 
 FORMAT_VERSION = 1
 _LEVELS_UNIT = "levels: 0 black, {most} white"  # of images
@@ -404,7 +405,7 @@ def is_matlab(path: Path) -> bool:
 
 
 def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
-    source, size = str(path), options.size
+    source = str(path)
     with reading(source):
         names = ("format", "version", "name", "width", "height")
         held = ((name, attribute(file, name)) for name in names)
@@ -416,26 +417,51 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
             f"reads version {FORMAT_VERSION}; update jaxevent"
         )
     extra = _read_extra(file, source)
-    if size is None and "width" in attributes and "height" in attributes:
-        size = whole_size(attributes["width"], attributes["height"], source)
-    if size is None and "events/width" in file and "events/height" in file:
-        size = whole_size(
-            *(array(file, f"events/{n}", source) for n in ("width", "height")), source
-        )
-    size = (640, 480) if size is None and _is_dsec(file) else size
     rectify_map = None if is_ours else _read_rectify_map(path)
+    size = options.size or _stored_size(file, source, attributes)
     if rectify_map is not None:
         extra["rectify_map"] = rectify_map
         size = size or (rectify_map.shape[1], rectify_map.shape[0])
     size = sensor_size(f"{path}: has no attributes width and height", size)
+    states_unit = is_ours or "ms_to_idx" in file
+    if states_unit:
+        options.refuse_time_unit(path)
+    events, notes = _read_events(file, source, size, options, states_unit)
+
+    def stored_times(name: str, what: str) -> NDArray[np.int64]:
+        clock = Clock("us", 0, 0, False) if states_unit else events.clock()
+        return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
+
+    parts = _read_parts(file, source, stored_times)
+    name = str(attributes.get("name", path.stem))
+    left_out = {} if parts.get("frames") is not None else _describe_frames(file, path)
+    return Recording(
+        name, *size, events.repaired(options), extra=extra, notes=tuple(notes), left_out=left_out,
+        **parts,
+    )  # fmt: skip
+
+
+def _stored_size(
+    file: h5py.File, source: str, attributes: Mapping[str, Any]
+) -> tuple[int, int] | None:
+    """Return the size of the sensor that a file tells by attributes, events or its kind."""
+    if "width" in attributes and "height" in attributes:
+        return whole_size(attributes["width"], attributes["height"], source)
+    if "events/width" in file and "events/height" in file:
+        width, height = (array(file, f"events/{name}", source) for name in ("width", "height"))
+        return whole_size(width, height, source)
+    return (640, 480) if _is_dsec(file) else None
+
+
+def _read_events(
+    file: h5py.File, source: str, size: tuple[int, int], options: ReadOptions, states_unit: bool
+) -> tuple[StoredEvents, list[str]]:
+    """Return the events, and notes about the unit of their times where it had to be inferred."""
     columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
     offset = 0
     if "t_offset" in file:
         offset = whole_number(array(file, "t_offset", source), source, "t_offset")
-    table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
-    found, states_unit = MICROSECOND_FORMAT, is_ours or table is not None
-    if states_unit:
-        options.refuse_time_unit(path)
+    found = MICROSECOND_FORMAT
     if not states_unit or columns["t"].dtype.kind == "f":
         found = infer_column_format(columns, size, source, options)
     if found.unit.name != "us" and offset:
@@ -443,12 +469,15 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
             f"{source}: events/t is in {UNIT_NAMES[found.unit.name]} and t_offset in microseconds; "
             "store all times in integer microseconds"
         )
-    notes = list(found.unit.notes)
+    table = dataset(file, "ms_to_idx", source) if "ms_to_idx" in file else None
     events = StoredEvents(columns, size, source, found, offset=offset, ms_to_idx=table)
+    return events, list(found.unit.notes)
 
-    def stored_times(name: str, what: str) -> NDArray[np.int64]:
-        clock = Clock("us", 0, 0, False) if states_unit else events.clock()
-        return clock.read(array(file, name, source), f"{source}: {name}", what, notes)
+
+def _read_parts(
+    file: h5py.File, source: str, stored_times: Callable[[str, str], NDArray[np.int64]]
+) -> dict[str, Any]:
+    """Return frames, camera, poses, IMU samples and triggers, as far as a file holds them."""
 
     def arrays(group: str, *names: str) -> list[NDArray]:
         return [array(file, f"{group}/{name}", source) for name in names]
@@ -465,7 +494,7 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
     if isinstance(file.get("camera"), h5py.Dataset):
         with reading(f"{source}: camera"):
             model = str(file["camera"].attrs.get("model", "radtan"))
-        parts["camera"] = make_camera(array(file, "camera", source), f"{path}: camera", model)
+        parts["camera"] = make_camera(array(file, "camera", source), f"{source}: camera", model)
     for group, make, what, names in (
         ("poses", Poses, "pose", ("position", "quaternion")),
         ("imu", Imu, "IMU sample", ("gyro", "acc")),
@@ -473,17 +502,12 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
     ):
         if isinstance(file.get(group), h5py.Group):
             parts[group] = make(stored_times(f"{group}/t", what), *arrays(group, *names))
-    name = str(attributes.get("name", path.stem))
-    left_out = {} if parts.get("frames") is not None else _describe_frames(file, path)
-    return Recording(
-        name, *size, events.repaired(options), extra=extra, notes=tuple(notes), left_out=left_out,
-        **parts,
-    )  # fmt: skip
+    return parts
 
 
 def _describe_frames(file: h5py.File, path: Path) -> dict[str, str]:
     """Describe, for `Recording.left_out`, frames in the file, or those of DSEC beside it."""
-    images = companions.images(path)
+    images = images_folder(path)
     if images is None:
         return describe_images(file)
     return {
@@ -508,7 +532,7 @@ def _is_dsec(file: Any) -> bool:
 
 def _read_rectify_map(path: Path) -> NDArray | None:
     """Read the places of a DSEC camera's pixels in the rectified image, (height, width, 2)."""
-    beside = companions.rectify_map(path)
+    beside = rectify_map_file(path)
     if beside is None:
         return None
     with open_file(beside) as file:

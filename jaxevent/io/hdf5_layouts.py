@@ -45,9 +45,9 @@ from jaxevent.io.columns import MICROSECOND_FORMAT, find_fields, order_of
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import Column, StoredEvents, StoredImages, infer_column_format, read_by
 from jaxevent.io.hdf5_files import array, attribute, dataset, describe_images, filter_ids
-from jaxevent.io.time_units import SAMPLE_EVENTS
 from jaxevent.io.truth import read_poses
 from jaxevent.recording import Frames, Imu, Recording, Triggers
+from jaxevent.time_units import SAMPLE_EVENTS
 
 _EVENT_GROUPS = ("events", "", "CD/events")
 _STEREO_GROUPS = ("prophesee", "davis")  # groups of the cameras of M3ED and MVSEC

@@ -37,8 +37,8 @@ from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.checks import check_unfolded, reading
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.output import complete
-from jaxevent.io.time_units import unit_of_name
 from jaxevent.recording import microseconds
+from jaxevent.time_units import unit_of_name
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
 TIMESTAMP_FILES = ("timestamps.txt", "images.txt", "timestamp.txt")
@@ -483,6 +483,8 @@ def read_exposures(place: Path) -> NDArray[np.int64] | None:
 def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.int64]:
     """Read the times of a text file, sorted: a time in each line, or a table with a column t.
 
+    A name that is no file but numbers with commas between them, as "0.65,0.66", are the times.
+
     Columns are separated by commas, semicolons or spaces, and the first line names them, t with a
     unit or without (t_ns); without names the times are the first column. Without a unit whole
     numbers are microseconds, others seconds, unless few of them then lie in the recording and all
@@ -498,7 +500,11 @@ def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.in
     Raises:
         InputError: The file holds something else.
     """
-    lines = [re.sub(r"\s+(?=[\[(])", "", line.strip()) for line in _read_lines(path)]
+    if re.fullmatch(r"[\d.e+-]+(,[\d.e+-]+)*", str(path)) and not path.exists():
+        source = str(path).split(",")
+    else:
+        source = _read_lines(path)
+    lines = [re.sub(r"\s+(?=[\[(])", "", line.strip()) for line in source]
     rows = [re.split(r"\s*[,;]\s*|\s+", line) for line in lines]
     column, unit = 0, None
     if rows and not re.match(r"[+-]?\.?\d", rows[0][0]):

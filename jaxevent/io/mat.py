@@ -48,8 +48,8 @@ from jaxevent.io.columns import (
     read_whole_columns,
     split_rows,
 )
-from jaxevent.io.time_units import SAMPLE_EVENTS, Clock
 from jaxevent.recording import Events, Frames, Recording
+from jaxevent.time_units import SAMPLE_EVENTS, Clock
 
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _FLAGS, _SIZES, _NAME = 6, 5, 1

@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io import toml
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.parameters import Parameters
 
 try:
@@ -130,6 +130,12 @@ def partial_path(path: Path) -> Path:
 def is_partial(path: Path) -> bool:
     """Return whether a name is one of `partial_path`, or that of a moment before."""
     return re.fullmatch(r"\..+\.[0-9a-f]{12}\.(part|new)", path.name) is not None
+
+
+def check_recording_name(path: Path) -> None:
+    """Raise `InputError` unless a recording can be stored under this name: it is of HDF5."""
+    if path.suffix.lower() not in ("", ".h5", ".hdf5", ".hdf") and not is_partial(path):
+        raise InputError(f"{path}: recordings are stored as HDF5; end the name in .h5")
 
 
 def partials(path: Path) -> list[Path]:

@@ -39,8 +39,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io import companions, decoded
-from jaxevent.io.checks import ReadOptions, check_whole_records, damaged, reading, sensor_size
+from jaxevent.io import decoded
+from jaxevent.io.checks import (
+    ReadOptions,
+    check_whole_records,
+    damaged,
+    reading,
+    sensor_size,
+    trigger_file,
+)
 from jaxevent.io.decoded import Columns, Decoder, FirstPass, read_events
 from jaxevent.recording import Recording
 
@@ -336,7 +343,7 @@ def _open_dat(
             "00 and 0c, 8 bytes) can be read"
         )
     fields = (14, 14) if header["version"] != "1" else (9, 8)
-    beside = companions.triggers(path)
+    beside = trigger_file(path)
     if beside is not None:
         _read_dat_triggers(beside, first_pass)
     return functools.partial(_decode_dat, path, start + 2, fields), start + 2

@@ -16,7 +16,7 @@ NumPy arrays (.npy) are structured or of shape (events, 4) or (4, events). Archi
     frame_t               mid-exposure times
     exp_start, exp_end    start and end of the exposures; where present, frame_t is not used
     imu_t, gyro, acc      (samples,), (samples, 3) rad/s, (samples, 3) m/s^2
-    calib                 fx fy cx cy k1 k2 p1 p2 k3; of another lens model of `jaxevent.lenses`
+    calib                 fx fy cx cy k1 k2 p1 p2 k3; of another lens model of `jaxevent.camera`
                           its numbers
     calib_model           the name of that model
 
@@ -67,8 +67,8 @@ from jaxevent.io.columns import (
     split_rows,
 )
 from jaxevent.io.decoded import Columns, read_events
-from jaxevent.io.time_units import SAMPLE_EVENTS, numbers_of_dates, split_unit
 from jaxevent.recording import Frames, Imu, Recording
+from jaxevent.time_units import SAMPLE_EVENTS, numbers_of_dates, split_unit
 
 NUMPY_MAGIC = b"\x93NUMPY"
 _TEXT_BLOCK_BYTES = 1 << 24  # of text parsed together: about a million events

@@ -38,9 +38,9 @@ from jaxevent.io.checks import (
 )
 from jaxevent.io.columns import find_fields, is_time, read_whole_columns
 from jaxevent.io.images import drop_alpha, gather_frames, read_image
-from jaxevent.io.time_units import unit_of_name
 from jaxevent.progress import bar
 from jaxevent.recording import Frames, Imu, Poses, Recording
+from jaxevent.time_units import unit_of_name
 
 
 def find_event_texts(names: Sequence[str]) -> list[str]:

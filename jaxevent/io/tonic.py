@@ -20,7 +20,7 @@ from jaxevent.arrays import times
 from jaxevent.errors import InputError
 from jaxevent.io.checks import check_events
 from jaxevent.io.columns import record_fields
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 EVENT_DTYPE: np.dtype = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
 
@@ -81,6 +81,7 @@ def to_item(recording: Recording, target: Any = None) -> tuple[NDArray, Any]:
     Raises:
         InputError: The sensor has coordinates above 32,767, which tonic's int16 does not hold.
     """
+    check_recording(recording, "to_item")
     if max(recording.width, recording.height) > 1 << 15:
         raise InputError(
             f"{recording.name}: its sensor of {recording.width}x{recording.height} pixels has "

@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.arrays import times
-from jaxevent.errors import InputError, require
-from jaxevent.io import companions
-from jaxevent.io.checks import reading
+from jaxevent.errors import InputError
+from jaxevent.io import png
+from jaxevent.io.checks import reading, truth_files
 from jaxevent.io.decoded import DecodedImages
 from jaxevent.io.hdf5 import StoredImages
 from jaxevent.io.hdf5_files import array, dataset, open_file
@@ -54,7 +54,7 @@ def read_poses(path: Path, camera: str) -> Poses | None:
     Raises:
         InputError: The file is damaged.
     """
-    for file in companions.truth(path):
+    for file in truth_files(path):
         with reading(file):
             if file.name.endswith("_gt.hdf5"):
                 return _read_poses_mvsec(file, camera)
@@ -77,7 +77,7 @@ def read_images(path: Path, side: str = "left") -> dict[str, Any]:
         InputError: A file is damaged.
     """
     found: dict[str, Any] = {}
-    for file in companions.truth(path):
+    for file in truth_files(path):
         with reading(file):
             if file.name.endswith("_gt.hdf5"):
                 found |= _open_images_mvsec(file, f"davis/{side}")
@@ -167,7 +167,7 @@ def _open_disparity_dsec(stamps: Path) -> dict[str, Any]:
 
 
 def _flow_of(stored: NDArray[np.float32]) -> NDArray[np.float32]:
-    known, y, x = np.moveaxis(stored, 2, 0)  # OpenCV has blue first
+    x, y, known = np.moveaxis(stored, 2, 0)
     return np.where(known == 1, (np.stack([x, y]) - 2**15) / 128, np.nan)
 
 
@@ -207,10 +207,8 @@ def _open_images_dsec(
 
 
 def _read_png(image: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    # Of images with colours Pillow reads 8 of the 16 bits.
-    cv2 = require("cv2", "vision")
-    stored = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.dtype != np.uint16 or stored.shape != shape:
+    stored = png.decode(image.read_bytes(), str(image))
+    if stored is None or stored.shape != shape:
         bits = "3 x 16" if len(shape) == 3 else "16"
         raise InputError(
             f"{image}: is no such image; store {shape[1]}x{shape[0]} pixels of {bits} bits"

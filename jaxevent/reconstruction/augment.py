@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration import CalibratedValues, recall_calibration, recall_numbers
 from jaxevent.calibration.clipping import find_clipping
-from jaxevent.deprecated import renamed_names
+from jaxevent.calibration.sampling import Sample
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.refinement import refine
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
 
@@ -77,13 +77,14 @@ class FrameParams(Parameters):
         Returns:
             The parameters; defaults where the recording does not determine a number.
         """
+        check_recording(recording, "Params.for_recording")
         params = cls(**explicit)
         values = calibrated_values(recording, params, cls.names_left_open(explicit))
         return params.replace(**values.found)
 
 
 def calibrated_values(
-    recording: Recording, params: FrameParams, names: Sequence[str]
+    recording: Recording, params: FrameParams, names: Sequence[str], sample: Sample | None = None
 ) -> CalibratedValues:
     """Return what a recording says of some numbers, thresholds at the `I0` of parameters.
 
@@ -94,6 +95,7 @@ def calibrated_values(
         recording: Events and frames.
         params: Parameters.
         names: Names of the numbers; none, or fewer than two frames, calibrate nothing.
+        sample: A sample of the recording; None: it is taken where it is needed.
 
     Returns:
         The values.
@@ -104,12 +106,14 @@ def calibrated_values(
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
     I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
-    values = recall_calibration(recording, I0).select(names)
+    values = recall_calibration(recording, I0, sample).select(names)
     method = params.predictor()
     if method is None or values.missing:
         return values
     if method.Params is not type(params):
-        of_method = calibrated_values(recording, method.Params(), method.Params.calibrated).found
+        of_method = calibrated_values(
+            recording, method.Params(), method.Params.calibrated, sample
+        ).found
         return CalibratedValues(
             {name: of_method.get(name, value) for name, value in values.found.items()}, {}
         )
@@ -668,6 +672,3 @@ class FrameInterpolation(eqx.Module):
     def __call__(self, points: Points) -> Float[Array, "*points"]:
         v = points.blend
         return (1 - v) * points.gather_frame(self.here) + v * points.gather_frame(self.there)
-
-
-__getattr__ = renamed_names(__name__)

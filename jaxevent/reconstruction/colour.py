@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.io.images import bayer_sites, demosaic
 from jaxevent.reconstruction.video import ImageSequence
-from jaxevent.recording import Events, Frames, Recording, Times, microseconds
+from jaxevent.recording import Events, Frames, Recording, Times, check_recording, microseconds
 
 REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)  # luminance of linear red, green and blue; the sum is 1
 _HIDDEN = 1e-3  # what a frame counts where it does not show a point, so that something does
@@ -195,6 +194,7 @@ def split_channels(recording: Recording, pattern: str = "RGGB") -> dict[str, Rec
     Raises:
         InputError: The pattern is unknown, or the width or height is odd.
     """
+    check_recording(recording, "split_channels")
     places = bayer_sites(pattern)
     if recording.width % 2 or recording.height % 2:
         raise InputError(
@@ -271,6 +271,3 @@ def join_channels(images: Mapping[str, NDArray], pattern: str = "RGGB") -> NDArr
     for name, (row, column) in places.items():
         mosaic[:, row::2, column::2] = channels[name]
     return demosaic(mosaic, pattern)
-
-
-__getattr__ = renamed_names(__name__)

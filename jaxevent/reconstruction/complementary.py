@@ -10,7 +10,6 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.parameters import Positive
 from jaxevent.reconstruction.augment import (
     AugmentedFrame,
@@ -127,5 +126,3 @@ high_pass = _filter(
     "The high-pass filter of events alone, whose images have no absolute brightness",
     fuses=False,
 )
-
-__getattr__ = renamed_names(__name__)

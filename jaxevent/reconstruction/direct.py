@@ -5,7 +5,6 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.reconstruction.augment import (
     AugmentedFrame,
     EventIntegral,
@@ -84,5 +83,3 @@ blend = _direct(
     "blend", LinearBlend, "The frames before and after, blended by time; no events.", fuses=False
 )
 last_frame = _direct("last-frame", ZeroOrderHold, "The last frame, held; no events.", fuses=False)
-
-__getattr__ = renamed_names(__name__)

@@ -426,7 +426,7 @@ class KernelEstimator(PixelEstimator[P]):
         On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
         in one pass over the events. `run` and `read` serve where a function has no translation, in
         double precision, on other devices and on several, for derivatives by the dead time
-        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.dispatch`).
+        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.threads`).
 
         Args:
             recording: Events and frames.

@@ -26,7 +26,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import DEVICE_AXIS, make_mesh, shard
 from jaxevent.estimator import ShortRepr
 
@@ -41,9 +40,6 @@ else:
     Numeric = Array | np.ndarray
 
 
-@renamed_methods(
-    of_frame="gather_frame", of_piece="gather_piece", of_piece_alone="gather_piece_value"
-)
 class Points(eqx.Module):
     """Positions of points among the frames, which look up tables [rows, pixels]."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration.clipping import find_clipping
 from jaxevent.codegen import njit
 from jaxevent.codegen.graph import evaluate_function
-from jaxevent.events.tail import Tail
+from jaxevent.events.live import Tail
 from jaxevent.reconstruction.features import (
     ExposureSegments,
     FrameFeatures,

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.parameters import Choice, Number, Positive
 from jaxevent.reconstruction.augment import (
     AugmentedFrame,
@@ -309,5 +308,3 @@ akf = Filter(
     "it estimates the log intensity and its variance: events move it by their threshold and make "
     "it less certain, and between events the augmented frame pulls it.",
 )
-
-__getattr__ = renamed_names(__name__)

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from jaxevent.deprecated import renamed_methods
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.events.tail import Tail
-from jaxevent.locks import TurnLock, refuse_to_pickle, synchronized
+from jaxevent.events.live import Tail
 from jaxevent.reconstruction.video import PixelMethod, Video
 from jaxevent.recording import Events, Frames, Recording, Times, microseconds
+from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
 MAX_WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
 MAX_HELD_FRAMES = 32  # before what is settled is dropped

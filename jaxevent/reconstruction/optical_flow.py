@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.camera import Response
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, require
 from jaxevent.estimator import Estimate, ShortRepr
-from jaxevent.locks import synchronized
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages
 from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.threads import synchronized
 
 MIN_SIDE_PX = 12  # pixels that OpenCV's search needs in width or height
 GREY_OUTLIER_FRACTION = 1e-3  # of the greys of two frames, at either end, that do not set the range
@@ -329,5 +328,3 @@ flow = Flow(
     about="The frames before and after, each moved along the optical flow between them (dense "
     "inverse search), blended by time; no events. Needs the extra `vision`.",
 )
-
-__getattr__ = renamed_names(__name__)

@@ -30,7 +30,7 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.deprecated import renamed_methods
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.parameters import Choice, Positive
 from jaxevent.reconstruction.augment import (
@@ -156,7 +156,6 @@ class Message(eqx.Module):
         return Message(self.h + other.h, self.J + other.J)
 
 
-@renamed_methods(before="apply", then="compose")
 class MessageMap(eqx.Module):
     """Map from the message after several frames to the one before them (Sarkka & Garcia-Fernandez
     2021).
@@ -939,5 +938,3 @@ aks = Smoother(
     "frames and events, earlier and later ones, with its variance; an event's change is shared "
     "with the neighbours, and the frames' likelihood can be fitted.",
 )
-
-__getattr__ = renamed_names(__name__)

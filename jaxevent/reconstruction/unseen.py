@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.events.tail import Tail
+from jaxevent.events.live import Tail
 from jaxevent.reconstruction.frames import FrameClock, FrameImages
 from jaxevent.recording import Recording
 

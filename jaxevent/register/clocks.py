@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.signal import correlate
 
 from jaxevent.errors import InputError
-from jaxevent.recording import Frames, Recording
-from jaxevent.register.frames import event_span, log_image
+from jaxevent.recording import Frames, Recording, check_recording
+from jaxevent.register.frames import log_image
 from jaxevent.register.geometry import Registration
 from jaxevent.register.refinement import refine
 
@@ -48,7 +48,7 @@ def clock_offsets(
     assert other.frames is not None
     t = other.frames.t
     step = max(float(np.median(np.diff(t))) / 2, 1.0)
-    begin, _ = event_span(recording)
+    begin, _ = recording.event_span()
     both = [_event_signatures(recording, step), _frame_signatures(other)]
     middle, along = (t[1:] + t[:-1]) / 2, begin + step * (np.arange(len(both[0])) + 1)
     across = np.arange(middle[0], middle[-1] + 1e-3, step)
@@ -127,7 +127,7 @@ def _frame_signatures(other: Recording) -> NDArray[np.float64]:
 def _event_signatures(recording: Recording, step: float) -> NDArray[np.float64]:
     """Return signatures of 0.2 (ON - OFF) per pixel in windows of two steps (us), a step apart."""
     down, along, rows = _cells(recording.width, recording.height)
-    begin, end = event_span(recording)
+    begin, end = recording.event_span()
     steps, out = int((end - begin) / step) + 1, []
     for first in range(0, max(steps - 1, 1), _BLOCK_STEPS):
         count = min(_BLOCK_STEPS + 1, steps - first)
@@ -186,6 +186,7 @@ def trigger_times(
     Raises:
         InputError: There are no such triggers.
     """
+    check_recording(recording, "trigger_times")
     triggers = recording.triggers
     if triggers is None or not len(triggers):
         missing = recording.describe_left_out("triggers")

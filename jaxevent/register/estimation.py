@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from jaxevent.errors import InputError
 from jaxevent.progress import stage
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 from jaxevent.register.clocks import clock_offsets
 from jaxevent.register.features import match_frames
 from jaxevent.register.geometry import Grid, Registration, check_homography, recording_grid
@@ -117,6 +117,8 @@ def _check_request(
     search: float | int | None,
 ) -> None:
     """Raise `InputError` if there is nothing to register, or for times that make no sense."""
+    check_recording(recording, "register.estimate")
+    check_recording(other, "register.estimate")
     frames = other.frames
     if frames is None or not len(recording.events):
         empty, what = (other, "frames") if frames is None else (recording, "events")

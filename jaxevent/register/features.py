@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from jaxevent.errors import InputError, require
 from jaxevent.progress import bar
-from jaxevent.recording import Events, Frames, Recording
-from jaxevent.register.frames import ResampledImages, event_span, log_image
+from jaxevent.recording import Events, Frames, Recording, check_recording
+from jaxevent.register.frames import ResampledImages, log_image
 from jaxevent.register.geometry import recording_grid, undistort
 
 _MAX_DISTANCE_RATIO = 0.75  # of the nearest and the second descriptor; Lowe's 0.8 is laxer
@@ -148,7 +148,7 @@ def _select_busiest_part(
     recording: Recording, t: NDArray[np.int64]
 ) -> tuple[Recording, NDArray[np.intp]]:
     """Return the ten seconds with the most events, and frames in them, evenly spread."""
-    begin, end = event_span(recording)
+    begin, end = recording.event_span()
     first = np.arange(begin, max(end - 5_000_000, begin + 1), 5_000_000)
     index = [[recording.events.index(int(f + s)) for s in (0, 10_000_000)] for f in first]
     begin = int(first[np.argmax(np.diff(index, axis=1)[:, 0])])
@@ -201,6 +201,7 @@ def register_still(
     Raises:
         InputError: The recording has no frames, the image cannot be used, or no frame matches.
     """
+    check_recording(recording, "register_still")
     cv2 = require("cv2", "vision")
     frames = recording.frames
     if frames is None:

@@ -128,12 +128,6 @@ def log_image(other: Recording, row: int) -> tuple[NDArray[np.float64], NDArray[
     return np.log(np.maximum(intensity, 0) + _DARK_INTENSITY), good
 
 
-def event_span(recording: Recording) -> tuple[int, int]:
-    """Return the times (us) of the first and the last event."""
-    events = recording.events
-    return int(events[:1].t[0]), int(events[len(events) - 1 :].t[0])
-
-
 _FRAME_EXTRAS = (
     "response",
     "certainty",
@@ -298,7 +292,7 @@ def apply_registration(
     assert other.frames is not None
     t = other.frames.t + round(found.offset * 1e6)
     gap = int(np.median(np.diff(t))) if len(t) > 1 else 0
-    begin, end = event_span(recording)
+    begin, end = recording.event_span()
     rows = np.flatnonzero((t >= begin - gap) & (t <= end + gap))
     if not len(rows):
         raise InputError(

@@ -13,7 +13,7 @@ from scipy import ndimage, sparse
 
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording
-from jaxevent.register.frames import event_span, log_image
+from jaxevent.register.frames import log_image
 from jaxevent.register.geometry import (
     Grid,
     Registration,
@@ -161,7 +161,7 @@ class _Alignment:
     def choose_pairs(self, offset: float) -> None:
         """Choose the pairs of frames with the most events, with about an event per pixel each."""
         t = self.frames.t + round(offset * 1e6)
-        begin, end = event_span(self.recording)
+        begin, end = self.recording.event_span()
         inside = np.flatnonzero((t >= begin) & (t <= end))
         if len(inside) < 2:
             raise InputError(

@@ -9,7 +9,7 @@ Settings of trackers in a configuration of `jaxevent.runs.fit`:
                                         # of the positions, or without any, tracks are born
     positions = "*.csv"                 # beside each recording, * being its name without suffix
 
-A method may have its own loss and events. PositionBatch are as in `jaxevent.runs.blob_positions`.
+A method may have its own loss and events. Positions are as in `jaxevent.runs.blob_scores`.
 
 A recording is cut into windows of `window` seconds. If neither validation nor test is given, they
 are shared out: with `split` = [2, 1, 1], of every 4 windows in turn 2 are to fit, 1 to validate and
@@ -45,20 +45,26 @@ from jaxevent.blob.losses import PositionBatch
 from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
-from jaxevent.parameters import Parameters, suggest_name
+from jaxevent.parameters import Parameters, check_choice
 from jaxevent.recording import Recording
-from jaxevent.runs import blob_positions
-from jaxevent.runs.blob_positions import (
+from jaxevent.runs.blob_scores import (
+    TARGET_SETTINGS,
     KnownPositions,
     Targets,
-    event_time_span,
+    TrackProtocol,
     seed_from_positions,
 )
-from jaxevent.runs.blob_scores import TrackProtocol
 from jaxevent.runs.config import NAME_CHECK
-from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources, batches_by_split
+from jaxevent.runs.family import (
+    SPLIT_NAMES,
+    Family,
+    FitData,
+    Goal,
+    LastBatches,
+    batches_by_split,
+    windows,
+)
 from jaxevent.show.tables import legend, results_table
-from jaxevent.splits import SPLIT_NAMES, windows
 from jaxevent.tuning import Batches
 
 LOSS_NAMES = ("likelihood", "positions")
@@ -121,10 +127,8 @@ class TrackGoal(Goal):
     def files(self, recording: Path) -> list[Path]:
         return self.targets.files(recording)
 
-    def problem(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[TrackerParams], Batches]:
-        found = [part for part in self._windows(sources, split, window) if part.split < 2]
+    def problem(self, data: FitData) -> Callable[[TrackerParams], Batches]:
+        found = [part for part in self._windows(data) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
 
@@ -136,23 +140,16 @@ class TrackGoal(Goal):
         return LastBatches(packing_key, make)
 
     def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: TrackerParams,
-        progress: bool | None,
+        self, data: FitData, params: TrackerParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        found = self._windows(sources, split, window)
+        found = self._windows(data)
         packed = self._packed(found, params, "likelihood")
-        for place, (given, recording) in (
-            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
-        ):
+        for place, given, recording in data:
             errors = self.targets.errors(recording, self.tracker, params, progress)
             of_this = [
                 (part, batch)
                 for part, batch in zip(found, packed, strict=True)
-                if part.recording is recording and (split is not None or part.split == place)
+                if part.recording is recording and (data.split is not None or part.split == place)
             ]
             for k, name in enumerate(SPLIT_NAMES):
                 mine = [(part, batch) for part, batch in of_this if part.split == k]
@@ -187,17 +184,13 @@ class TrackGoal(Goal):
             columns[3:3] = [("covered", "covered", 1, 3)]
         return results_table(rows, columns) + legend(columns)
 
-    def _windows(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> list[TrackWindow]:
+    def _windows(self, data: FitData) -> list[TrackWindow]:
         """Cut all recordings into windows, and leave out those without events."""
         found = []
-        for place, (_, recording) in (
-            (place, source) for place, name in enumerate(SPLIT_NAMES) for source in sources[name]
-        ):
+        for place, _, recording in data:
             known = self.targets.known(recording)
-            first, stop = event_time_span(recording)
-            spans = windows(first, stop, window, split, place)
+            first, last = recording.event_span()
+            spans = windows(first, last + 1, data.window, data.split, place)
             cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
             for (begin, end, s), seeds in zip(spans, cuts, strict=True):
                 index = recording.events.index
@@ -340,15 +333,14 @@ class Blobs(Family):
     fit_settings = {
         "loss": NAME_CHECK,
         "events": (lambda value: value in EVENT_CHOICES, '"all" or "associated"'),
-        **blob_positions.TARGET_SETTINGS,
+        **TARGET_SETTINGS,
     }
     own = ("loss", "events")
 
     def goal(self, method: Tracker, params: Parameters, settings: Mapping[str, Any]) -> TrackGoal:
         assert isinstance(params, TrackerParams)
         loss = settings.get("loss", "likelihood")
-        if loss not in LOSS_NAMES:
-            raise InputError(f"there is no loss {loss!r}; {suggest_name(loss, LOSS_NAMES)}")
+        check_choice(loss, "loss", LOSS_NAMES)
         if loss == "positions" and settings.get("positions") is None:
             raise InputError(
                 "the loss 'positions' needs tables of them; give their name beside the "

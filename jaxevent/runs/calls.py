@@ -56,7 +56,8 @@ class Forms(NamedTuple):
                 read_toml(first)
             except InputError as error:
                 raise InputError(
-                    f"{error}; or if it is a recording, give a method too: {self.example}"
+                    f"{error}; if it is a recording, name it in a configuration, or in Python "
+                    f"give a method too: {self.example}"
                 ) from None
         if beside:
             raise InputError(

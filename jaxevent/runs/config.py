@@ -6,7 +6,7 @@ import glob
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from jaxevent import datasets
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
-from jaxevent.parameters import Parameters, read_toml, suggest_name
+from jaxevent.parameters import Parameters, check_choice, read_toml, suggest_name
 from jaxevent.recording import Recording
 
 Check = tuple[Callable[[Any], bool], str]  # of a setting: what is accepted, and how to say so
@@ -125,12 +125,23 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value)
 
 
+def is_numbers(value: Any, *counts: int) -> bool:
+    """Return true for a list of finite numbers, as many as one of `counts`."""
+    return isinstance(value, list) and len(value) in counts and all(map(is_number, value))
+
+
+def is_flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
 def is_natural(value: Any) -> bool:
     return type(value) is int and value > 0
 
 
 POSITIVE_CHECK = (lambda value: is_number(value) and value > 0, "a positive number")
 NOT_NEGATIVE_CHECK = (lambda value: is_number(value) and value >= 0, "a number, 0 or more")
+FLAG_CHECK = (is_flag, "true or false")
+SEED_CHECK = (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more")
 NATURAL_CHECK = (is_natural, "a whole number, 1 or more")
 NAME_CHECK = (is_text, "text")
 PATHS_CHECK = (
@@ -148,7 +159,7 @@ def is_metrics(value: Any) -> bool:
 
 METRICS_CHECK = (is_metrics, 'a list of names, as ["lpips"], or of "package.module:function"')
 CALIBRATE_CHECK: Check = (
-    lambda value: isinstance(value, bool),
+    is_flag,
     "true, to take clock and thresholds that are not given from the recording, or false",
 )
 STREAM_CHECK = (is_text, 'the name of a camera, as "left"')
@@ -160,18 +171,10 @@ SIZE_CHECK: Check = (
 
 def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
     for name, value in table.items():
-        if name not in known:
-            raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
+        check_choice(name, "setting", known)
         accepts, text = known[name]
         if not accepts(value):
             raise InputError(f"{name} is {str(value)[:60]!r}; give {text}")
-
-
-def check_choice(value: str, what: str, known: Sequence[str]) -> str:
-    """Return the value; raise `InputError` unless it is one of those known."""
-    if value not in known:
-        raise InputError(f"there is no {what} {value!r}; {suggest_name(value, known)}")
-    return value
 
 
 def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recording]]:

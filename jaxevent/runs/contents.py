@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -11,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.io import load
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.io.output import complete
 from jaxevent.parameters import Parameters
 from jaxevent.progress import bar
@@ -152,13 +152,14 @@ def _feed(thing: Any, update: Callable[[Any], None]) -> None:
     def begin(kind: str, *about: Any) -> None:
         update(f"{kind} {' '.join(map(repr, about))};".encode())
 
+    pandas: Any = sys.modules.get("pandas")  # imported where there is a table
     if thing is None or isinstance(thing, str | bool | int | float | np.generic):
         begin(type(thing).__name__, thing)
     elif isinstance(thing, list | tuple):
         begin("list", len(thing))
         for one in thing:
             _feed(one, update)
-    elif isinstance(thing, pd.DataFrame):
+    elif pandas is not None and isinstance(thing, pandas.DataFrame):
         _feed({str(name): thing[name].to_numpy() for name in thing.columns}, update)
     elif isinstance(thing, EventSource):
         begin("events", len(thing))

@@ -1,15 +1,18 @@
 """The packaged recording reconstructed by every method: table, figures and videos."""
 
 import dataclasses
+import pickle
+import tempfile
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.errors import MissingExtra
+from jaxevent.codegen import N_THREADS
+from jaxevent.errors import InputError, MissingExtra
 from jaxevent.estimator import Estimate
 from jaxevent.io import load
 from jaxevent.methods import find, names
@@ -18,6 +21,7 @@ from jaxevent.runs.own import MethodFunction
 from jaxevent.runs.protocols import held_out
 from jaxevent.runs.results import check_folder, open_results, write_rows
 from jaxevent.runs.scores import Sample, ScoringOptions, score_and_sample
+from jaxevent.runs.tasks import ComputeResources, Task, run
 from jaxevent.show.export import display_images, evenly_spaced_times
 from jaxevent.show.images import (
     Kind,
@@ -29,45 +33,60 @@ from jaxevent.show.images import (
 from jaxevent.show.tables import markdown_table
 
 RECORDING_FILE = resources.files("jaxevent") / "data/slider_depth_crop.h5"
+VIDEO = "video.mp4"
 RESULT_FILES = (
-    *("comparison.png", "events_only.png", "events_only.mp4", "video.mp4"),
+    *("comparison.png", "events_only.png", "events_only.mp4", VIDEO),
     *("results.md", "results.json"),
 )
+NOT_CALIBRATED = ", not calibrated"
+SLOWEST = ("mc", "events-only")  # methods, by the time that they take to compile
 
 
 def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     """Score every method on the packaged recording; prints the table, writes all to a folder.
 
-    Without the extras "plot" and "video" the picture and the video are left out. Raises
-    `InputError` if the folder cannot be written, or holds files of these names and `replace` is
-    False.
+    Methods do not need each other: two processes share them, where there are two cores.
+
+    Args:
+        out: The folder, made if missing.
+        progress: Whether a bar is shown; None: where somebody looks on.
+        replace: Whether files of these names are replaced.
+
+    Raises:
+        InputError: The folder cannot be written, or holds files of these names and `replace` is
+            False. Without the extras "plot" and "video" pictures and videos are only left out.
     """
     check_folder(out, RESULT_FILES, replace=replace)
-    with resources.as_file(RECORDING_FILE) as path:
-        recording = load(path)
-    runs: list[tuple[str, Any, Any]] = [
-        *((name, find(name), None) for name in names("reconstruction")),
-        *(
-            (f"{name}, not calibrated", find(name), find(name).Params())
-            for name in ("akf", "augmented")
-        ),
-    ]
-    samples: dict[str, Sample] = {}  # of the hidden frame in the middle, by label
-    alone: dict[str, Estimate] = {}  # of events alone, at all hidden frames
-    with open_results(out) as write:
-        rows, skipped = [], []
-        for label, method, params in runs:
-            fused = method.fuses or method.needs_frames
-            # The scale of images from events alone is not known, so it is fitted to the truth.
-            asked = ScoringOptions(normalise="none" if fused else "affine")
-            scored = method if fused else _remembered(method, alone, progress)
-            try:
-                row, some = score_and_sample(recording, scored, params, asked, progress)
-            except MissingExtra as error:
-                skipped.append(f"{label} is left out: {error}")
-                continue
-            rows.append({**row, "method": label})
-            samples[label] = some[len(some) // 2]
+    with (
+        resources.as_file(RECORDING_FILE) as path,
+        tempfile.TemporaryDirectory(prefix="jaxevent") as folder,
+        open_results(out) as write,
+    ):
+        results = Path(folder)
+        labels = [
+            *names("reconstruction"),
+            *(f"{name}{NOT_CALIBRATED}" for name in ("akf", "augmented")),
+        ]
+        # Those that take longest to compile come first, one to each process.
+        started = sorted(labels, key=lambda label: SLOWEST.index(label) if label in SLOWEST else 9)
+        common = {"path": path, "results": results}
+        tasks = [
+            *(Task(label, {"label": label, **common}) for label in started),
+            Task(VIDEO, {"label": VIDEO, **common, "video": out / VIDEO}),
+        ]
+        place = ComputeResources(workers=2) if N_THREADS > 1 else None
+        outcomes = run(_run_part, tasks, place=place, retries=0, progress=progress)
+        found = {task.name: outcome for task, outcome in zip(tasks, outcomes, strict=True)}
+        for label, outcome in found.items():
+            if outcome.error is not None and not outcome.skipped:
+                raise InputError(f"{label}: {outcome.error}")
+        skipped = [
+            f"{label} is left out: {found[label].error}"
+            for label in [*labels, VIDEO]
+            if found[label].skipped
+        ]
+        done = [label for label in labels if not found[label].skipped]
+        rows = [found[label].result for label in done]
         print(markdown_table(rows))
         print(
             "Every second frame was hidden and reconstructed; clock and thresholds are from the "
@@ -76,16 +95,24 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
         )
         write_rows(rows, write)
         written = ["results.md", "results.json"]
+        parts: dict[str, Part] = {
+            label: pickle.loads((results / label).read_bytes()) for label in done
+        }
+        recording = load(path)
         _, hidden = held_out(recording)
-        toned = [_toned(alone["high-pass"], "changes"), _toned(alone["events-only"], "relative")]
+        alone = parts["events-only"].estimate
+        toned = [_toned(parts["high-pass"].estimate, "changes"), _toned(alone, "relative")]
         toned.append(tone_map(hidden.intensity, "display"))
-        doubt = np.sqrt(np.asarray(alone["events-only"].covariance))
+        doubt = np.sqrt(np.asarray(alone.covariance))
+        samples = {label: part.sample for label, part in parts.items()}
         for name, draw in (
             ("comparison.png", lambda path: _figure(recording.name, samples, path)),
             ("events_only.png", lambda path: _figure_of_events(recording.name, toned, doubt, path)),
             ("events_only.mp4", lambda path: _video_of_events(toned, hidden.t, path)),
-            ("video.mp4", lambda path: _video(recording, path, progress)),
+            (VIDEO, lambda _: found[VIDEO].result),
         ):
+            if name in found and found[name].skipped:
+                continue
             try:
                 slower = draw(out / name)
                 slow = "" if slower is None else f" ({slower:.0f} times slower than real time)"
@@ -96,17 +123,37 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
     print(*(f"written: {out / name}" for name in written), sep="\n")
 
 
-def _remembered(
-    method: Any, estimates: dict[str, Estimate], progress: bool | None
-) -> MethodFunction:
-    """Return a method of events alone that keeps what it estimates, by its name."""
+class Part(NamedTuple):
+    """Images of one method that the pictures show."""
+
+    sample: Sample  # of the hidden frame in the middle
+    estimate: Any  # of a method of events alone, at all hidden frames; else None
+
+
+def _run_part(
+    label: str, path: Path, results: Path, video: Path | None = None
+) -> dict[str, Any] | float:
+    """Score one method, whose `Part` goes to a file of its name, or write the video."""
+    recording = load(path)
+    if video is not None:
+        return _video(recording, video)
+    name = label.removesuffix(NOT_CALIBRATED)
+    method: Any = find(name)
+    params = None if name == label else method.Params()
+    kept: list[Estimate] = []
 
     def estimate(given: Recording, times: NDArray[np.int64]) -> Estimate:
-        alone = dataclasses.replace(given, frames=None)
-        estimates[method.name] = method.estimate(alone, progress=progress)(times)
-        return estimates[method.name]
+        kept.append(method.estimate(dataclasses.replace(given, frames=None), progress=False)(times))
+        return kept[0]
 
-    return MethodFunction(method.name, estimate)
+    fused = method.fuses or method.needs_frames
+    # The scale of images from events alone is not known, so it is fitted to the truth.
+    asked = ScoringOptions(normalise="none" if fused else "affine")
+    scored = method if fused else MethodFunction(name, estimate)
+    row, some = score_and_sample(recording, scored, params, asked, False)
+    part = Part(some[len(some) // 2], kept[0] if kept else None)
+    (results / label).write_bytes(pickle.dumps(part))
+    return {**row, "method": label}
 
 
 def _toned(estimate: Estimate, tone: str) -> NDArray[np.uint8]:
@@ -159,10 +206,10 @@ def _figure(name: str, samples: Mapping[str, Sample], path: Path) -> None:
     comparison_figure(path, panels, f"{name} at {best.t / 1e6:.3f} s")
 
 
-def _video(recording: Recording, path: Path, progress: bool | None) -> float:
+def _video(recording: Recording, path: Path) -> float:
     """Write 200 images per second of the recording, shown at 30; return the slow-down."""
     rate, fps, longest = 200.0, 30.0, 180
-    video = find("akf").estimate(recording, progress=progress)
+    video = find("akf").estimate(recording, progress=False)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
         for _, image in display_images(

@@ -19,7 +19,8 @@
     name = "akf"                                    # a key of jaxevent.METHODS, or of your own:
                                                     # "package.module:object", an Estimator or
                                                     # a function: see jaxevent.runs.own
-    params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted: defaults
+    params = { c_on = 0.08, clock_offset = 0.0075 } # or the path of a TOML file; omitted:
+                                                    # calibrated, else defaults
                                                     # { file = "PATH", c_on = 0.08 }: both
     label = "akf, by hand"                          # in the table; omitted: the name
     grid = { c_on = [0.05, 0.1], kappa = [1, 2] }   # each combination, added to params and label
@@ -33,10 +34,10 @@ whole. A row's `params` are those that were used, and its `calibrated` names tho
 
 Each family of estimators has protocols of its own, with settings of their own beside it: images
 are asked for by "held-out" and "reference", described below, the others are described in
-`jaxevent.runs.egomotion_scores` ("motion") and `jaxevent.runs.blob_scores` ("tracks").
+`jaxevent.runs.egomotion` ("motion") and `jaxevent.runs.blob_scores` ("tracks").
 
 A method of the name "external" scores images of another program: `jaxevent.runs.external`; one of
-the name "published" shows numbers that were printed beside ours: `jaxevent.runs.published`. Paths
+the name "published" shows numbers that were printed beside ours: `jaxevent.runs.external`. Paths
 are relative to the folder of this file. The protocol "held-out" gives the methods frames 0, 2, 4,
 ... and asks for images where frames 1, 3, 5, ... are, at their time stamps plus the method's
 `clock_offset`; with another `gap` g it gives frames 0, g, 2 g, ... and asks for all others. Images
@@ -79,7 +80,7 @@ from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io import toml
-from jaxevent.io.companions import companions
+from jaxevent.io.checks import companions
 from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
@@ -593,7 +594,10 @@ def _methods(
     given: Any, folder: Path, protocol: Protocol, family: str, options: Mapping[str, Any]
 ) -> list[Entry]:
     if not (isinstance(given, list) and given and all(isinstance(one, dict) for one in given)):
-        raise InputError('no method is given; add [[method]] with name = "akf"')
+        raise InputError(
+            'no method is given; give one such as "akf", in a configuration by [[method]] with '
+            'name = "akf"'
+        )
     entries: list[Entry] = []
     for number, table in enumerate(given, 1):
         try:

@@ -1,4 +1,6 @@
-"""Images that other programs made of a recording, compared like those of the methods here.
+"""Results from elsewhere: images that other programs made, and published numbers.
+
+Images of a recording are compared like those of the methods here:
 
     [[method]]
     name = "external"
@@ -19,9 +21,24 @@ recording's clock.
 Programs that see only events know neither the unit nor the zero of intensity. With "affine", which
 every method may have, each image is replaced by a * image + b, a >= 0, that fits the truth best
 (Huber's loss, quadratic up to 0.1 of the white) before it is scored.
+
+Published numbers are shown beside those computed here:
+
+    [[method]]
+    name = "published"
+    label = "AKF, paper's table 2"
+    measures = ["mse", "ssim", "lpips"]
+
+    [method.values]
+    boxes_6dof = [0.0026, 0.80, 0.26]
+    "trees*1" = [0.0179, 0.82]          # any name that matches; missing numbers are unknown
+
+A row is that of the recording whose name matches, and needs no file. Measures are those that the
+tables of an evaluation have columns for, in the units of its rows: `mse` is not times 100.
 """
 
 import dataclasses
+import fnmatch
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,8 +50,10 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.io.images import TIMESTAMP_FILES, Scale, Series, read_series
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
+from jaxevent.runs.config import check, is_number, is_texts
 from jaxevent.runs.family import Source
+from jaxevent.show.tables import COLUMNS
 
 Normalise = Literal["none", "affine"]
 
@@ -42,6 +61,7 @@ HUBER_INTENSITY = 0.1  # intensity; larger errors count linearly
 HOT_PIXEL_RANGES = (
     3  # pixels so many times the image's 5-95 % range off its median are not fitted to
 )
+MEASURE_NAMES = [place for _, place, _, _ in COLUMNS if "." not in place]
 MAX_FITTED_PIXELS = 1 << 13  # pixels that the brightness is fitted to, at most
 
 
@@ -63,16 +83,12 @@ class ExternalImages(Source):
     def of(cls, table: Mapping[str, Any], folder: Path) -> "ExternalImages":
         known = {field.name: field for field in dataclasses.fields(cls) if field.name != "folder"}
         for name, value in table.items():
-            if name not in known:
-                raise InputError(f"there is no setting {name!r}; {suggest_name(name, known)}")
+            check_choice(name, "setting", known)
             if name in ("images", "timestamps"):
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{name} is {value!r}; give a path")
-            elif (
-                not isinstance(value, int | float)
-                or isinstance(value, bool)
-                or not math.isfinite(value)
-                or (value < 0 if name == "tolerance" else value <= 0 and name != "clock_offset")
+            elif not is_number(value) or (
+                value < 0 if name == "tolerance" else value <= 0 and name != "clock_offset"
             ):
                 raise InputError(f"{name} is {value!r}; give a positive number")
         if "images" not in table:
@@ -176,3 +192,48 @@ def fit_brightness(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
     )
     a, b = found.x
     return a * ((image - middle) / scale) + b
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedResults(Source):
+    """Published numbers by recording; see the text of this module."""
+
+    measures: Sequence[str]
+    numbers: Mapping[str, Sequence[float | int]]  # by the recordings' names
+
+    name = "published"
+
+    @classmethod
+    def of(cls, table: Mapping[str, Any], folder: Path) -> "PublishedResults":
+        is_table = (lambda value: isinstance(value, dict) and bool(value), "a table of lists")
+        check(table, {"measures": (is_texts, 'names, as ["mse", "ssim"]'), "values": is_table})
+        for name in ("measures", "values"):
+            if name not in table:
+                raise InputError(f"{name} is missing; published numbers need measures and values")
+        for measure in table["measures"]:
+            check_choice(measure, "measure", MEASURE_NAMES)
+        for name, numbers in table["values"].items():
+            few = isinstance(numbers, list) and len(numbers) <= len(table["measures"])
+            if not few or not all(map(is_number, numbers)):
+                raise InputError(
+                    f"the published values of {name} are {numbers!r}; give a list of at most "
+                    f"{len(table['measures'])} numbers, those of {', '.join(table['measures'])}"
+                )
+        return cls(table["measures"], table["values"])
+
+    def values(self) -> dict[str, Any]:
+        """Return the settings."""
+        return {"measures": list(self.measures), "values": dict(self.numbers)}
+
+    def files(self, recording: str) -> Sequence[Path]:
+        return ()
+
+    def row(self, recording: str) -> dict[str, Any]:
+        """Return the numbers of a recording, None for those that are not published."""
+        found: Sequence[float | int] = ()
+        for name, numbers in self.numbers.items():
+            if fnmatch.fnmatchcase(recording, name):
+                found = numbers
+                break
+        told = dict.fromkeys(("mse", "ssim", *self.measures))
+        return {**told, **dict(zip(self.measures, found, strict=False))}

@@ -5,18 +5,23 @@ which `fit` fits it. `family_of` and `find_protocol` find them.
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from jaxevent.devices import partition_batches
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, import_object
-from jaxevent.parameters import Parameters, suggest_name
+from jaxevent.parameters import Parameters, check_choice, suggest_name
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Check
 from jaxevent.tuning import Batches, Loss
 
+SPLIT_NAMES = ("fit", "validation", "test")
 Sources = Mapping[str, Sequence[tuple[str, Recording]]]  # (as given, recording) by split
 Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have their own recordings
 
@@ -111,6 +116,27 @@ class Protocol(abc.ABC):
         """
 
 
+@dataclasses.dataclass(frozen=True)
+class FitData:
+    """Recordings of a fit, and how they are cut into parts.
+
+    Attributes:
+        sources: Recordings by split, each with its name.
+        split: Shares of fit, validation and test; None if recordings are given for each.
+        window: Length of a window, s; None for the default.
+    """
+
+    sources: Sources
+    split: Shares = None
+    window: float | int | None = None
+
+    def __iter__(self) -> Iterator[tuple[int, str, Recording]]:
+        """Yield the place in `SPLIT_NAMES`, the name and the recording of each source."""
+        for place, split in enumerate(SPLIT_NAMES):
+            for given, recording in self.sources[split]:
+                yield place, given, recording
+
+
 class LastBatches:
     """Batches as a function of parameters, made again only if `key(params)` changes.
 
@@ -153,11 +179,11 @@ class Goal(abc.ABC):
         """Return the files that are read besides the recording."""
         return []
 
-    def calibrate(self, sources: Sources, params: Any, names: Sequence[str]) -> Any:
+    def calibrate(self, data: FitData, params: Any, names: Sequence[str]) -> Any:
         """Return the start of a fit, with what the recordings to fit say of some numbers.
 
         Args:
-            sources: Recordings by split.
+            data: The recordings.
             params: Parameters.
             names: Names of the numbers.
 
@@ -167,35 +193,22 @@ class Goal(abc.ABC):
         return params
 
     @abc.abstractmethod
-    def problem(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[Any], Batches]:
+    def problem(self, data: FitData) -> Callable[[Any], Batches]:
         """Make the batches to fit to and to validate on, as functions of parameters.
 
         Args:
-            sources: Recordings by split.
-            split: Shares of fit, validation and test; None if recordings are given for each.
-            window: Length of a window, s; None for the default.
+            data: The recordings.
 
         Returns:
             A function from parameters to batches, as `tuning.optimise` takes it.
         """
 
     @abc.abstractmethod
-    def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: Any,
-        progress: bool | None,
-    ) -> Iterator[dict[str, Any]]:
+    def score(self, data: FitData, params: Any, progress: bool | None) -> Iterator[dict[str, Any]]:
         """Yield rows of every recording and split, with the keys recording and split.
 
         Args:
-            sources: Recordings by split.
-            split: Shares of fit, validation and test; None if recordings are given for each.
-            window: Length of a window, s; None for the default.
+            data: The recordings.
             params: Parameters to score.
             progress: Whether to show a bar; None shows it in a terminal or notebook.
 
@@ -260,6 +273,63 @@ def find_protocol(name: Any) -> tuple[Protocol, str]:
         for family in MODULE_OF_FAMILY
         for protocol in find_family(family).protocols
     }
-    if name not in known:
-        raise InputError(f"there is no protocol {name!r}; {suggest_name(str(name), known)}")
+    check_choice(name, "protocol", known)
     return find_family(known[name]).protocols[name], known[name]
+
+
+def interleave(shares: Sequence[int], n_images: int) -> NDArray[np.int64]:
+    """Assign each of `n_images` images to a split, with `shares` in a fixed pattern.
+
+    [2, 1, 1] repeats fit, validation, fit, test.
+
+    Args:
+        shares: Shares of fit, validation and test.
+        n_images: Number of images.
+
+    Returns:
+        (count,) index in `SPLIT_NAMES`.
+    """
+
+    def spread(share: int, of: int) -> NDArray[np.bool_]:
+        steps = np.ceil(np.arange(of + 1) * share / max(of, 1))
+        return np.diff(steps) > 0
+
+    pattern = np.zeros(sum(shares), np.int64)
+    others = np.flatnonzero(~spread(shares[0], sum(shares)))
+    pattern[others] = np.where(spread(shares[1], len(others)), 1, 2)
+    return np.resize(pattern, n_images)
+
+
+def windows(
+    start_us: int,
+    stop_us: int,
+    window_s: float | int | None,
+    shares: Sequence[int] | None,
+    unsplit_index: int,
+) -> list[tuple[int, int, int]]:
+    """Cut the time from `start_us` to `stop_us` into windows.
+
+    Args:
+        start_us: Start of the first window, us.
+        stop_us: End of the last window, us.
+        window_s: Length of a window, s; by default an eighth of the time if `shares` is given, else
+            all.
+        shares: Shares of fit, validation and test; None assigns all windows to `unsplit_index`.
+        unsplit_index: Index in `SPLIT_NAMES` of all windows without `shares`.
+
+    Returns:
+        Start (us), end (us) and index in `SPLIT_NAMES` of each window.
+    """
+    length = stop_us - start_us
+    if window_s is not None:
+        length = round(window_s * 1e6)
+    elif shares is not None:
+        length = -(-length // 8)
+    begins = np.arange(start_us, stop_us, max(length, 1))
+    whose = (
+        np.full(len(begins), unsplit_index) if shares is None else interleave(shares, len(begins))
+    )
+    return [
+        (b, min(b + length, stop_us), s)
+        for b, s in zip(begins.tolist(), whose.tolist(), strict=True)
+    ]

@@ -26,7 +26,8 @@ describes it:
     [[method]]
     name = "akf"                        # a key of jaxevent.METHODS, or "package.module:object"
     label = "akf, mine"                 # in the results; omitted: the name
-    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted: defaults
+    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted:
+                                        # calibrated, else defaults
     fit = ["c_on", "c_off"]             # by gradient
     search = { clock_offset = [-0.02, 0.02, 9] }  # from, to, number of points
     prior = { c_on = [0.1, 0.5] }       # what is believed, standard deviation of its logarithm
@@ -53,7 +54,7 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
@@ -74,7 +75,7 @@ from jaxevent.runs.calls import (
     to_toml_table,
 )
 from jaxevent.runs.contents import digest
-from jaxevent.runs.family import Sources
+from jaxevent.runs.family import SPLIT_NAMES, FitData
 from jaxevent.runs.fit_config import Plan, Task, plan_of, read_plan
 from jaxevent.runs.results import (
     Fits,
@@ -90,7 +91,6 @@ from jaxevent.runs.results import (
     write_rows,
 )
 from jaxevent.show import plot_losses
-from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import FitResult, Run, optimise
 
 CHECKPOINT_FILE = "checkpoint"  # the name of the file in the folder
@@ -267,8 +267,8 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             rows = devices.on_process_zero(lambda: _ended_before(out, plan, resume, replace, held))
             if rows is not None:
                 return _finished(rows, out, plan)
-        sources = devices.on_all_processes(lambda: _sources(plan, progress))
-        plan = devices.on_all_processes(lambda: calibrated_plan(plan, sources))
+        data = devices.on_all_processes(lambda: _load_all(plan, progress))
+        plan = devices.on_all_processes(lambda: calibrated_plan(plan, data))
         key = ""
         if out is not None or jax.process_count() > 1:
             key = devices.on_all_processes(plan.digest)
@@ -277,11 +277,11 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
                 f"{plan.where()}the processes see different configurations or recordings; give all "
                 "the same"
             )
-        done, found, write = _fit_tasks(plan, sources, key, out, progress, held)
+        done, found, write = _fit_tasks(plan, data, key, out, progress, held)
         with warnings.catch_warnings():
             # At the start of a fit thresholds need not be the sensor's.
             warnings.filterwarnings("ignore", ".*events contradict frames", InputWarning)
-            rows = _score(plan, done, sources, progress)
+            rows = _score(plan, done, data, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
         gained = compute_gains(plan.tasks, rows_outside_fit(rows))
         fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
@@ -299,18 +299,18 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
     return fits
 
 
-def calibrated_plan(plan: Plan, sources: Sources) -> Plan:
+def calibrated_plan(plan: Plan, data: FitData) -> Plan:
     """Return a plan whose fits start from what the recordings to fit show.
 
     Args:
         plan: The plan.
-        sources: Its recordings by split.
+        data: Its recordings.
 
     Returns:
         The plan with other parameters to start from.
     """
     tasks = [
-        dataclasses.replace(task, params=task.goal.calibrate(sources, task.params, task.left_open))
+        dataclasses.replace(task, params=task.goal.calibrate(data, task.params, task.left_open))
         for task in plan.tasks
     ]
     return dataclasses.replace(plan, tasks=tasks)
@@ -354,7 +354,7 @@ def _ended_before(
 
 def _fit_tasks(
     plan: Plan,
-    sources: Sources,
+    data: FitData,
     key: str,
     out: Path | None,
     progress: bool | None,
@@ -407,7 +407,7 @@ def _fit_tasks(
 
         for number, task in enumerate(plan.tasks):
             try:
-                problem = task.goal.problem(sources, plan.split, plan.window)
+                problem = task.goal.problem(data)
                 if number == len(done):
                     one = optimise(
                         task.loss, task.params, task.names, problem, (),
@@ -426,7 +426,7 @@ def _fit_tasks(
 
 
 def _score(
-    plan: Plan, done: Sequence[FitResult], sources: Sources, progress: bool | None
+    plan: Plan, done: Sequence[FitResult], data: FitData, progress: bool | None
 ) -> list[dict[str, Any]]:
     """Rows of all methods, before and after; several processes share them out."""
     scored: list[tuple[Task, str, Any, dict[str, str]]] = []
@@ -435,25 +435,14 @@ def _score(
         scored.append((task, f"{task.label}, before", task.params, {}))
         scored.append((task, task.label, one.params, warning))
     mine = range(jax.process_index(), len(scored), jax.process_count())
-    found = devices.on_all_processes(
-        lambda: {k: list(_rows(*scored[k], sources, plan, progress=progress)) for k in mine}
-    )
+
+    def score(task: Task, label: str, params: Any, warning: dict[str, str]) -> list[dict[str, Any]]:
+        rows = task.goal.score(data, params, progress)
+        return [{**row, "method": label, **warning} for row in rows]
+
+    found = devices.on_all_processes(lambda: {k: score(*scored[k]) for k in mine})
     told = {k: some for each in devices.allgather(found) for k, some in each.items()}
     return [row for k in range(len(scored)) for row in told[k]]
-
-
-def _rows(
-    task: Task,
-    label: str,
-    params: Any,
-    warning: dict[str, str],
-    sources: Sources,
-    plan: Plan,
-    *,
-    progress: bool | None,
-) -> Iterator[dict[str, Any]]:
-    for row in task.goal.score(sources, plan.split, plan.window, params, progress):
-        yield {**row, "method": label, **warning}
 
 
 def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
@@ -476,11 +465,12 @@ def rows_outside_fit(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return []
 
 
-def _sources(plan: Plan, progress: bool | None) -> Sources:
-    return {
+def _load_all(plan: Plan, progress: bool | None) -> FitData:
+    sources = {
         split: [(given, _load(given, one, plan, progress)) for given, one in plan.recordings[split]]
         for split in SPLIT_NAMES
     }
+    return FitData(sources, plan.split, plan.window)
 
 
 def _load(given: str, path: Path | Recording, plan: Plan, progress: bool | None) -> Recording:

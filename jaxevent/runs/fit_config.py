@@ -18,11 +18,13 @@ from jaxevent.runs import contents
 from jaxevent.runs.calls import to_toml_table
 from jaxevent.runs.config import (
     CALIBRATE_CHECK,
+    FLAG_CHECK,
     NAME_CHECK,
     NATURAL_CHECK,
     NOT_NEGATIVE_CHECK,
     PATHS_CHECK,
     POSITIVE_CHECK,
+    SEED_CHECK,
     SIZE_CHECK,
     STREAM_CHECK,
     Check,
@@ -30,14 +32,13 @@ from jaxevent.runs.config import (
     check,
     files_named_in,
     find_recordings,
-    is_number,
+    is_numbers,
     is_text,
     is_texts,
     read_params,
 )
-from jaxevent.runs.family import MODULE_OF_FAMILY, Goal, Shares, family_of, find_family
+from jaxevent.runs.family import MODULE_OF_FAMILY, SPLIT_NAMES, Goal, Shares, family_of, find_family
 from jaxevent.runs.own import MethodFunction, find_method
-from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import Interval, Loss, Settings, begin, with_prior
 
 
@@ -120,8 +121,8 @@ _SETTINGS: dict[str, Check] = {
     "spread": NOT_NEGATIVE_CHECK,
     "rounds": NATURAL_CHECK,
     "batch": NATURAL_CHECK,
-    "seed": (lambda value: type(value) is int and value >= 0, "a whole number, 0 or more"),
-    "probe": (lambda value: isinstance(value, bool), "true or false"),
+    "seed": SEED_CHECK,
+    "probe": FLAG_CHECK,
 }
 _COMMON: dict[str, Check] = {
     **_SETTINGS,
@@ -152,13 +153,7 @@ _METHOD: dict[str, Check] = {
     "calibrate": CALIBRATE_CHECK,
     "prior_weight": POSITIVE_CHECK,
     "prior": (
-        lambda value: (
-            isinstance(value, dict)
-            and all(
-                isinstance(v, list) and len(v) == 2 and all(map(is_number, v))
-                for v in value.values()
-            )
-        ),
+        lambda value: isinstance(value, dict) and all(is_numbers(v, 2) for v in value.values()),
         "a table of name = [believed value, standard deviation of its logarithm]",
     ),
     "name": (lambda value: is_text(value) or isinstance(value, Estimator), "text"),
@@ -171,10 +166,7 @@ _METHOD: dict[str, Check] = {
     "search": (
         lambda value: (
             isinstance(value, dict)
-            and all(
-                isinstance(v, list) and len(v) == 3 and all(map(is_number, v)) and type(v[2]) is int
-                for v in value.values()
-            )
+            and all(is_numbers(v, 3) and type(v[2]) is int for v in value.values())
         ),
         "a table of name = [from, to, number of points]",
     ),
@@ -245,7 +237,10 @@ def plan_of(table: Mapping[str, Any], folder: Path, config: Path | None, text: b
     if apart and "split" in table:
         raise InputError("split is for configurations without validation and test; omit it")
     if not table.get("method"):
-        raise InputError('no method is given; add [[method]] with name = "akf"')
+        raise InputError(
+            'no method is given; give one such as "akf", in a configuration by [[method]] with '
+            'name = "akf"'
+        )
     tasks: list[Task] = []
     for number, entry in enumerate(table["method"], 1):
         try:

@@ -18,6 +18,7 @@ import dataclasses
 import hashlib
 import importlib
 import sys
+import traceback
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ from jaxevent.arrays import shorten_value
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, Estimator, import_object
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
 from jaxevent.recording import Recording
 
 # Keys of rows that are no measures: no metric may have their names.
@@ -57,7 +58,7 @@ class Metric:
         try:
             value = self.function(np.array(estimate), np.array(truth))
         except Exception as error:  # whatever the user's code raises
-            raise InputError(f"{where} raised {describe_error(error)}; correct it") from error
+            raise InputError(describe_failure(where, error, self.function)) from error
         try:
             number = float(value) if np.size(value) == 1 else None
         except (TypeError, ValueError):
@@ -87,8 +88,7 @@ def find_metrics(given: Iterable[Any], known: Collection[str]) -> list[Metric]:
     found: dict[str, Metric] = {}
     for one in given:
         if isinstance(one, str) and ":" not in one:
-            if one not in known:
-                raise InputError(f"there is no metric {one!r}; {suggest_name(one, known)}")
+            check_choice(one, "metric", known)
             continue
         metric = one if isinstance(one, Metric) else _metric(one)
         if metric.name in known or metric.name in RESERVED_NAMES:
@@ -148,7 +148,12 @@ class MethodFunction(NamedTuple):
     function: Callable[[Recording, NDArray[np.int64]], Any]
 
     def estimate(
-        self, recording: Recording, times: NDArray[np.int64], shapes: Sequence[tuple[int, ...]]
+        self,
+        recording: Recording,
+        times: NDArray[np.int64],
+        shapes: Sequence[tuple[int, ...]],
+        *,
+        intensity: bool = False,
     ) -> Estimate:
         """Call the function and check its result.
 
@@ -156,18 +161,21 @@ class MethodFunction(NamedTuple):
             recording: The recording that the method is given.
             times: (T,) int64, us.
             shapes: Allowed shapes of the mean without the axis of times; -1 is any number.
+            intensity: Whether the mean is intensity, which is 0 at black and 1 at white: grey
+                levels are refused, and so is what has no finite number.
 
         Returns:
             Mean and covariance; the latter is None if the function returns none.
 
         Raises:
-            InputError: The function raised an error, or returned no array of an allowed shape.
+            InputError: The function raised an error, or returned no array of an allowed shape,
+                or no intensity where this is asked for.
         """
         where = f"{recording.name}: the method {self.name!r}"
         try:
             found = self.function(recording, times)
         except Exception as error:  # whatever the user's code raises
-            raise InputError(f"{where} raised {describe_error(error)}; correct it") from error
+            raise InputError(describe_failure(where, error, self.function)) from error
         parts = [*found] if isinstance(found, tuple | Estimate) else [found]
         try:
             arrays = [None if part is None else np.asarray(part) for part in parts[:2]]
@@ -179,6 +187,13 @@ class MethodFunction(NamedTuple):
             raise InputError(
                 f"{where} returned {_describe_value(parts[0])}; return an array {wanted}"
             )
+        if intensity and mean.dtype.kind in "iu":
+            raise InputError(
+                f"{where} returned grey levels as {mean.dtype}; return intensity as floats, 0 at "
+                "black and 1 at white, for example levels / 255"
+            )
+        if intensity and not np.isfinite(mean).any():
+            raise InputError(f"{where} returned no finite number; return images of intensity")
         covariance = arrays[1] if len(arrays) > 1 else None
         mean = mean.astype(np.float64) if mean.dtype.kind != "f" else mean
         return Estimate(mean, covariance, np.isfinite(mean))
@@ -261,6 +276,15 @@ def module_hash(path: str) -> str | None:
     if file is None or not Path(file).is_file():
         return None
     return hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
+
+
+def describe_failure(where: str, error: BaseException, function: Callable[..., Any]) -> str:
+    """Describe an exception of a user's function, with the last line in the function's own file."""
+    lines = traceback.extract_tb(error.__traceback__)[1:]
+    file = getattr(getattr(function, "__code__", None), "co_filename", None)
+    own = [line for line in lines if line.filename == file] or lines
+    place = f" at line {own[-1].lineno} of {own[-1].filename}" if own else ""
+    return f"{where} raised {describe_error(error)}{place}; correct it"
 
 
 def describe_error(error: BaseException) -> str:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.events.clocks import check_clocks
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
 from jaxevent.recording import Frames, Recording, microseconds
 
 DEFAULT_GAP_FRAMES = 2  # every second frame is given
@@ -188,8 +188,7 @@ def divide(
         InputError: The recording cannot be used, the protocol is unknown, or the gap hides no
             frames.
     """
-    if protocol not in PROTOCOLS:
-        raise InputError(f"there is no protocol {protocol!r}; {suggest_name(protocol, PROTOCOLS)}")
+    check_choice(protocol, "protocol", PROTOCOLS)
     check_clocks(recording)
     if protocol == "held-out":
         return held_out(recording, gap)

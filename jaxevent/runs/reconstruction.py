@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from jaxevent.devices import REMOTE_BATCH
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters
+from jaxevent.parameters import Parameters, check_choice
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric, make_pixel_mesh, shard_over_pixels
@@ -31,10 +31,9 @@ from jaxevent.runs.config import (
     NAME_CHECK,
     NOT_NEGATIVE_CHECK,
     POSITIVE_CHECK,
-    check_choice,
     is_number,
 )
-from jaxevent.runs.family import Family, Goal, LastBatches, Shares, Sources
+from jaxevent.runs.family import SPLIT_NAMES, Family, FitData, Goal, LastBatches, interleave
 from jaxevent.runs.protocols import (
     DEFAULT_GAP_FRAMES,
     GAP_DOMAIN,
@@ -46,7 +45,6 @@ from jaxevent.runs.protocols import (
 )
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
 from jaxevent.show.tables import legend, markdown_table, results_table
-from jaxevent.splits import SPLIT_NAMES, interleave
 from jaxevent.tuning import Batches
 
 ERROR_KINDS = ("linear", "log", "nll")
@@ -373,54 +371,48 @@ class ImageGoal(Goal):
     def measure(self) -> str:
         return "log_mse" if self.loss.error == "log" and self.protocol == "reference" else "mse"
 
-    def calibrate(self, sources: Sources, params: FrameParams, names: Sequence[str]) -> FrameParams:
+    def calibrate(self, data: FitData, params: FrameParams, names: Sequence[str]) -> FrameParams:
         found: dict[str, list[float]] = {}
-        for _, recording in sources["fit"] if names else ():
+        for _, recording in data.sources["fit"] if names else ():
             given, _ = divide(recording, self.protocol, self.gap)
             for name, value in calibrated_values(given, params, names).found.items():
                 found.setdefault(name, []).append(value)
         return params.replace(**{name: float(np.median(one)) for name, one in found.items()})
 
-    def problem(self, sources: Sources, split: Shares, window: float | int | None) -> Problem:
+    def problem(self, data: FitData) -> Problem:
         cut = functools.partial(
             cut_windows,
             protocol=self.protocol,
-            split=split or (1, 0, 0),
-            window=window,
+            split=data.split or (1, 0, 0),
+            window=data.window,
             warm_up=self.warm_up,
             gap=self.gap,
         )
         found: dict[str, list] = {}
         for name in ("fit", "validation"):
             found[name] = []
-            for _, recording in sources[name]:
+            for _, recording in data.sources[name]:
                 self.method.check(recording)
                 found[name] += cut(recording)
         return Problem(self.loss, found["fit"], found["validation"], self.weights)
 
     def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: FrameParams,
-        progress: bool | None,
+        self, data: FitData, params: FrameParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        for whole in SPLIT_NAMES:
-            for given, recording in sources[whole]:
-                row = score(
-                    recording, self.method, params, self.protocol, gap=self.gap, progress=progress
-                )
-                row["recording"] = given
-                if split is None:
-                    yield {**row, "split": whole}
-                    continue
-                shared = interleave(split, row["frames"])
-                if self.loss.error is None:  # no image was looked at
-                    shared[:] = SPLIT_NAMES.index("test")
-                for place, name in enumerate(SPLIT_NAMES):
-                    if (shared == place).any():
-                        yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
+        for whole, given, recording in data:
+            row = score(
+                recording, self.method, params, self.protocol, gap=self.gap, progress=progress
+            )
+            row["recording"] = given
+            if data.split is None:
+                yield {**row, "split": SPLIT_NAMES[whole]}
+                continue
+            shared = interleave(data.split, row["frames"])
+            if self.loss.error is None:  # no image was looked at
+                shared[:] = SPLIT_NAMES.index("test")
+            for place, name in enumerate(SPLIT_NAMES):
+                if (shared == place).any():
+                    yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
 
     def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
         return markdown_table(rows)
@@ -434,14 +426,12 @@ class EventGoal(Goal):
     loss: Objective
     measure: ClassVar[str] = "nll"
 
-    def problem(
-        self, sources: Sources, split: Shares, window: float | int | None
-    ) -> Callable[[FrameParams], Batches]:
+    def problem(self, data: FitData) -> Callable[[FrameParams], Batches]:
         def prepare(params: FrameParams) -> Batches:
             batches: tuple[list[Any], list[Any]] = ([], [])
-            for name, shares in (("fit", split), ("validation", (0, 1, 0))):
-                for _, recording in sources[name]:
-                    for s, times in _window_times(recording, shares or (1, 0, 0), window):
+            for name, shares in (("fit", data.split), ("validation", (0, 1, 0))):
+                for _, recording in data.sources[name]:
+                    for s, times in _window_times(recording, shares or (1, 0, 0), data.window):
                         if s < len(batches):
                             batches[s].append(self._batch(recording, times, params))
             return batches
@@ -456,26 +446,20 @@ class EventGoal(Goal):
         return jax.device_put(LikelihoodBatch(features, count))
 
     def score(
-        self,
-        sources: Sources,
-        split: Shares,
-        window: float | int | None,
-        params: FrameParams,
-        progress: bool | None,
+        self, data: FitData, params: FrameParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        for whole, name in enumerate(SPLIT_NAMES):
+        for whole, given, recording in data:
             shares = tuple(int(s == whole) for s in range(len(SPLIT_NAMES)))
-            for given, recording in sources[name]:
-                for s, times in _window_times(recording, split or shares, window):
-                    batch = self._batch(recording, times, params)
-                    nll = float(jax.jit(self.loss)(params, batch))
-                    yield {
-                        "recording": given,
-                        "split": SPLIT_NAMES[s],
-                        "windows": len(times),
-                        "events": int(batch.weight),
-                        "nll": nll,
-                    }
+            for s, times in _window_times(recording, data.split or shares, data.window):
+                batch = self._batch(recording, times, params)
+                nll = float(jax.jit(self.loss)(params, batch))
+                yield {
+                    "recording": given,
+                    "split": SPLIT_NAMES[s],
+                    "windows": len(times),
+                    "events": int(batch.weight),
+                    "nll": nll,
+                }
 
     def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
         columns = [("NLL", "nll", 1, 4), ("windows", "windows", 1, 0), ("events", "events", 1, 0)]

@@ -24,9 +24,9 @@ import numpy as np
 
 from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
+from jaxevent.runs.family import SPLIT_NAMES
 from jaxevent.runs.fit_config import Plan, Task
 from jaxevent.show.tables import format_aligned_table
-from jaxevent.splits import SPLIT_NAMES
 from jaxevent.tuning import Batches, FitResult, RoughNumber, Run, begin
 
 Write = Callable[[str, bytes], None]

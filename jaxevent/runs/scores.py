@@ -29,17 +29,24 @@ from jaxevent.metrics import (
     regions,
     ssim,
 )
+from jaxevent.parameters import check_choice
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import (
     CALIBRATE_CHECK,
+    FLAG_CHECK,
     METRICS_CHECK,
-    check_choice,
     external_name,
     is_texts,
 )
-from jaxevent.runs.external import ExternalImages, Normalise, check_normalise, fit_brightness
+from jaxevent.runs.external import (
+    ExternalImages,
+    Normalise,
+    PublishedResults,
+    check_normalise,
+    fit_brightness,
+)
 from jaxevent.runs.family import Protocol
 from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
 from jaxevent.runs.protocols import (
@@ -51,7 +58,6 @@ from jaxevent.runs.protocols import (
     frames_around,
     is_gap,
 )
-from jaxevent.runs.published import PublishedResults
 from jaxevent.show.page import spread_rows
 
 # Further measures of an image and the truth, each a number per image; the first two need an extra.
@@ -467,7 +473,7 @@ class HeldOut(ImageProtocol):
     settings = {
         **ImageProtocol.settings,
         "gap": (is_gap, GAP_DOMAIN),
-        "moving": (lambda value: isinstance(value, bool), "true or false"),
+        "moving": FLAG_CHECK,
     }
 
 
@@ -594,7 +600,7 @@ def _estimates(
 
 def _of_function(given: Recording, hidden: Frames, method: MethodFunction) -> Estimates:
     shape = (given.height, given.width)
-    found = method.estimate(given, hidden.t, [shape])
+    found = method.estimate(given, hidden.t, [shape], intensity=True)
     variance = found.covariance
     if variance is None:
         variance = np.full(found.mean.shape, np.nan)

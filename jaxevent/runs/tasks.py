@@ -24,12 +24,13 @@ import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxevent import cache
+from jaxevent.codegen import N_THREADS
 from jaxevent.devices import double_precision, local_devices
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, MissingExtra, require
@@ -164,14 +165,15 @@ def run(
             same.setdefault(number if task.key is None else task.key, []).append(number)
     firsts = [numbers[0] for numbers in same.values()]
     todo = [tasks[number] for number in firsts]
+    work = _Work(function, todo, folder, retries)
     if place.workers is not None:
-        done = _in_processes(function, todo, folder, retries, place.workers)
+        done = _in_processes(work, place.workers)
     elif place.remote:
-        done = _on_cluster(function, todo, folder, retries, place)
+        done = _on_cluster(work, place)
     elif len(todo) >= len(devices := local_devices()) > 1:
-        done = _on_devices(function, todo, folder, retries, devices)
+        done = _on_devices(work, devices)
     else:
-        done = _here(function, todo, folder, retries)
+        done = ((number, work.try_task(task)) for number, task in enumerate(todo))
     with (
         bar(
             total=len(tasks), initial=len(found), desc="evaluate", unit="task", progress=progress
@@ -186,15 +188,7 @@ def run(
             found.update(dict.fromkeys(numbers, record))
             shown.set_postfix_str(task.name)
             shown.update(len(numbers))
-    return [
-        Outcome(
-            record.get("result"),
-            record.get("error"),
-            record.get("skipped", False),
-            record.get("host", ""),
-        )
-        for record in (found[number] for number in range(len(tasks)))
-    ]
+    return [Outcome(**found[number]) for number in range(len(tasks))]
 
 
 # The number of a task and its record: {"result", "host"} or {"error", "skipped"}.
@@ -247,7 +241,7 @@ def _stored(folder: Path | None, key: str | None) -> dict[str, Any] | None:
         return None
     with contextlib.suppress(OSError, ValueError):
         record = json.loads(file.read_bytes())
-        if isinstance(record, dict) and "result" in record:
+        if isinstance(record, dict) and {"result"} <= record.keys() <= {"result", "host"}:
             return record
     return None
 
@@ -274,48 +268,42 @@ def _log(folder: Path | None, key: str | None, what: str) -> None:
             file.write(line.encode())
 
 
-def _here(
-    function: Callable[..., Any], tasks: Sequence[Task], folder: Path | None, retries: int
-) -> Records:
-    for number, task in enumerate(tasks):
-        yield number, _tried(function, task, folder, retries)
+class _Work(NamedTuple):
+    """Tasks that are computed, and how often each is tried again."""
+
+    function: Callable[..., Any]
+    tasks: Sequence[Task]
+    folder: Path | None
+    retries: int
+
+    def try_task(self, task: Task) -> dict[str, Any]:
+        """Run a task in this process, until an attempt ends it or none is left."""
+        record: dict[str, Any] = {}
+        for _ in range(1 + self.retries):
+            try:
+                return attempt(self.function, task, self.folder)
+            except Exception as error:
+                record = _said(error)
+        return record
 
 
-def _tried(
-    function: Callable[..., Any], task: Task, folder: Path | None, retries: int
-) -> dict[str, Any]:
-    record: dict[str, Any] = {}
-    for _ in range(1 + retries):
-        try:
-            return attempt(function, task, folder)
-        except Exception as error:
-            record = _said(error)
-    return record
-
-
-def _on_devices(
-    function: Callable[..., Any],
-    tasks: Sequence[Task],
-    folder: Path | None,
-    retries: int,
-    devices: Sequence[Any],
-) -> Records:
+def _on_devices(work: _Work, devices: Sequence[Any]) -> Records:
     """A thread for each device; a task finds it as JAX's default device."""
     idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for device in devices:
         idle.put(device)
     double = jnp.result_type(float) == jnp.float64  # as the default device, a thread's own
 
-    def work(task: Task) -> dict[str, Any]:
+    def compute(task: Task) -> dict[str, Any]:
         device = idle.get()
         try:
             with jax.default_device(device), double_precision(double):
-                return _tried(function, task, folder, retries)
+                return work.try_task(task)
         finally:
             idle.put(device)
 
     with ThreadPoolExecutor(len(devices)) as pool:
-        numbers = {pool.submit(work, task): number for number, task in enumerate(tasks)}
+        numbers = {pool.submit(compute, task): number for number, task in enumerate(work.tasks)}
         try:
             for future in as_completed(numbers):
                 yield numbers[future], future.result()
@@ -323,22 +311,17 @@ def _on_devices(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _in_processes(
-    function: Callable[..., Any],
-    tasks: Sequence[Task],
-    folder: Path | None,
-    retries: int,
-    workers: int,
-) -> Records:
+def _in_processes(work: _Work, workers: int) -> Records:
     """One pipe and one task at a time for each process, so that a death has one task to blame.
 
     A `ProcessPoolExecutor` breaks as a whole when a process dies, does not say which task it was,
     and leaves its processes behind when this one is killed.
     """
+    function, tasks, folder, retries = work
     context = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
     waiting = collections.deque((number, 0) for number in range(len(tasks)))
     workers = min(workers, len(tasks))
-    threads = max(1, _cores() // max(workers, 1))
+    threads = max(1, N_THREADS // max(workers, 1))
     idle: list[tuple[Any, Any]] = []
     busy: dict[Any, tuple[Any, int, int]] = {}  # by connection: its process, task, earlier attempts
 
@@ -386,12 +369,6 @@ def _in_processes(
             process.join()
 
 
-def _cores() -> int:
-    with contextlib.suppress(AttributeError):  # not on every system
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def _serve(connection: multiprocessing.connection.Connection, threads: int, number: int) -> None:
     """Run a worker process: answer tasks by (record, whether to try again)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
@@ -418,17 +395,11 @@ def _serve(connection: multiprocessing.connection.Connection, threads: int, numb
         connection.send(answer)
 
 
-def _on_cluster(
-    function: Callable[..., Any],
-    tasks: Sequence[Task],
-    folder: Path | None,
-    retries: int,
-    place: ComputeResources,
-) -> Records:
+def _on_cluster(work: _Work, place: ComputeResources) -> Records:
     distributed = require("distributed", "cluster")
     given = place.cluster
     if hasattr(given, "submit"):  # a Client stays its owner's
-        yield from _by_client(given, str(given), function, tasks, folder, retries)
+        yield from _by_client(given, str(given), work)
         return
     if given is not None and not isinstance(given, str):
         given = given.scheduler_address
@@ -446,25 +417,19 @@ def _on_cluster(
             f"{address}: no Dask scheduler answers ({reason}); start one or correct the address"
         ) from None
     with client:
-        yield from _by_client(client, address, function, tasks, folder, retries)
+        yield from _by_client(client, address, work)
 
 
-def _by_client(
-    client: Any,
-    address: str,
-    function: Callable[..., Any],
-    tasks: Sequence[Task],
-    folder: Path | None,
-    retries: int,
-) -> Records:
+def _by_client(client: Any, address: str, work: _Work) -> Records:
     distributed = require("distributed", "cluster")
     numbers = {}
-    for number, task in enumerate(tasks):
+    for number, task in enumerate(work.tasks):
         key = None if task.key is None else f"jaxevent-{task.key}"
         try:
             future = client.submit(
-                attempt, function, task, folder, key=key, pure=False, retries=retries
-            )
+                attempt, work.function, task, work.folder,
+                key=key, pure=False, retries=work.retries,
+            )  # fmt: skip
         except (TypeError, pickle.PicklingError):
             task.check_sendable()
             raise

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.event_flow import EventFlow
+from jaxevent.io import png
+from jaxevent.io.checks import reading
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
@@ -151,6 +153,34 @@ def encode_flow(displacement: NDArray[np.floating], valid: NDArray[np.bool_]) ->
     return (
         b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
     )
+
+
+def decode_flow(image: bytes | str | Path) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Decode a PNG image of flow, of `write_flow_images` or of the DSEC data set.
+
+    Pillow and imageio read 8 of its 16 bits.
+
+    Args:
+        image: Path of the file, or its bytes.
+
+    Returns:
+        Displacement (H, W, 2) along x and y in px, NaN where it is not valid, and validity (H, W).
+
+    Raises:
+        InputError: The file is missing, damaged or another image.
+    """
+    source = "the image" if isinstance(image, bytes) else str(image)
+    with reading(source):
+        data = image if isinstance(image, bytes) else Path(image).read_bytes()
+    code = png.decode(data, source)
+    if code is None or code.ndim != 3:
+        raise InputError(
+            f"{source}: is no PNG image of 16 bits in three colours; give one of flow, as "
+            "`jaxevent flow --out FOLDER` and DSEC store it"
+        )
+    valid = code[..., 2] > 0
+    displacement = (code[..., :2].astype(np.float32) - PNG_ZERO) / PNG_SCALE
+    return np.where(valid[..., None], displacement, np.float32(np.nan)), valid
 
 
 def write_flow_video(

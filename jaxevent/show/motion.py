@@ -17,30 +17,29 @@ from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import MotionEstimate, is_observable, table_columns
-from jaxevent.egomotion.scores import MotionScores, score_motion
+from jaxevent.egomotion.scores import MotionScores, find_gyro_axes, score_motion
 from jaxevent.egomotion.truth import (
     KnownMotion,
-    find_imu_axes,
     fit_gyro_bias,
     from_poses,
     known_motion,
 )
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
-from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5
+from jaxevent.io.output import CLOCK_UNIT, check_writable, complete, complete_hdf5, finite
 from jaxevent.metrics import MEASURE_MEANINGS
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording
 from jaxevent.show.images import save_figure
 from jaxevent.show.motion_figures import (
     motion_figure,
-    motion_span,
     plot_flow,
     plot_warped,
     representative_window,
     window_flow,
 )
 from jaxevent.show.tables import align_cells
+from jaxevent.show.track_tables import check_rate
 
 
 def write_motion_table(
@@ -59,12 +58,6 @@ def write_motion_table(
     _write_csv(path, table_columns(model, times, estimated))
 
 
-def _check_rate(rate: float | int) -> None:
-    """Raise `InputError` for a number of rows per second that is not possible."""
-    if not 0 < rate <= 1e6:
-        raise InputError(f"--rate {rate:g} is not possible; give times per s, up to 1e6")
-
-
 class LiveTable:
     """Table of a live motion, row by row, as `write_motion_table` writes that of a recording.
 
@@ -77,7 +70,7 @@ class LiveTable:
     """
 
     def __init__(self, live: LiveMotion, rate: float):
-        _check_rate(rate)
+        check_rate(rate)
         self._live, self._period, self._count, self._first = live, 1e6 / rate, 0, 0
 
     def rows(self) -> str:
@@ -174,17 +167,12 @@ def write_errors(folder: Path, errors: MotionScores) -> None:
     _write_csv(folder / "errors.csv", dict(zip(("figure", "value", "unit"), zip(*rows, strict=True),
                                                strict=True)))  # fmt: skip
     table = {
-        name: {"value": _plain(value), "unit": unit, "meaning": MEASURE_MEANINGS[name]}
+        name: {"value": finite(value), "unit": unit, "meaning": MEASURE_MEANINGS[name]}
         for name, value, unit in rows
     }
     about = {"times": errors.count, "truth": errors.truth}
     with complete(folder / "errors.json") as partial:
         partial.write_text(json.dumps({"figures": table, **about}, indent=2) + "\n")
-
-
-def _plain(value: float) -> float | None:
-    """Return a number for JSON, None if it is not finite."""
-    return value if math.isfinite(value) else None
 
 
 def fitted_velocity(
@@ -226,9 +214,7 @@ class Truth(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def measured_rotation(
-    truth: KnownMotion, motion: MotionEstimate, unbiased: bool, turned: bool
-) -> Truth:
+def measured_rotation(truth: KnownMotion, motion: MotionEstimate, unbiased: bool) -> Truth:
     """Prepare the angular velocity of a gyro for the comparison with an estimate.
 
     Without a known bias the constant that fits the estimate is subtracted. Without a known rotation
@@ -238,7 +224,6 @@ def measured_rotation(
         truth: Angular velocity of the gyro.
         motion: The estimate.
         unbiased: Whether the bias is known and subtracted.
-        turned: Whether the rotation to the camera is known and applied.
     """
     estimated = motion(truth.t, centred=True, extrapolate=True)
     rows = estimated.valid & np.isfinite(estimated.mean).all(1)
@@ -246,7 +231,8 @@ def measured_rotation(
     if not rows.any():
         return Truth(truth, words)
     estimate, measured = estimated.mean[rows], truth.values[rows]
-    axes = None if turned else find_imu_axes(estimate, measured)
+    axes = find_gyro_axes(motion, truth)
+    truth = dataclasses.replace(truth, guesses_axes=False)  # the note is enough
     if axes is not None:
         notes.append(
             f"the gyro is like the estimate in other axes: give --imu-rotation {axes} if they are "
@@ -294,7 +280,7 @@ class Output:
             raise InputError(
                 f"{self.path}: is not a folder's name; the motion is written into a new folder"
             )
-        _check_rate(self.rate)
+        check_rate(self.rate)
         check_writable(self.path, directory=True)
 
     def known(
@@ -337,9 +323,7 @@ class Output:
         truth = known_motion(recording, model, "auto", zero, rotation=rotation)
         if recording.poses is not None:
             return lambda motion: Truth(truth, "poses")
-        return lambda motion: measured_rotation(
-            truth, motion, bias is not None, rotation is not None
-        )
+        return lambda motion: measured_rotation(truth, motion, bias is not None)
 
     def write(
         self,
@@ -363,9 +347,7 @@ class Output:
             method: Name of the method that estimated the motion.
             params: Parameters of the method.
         """
-        if not len(recording.events):
-            raise InputError(f"{recording.name}: holds no events; choose another recording")
-        start, stop = motion_span(recording)
+        start, stop = recording.event_span()
         count = math.floor((stop - start) * self.rate / 1e6 + 1e-9) + 1
         times = start + np.rint(np.arange(count) * (1e6 / self.rate)).astype(np.int64)
         estimated = motion(times, centred=self.centred)

@@ -18,7 +18,7 @@ from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.flow import Flow
 from jaxevent.egomotion.geometry import blur, image_variance, splat
-from jaxevent.egomotion.models import Model, Numeric
+from jaxevent.egomotion.models import Model, Numeric, Part
 from jaxevent.egomotion.motion import MotionEstimate, is_observable
 from jaxevent.egomotion.scores import axis_error, endpoint_error
 from jaxevent.egomotion.truth import KnownMotion
@@ -61,56 +61,17 @@ def motion_figure(
         times = times[np.linspace(0, len(times) - 1, _MAX_TIMES).astype(int)]
     estimated = motion(times, centred=centred)
     model, seconds = motion.model, times * 1e-6
-    errors = _errors(model, times, estimated, truth)
-    trust = np.where(
-        estimated.valid[:, None] & is_observable(model, estimated.covariance), 1.0, np.nan
-    )
-    extra = errors or _contrasts(motion, times)
+    extra = _errors(model, times, estimated, truth) or _contrasts(motion, times)
     sizes = [len(model.components[part.rows]) for part in model.parts]
     rows, columns = max(sizes), len(sizes)  # a column for each part
     figure.set_size_inches(6.0 * columns + 2 * (columns == 1), 1.9 * rows + 1.9 * bool(extra))
     grid = figure.subplots(rows + bool(extra), columns, sharex=True, squeeze=False)
-    order = {
-        i: (row, column, part)
-        for column, part in enumerate(model.parts)
-        for row, i in enumerate(range(len(model.components))[part.rows])
-    }
-    sigma = np.sqrt(np.diagonal(estimated.covariance, axis1=1, axis2=2).clip(0))
-    for i, name in enumerate(model.components):
-        row, column, part = order[i]
-        axis = grid[row, column]
-        value = estimated.mean[:, i] * trust[:, i]
-        _cloud(axis, motion, i, centred)
-        low, high = value - 2 * sigma[:, i], value + 2 * sigma[:, i]
-        band = {"color": _ESTIMATE, "alpha": 0.25, "lw": 0, "label": "2 sigma"}
-        axis.fill_between(seconds, low, high, **band)
-        axis.plot(seconds, value, color=_ESTIMATE, lw=1.3, label="estimate")
-        seen = [band[np.isfinite(band)] for band in (low, value, high)]
-        seen = [np.percentile(band, [2, 98]) for band in seen if len(band)]
-        if truth is not None:
-            inside = truth.covers(times)
-            true = truth(times[inside])[:, i]
-            axis.plot(seconds[inside], true, color=_TRUE, lw=1.0, ls="--", label="truth")
-            seen.append(true)
-        unit = model.units[i]
-        axis.set_ylabel(name if unit == "1" else f"{name} ({unit})")
-        if part.direction:
-            axis.set_ylim(-1.08, 1.08)
-            _mark_unobservable(axis, seconds, estimated.valid & np.isnan(value))
-        elif any(map(len, seen)):
-            # A component that hardly changes is not enlarged until its noise fills the axis.
-            low, high = np.concatenate(seen).min(), np.concatenate(seen).max()
-            half = max(
-                0.6 * (high - low), 0.08 * np.abs(estimated.mean[estimated.valid]).max(initial=0)
-            )
-            axis.set_ylim((low + high) / 2 - half - 1e-9, (low + high) / 2 + half + 1e-9)
+    for column, part in enumerate(model.parts):
+        for row, i in enumerate(range(len(model.components))[part.rows]):
+            _cloud(grid[row, column], motion, i, centred)
+            _plot_component(grid[row, column], i, part, model, times, estimated, truth)
     for k, (label, series) in enumerate(extra):
-        axis = grid[rows, min(k, columns - 1)]
-        axis.plot(seconds, series, color=_ESTIMATE, lw=1.1)
-        axis.set_ylabel(label)
-        good = series[np.isfinite(series)]
-        if len(good):
-            axis.set_ylim(0, 1.15 * max(np.percentile(good, 99), 1e-9))
+        _plot_extra(grid[rows, min(k, columns - 1)], seconds, label, series)
     empty = range(len(extra), columns) if extra else ()
     for column in empty:
         grid[-1, column].remove()
@@ -132,6 +93,53 @@ def motion_figure(
         bbox_to_anchor=(0, 1), borderpad=0.2,
     )  # fmt: skip
     return figure
+
+
+def _plot_component(
+    axis: Any,
+    i: int,
+    part: Part,
+    model: type[Model],
+    times: NDArray[np.int64],
+    estimated: Estimate,
+    truth: KnownMotion | None,
+) -> None:
+    """Plot a component of a part of the model with its band and its truth."""
+    seconds = times * 1e-6
+    observable = is_observable(model, estimated.covariance)[:, i]
+    value = np.where(estimated.valid & observable, estimated.mean[:, i], np.nan)
+    sigma = np.sqrt(estimated.covariance[:, i, i].clip(0))
+    low, high = value - 2 * sigma, value + 2 * sigma
+    band = {"color": _ESTIMATE, "alpha": 0.25, "lw": 0, "label": "2 sigma"}
+    axis.fill_between(seconds, low, high, **band)
+    axis.plot(seconds, value, color=_ESTIMATE, lw=1.3, label="estimate")
+    seen = [line[np.isfinite(line)] for line in (low, value, high)]
+    seen = [np.percentile(line, [2, 98]) for line in seen if len(line)]
+    if truth is not None:
+        inside = truth.covers(times)
+        true = truth(times[inside])[:, i]
+        axis.plot(seconds[inside], true, color=_TRUE, lw=1.0, ls="--", label="truth")
+        seen.append(true)
+    name, unit = model.components[i], model.units[i]
+    axis.set_ylabel(name if unit == "1" else f"{name} ({unit})")
+    if part.direction:
+        axis.set_ylim(-1.08, 1.08)
+        _mark_unobservable(axis, seconds, estimated.valid & np.isnan(value))
+    elif any(map(len, seen)):
+        # A component that hardly changes is not enlarged until its noise fills the axis.
+        least, most = np.concatenate(seen).min(), np.concatenate(seen).max()
+        usual = np.abs(estimated.mean[estimated.valid]).max(initial=0)
+        half = max(0.6 * (most - least), 0.08 * usual)
+        axis.set_ylim((least + most) / 2 - half - 1e-9, (least + most) / 2 + half + 1e-9)
+
+
+def _plot_extra(axis: Any, seconds: NDArray, label: str, series: NDArray) -> None:
+    """Plot an error or a contrast over time, from 0 up."""
+    axis.plot(seconds, series, color=_ESTIMATE, lw=1.1)
+    axis.set_ylabel(label)
+    good = series[np.isfinite(series)]
+    if len(good):
+        axis.set_ylim(0, 1.15 * max(np.percentile(good, 99), 1e-9))
 
 
 def _errors(
@@ -217,12 +225,6 @@ class Window:
     reference: int
 
 
-def motion_span(recording: Recording) -> tuple[int, int]:
-    """Return the times (us) of the first and the last event."""
-    first, last = (recording.events[i : i + 1].t[0] for i in (0, len(recording.events) - 1))
-    return int(first), int(last)
-
-
 def representative_window(recording: Recording, motion: MotionEstimate) -> Window:
     """Choose a window of 20 to 500 ms in the middle of the recording, or where motion is found.
 
@@ -230,7 +232,7 @@ def representative_window(recording: Recording, motion: MotionEstimate) -> Windo
     million are left out.
     """
     events = recording.events
-    middle = sum(motion_span(recording)) // 2
+    middle = sum(recording.event_span()) // 2
     good = motion.t[motion.valid]
     if len(good) and not motion(middle, extrapolate=True).valid[0]:
         middle = int(good[np.argmin(np.abs(good - middle))])

@@ -33,6 +33,7 @@ from jaxevent.show.track_tables import (
 )
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+_TABLE_SUFFIXES = {".csv", ".h5", ".hdf5"}
 _EXTRA_OF_SUFFIX = {".mp4": ("imageio_ffmpeg", "video")} | {
     kind: ("matplotlib", "plot") for kind in _PLOT_SUFFIXES
 }
@@ -167,56 +168,24 @@ class Output:
         method: str | None,
     ) -> "WrittenTracks":
         """Write files by kind; states are read once for all of them."""
-        duration = (tracks.stop - tracks.start) * 1e-6
-        rate = TABLE_RATE_HZ if self.rate is None else float(self.rate)
-        coarse = evenly_spaced_times(tracks.start, tracks.stop, min(rate, _MAX_TIMES / duration))
-        often = min(max(_MAX_FPS, _MIN_PICTURES / duration), max(rate, _MAX_FPS))
-        pictures = (
-            evenly_spaced_times(tracks.start, tracks.stop, often)
-            if ".mp4" in places
-            else coarse[:0]
-        )
-        tables = [path for kind, path in places.items() if kind in (".csv", ".h5", ".hdf5")]
-        times = (
-            evenly_spaced_times(tracks.start, tracks.stop, rate)
-            if tables and self.rate is not None
-            else coarse[:0]
-        )
-        rows = _TrackRows(coarse, tracks.id)
+        times = self._choose_times(tracks, places)
+        rows = _TrackRows(times.coarse, tracks.id)
         with contextlib.ExitStack() as stack:
             writers = [
-                stack.enter_context(track_writer(path, method, tracks.params)) for path in tables
+                stack.enter_context(track_writer(path, method, tracks.params))
+                for kind, path in places.items()
+                if kind in _TABLE_SUFFIXES
             ]
 
             def write(*table: Any) -> None:
                 for one in writers:
                     one(*table)
 
-            def states() -> Iterator[tuple[NDArray, NDArray]]:
-                """Yield the states at the pictures' times; the tables are written on the way."""
-                everything = np.unique(np.concatenate([coarse, pictures, times]))
-                with bar(
-                    total=len(everything), unit="time", desc="read", progress=progress
-                ) as shown:
-                    for t, now in tracks.batches(everything):
-                        k = _within(t, times)
-                        if len(k):
-                            write(t[k], tracks.id, now.mean[k], now.covariance[k], now.valid[k])
-                        k = _within(t, coarse)
-                        rows.add(t[k], now.mean[k], now.covariance[k], now.valid[k])
-                        for i in _within(t, pictures):
-                            yield now.mean[i], now.valid[i]
-                        shown.update(len(t))
-
+            states = _read_states(tracks, times, write, rows, progress)
             if ".mp4" in places:
-                recording = tracks.recording
-                behind = _high_pass(recording, pictures) if self.background != "events" else None
-                fps = min(often, _MAX_FPS)
-                with video_writer(places[".mp4"], fps) as show:
-                    for image in draw_frames(recording, pictures, tracks.id, states(), behind):
-                        show(image)
+                self._write_video(places[".mp4"], tracks, times, states)
             else:
-                for _ in states():
+                for _ in states:
                     pass
             if self.rate is None and writers:
                 put = None
@@ -232,16 +201,48 @@ class Output:
         if "quantities" in places:
             self._write_quantities(places["quantities"], rows, tracks)
         for kind in set(places) & set(_PLOT_SUFFIXES):
-            chosen = rows.longest(_MAX_TRACKS, [one for pair in self.pairs for one in pair])
-            mean, covariance, valid = rows.dense(chosen)
-            write_track_plot(
-                places[kind], tracks.recording, coarse, tracks.id[chosen], mean, covariance,
-                valid=valid, pairs=self.pairs, extent=self.extent, focal=self.focal,
-                size_factor=self._factor(), total=len(tracks),
-                Q_lambda=float(tracks.params.Q_lambda),
-            )  # fmt: skip
-        slow = min(often, _MAX_FPS) / often if ".mp4" in places else None
+            self._write_plot(places[kind], rows, tracks)
+        slow = min(times.per_second, _MAX_FPS) / times.per_second if ".mp4" in places else None
         return WrittenTracks(tracks, rows, [path.name for path in places.values()], slow, [])
+
+    def _choose_times(self, tracks: Tracks, places: Mapping[str, Path]) -> "_Times":
+        """Choose the times at which the files show states."""
+        duration = (tracks.stop - tracks.start) * 1e-6
+        rate = TABLE_RATE_HZ if self.rate is None else float(self.rate)
+        often = min(max(_MAX_FPS, _MIN_PICTURES / duration), max(rate, _MAX_FPS))
+        spaced = functools.partial(evenly_spaced_times, tracks.start, tracks.stop)
+        none = np.empty(0, np.int64)
+        return _Times(
+            coarse=spaced(min(rate, _MAX_TIMES / duration)),
+            pictures=spaced(often) if ".mp4" in places else none,
+            rows=spaced(rate) if self.rate is not None and set(places) & _TABLE_SUFFIXES else none,
+            per_second=often,
+        )
+
+    def _write_video(
+        self,
+        path: Path,
+        tracks: Tracks,
+        times: "_Times",
+        states: Iterator[tuple[NDArray, NDArray]],
+    ) -> None:
+        """Write a video of the states at the pictures' times."""
+        recording, pictures = tracks.recording, times.pictures
+        behind = _high_pass(recording, pictures) if self.background != "events" else None
+        with video_writer(path, min(times.per_second, _MAX_FPS)) as show:
+            for image in draw_frames(recording, pictures, tracks.id, states, behind):
+                show(image)
+
+    def _write_plot(self, path: Path, rows: "_TrackRows", tracks: Tracks) -> None:
+        """Write a plot of the longest tracks and of those of pairs."""
+        chosen = rows.longest(_MAX_TRACKS, [one for pair in self.pairs for one in pair])
+        mean, covariance, valid = rows.dense(chosen)
+        write_track_plot(
+            path, tracks.recording, rows.t, tracks.id[chosen], mean, covariance,
+            valid=valid, pairs=self.pairs, extent=self.extent, focal=self.focal,
+            size_factor=self._factor(), total=len(tracks),
+            Q_lambda=float(tracks.params.Q_lambda),
+        )  # fmt: skip
 
     def _factor(self) -> float | int:
         return SIZE_FACTORS["ring"] if self.size_factor is None else self.size_factor
@@ -363,6 +364,15 @@ END_REASONS = {  # of `Tracks.ended`, what it means
 }
 
 
+class _Times(NamedTuple):
+    """Times (us) at which states are read."""
+
+    coarse: NDArray[np.int64]  # of the plot and of quantities
+    pictures: NDArray[np.int64]  # of the video
+    rows: NDArray[np.int64]  # of tables
+    per_second: float  # pictures, in time of the recording
+
+
 class _EventStates(NamedTuple):
     """States at the times of some events, and the tracks of the events."""
 
@@ -435,6 +445,27 @@ class _TrackRows:
             mean[at[part], k], covariance[at[part], k] = rows[part], P[part]
             valid[at[part], k] = True
         return mean, covariance, valid
+
+
+def _read_states(
+    tracks: Tracks,
+    times: _Times,
+    write: Callable[..., None],
+    rows: _TrackRows,
+    progress: bool | None,
+) -> Iterator[tuple[NDArray, NDArray]]:
+    """Yield means and validity at the pictures' times; tables and rows are filled on the way."""
+    everything = np.unique(np.concatenate([times.coarse, times.pictures, times.rows]))
+    with bar(total=len(everything), unit="time", desc="read", progress=progress) as shown:
+        for t, now in tracks.batches(everything):
+            k = _within(t, times.rows)
+            if len(k):
+                write(t[k], tracks.id, now.mean[k], now.covariance[k], now.valid[k])
+            k = _within(t, times.coarse)
+            rows.add(t[k], now.mean[k], now.covariance[k], now.valid[k])
+            for i in _within(t, times.pictures):
+                yield now.mean[i], now.valid[i]
+            shown.update(len(t))
 
 
 def _within(t: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -54,12 +54,12 @@ from jaxevent.simulate.motion import (
     simulate_frame_events,
     simulate_motion,
 )
-from jaxevent.simulate.objects import MovingObjects
 from jaxevent.simulate.scenes import (
     FITTING_SCENES,
     SCENES,
     TESTING_SCENES,
     IntensitySource,
+    MovingObjects,
     Pan,
     scene,
 )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice, suggest_name
 from jaxevent.recording import Events, Recording, Times
 from jaxevent.simulate.scenes import parse_seconds
 
@@ -581,8 +581,7 @@ def blob_scene(name: str, seed: int = 0, **settings: Any) -> tuple[Recording, Bl
     Raises:
         InputError: The name is unknown.
     """
-    if name not in _SCENES:
-        raise InputError(f"there is no scene {name!r}; {suggest_name(name, BLOB_SCENES)}")
+    check_choice(name, "scene", BLOB_SCENES)
     targets, size, duration, noise = _SCENES[name](**settings)
     return simulate_blobs(targets, size, duration, noise, seed, name)
 

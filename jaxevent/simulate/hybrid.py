@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from jaxevent.camera import Response, SCurve
 from jaxevent.codegen import njit_noalloc
-from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate.scenes import IntensitySource
@@ -394,6 +393,3 @@ def _cross_thresholds(times, levels, pixels, noise, refractory, out):
                 t = at
                 ready[i] = stamp + refractory if refractory > 0 else at
     return n
-
-
-__getattr__ = renamed_names(__name__)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
-from jaxevent.parameters import suggest_name
+from jaxevent.parameters import check_choice
 from jaxevent.recording import Events, Poses, Recording, Times
 from jaxevent.simulate.hybrid import SENSORS, Sensor, simulate
 from jaxevent.simulate.scenes import parse_seconds
@@ -196,8 +196,7 @@ def make_texture(
         InputError: The name is unknown, or the grain is not positive.
     """
     kinds = ("noise", "shapes", "plain")
-    if kind not in kinds:
-        raise InputError(f"there is no texture {kind!r}; {suggest_name(kind, kinds)}")
+    check_choice(kind, "texture", kinds)
     if not 0 < grain < math.inf:
         raise InputError(f"a texture's grain of {grain} m is not possible; give a positive length")
     rng = np.random.default_rng(seed)
@@ -584,10 +583,8 @@ def motion_scene(
     Raises:
         InputError: The name or the motion is unknown, or the camera leaves the world.
     """
-    if name not in MOTION_SCENES:
-        raise InputError(f"there is no scene {name!r}; {suggest_name(name, MOTION_SCENES)}")
-    if motion not in get_args(Change):
-        raise InputError(f"there is no motion {motion!r}; {suggest_name(motion, get_args(Change))}")
+    check_choice(name, "scene", MOTION_SCENES)
+    check_choice(motion, "motion", get_args(Change))
     rng = np.random.default_rng([seed, MOTION_SCENES.index(name)])
     texture_seed = int(rng.integers(1 << 30))
     if name == "planar":

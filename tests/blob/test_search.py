@@ -148,6 +148,7 @@ def test_paths_in_contact_all_their_lives_are_one():
     )
 
 
+@pytest.mark.slow
 def test_two_that_begin_together_and_part_are_two():
     """Where cells are coarse, they are one blob until they are far apart."""
     starts = [((60.0, 40.0), (-90.0, 0.0)), ((70.0, 44.0), (90.0, 5.0))]

@@ -9,7 +9,9 @@ import jaxevent
 from jaxevent.calibration.brightness import interpolate, read_positions, sort_by_pixel
 from jaxevent.calibration.sampling import SampledSegment, choose_pixels, correlate, take_sample
 from jaxevent.recording import Frames, Recording
+from jaxevent.runs.protocols import held_out
 from jaxevent.simulate import MovingObjects, Sensor, simulate
+from jaxevent.simulate.faults import blur_frames
 
 SENSOR = Sensor(
     c_on=0.15, c_off=0.2, mismatch=0.02, dark_offset=0.02, refractory=5e-4, background_rate=0.1,
@@ -45,6 +47,39 @@ def moved(recording, us):
     )
 
 
+def test_a_grating_that_repeats_itself_has_the_clock_of_its_stamps():
+    """Half of its period of 1/3 s away events are the opposite of frames, as clearly."""
+    rng, y, x = np.random.default_rng(0), *np.mgrid[:48, :64]
+    places, c, late = np.stack([x.ravel(), y.ravel()]), 0.03, 20_000
+
+    def image(t):
+        wave = np.sin(2 * np.pi * (x - 60 * t) / 20) * np.cos(2 * np.pi * y / 30)
+        return 0.5 + 0.3 * wave + 0.1 * np.cos(x / 7)
+
+    level, rows = np.log(image(0) + 1) + rng.uniform(-c, c, x.shape), []
+    for t in np.arange(0, 0.5, 5e-4):
+        change = np.log(image(t) + 1) - level
+        on = change > 0
+        hit = np.abs(change) >= c  # at most one each: brightness changes by less in a step
+        level = np.where(hit, level + np.where(on, c, -c), level)
+        times = rng.uniform(t, t + 5e-4, hit.sum())
+        rows.append(np.column_stack([times, places[:, hit.ravel()].T, on[hit]]))
+    t, x_of, y_of, p = (events := np.concatenate(rows))[np.argsort(events[:, 0])].T
+    stamps = np.arange(50_000, 451_000, 50_000)
+    grey = [np.round(255 * image(1e-6 * stamp)) for stamp in stamps]
+    found = jaxevent.calibrate(
+        Recording.from_arrays(
+            (1e6 * t).astype(np.int64), x_of.astype(int), y_of.astype(int), p > 0,
+            width=64, height=48, frames=np.array(grey, np.uint8), frame_times=stamps + late,
+        )
+    )  # fmt: skip
+    assert found.clock_offset.low < -1e-6 * late < found.clock_offset.high
+    for one in (found.c_on, found.c_off):
+        assert one.low < c < one.high
+    assert np.nanmin(found.correlations) < -0.8 * np.nanmax(found.correlations)
+
+
+@pytest.mark.slow
 def test_simulated_truth(found):
     truth = {
         "clock_offset": SENSOR.clock_offset,
@@ -60,6 +95,16 @@ def test_simulated_truth(found):
         assert wide < (2.5 if name == "exposure" else 0.25) * abs(true), name
     noise = np.hypot(SENSOR.read_noise, 12**-0.5) / 255
     assert found.frame_noise.value == pytest.approx(noise, rel=0.4)
+
+
+def test_exposures_longer_than_the_interval_are_found(recording):
+    given, _ = held_out(blur_frames(recording))
+    interval = float(np.diff(recording.frames.t).mean()) * 1e-6
+    # As wide as the exposure and the three frames that were averaged, by the second moment.
+    width = (SENSOR.exposure**2 + 8 * interval**2) ** 0.5
+    exposure = jaxevent.calibrate(given, SENSOR.dark_offset).exposure
+    assert exposure.low < width < exposure.high
+    assert exposure.low > interval
 
 
 def test_hot_pixels_are_found(recording, found):

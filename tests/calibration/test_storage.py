@@ -38,7 +38,7 @@ def count_calibrations(monkeypatch) -> list[float]:
     """Count from now on how often `calibrate` runs."""
     runs: list[float] = []
 
-    def counted(recording, I0):
+    def counted(recording, I0, sample=None):
         runs.append(I0)
         return made_up(recording, I0)
 

@@ -13,10 +13,11 @@ from estimates import NAMES, made_up, make_up
 from PIL import Image
 
 import jaxevent
-from jaxevent import akf, aks, cli
+from jaxevent import akf, aks, cli, events
 from jaxevent.calibration import Fault
 from jaxevent.recording import Frames
 from jaxevent.runs.evaluate import evaluate
+from jaxevent.runs.family import FitData
 from jaxevent.runs.fit import calibrated_plan
 from jaxevent.runs.fit_config import plan_of
 from jaxevent.runs.protocols import held_out
@@ -26,7 +27,7 @@ from jaxevent.runs.protocols import held_out
 def recording():
     """The middle of a real recording."""
     whole = jaxevent.load(files("jaxevent") / "data/slider_depth_crop.h5")[0.6:0.95]
-    return dataclasses.replace(whole, name="part")
+    return dataclasses.replace(events.crop(whole, 60, 45, 120, 90), name="part")
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +43,9 @@ def found(recording):
 
 
 @pytest.fixture(autouse=True)
-def made_up_values(monkeypatch):
+def made_up_values(monkeypatch, float32):
     make_up(monkeypatch)
-    monkeypatch.setenv("JAXEVENT_CACHE", "0")
+    monkeypatch.setattr("jaxevent.cache.folder_for_calibrations", lambda: None)
 
 
 def values_of(params) -> list[float]:
@@ -221,7 +222,7 @@ def test_fits_start_from_the_median_of_recordings(recording):
     ]
     plan = plan_of({"recordings": [recording, other], "method": methods}, Path(), None, b"")
     sources = {"fit": [("part", recording), ("other", other)], "validation": [], "test": []}
-    started = calibrated_plan(plan, sources)
+    started = calibrated_plan(plan, FitData(sources))
     for task, expected in zip(
         started.tasks,
         [(clock, on, off), (clock, 0.3, off), (0, 0.1, 0.1), (0, 0.1, 0.1)],

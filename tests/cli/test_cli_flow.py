@@ -12,7 +12,8 @@ from commands import decoded, described, fails
 import jaxevent
 from jaxevent import cli
 from jaxevent.event_flow import FlowParams, flow_from_events
-from jaxevent.show.flow import encode_flow, flow_colours, write_flow_hdf5
+from jaxevent.io import png
+from jaxevent.show.flow import decode_flow, encode_flow, flow_colours, write_flow_hdf5
 from jaxevent.simulate import motion_scene
 
 
@@ -44,6 +45,50 @@ def decode_png(data: bytes) -> np.ndarray:
     return plain.view(">u2").reshape(height, width, 3).astype(int)
 
 
+PNG = encode_flow(np.zeros((2, 2, 2)), np.ones((2, 2), bool))
+
+
+def paeth(a: int, b: int, c: int) -> int:
+    return min((a, b, c), key=lambda one: abs(a + b - c - one))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_png_of_any_filter_is_decoded(channels):
+    image = np.random.default_rng(0).integers(0, 2**16, (10, 6, channels)).astype(np.uint16)
+    raw = image.astype(">u2").view(np.uint8).reshape(10, -1).astype(int)
+    rows, step = [], 2 * channels
+    for y in range(10):
+        above = raw[y - 1] if y else np.zeros_like(raw[0])
+        left = np.append(np.zeros(step, int), raw[y])[: raw.shape[1]]
+        corner = np.append(np.zeros(step, int), above)[: raw.shape[1]]
+        guess = [
+            np.zeros_like(left), left, above, (left + above) // 2,
+            np.array([paeth(*one) for one in zip(left, above, corner, strict=True)]),
+        ][y % 5]  # fmt: skip
+        rows.append(bytes([y % 5]) + ((raw[y] - guess) % 256).astype(np.uint8).tobytes())
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + bytes(4)
+
+    packed = zlib.compress(b"".join(rows))
+    head = b"\x89PNG\r\n\x1a\n" + chunk(
+        b"IHDR", struct.pack(">IIBBBBB", 6, 10, 16, {1: 0, 3: 2}[channels], 0, 0, 0)
+    )
+    parts = [chunk(b"IDAT", packed[:50]), chunk(b"IDAT", packed[50:]), chunk(b"IEND", b"")]
+    found = png.decode(head + b"".join(parts), "a")
+    assert np.array_equal(found, image if channels == 3 else image[..., 0])
+    with pytest.raises(jaxevent.InputError, match="^a: its image .* fetch it again"):
+        png.decode(head + parts[0], "a")
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF", PNG[:20], b"x" + PNG[1:]])
+def test_what_is_no_image_of_flow_is_refused(data, tmp_path):
+    with pytest.raises(jaxevent.InputError, match="no PNG image of 16 bits"):
+        decode_flow(data)
+    with pytest.raises(jaxevent.InputError, match="none.png: cannot be read"):
+        decode_flow(tmp_path / "none.png")
+
+
 def test_png_has_displacements_as_dsec_does(tmp_path):
     rng = np.random.default_rng(0)
     d = rng.normal(size=(7, 9, 2)) * 40
@@ -55,6 +100,11 @@ def test_png_has_displacements_as_dsec_does(tmp_path):
     known[0, 0] = False
     assert np.array_equal(code[..., 2], known)
     assert np.abs((code[..., :2] - 2**15) / 128 - d)[known].max() <= 1 / 256
+    (tmp_path / "mine.png").write_bytes(encode_flow(d, valid))
+    for given in (encode_flow(d, valid), tmp_path / "mine.png", str(tmp_path / "mine.png")):
+        read, read_valid = decode_flow(given)
+        assert np.array_equal(read_valid, known) and np.isnan(read[~known]).all()
+        assert np.abs(read - d)[known].max() <= 1 / 256
     cv2 = pytest.importorskip("cv2")
     (tmp_path / "one.png").write_bytes(encode_flow(d, valid))
     assert np.array_equal(cv2.imread(str(tmp_path / "one.png"), -1)[..., ::-1], code)

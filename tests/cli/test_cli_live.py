@@ -14,7 +14,7 @@ from jaxevent import cli
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.particle_filter.estimator import VotingEstimator
 from jaxevent.errors import InputError
-from jaxevent.io.chunks import read_lines
+from jaxevent.events.live import read_lines
 
 SETTINGS = "particles = 60\ncandidates = 24\nbatch = 32\ntau_max = 0.06\n"
 
@@ -26,6 +26,7 @@ class Pipe(io.BytesIO):
         return super().read1(min(size, 777))
 
 
+@pytest.mark.slow
 def test_live_rows_are_those_of_the_causal_estimate(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(VotingEstimator, "_kernel", lambda *_: None)
     recording = moved(lambda at: np.array([180.0, -90.0]), 0.3, 80, seed=3)

@@ -17,7 +17,7 @@ from jaxevent.egomotion.truth import known_motion
 from jaxevent.io import output
 from jaxevent.register.geometry import read_homography
 from jaxevent.runs import results
-from jaxevent.runs.blob_positions import read_positions
+from jaxevent.runs.blob_scores import read_positions
 
 RECONSTRUCT = "reconstruct {source} --method blend --rate 5 --out {out}"
 COMMANDS = {
@@ -99,6 +99,13 @@ def test_no_folder_is_written_that_holds_an_input_or_is_a_part_of_it(name, folde
         fails(capsys, [*argv, "--force"], out, said)
     fails(capsys, ["convert", "sub/rec", "sub/rec/events.txt", "--force"], "is a part of the input")
     assert state(folder) == before
+
+
+@pytest.mark.parametrize("name", ["convert", "simulate", "register"])
+def test_a_recording_is_not_stored_under_the_name_of_another_format(name, folder, capsys):
+    words = COMMANDS[name].format(source="source.h5", out="new.npz").split()
+    fails(capsys, words, "new.npz", "end the name in .h5")
+    assert not Path("new.npz").exists()
 
 
 def test_two_outputs_have_two_names(folder, capsys):
@@ -231,11 +238,10 @@ def test_a_fit_has_its_folder_alone(folder, capsys):
 
 
 def as_process(*words: object, **how: Any) -> subprocess.CompletedProcess:
-    code = "import sys; from jaxevent.cli import main; sys.exit(main())"
     env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     env["PYTHONPATH"] = str(Path(jaxevent.__file__).parents[1])
     env.update(how.pop("env", {}))
-    return subprocess.run([sys.executable, "-c", code, *map(str, words)], env=env, **how)
+    return subprocess.run([sys.executable, "-m", "jaxevent", *map(str, words)], env=env, **how)
 
 
 @pytest.mark.slow
@@ -255,9 +261,8 @@ def test_what_cannot_be_printed(folder):
     os.close(write)
     assert (done.returncode, done.stderr) == (141, b"")
     for closed, said in ((1, "Bad file descriptor"), (2, "")):
-        program = "import sys; from jaxevent.cli import main; sys.exit(main())"
         done = subprocess.run(
-            ["sh", "-c", f'exec "$@" {closed}>&-', "sh", sys.executable, "-c", program]
+            ["sh", "-c", f'exec "$@" {closed}>&-', "sh", sys.executable, "-m", "jaxevent"]
             + ["convert", "source.h5", f"{closed}.h5"],
             env={**os.environ, "PYTHONPATH": str(Path(jaxevent.__file__).parents[1])},
             capture_output=True,

@@ -26,7 +26,7 @@ def test_the_script_is_that_of_shtab(capsys, monkeypatch):
 
 def test_bash_completes_options(tmp_path):
     pytest.importorskip("shtab", reason="needs the extra completion")
-    command = [sys.executable, "-m", "jaxevent.cli", "--print-completion", "bash"]
+    command = [sys.executable, "-m", "jaxevent", "--print-completion", "bash"]
     script = tmp_path / "completion.bash"
     script.write_text(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     (tmp_path / "street.aedat4").touch()

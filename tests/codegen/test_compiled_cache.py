@@ -21,11 +21,15 @@ from jaxevent.codegen.graph import TranslationError
 def half(tmp_path, monkeypatch):
     """Makes new dispatchers of a function in a file of its own, as new processes would."""
     monkeypatch.setenv("JAXEVENT_CACHE", str(tmp_path / "kept"))
-    (tmp_path / "halves.py").write_text("def half(x):\n    return x / 2\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "halves", raising=False)
-    function = importlib.import_module("halves").half
-    return lambda: kernel_cache.njit_cached(function)
+
+    def fresh(folder=tmp_path):
+        (folder / "halves.py").write_text("def half(x):\n    return x / 2\n")
+        with monkeypatch.context() as there:
+            there.syspath_prepend(folder)
+            there.delitem(sys.modules, "halves", raising=False)
+            return kernel_cache.njit_cached(importlib.import_module("halves").half)
+
+    return fresh
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -105,6 +109,13 @@ def spoil(path: Path, how: str) -> None:
         "a pickle": b"cos\nsystem\n(S'exit 1'\ntR.",
     }
     path.write_bytes(changed[how])
+
+
+def test_installations_share_what_is_the_same_in_both(half, tmp_path):
+    (tmp_path / "other").mkdir()
+    assert half()(5) == 2.5
+    there = half(tmp_path / "other")
+    assert there(5) == 2.5 and sum(there.stats.cache_hits.values()) == 1
 
 
 HOW = ("empty", "cut in the hash", "one bit", "a pickle", "a folder")

@@ -541,7 +541,7 @@ def test_means_over_the_ages_of_candidates_are_undone():
     true = 1 + size * np.sin(w * 1e-6 * t)[:, None]
     mean = 1 + size * np.sin(w * 1e-6 * t)[:, None] * np.sin(w * span / 2) / (w * span / 2)
     assert np.abs(mean - true).max() > 0.1
-    for sigma, low, high in ((1e-4, 0.0, 0.08), (1.0, 0.4, 1.1)):
+    for sigma, low, high in ((1e-12, 0.0, 0.08), (1e-4, 0.0, 0.08), (1.0, 0.4, 1.1)):
         covariance = np.tile(sigma**2 * np.eye(3), (len(t), 1, 1))
         motion = MotionEstimate.from_arrays("rotation", t, mean, covariance)
         found = filtering.undo_averages(motion, np.full(len(t), span), params)

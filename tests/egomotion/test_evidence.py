@@ -75,6 +75,9 @@ class Script(EvidenceTest):
     def __init__(self, rows):
         self.rows = iter(rows)
 
+    def speed(self, motion):
+        return np.linalg.norm(motion, axis=1)
+
     def measure(self, *_):
         rest, rival, blocks = next(self.rows)
         return Evidence(rest, rival, np.zeros(2), 0.0, 0.0, blocks, 0.01)
@@ -85,7 +88,7 @@ def told_by(rows, drift=0.0, moves=False):
     lock = Lock(Script(rows), 6.5, 0.1, lambda m: np.zeros(2), moves)
     mean = np.array([100.0, 0.0])
     return [
-        bool(lock.update(None, np.array([10_000 * k]), mean[None] + drift * k,
+        bool(lock.update(None, np.array([50]), np.array([10_000 * k]), mean[None] + drift * k,
                          np.eye(2)[None], np.array([False]))[0])
         for k in range(len(rows))
     ]  # fmt: skip
@@ -106,8 +109,9 @@ def test_a_search_and_a_pause_begin_anew():
 
     def update(t, searching):
         n = len(t)
-        return lock.update(None, np.array(t), np.ones((n, 2)), np.tile(np.eye(2), (n, 1, 1)),
-                           np.array(searching)).tolist()  # fmt: skip
+        mean, cov = np.ones((n, 2)), np.tile(np.eye(2), (n, 1, 1))
+        locked = lock.update(None, np.full(n, 50), np.array(t), mean, cov, np.array(searching))
+        return locked.tolist()
 
     for k in range(4):
         last = update([10_000 * k], [False])
@@ -116,6 +120,25 @@ def test_a_search_and_a_pause_begin_anew():
     for k in range(5, 9):
         last = update([10_000 * k], [False])
     assert last == [True] and update([500_000], [False]) == [False]
+
+
+def test_a_motion_whose_events_cease_is_lost_with_them():
+    """Noise alone after 10 batches of 50 events; a motion half as fast makes half as many."""
+
+    def told(count, speed):
+        lock = Lock(Script([(4.0, 1.0, 9.0)] * 20), 6.5, 0.1, lambda m: np.ones(2), True)
+        n = len(count)
+        mean = np.stack([speed, np.zeros(n)], 1)
+        return [
+            lock.update(None, count[k : k + 1], np.array([10_000 * k]), mean[k : k + 1],
+                        np.eye(2)[None], np.zeros(1, bool)).item()
+            for k in range(n)
+        ]  # fmt: skip
+
+    steady, slower = np.full(14, 100.0), np.repeat([100.0, 50.0], [10, 4])
+    stopped = np.repeat([50, 5], [10, 4])
+    assert told(stopped, steady)[8:12] == [True, True, False, False]
+    assert all(told(np.repeat([50, 25], [10, 4]), slower)[8:])
 
 
 def test_earlier_estimates_are_told_where_they_agree():

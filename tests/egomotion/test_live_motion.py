@@ -15,6 +15,7 @@ PARAMS = voting.Params.of(
 )
 
 
+@pytest.mark.slow
 def test_live_motion_equals_the_causal_filter():
     recording = moved(lambda at: np.array([180.0, -90.0]), 0.44, 100, seed=3)
     e = recording.events

@@ -203,7 +203,7 @@ def test_every_reader_repairs(suffix, in_memory, tmp_path):
 def test_convert_repairs(tmp_path):
     t, x, y, p = columns_of(clean_times(500))
     path = stored(tmp_path / "a.h5", np.concatenate([t[:300], t[300:] - 60_000_000]), x, y, p)
-    command = [sys.executable, "-m", "jaxevent.cli", "convert", str(path), str(tmp_path / "b.h5")]
+    command = [sys.executable, "-m", "jaxevent", "convert", str(path), str(tmp_path / "b.h5")]
     command += ["--size", f"{WIDTH},{HEIGHT}"]
     refused = subprocess.run(command, capture_output=True, text=True)
     assert refused.returncode == 2

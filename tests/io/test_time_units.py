@@ -18,9 +18,8 @@ from refusals import refuses
 import jaxevent
 from jaxevent import cli
 from jaxevent.errors import InputWarning
-from jaxevent.io.checks import ReadOptions
 from jaxevent.io.images import read_times
-from jaxevent.io.time_units import infer_unit, numbers_of_dates, to_microseconds, unit_of_name
+from jaxevent.time_units import infer_unit, numbers_of_dates, to_microseconds, unit_of_name
 
 SIZE = (48, 32)
 COUNT = 600
@@ -471,7 +470,7 @@ def test_long_and_quiet_recordings_are_not_doubted(unit):
         sample = {"t": t / 1e6 if unit == "s" else t, "x": x, "y": y}
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            found = infer_unit(sample, count + 1, (240, 180), "a", ReadOptions())
+            found = infer_unit(sample, count + 1, (240, 180), "a")
         assert found == (unit, ())
 
 
@@ -498,6 +497,12 @@ def test_what_was_written_is_read(tmp_path_factory, us, seconds, between, place,
     lines = ([between.join(names)] if named else []) + [between.join(row) for row in rows]
     path.write_text("# made up\n" + "\n".join(lines) + "\n\n")
     assert read_times(path).tolist() == us
+
+
+def test_a_list_in_place_of_a_file():
+    assert read_times(Path("0.65,.7")).tolist() == [650_000, 700_000]
+    assert read_times(Path("650000")).tolist() == [650_000]
+    refuses("times.csv", read_times, Path("times.csv"))
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,7 @@ def correlation(image: np.ndarray, truth: np.ndarray) -> float:
     return float(np.corrcoef(image[inner].ravel(), truth[inner].ravel())[0, 1])
 
 
+@pytest.mark.slow
 def test_images_are_those_of_the_scene_up_to_scale():
     params = PLAIN.replace(c_on=C_ON, c_off=C_OFF, window=1.0)
     video = events_only.estimate(translated(), params, motion=EvenFlow())
@@ -91,6 +92,7 @@ def with_frames(stamps: list[float], seen: list[float], gain: float = 1.0) -> Re
     return dataclasses.replace(translated(), frames=frames)
 
 
+@pytest.mark.slow
 def test_one_frame_gives_the_scale_whatever_its_clock():
     params = PLAIN.replace(c_on=C_ON, c_off=C_OFF, window=1.0, use_frames=True)
     inner = np.s_[0, 3:-3, 3:-3]
@@ -111,6 +113,7 @@ def test_one_frame_gives_the_scale_whatever_its_clock():
     assert np.sqrt(np.mean((none - truth)[inner] ** 2)) > 0.5
 
 
+@pytest.mark.slow
 def test_images_do_not_depend_on_order_time_or_copies():
     times = np.array([80_000, 200_000, 140_000])
     video = events_only.estimate(translated())
@@ -123,6 +126,7 @@ def test_images_do_not_depend_on_order_time_or_copies():
     np.testing.assert_allclose(late.mean, whole.mean, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_jax_makes_the_images_of_the_host():
     """For a batch of parameters at once."""
     host = events_only.estimate(translated())(0.15)
@@ -136,6 +140,7 @@ def test_jax_makes_the_images_of_the_host():
     assert 0.5 < np.median(made.covariance[0].reshape(SIZE) / host.covariance[0]) < 2
 
 
+@pytest.mark.slow
 def test_derivatives_are_differences():
     """Of image and variance by all numbers at once, through the solution."""
     weights = np.random.default_rng(0).normal(size=SIZE)
@@ -161,6 +166,7 @@ def test_derivatives_are_differences():
     np.testing.assert_allclose(slope, difference, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_the_likelihood_refuses_ratios_of_thresholds_far_from_the_true_one():
     held = events_only.prepare_likelihood(translated(), [0.1, 0.2], PLAIN)
     ratios = np.array([0.75, 1.0, 1.5, 2.25, 3.0])

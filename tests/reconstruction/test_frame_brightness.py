@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -165,6 +166,30 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
     monkeypatch.setattr(estimator.FrameBrightness, "is_steady", lambda *_: True)
     unaware = mc.estimate(recording, params, progress=False)(t).mean
     assert error(image) < 0.5 * error(unaware)
+
+
+@pytest.mark.slow
+def test_white_between_white_frames_of_different_brightness():
+    sound, factors = pane(), np.array([2.2, 2.6, 3.2, 2.2, 2.6, 2.2])
+    grey = np.rint(factors[:, None, None] * sound.frames.images).clip(0, 255)
+    frames = dataclasses.replace(sound.frames, images=grey.astype(np.uint8))
+    recording = dataclasses.replace(sound, frames=frames)
+    t = np.array([(frames.t[BRIGHT] + frames.t[BRIGHT + 1]) // 2])
+    params = mc.Params(c_on=0.2, c_off=0.18, I0=0.1, rho_ref=5e-4)
+    video = mc.estimate(recording, params, progress=False)
+    target = video.trajectories(int(t[0]))
+    assert target.smooth is not None
+    image, P, _ = video(t)
+    free = estimator.fuse_target(params, target)
+    free = estimator.add_smooth_part(target, free, video.trajectories.brightness.prior(int(t[0])))
+    free = np.exp(np.asarray(free.L)) - 0.1
+    white = (grey[BRIGHT : BRIGHT + 2] >= 255).all(0)
+    lacking, left = (np.maximum(1 - one, 0)[white].sum() for one in (free, image[0]))
+    assert left < 0.8 * lacking
+    features, out = mc.prepare(recording, t, params)
+    found = jax.jit(lambda p: mc.read(p, mc.run(p, features)[0], out))(params)
+    np.testing.assert_allclose(found.mean.reshape(image.shape), image, atol=5e-3)
+    np.testing.assert_allclose(found.covariance.reshape(P.shape), P, rtol=0.1, atol=1e-4)
 
 
 @pytest.mark.slow

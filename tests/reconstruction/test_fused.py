@@ -241,6 +241,7 @@ def test_images_that_are_held_are_not_written_over(monkeypatch):
     assert video._buffers.take(1).mean.ctypes.data == address
 
 
+@pytest.mark.slow
 def test_float_frames_are_those_of_their_levels():
     recording = random_recording(8, 90, 4)
     frames = recording.frames

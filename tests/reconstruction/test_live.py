@@ -9,7 +9,7 @@ from noise import HEIGHT, WIDTH, small
 
 import jaxevent
 from jaxevent.errors import InputError
-from jaxevent.events.tail import Tail
+from jaxevent.events.live import Tail
 from jaxevent.recording import Events, Frames, Recording
 
 EVENTS = 128  # of a window

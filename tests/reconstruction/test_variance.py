@@ -70,6 +70,7 @@ def scene(seed, sensor):
     return given, times, np.stack([source.intensity(t * 1e-6) for t in times])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["akf", "aks"])
 def test_variances_cover_true_errors_of_simulated_scenes(name):
     method, means = jaxevent.METHODS[name], []

@@ -46,11 +46,17 @@ def triggered_rig(near) -> tuple[Recording, Recording, register.Grid, np.ndarray
     return recording, dataclasses.replace(other, frames=frames), grid, true[kept]
 
 
-@pytest.mark.slow
-def test_stamps_and_lag_are_those_simulated(near):
+@pytest.fixture(scope="module")
+def registered(near):
+    """The rig, and what is found of it without triggers."""
     recording, other, grid, true = triggered_rig(near)
-    exposure = int(near[3].frames.exposure[0])
-    before = register.estimate(recording, other, grid)
+    return recording, other, true, register.estimate(recording, other, grid)
+
+
+@pytest.mark.slow
+def test_stamps_and_lag_are_those_simulated(near, registered):
+    recording, other, true, before = registered
+    grid, exposure = before.grid, int(near[3].frames.exposure[0])
     for edge, lag in (("falling", -exposure / 2e6), ("auto", 0)):
         stamped, found = register.stamp_by_triggers(recording, other, before, edge)
         assert abs(found.offset - lag) < 1e-3 and found.grid is grid
@@ -63,8 +69,9 @@ def test_stamps_and_lag_are_those_simulated(near):
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_lag(near, tmp_path, capsys):
-    recording, other, _, true = triggered_rig(near)
+def test_the_command_prints_the_lag(near, registered, tmp_path, capsys, monkeypatch):
+    recording, other, true, before = registered
+    monkeypatch.setattr(register, "estimate", lambda *_, **__: before)
     jaxevent.save(recording, tmp_path / "own.h5")
     jaxevent.save(other, tmp_path / "frames.h5")
     jaxevent.save(dataclasses.replace(recording, triggers=None), tmp_path / "none.h5")

@@ -317,7 +317,7 @@ def wait_for(count: int, tasks: Path, process: subprocess.Popen, what: str = "fi
 def killed_twice(folder: Path, out: Path, *options: str) -> Path:
     """Start an evaluation, kill one of its workers and then itself, both while they compute."""
     config = folder / "run.toml"
-    argv = [sys.executable, "-m", "jaxevent.cli", "evaluate", str(config), "--out", str(out)]
+    argv = [sys.executable, "-m", "jaxevent", "evaluate", str(config), "--out", str(out)]
     client = subprocess.Popen([*argv, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     with client:
         wait_for(2, out / "tasks", client)

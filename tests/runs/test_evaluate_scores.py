@@ -16,7 +16,7 @@ from jaxevent.egomotion.scores import endpoint_error
 from jaxevent.egomotion.truth import read_motion
 from jaxevent.errors import InputError
 from jaxevent.runs import evaluate
-from jaxevent.runs.blob_positions import read_positions
+from jaxevent.runs.blob_scores import read_positions
 from jaxevent.runs.scores import Sample
 from jaxevent.show.page import page, picture
 from jaxevent.show.tables import markdown_table, short_names

@@ -18,7 +18,8 @@ from jaxevent.blob import constant_velocity as tracker
 from jaxevent.blob import negative_log_likelihood, prepare_positions
 from jaxevent.recording import Recording
 from jaxevent.runs.blob import FAMILY
-from jaxevent.runs.blob_positions import read_positions
+from jaxevent.runs.blob_scores import read_positions
+from jaxevent.runs.family import FitData
 from jaxevent.runs.fit import fit
 from jaxevent.simulate import CircularMotion, Target, simulate_blobs
 
@@ -124,7 +125,7 @@ def test_batches_are_their_windows_filled_up_to_one_shape(loss, folder):
     mine = goal(loss=loss, positions="*.csv", seeds=[[85.0, 45.0, 6.0]])
     params = tracker.Params(**START)
     sources = {"fit": [("a.h5", source)], "validation": [], "test": []}
-    fitted, validation = mine.problem(sources, None, 0.05)(params)
+    fitted, validation = mine.problem(FitData(sources, None, 0.05))(params)
     assert len(fitted) == 2 and not validation
     shapes = [jax.tree.map(np.shape, batch) for batch in fitted]
     assert shapes[0] == shapes[1]
@@ -180,7 +181,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
     tracks = tracker.estimate(
         recording, tracker.Params(**START), seeds=[(85.0, 45.0, 6.0)]
     ).filtered
-    parts = mine._windows(sources, (2, 1, 1), None)
+    parts = mine._windows(FitData(sources, (2, 1, 1), None))
     assert [part.split for part in parts] == [0, 1, 0, 2, 0, 1, 0, 2]
     assert parts[0].start == recording.start and parts[-1].stop == recording.stop + 1
     assert all(a.stop == b.start for a, b in zip(parts, parts[1:], strict=False))
@@ -192,7 +193,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
         np.testing.assert_allclose((x, y, size), mean[[0, 1, 4]], rtol=1e-12)
         assert at == part.start
     # Without seeds and positions tracks are born in every window.
-    assert all(part.seeds is None for part in goal()._windows(sources, None, 0.05))
+    assert all(part.seeds is None for part in goal()._windows(FitData(sources, None, 0.05)))
 
 
 def test_sizes_that_are_not_given_can_be_fitted(folder):
@@ -200,7 +201,7 @@ def test_sizes_that_are_not_given_can_be_fitted(folder):
     sources = {"fit": [("a", recording)], "validation": [], "test": []}
     for seeds, size in ((None, 0.0), ([[85.0, 45.0, 6.0]], 6.0)):
         mine = goal(positions="*.csv", **({} if seeds is None else {"seeds": seeds}))
-        (batch,) = mine.problem(sources, None, None)(tracker.Params(**START))[0]
+        (batch,) = mine.problem(FitData(sources))(tracker.Params(**START))[0]
         assert batch.features.seed_size.tolist() == [size]
 
 

@@ -11,6 +11,7 @@ from texture import moving
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.methods import METHODS, names
+from jaxevent.runs.family import FitData
 from jaxevent.runs.fit_config import Task, read_plan
 from jaxevent.simulate import CircularMotion, Target, motion_scene, simulate_blobs
 from jaxevent.tuning import loss_and_grad, optimise
@@ -92,7 +93,7 @@ def test_the_loss_has_a_slope(folder, name):
     path = folder / f"{METHODS[name].family}.h5"
     recording = dataclasses.replace(jaxevent.load(path), name=str(path))
     sources = {"fit": [(path.name, recording)], "validation": [], "test": []}
-    problem = one.goal.problem(sources, (1, 0, 0), 0.1)
+    problem = one.goal.problem(FitData(sources, (1, 0, 0), 0.1))
     (batch, *_), _ = problem(one.params)
     raw = {number: one.params.raw[number][None]}
     forward = one.settings.forward is not False
@@ -122,7 +123,7 @@ def test_a_search_ends_at_the_least_loss_of_what_the_method_tells(folder, name):
     path = folder / "egomotion.h5"
     recording = dataclasses.replace(jaxevent.load(path), name=str(path))
     sources = {"fit": [(path.name, recording)], "validation": [], "test": []}
-    problem = one.goal.problem(sources, (1, 0, 0), 1.0)
+    problem = one.goal.problem(FitData(sources, (1, 0, 0), 1.0))
     losses = {}
     for value in points:
         params = one.params.replace(**{number: value})

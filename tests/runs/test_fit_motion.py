@@ -20,7 +20,7 @@ from jaxevent.egomotion import voting
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Imu, Poses, Recording
-from jaxevent.runs import egomotion_scores
+from jaxevent.runs import egomotion
 from jaxevent.runs.egomotion import FAMILY, MotionLoss
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
@@ -157,13 +157,13 @@ def test_settings_say_what_is_true():
     imu = Imu(t, np.tile([0.1, 0.2, 0.3], (len(t), 1)), np.zeros((len(t), 3)))
     recording = Recording("r", 20, 16, Events.empty(), camera=camera, poses=poses, imu=imu)
     planar = {"model": "planar", "truth": "poses", "depth": 3.0}
-    found = egomotion_scores.true_motion(recording, planar)
+    found = egomotion.true_motion(recording, planar)
     np.testing.assert_allclose(found.values, np.tile([-12.0, 3.0], (len(found.t), 1)))
     turned = {"model": "rotation", "truth": "gyro", "imu_rotation": "y-up"}
     turned["gyro_bias"] = [0.1, 0.0, 0.0]
-    found = egomotion_scores.true_motion(recording, turned)
+    found = egomotion.true_motion(recording, turned)
     np.testing.assert_allclose(found.values, np.tile([0.0, -0.2, -0.3], (len(t), 1)), atol=1e-12)
     with pytest.raises(InputError, match="imu-rotation 'up'"):
-        egomotion_scores.check({**turned, "imu_rotation": "up"})
+        egomotion.check_settings({**turned, "imu_rotation": "up"})
     with pytest.raises(InputError, match="or the depth"):
-        egomotion_scores.true_motion(recording, {"model": "planar", "truth": "poses"})
+        egomotion.true_motion(recording, {"model": "planar", "truth": "poses"})

@@ -33,7 +33,7 @@ from jaxevent.deprecated import RenamedAttribute
 from jaxevent.display import plural
 from jaxevent.errors import InputError
 from jaxevent.progress import stage
-from jaxevent.recording import Recording
+from jaxevent.recording import Recording, check_recording
 
 # Coefficients of x^3, x^2 and x in 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)), see
 # `max_events_per_step`.
@@ -291,6 +291,7 @@ def find(
     Raises:
         InputError: There is no time between `start` and `stop`.
     """
+    check_recording(recording, "blob.find")
     stream = Stream(recording, *tracking_span(recording, start, stop))
     if len(stream) < CONFIG.min_recording_events:
         return TargetSearchResult((), (), 0, 0.0, recording)

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.baselines.fits import Fit, motion_of_fits
 from jaxevent.egomotion.candidates import pixel_coordinates
@@ -66,6 +66,7 @@ WINDOW_DURATION_RANGE_S = (0.002, 2.0)
 COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.09)
 SYSTEMATIC_ERROR_PX = 0.25  # of the displacement in a window, from events at pixels' middles
 N_NEIGHBOURS = 3  # estimates, up to which halves of windows show how the motion changes
+RELATIVE_NOISE = 0.5  # 1/sqrt(s), change of a motion that few windows do not show
 INITIAL_VARIANCE_PX2 = 2.0  # px^2, inverse curvature relative to the objective, at the start
 
 Numeric = Array | np.ndarray
@@ -425,12 +426,12 @@ class WindowSequence:
     @functools.cached_property
     def _begins(self) -> NDArray[np.int64]:
         """Times (us) at which windows begin, or rows of events."""
-        events, n = self.recording.events, len(self.recording.events)
+        n = len(self.recording.events)
         if not n:
             return np.zeros(0, np.int64)
         if self.params.window == "events":
             return np.arange(0, max(n - self.params.events, 0) + 1, self._stride)
-        first, last = int(events[:1].t[0]), int(events[n - 1 :].t[0])
+        first, last = self.recording.event_span()
         return np.arange(first, max(last - self._length, first) + 1, self._step)
 
     def __iter__(self) -> Iterator[EventRange]:
@@ -594,7 +595,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     Returns:
         The estimate.
     """
-    dispatch.check_not_forked()
+    threads.check_not_forked()
     windows = WindowSequence(inputs.recording, params, inputs.model, inputs.camera, inputs.seed)
     if not len(windows):
         return MotionEstimate.empty(inputs.model)
@@ -634,6 +635,12 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         rate = np.outer(change[k], change[k]) / max(1e6 * spans[k], 1) ** 2
     calibration = COVARIANCE_CALIBRATION.with_lens(inputs.camera)
     estimate = estimate.with_calibrated_covariance(calibration, spans, change)
+    if change is not None:
+        # A random walk of variance q^2 t is off its mean over a window T by q^2 T / 6, squared.
+        # Each window that is there shows as much of the changes as is expected beforehand.
+        square = RELATIVE_NOISE**2 * (estimate.mean**2).sum(1) * spans / (6 * len(valid))
+        added = square[:, None, None] * np.eye(estimate.mean.shape[1])
+        estimate = dataclasses.replace(estimate, covariance=estimate.covariance + added)
     before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))
     return estimate.extended_to(int(t[0]) - before, int(t[-1]) + after, rate)
 

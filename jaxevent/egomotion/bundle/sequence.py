@@ -47,7 +47,7 @@ def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
     if not len(recording.events):
         return MotionEstimate.empty(given.model)
     windows = WindowFitter(recording, params, camera, gyro, given.seed)
-    first, last = int(recording.events[:1].t[0]), int(recording.events[-1:].t[0])
+    first, last = recording.event_span()
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
     centres = np.arange(first + half, last - half + 1, step)
     if not len(centres):
@@ -147,8 +147,7 @@ def _refit_backwards(
         if old is None or later is None or is_near(later.path, old.path):
             break
         new[row] = later
-        gained += old.cost + windows.rotation_prior(old.path)
-        gained -= later.cost + windows.rotation_prior(later.path)
+        gained += old.cost - later.cost
         if gained > 0:
             for at, fit in new.items():
                 fits[at] = fit

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen.module import make_kernel
 from jaxevent.deprecated import renamed_methods
@@ -36,7 +36,7 @@ from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.patches import ImageSpeed, is_camera_known_to_move
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.events.tail import Tail
+from jaxevent.events.live import Tail
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
@@ -228,7 +228,7 @@ class VotingEstimator(MotionEstimator[Params]):
         self.check_options(seed=seed, progress=progress, causal=causal, smooth=smooth, cloud=cloud)
         if causal and smooth:
             raise InputError("a causal estimate cannot be smoothed; leave out causal or smooth")
-        dispatch.check_not_forked()
+        threads.check_not_forked()
         if params is None:
             found, _ = self.find_model_and_camera(recording, model, camera)
             start = self.initial_params(found)
@@ -527,7 +527,8 @@ class ChunkRunner:
         t, told = sample.t[:used], ~info.searching
         if self.lock is not None:
             events = self.sampler.recording.events
-            told = self.lock.update(events, t, info.mean, info.covariance, info.searching)
+            count = np.diff(sample.row[:used].max(1), prepend=self.row - 1)
+            told = self.lock.update(events, count, t, info.mean, info.covariance, info.searching)
         self._number += 1
         self.row = int(sample.row.max(initial=self.row - 1)) + 1
         return t, info, told

@@ -25,6 +25,7 @@ SEARCH_NOISE_SIGMAS = 0.1  # noise of a search, per batch, in standard deviation
 MAX_LOG_WEIGHT_STD = 0.5  # of a batch over particles, in a search
 MIN_RELATIVE_HISTORY = 0.99  # of the oldest candidates of a search
 KNOTS_PER_LAG = 4  # of the motion whose means over candidates' ages are estimated
+MIN_RELATIVE_VARIANCE = 1e-9  # of an estimate, as part of that of the motion between knots
 MIN_RUN_ESTIMATES = 16  # in a row, from which such means are undone
 
 
@@ -510,6 +511,8 @@ def _solve_averages(x: NDArray, s2: NDArray, q: NDArray) -> NDArray[np.float64]:
     """Return the values whose means over spans are x (n,), with variances q (n - 1,) of steps."""
     reach = KNOTS_PER_LAG
     n = len(x) + 2 * reach  # with knots beyond both ends
+    # Particles that all agree have no variance, of which no sum is positive definite.
+    s2 = np.maximum(s2, MIN_RELATIVE_VARIANCE * q.mean())
     weights = np.r_[0.5, np.ones(2 * reach - 1), 0.5] / (2 * reach)
     steps = np.pad(1 / q, reach, mode="edge")
     band, side = np.zeros((2 * reach + 1, n)), np.zeros(n)

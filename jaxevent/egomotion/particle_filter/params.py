@@ -72,7 +72,7 @@ class Params(Parameters):
     s0: Positive = Positive(10.0, "", "score from which an event's vote grows like its logarithm")
     alpha: Positive = Positive(5.0, "", "weight of one event's vote; larger with larger `every`")
     noise: Positive = Positive(
-        0.2, "1/sqrt(s)", "planar: change of the velocity, relative to the speed"
+        0.5, "1/sqrt(s)", "planar: change of the velocity, relative to the speed"
     )
     noise_rotation: Positive = Positive(1.0, "rad/s/sqrt(s)", "change of the angular velocity")
     noise_heading: Positive = Positive(1.0, "1/sqrt(s)", "general: change of the heading")

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision
 from jaxevent.estimator import ShortRepr
 from jaxevent.reconstruction.compensated.images import gaussian_blur
@@ -311,6 +310,3 @@ def fuse(
     mean = robust_mean_jax(params, L, warped, layout)
     images = reference_images(L, V, warped, layout, squared_reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, images))
-
-
-__getattr__ = renamed_names(__name__)

@@ -22,15 +22,13 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from jaxevent import dispatch
+from jaxevent import threads
 from jaxevent.codegen import run_over_rows
 from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.module import choose_backend, make_kernel
-from jaxevent.deprecated import renamed_names
 from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
-from jaxevent.locks import TurnLock
 from jaxevent.progress import bar
 from jaxevent.reconstruction.engine.bands import (
     NEVER_US,
@@ -66,11 +64,12 @@ from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.video import MAX_WINDOW_STARTS, ImageSequence, P
 from jaxevent.reconstruction.windows import sorted_times
 from jaxevent.recording import Recording, Times
+from jaxevent.threads import TurnLock
 
 MAX_WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
 MAX_SEGMENT_EVENTS = 1 << 22  # 8 bytes each
 MAX_SEGMENT_FRAME_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
-IS_SYNCHRONOUS = dispatch.use_synchronous_dispatch()  # so that programs may call kernels
+IS_SYNCHRONOUS = threads.use_synchronous_dispatch()  # so that programs may call kernels
 
 
 class WindowStart(NamedTuple):
@@ -714,5 +713,3 @@ def _tangent_dtype(image: Any) -> Any:
 
 _images.defjvp(_images_jvp, symbolic_zeros=True)
 _with_derivatives.defjvp(_with_derivatives_jvp, symbolic_zeros=True)
-
-__getattr__ = renamed_names(__name__)

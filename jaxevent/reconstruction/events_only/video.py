@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.locks import synchronized
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.windows import SolvedWindow, WindowSolver
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.video import FlowSource, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.threads import synchronized
 
 GREY = 0.5  # intensity where the log image is at its mean: events alone tell it up to a factor
 

@@ -1,4 +1,4 @@
-"""python -m jaxevent.cli"""
+"""The command line as a module: `python -m jaxevent`."""
 
 import sys
 

@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 
 from jaxevent.arrays import UNIT_NAMES, US_PER_UNIT, check_resolution, time_step, to_microseconds
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.io.checks import ReadOptions
 
 MIN_EVENTS = 300
 SAMPLE_EVENTS = 1 << 16  # events from which order, unit and signs are inferred
+_JUDGED_EVENTS = 1 << 12  # of a caller's arrays, whose unit is doubted
 _MIN_REPETITIONS = 100  # intervals between events of one pixel
 _BURST_FRACTION = (
     0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
@@ -136,7 +136,7 @@ def infer_unit(
     n_events: int,
     size: tuple[int, int],
     source: str,
-    options: ReadOptions,
+    time_unit: str | None = None,
     *,
     stated: tuple[str, str] | None = None,
     usual: str | None = None,
@@ -148,7 +148,7 @@ def infer_unit(
         n_events: Number of events in all.
         size: (width, height) of the sensor in pixels.
         source: Name of the file for messages.
-        options: Their `time_unit`, where given, is taken.
+        time_unit: Unit that the caller gives; None infers it.
         stated: Unit that the file states, and the words for how it does ("the name 't_ns'").
         usual: Unit of the layout; None has microseconds for whole numbers, seconds for others.
 
@@ -161,7 +161,7 @@ def infer_unit(
     """
     t = sample["t"]
     if t.dtype.kind not in "iuf" or not len(t):
-        return InferredUnit(options.time_unit or (stated[0] if stated else usual or "us"))
+        return InferredUnit(time_unit or (stated[0] if stated else usual or "us"))
     numbers = _Numbers.from_sample(sample, n_events, size)
     expected = usual or _convention(numbers)
     scores = {unit: numbers.score(unit, usual) for unit in US_PER_UNIT}
@@ -169,16 +169,16 @@ def infer_unit(
     known = n_events >= MIN_EVENTS and numbers.span > 0
     notes: list[str] = []
     doubt = ""
-    if options.time_unit is not None:
-        unit = options.time_unit
+    if time_unit is not None:
+        unit = time_unit
     elif stated is not None:
         unit = stated[0]
         notes.append(f"event times are {UNIT_NAMES[unit]}, by {stated[1]}")
-        if known and scores[best] > scores[unit] + _CONTRADICTION_NATS:
+        if contradiction := _contradiction(numbers, unit, _CONTRADICTION_NATS, usual):
             doubt = (
                 f"{source}: event times are {UNIT_NAMES[unit]} by {stated[1]}, but "
-                f"{numbers.describe(unit)}; as {UNIT_NAMES[best]} {numbers.describe(best)}: if the "
-                f"name is wrong, give time_unit={best!r} or --time-unit {best}"
+                f"{contradiction.text}: if the name is wrong, give "
+                f"time_unit={contradiction.unit!r} or --time-unit {contradiction.unit}"
             )
     elif not known:
         unit = expected
@@ -200,11 +200,7 @@ def infer_unit(
             )
             doubt = _doubt(source, numbers, unit, expected if unit != expected else after)
     scale = US_PER_UNIT[unit]
-    if (
-        options.time_unit is None
-        and numbers.has_decimals
-        and numbers.span * scale > _MAX_DECIMAL_SPAN_US
-    ):
+    if time_unit is None and numbers.has_decimals and numbers.span * scale > _MAX_DECIMAL_SPAN_US:
         raise InputError(
             f"{source}: the times are numbers with decimals, so {UNIT_NAMES[unit]}, but span "
             f"{numbers.span * scale / 86400e6:.0f} days; store them as integer microseconds, or "
@@ -216,6 +212,56 @@ def infer_unit(
     if doubt:
         _warn(doubt)
     return InferredUnit(unit, tuple(notes))
+
+
+def doubt_given_unit(
+    t: NDArray, x: NDArray, y: NDArray, size: tuple[int, int], unit: str | None
+) -> str | None:
+    """Compare events in a unit that a caller gives with what recordings are like.
+
+    Args:
+        t: (n,) times as given.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        size: (width, height) of the sensor in pixels.
+        unit: The unit, "s", "ms", "us" or "ns"; None: microseconds, which are not stated.
+
+    Returns:
+        What speaks for another unit and the remedy, for a message; None where nothing does.
+    """
+    if len(t) < MIN_EVENTS:
+        return None
+    rows = np.append(np.arange(min(len(t) - 1, _JUDGED_EVENTS)), len(t) - 1)
+    sample = {name: part[rows] for name, part in (("t", t), ("x", x), ("y", y))}
+    least = _WINNING_NATS if unit is None else _CONTRADICTION_NATS
+    numbers, unit = _Numbers.from_sample(sample, len(t), size), unit or "us"
+    found = _contradiction(numbers, unit, least)
+    if found is None:
+        return None
+    return (
+        f"as {UNIT_NAMES[unit]} events are unusual: {found.text}; if this is right, give "
+        f"time_unit={found.unit!r}"
+    )
+
+
+class _Contradiction(NamedTuple):
+    """A unit that fits far better than the one stated, and the comparison in words."""
+
+    unit: str
+    text: str
+
+
+def _contradiction(
+    numbers: "_Numbers", unit: str, least: float, usual: str | None = None
+) -> _Contradiction | None:
+    """Return another unit that exceeds the one stated by `least` nats; None where none does."""
+    scores = {other: numbers.score(other, usual) for other in US_PER_UNIT}
+    best = max(scores, key=lambda other: scores[other])
+    known = numbers.count >= MIN_EVENTS and numbers.span > 0
+    if not known or scores[best] <= scores[unit] + least:
+        return None
+    told = f"{numbers.describe(unit)}; as {UNIT_NAMES[best]} {numbers.describe(best)}"
+    return _Contradiction(best, told)
 
 
 def _warn(text: str) -> None:

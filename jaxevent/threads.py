@@ -1,4 +1,4 @@
-"""Settings of JAX's dispatch: synchronous programs on CPUs, and checks of platform and threads.
+"""Threads: locks of the objects that they share, JAX's own, and both in a forked process.
 
 Kernels with derivatives are called from within JAX's programs, and use JAX for what depends on
 parameters alone. If a program runs in the background while its caller begins another, such a call
@@ -11,11 +11,82 @@ There JAX's programs are refused; kernels work.
 import functools
 import os
 import sys
-from typing import Any, NoReturn
+import threading
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 from jaxevent.errors import InputError
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_locks: weakref.WeakSet["TurnLock"] = weakref.WeakSet()
 _lacks_threads = False  # whether the threads of JAX stayed in the parent of this process
+
+
+class TurnLock:
+    """A lock of an object that changes while it is read, so that threads read it in turn.
+
+    A thread that holds the lock may enter again. A copy of the object has a lock of its own. In a
+    forked process entering raises `InputError` where another thread held the lock, since nobody
+    will finish that thread's work.
+    """
+
+    def __init__(self, owner: str):
+        """`owner` names the object, for the message."""
+        self._owner, self._lock, self._was_locked = owner, threading.RLock(), False
+        _locks.add(self)
+
+    def __enter__(self) -> None:
+        if self._was_locked:
+            raise InputError(
+                f"{self._owner}: another thread was reading it when this process was forked; make "
+                "it in the process that reads it, or start processes by spawn or forkserver"
+            )
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def iterate(self, items: Iterable[T]) -> Iterator[T]:
+        """Yield the items of an iterable, each made while the lock is held."""
+        rest, none = iter(items), object()
+        while True:
+            with self:
+                item: Any = next(rest, none)
+            if item is none:
+                return
+            yield item
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return TurnLock, (self._owner,)
+
+    def mark_forked(self) -> None:
+        """Record in a forked process whether another thread held the lock."""
+        self._was_locked = not self._lock.acquire(blocking=False)
+        if not self._was_locked:
+            self._lock.release()
+
+
+def synchronized(method: Callable[P, T]) -> Callable[P, T]:
+    """Make threads call a method in turn with all others of the object that are marked so.
+
+    The object holds a `TurnLock` as `_turns`.
+    """
+
+    @functools.wraps(method)
+    def called(*arguments: P.args, **options: P.kwargs) -> T:
+        it: Any = arguments[0]
+        with it._turns:
+            return method(*arguments, **options)
+
+    return called
+
+
+def refuse_to_pickle(what: str, instead: str) -> NoReturn:
+    """Raise `InputError` for an object that cannot be pickled or copied, with the remedy."""
+    raise InputError(f"{what} can be neither pickled nor copied; {instead}")
 
 
 def use_synchronous_dispatch() -> bool:
@@ -72,6 +143,8 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 def _in_child() -> None:
     global _lacks_threads
+    for one in list(_locks):
+        one.mark_forked()
     bridge: Any = sys.modules.get("jax._src.xla_bridge")
     compiler: Any = sys.modules.get("jax._src.compiler")
     if bridge is not None and bridge.backends_are_initialized():
