@@ -148,23 +148,6 @@ def test_paths_in_contact_all_their_lives_are_one():
     )
 
 
-def test_a_small_piece_that_goes_along_is_of_the_larger_one():
-    t = np.arange(0, 50_000, 1000)
-    x = 20 + 1.2e-3 * t
-    whole = _path(t, x, 30.0, 6.0, 30)
-    for y, slides, size, joined in (
-        (52.0, 0, 2.0, True),
-        (62.0, 0, 2.0, False),  # farther than twice what the two halves of the larger one are
-        (52.0, 24, 2.0, False),  # goes its own way
-        (52.0, 0, 4.0, False),  # not much smaller
-        (52.0, 0, 1.2, False),  # a star beside a diffuse light
-    ):
-        piece = _path(t, x, y + slides * np.linspace(0, 1, len(t)), size, 10)
-        assert len(merge_parts([whole, piece])) == (1 if joined else 2)
-    stars = _path(t, x, 30.0, 1.5, 30), _path(t, x, 35.5, 0.7, 10)
-    assert len(merge_parts(list(stars))) == 2
-
-
 @pytest.mark.slow
 def test_two_that_begin_together_and_part_are_two():
     """Where cells are coarse, they are one blob until they are far apart."""

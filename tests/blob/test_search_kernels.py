@@ -16,7 +16,14 @@ from jaxevent.blob.search.background import (
     measure_dispersions,
 )
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import Blobs, Scale, clutter_model, detect, measure_blobs
+from jaxevent.blob.search.detection import (
+    Blobs,
+    Scale,
+    clutter_model,
+    detect,
+    measure_blobs,
+    split_blob,
+)
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import prefer_sharper
 from jaxevent.blob.search.prediction import KERNEL_RADII_PX, predict, sample_scored, score
@@ -383,3 +390,27 @@ def test_a_known_target_does_not_leap_to_few_events(background):
         blobs = Blobs(np.array([float(n)]), np.array([[away, 0.0]]), 0.1 * np.eye(2)[None])
         assert update_at(tracks, background, blobs).detected[0] == detected
         assert (tracks.p[0, 0] > 40.5) == detected
+
+
+def test_blobs_of_two_targets_are_told_from_a_bar_and_from_a_tail():
+    rng = np.random.default_rng(8)
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    side = np.arange(400) < 250
+    wide = rng.normal(0, 2.0, (400, 2))
+    shapes = {
+        "two": np.where(side, 0.0, 12.0),
+        "bar": rng.uniform(0, 22, 400),
+        "tail": np.where(side, 0.0, rng.exponential(10, 400)),
+        "one": np.zeros(400),
+    }
+    for name, along in shapes.items():
+        p = 40 + (wide + np.stack([along, np.zeros(400)], 1)) @ turn.T
+        part = WindowEvents(np.zeros(401), *np.append(np.rint(p), [[5, 90]], 0).T.astype(np.int32))
+        owner, two = np.append(np.full(400, 3), -1), Blobs.empty(2)
+        nats = split_blob(part, owner, 3, two)
+        assert (nats > 20) == (name == "two"), name
+        assert nats > 20 or nats < 0
+        if name == "two":
+            np.testing.assert_allclose(two.n, [250, 150], atol=3)
+            np.testing.assert_allclose(two.p, 40 + np.outer([0, 12], turn[:, 0]), atol=0.6)
+            np.testing.assert_allclose(two.C, np.broadcast_to(4 * np.eye(2), (2, 2, 2)), atol=1.2)

@@ -97,11 +97,6 @@ class SearchConfig(NamedTuple):
     edge_along_share: float = 0.75  # share of its variance along its way: within 30 degrees of it
     edge_event_share: float = 0.25  # events of the piece, as share of a long object's own
     edge_contact: float = 3.0  # contact distance of pieces of an edge
-    piece_size: float = 0.55  # size of a piece, in sizes of the larger part
-    piece_distance: float = 5.0  # its distance, in the same sizes
-    rigid_change: float = 1 / 3  # change of that distance, as share of the common way
-    min_wide_size_px: float = 4.0  # px; smaller objects are seen as one
-    point_size_px: float = 1.5  # px; smaller ones are no pieces, as stars about a diffuse light
     turning_contact: float = 4.0  # contact distance of parts that turn about each other
     turning_change: float = 0.15  # change of that distance, as share of it
     turning_angle: float = 2 * math.pi  # rad by which they turn

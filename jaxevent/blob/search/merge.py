@@ -64,24 +64,17 @@ def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
     sizes = np.stack([np.interp(t, path.t, path.size[:, 0]) for path in (one, other)])
     edge = _is_edge(one, other) or _is_edge(other, one)
     small, large = np.sort(np.median(sizes, 1))
-    # What an object lacks when a piece of it is a target of its own makes it smaller than it is.
     contact = CONFIG.edge_contact if edge else CONFIG.contact_distance
-    near = np.quantile(apart / sizes.sum(0), share) < contact
-    piece = large > CONFIG.min_wide_size_px and np.quantile(apart, share) < (
-        CONFIG.piece_distance * large
-    )
-    piece = piece and CONFIG.point_size_px < small < CONFIG.piece_size * large
-    if not (near or piece):
+    if np.quantile(apart / sizes.sum(0), share) >= contact:
         return _turn_together(p, q, CONFIG.turning_contact * float(np.median(sizes.sum(0))))
-    # Pieces slide along an edge, but less far than they go with it.
-    far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
-    changed, way = np.ptp(np.quantile(apart, (0.02, 0.98))), CONFIG.common_way_sizes
     both = [_interpolate(path, t) for path in (one, other)]
     if not edge and _separate_nats(both) > CONFIG.log_bayes_factor:
         return False
-    if not near:
-        return bool(far > way * large and changed < CONFIG.rigid_change * far)
-    return bool(far > way * small and changed < max(large, far if edge else far / 2))
+    # Pieces slide along an edge, but less far than they go with it.
+    far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
+    changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
+    most = max(large, far if edge else far / 2)
+    return bool(far > CONFIG.common_way_sizes * small and changed < most)
 
 
 @njit_noalloc
