@@ -168,11 +168,7 @@ def error_inflation(inliers: float) -> float:
 class WindowFitter(Windows):
     """Windows of a recording, and the fit of each."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.rotation = functools.lru_cache(2)(self._rotation)
-
-    def _rotation(self, centre: int) -> NDArray[np.float64]:
+    def rotation(self, centre: int) -> NDArray[np.float64]:
         """Return the rotation (3,), rad/s, at the middle of a window, by a gyro if there is one."""
         if self.gyro is None:
             return sharpest_rotation(self.sample_events(centre, self.half / 3, MAX_FLOW_EVENTS))
