@@ -278,7 +278,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
 
     @property
     def _lacks_frames(self) -> bool:
-        """Whether the method fuses frames with events, and there are none."""
+        """Tell whether the method fuses frames with events, and there are none."""
         return self.estimator.fuses and self.recording.frames is None
 
     def _doubt(self) -> str | None:
