@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         "a step that costs more is not damped",
         "jaxevent/egomotion/bundle/photometric_ba.py",
-        "max(damping * DAMPING_GROWTH, FIRST_DAMPING)",
+        "max(damping * DAMPING_GROWTH_FACTOR, INITIAL_DAMPING)",
         "damping",
         "tests/egomotion/test_gauss_newton.py -k accepted",
     ),

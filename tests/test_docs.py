@@ -12,6 +12,7 @@ from pathlib import Path
 import browser
 import pytest
 from pages import run_page, shortened
+from scripts import script
 
 import jaxevent
 from jaxevent.metrics import MEASURE_MEANINGS
@@ -137,6 +138,15 @@ def test_pages_of_the_reference_show_names_that_exist():
     for module, members in shown:
         known = dir(pkgutil.resolve_name(module))
         assert {name.strip() for name in members.split(",")} <= {*known}, module
+
+
+def test_the_page_of_guards_lists_the_faults_that_can_be_put_in():
+    page = (DOCS / "guards.md").read_text()
+    rows = re.findall(r"^\| (.*?) \| `(.*?)` \| `.*?` \| caught \|$", page, re.MULTILINE)
+    mutations = script("mutations").MUTATIONS
+    assert rows == [(one.fault, one.file) for one in mutations]
+    for one in mutations:
+        assert one.old in (ROOT / one.file).read_text(), one.fault
 
 
 def test_links_outside_of_the_site_lead_somewhere():
