@@ -145,14 +145,16 @@ class _RecycledMemory:
                 self._kept += size
 
 
-ALIGNMENT_BYTES = 64
+ALIGNMENT_BYTES, MIN_RECYCLED_BYTES = 64, 1 << 18
 _recycled_memory = _RecycledMemory(256 << 20)
 
 
 def empty(*shape: int) -> NDArray[np.float32]:
-    """Return an array (float32) of memory that other such arrays have used before."""
+    """Return an array (float32); a large one has memory that others have used before."""
     count = math.prod(shape)
-    return np.frombuffer(_recycled_memory(4 * max(count, 1)), np.float32, count).reshape(shape)
+    if 4 * count < MIN_RECYCLED_BYTES:
+        return np.empty(shape, np.float32)
+    return np.frombuffer(_recycled_memory(4 * count), np.float32, count).reshape(shape)
 
 
 def row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
@@ -168,12 +170,13 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(N_THREADS)
 
 
-def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
+def run_over_rows(kernel: Callable, n_rows: int, *args: Any, min_rows: int = 1) -> None:
     """Call `kernel(begin, end, *args)` for parts of the rows, each on a thread of its own.
 
-    Kernels release the interpreter's lock. What they compute must not depend on the parts.
+    Kernels release the interpreter's lock. What they compute must not depend on the parts, each of
+    which has `min_rows` rows or more.
     """
-    parts = min(N_THREADS, n_rows)
+    parts = min(N_THREADS, n_rows // min_rows)
     if parts <= 1:
         kernel(0, n_rows, *args)
         return

@@ -43,6 +43,11 @@ SEEN: dict[str, Any] = {"size": (WIDTH, HEIGHT), "focal": 80.0}
 SIMULATE = ["simulate", "--size", f"{WIDTH},{HEIGHT}", "--duration", "0.3", "--seed", "1"]
 
 
+@pytest.fixture(autouse=True)
+def precision(float32):
+    """As users have it; kernels compute in single precision."""
+
+
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory) -> Path:
     """planar.h5 and turn.h5 with tables of the truth, mine.toml."""

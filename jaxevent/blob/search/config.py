@@ -37,9 +37,6 @@ class SearchConfig(NamedTuple):
     dropped_sigmas: float = 2.0  # ... by so many standard deviations of the difference
     equal_score_loss: float = 0.03  # share of the best score that an equally good scale may lose,
     equal_window_loss: float = 0.005  # and among windows of one cell size
-    max_merged_share: float = 0.3  # share of events that smaller cells separate from a blob
-    sharp_score: float = 0.9  # share of a cell size's best score at which its blobs are sharp
-    max_gap_blobs: int = 200  # blobs of a window in which gaps are sought
 
     # Tracking from window to window
     gate_sigmas: float = 3.0  # standard deviations
@@ -90,7 +87,6 @@ class SearchConfig(NamedTuple):
     erratic_sizes: float = 0.4  # sizes by which it leaves its way in a window
     persistent_share: float = 0.5  # share of a path's windows in which the target is seen
     velocity_windows: int = 8  # windows from which the velocity at an end of a path is measured
-    max_leap_sizes: float = 6.0  # sizes from its fitted way at which a path's row is no beginning
     whole_share: float = 0.8  # share of its median size and events at which a target is seen whole
     duplicate_share: float = 0.5  # share of a path near one of an earlier pass: a duplicate
 

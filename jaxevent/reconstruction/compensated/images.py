@@ -83,7 +83,7 @@ class InstantSmoother(Smoother[Params]):
         return FrameLevels(z, V, measured.clear)
 
     def readout(self, params: Params, state: Gaussian, info: FrameLevels, here: Array) -> Estimate:
-        L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
+        L = jnp.maximum(state.m, jnp.log(params.I0))  # no intensity is below 0
         shown = here & (info.clear > 0.5)
         V = jnp.where(shown, jnp.minimum(state.P, info.V), state.P)
         return Estimate(jnp.where(shown, info.z, L), V, shown)

@@ -27,19 +27,22 @@ from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     RowScratch,
-    bilinear_weights,
     gradient_at_pixel,
     gradient_jax,
-    interpolate_path,
     interpolate_paths_jax,
+    interpolate_row,
     is_in_image,
     locate_points,
     pad_edges,
     path_positions,
+    read_bilinear,
     sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
 
+MIN_ROWS = 32  # of pixels or nodes, which are worth a thread
+# Places of a symmetric matrix's entries among those of its upper triangle.
+SYMMETRIC = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
 OUTSIDE_INFORMATION = np.float32(1e-6)  # of values outside the image
 # Iterations for derivatives: of conjugate gradients with the normal matrix, and of the whole.
 CG_ITERATIONS, BICGSTAB_ITERATIONS = 30, 8
@@ -80,25 +83,27 @@ class NormalEquations(NamedTuple):
     ridge: Float[Numeric, " 4"]
 
 
-class PackedImages(NamedTuple):
+class InstantStack(NamedTuple):
     """Images at K instants."""
 
-    pixels: NDArray[np.float32]  # (K, h, w, 2): log intensity and its variance
+    L: NDArray[np.float32]  # (K, h, w), log intensity
+    V: NDArray[np.float32]  # (K, h, w), its variance, (ln I)^2
     s: NDArray[np.float32]  # (K,), times relative to the target, -1..1
     near: NDArray[np.float32]  # (K,), weights with which a robust mean begins
 
     @classmethod
-    def of(cls, pixels: NDArray[np.float32], s: NDArray[np.float32]) -> "PackedImages":
+    def of(cls, L: NDArray, V: NDArray, s: NDArray[np.float32]) -> "InstantStack":
         """Add the weights, which fall with the distance from the target.
 
         Args:
-            pixels: (K, h, w, 2) log intensity and its variance, (ln I)^2.
+            L: (K, h, w) float32, log intensity.
+            V: (K, h, w) float32, its variance, (ln I)^2.
             s: (K,) times relative to the target, -1..1.
 
         Returns:
             Images with weights.
         """
-        return cls(pixels, s, np.exp(-2 * (s / max_instant_distance(s)) ** 2).astype(np.float32))
+        return cls(L, V, s, np.exp(-2 * (s / max_instant_distance(s)) ** 2).astype(np.float32))
 
 
 def max_instant_distance(s: NDArray[np.float32]) -> np.float32:
@@ -167,24 +172,15 @@ def robust_means(values, information, initial_weights, nu, out_means):
 
 
 @njit_fastmath_inlined
-def read_image(image, pixel, part, out_level, out_variance):
-    """Write log intensity and variance of a packed image at points, bilinear.
+def _add_product(a, b, out):
+    for i in range(len(out)):
+        out[i] += a[i] * b[i]
 
-    Args:
-        image: (h, w, 2) the image.
-        pixel: (2, points) x and y of the pixels before the points.
-        part: (2, points) distance from those, px.
-        out_level: (points,) output, log intensity.
-        out_variance: (points,) output, its variance, (ln I)^2.
-    """
-    h, w, _ = image.shape
-    for i in range(len(out_level)):
-        x0, y0 = pixel[0, i], pixel[1, i]
-        x1 = min(x0 + 1, w - 1)
-        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
-        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
-        out_level[i] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
-        out_variance[i] = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
+
+@njit_fastmath_inlined
+def _add_scaled(factor, a, out):
+    for x in range(len(out)):
+        out[x] += factor * a[x]
 
 
 class _SampleScratch(NamedTuple):
@@ -205,67 +201,63 @@ class _SampleScratch(NamedTuple):
 def _sum_instants(begin, end, inputs, scratch, out):
     """Write the `TrajectorySums` of some rows."""
     images, p, cost = inputs
-    count, h, w, _ = images.pixels.shape
-    rows, half = scratch.rows, np.float32(0.5)
+    count, h, w = images.L.shape
+    rows, zero = scratch.rows, np.float32(0)
     path, at, pixel = rows.path[begin], rows.x[begin], rows.pixel[begin]
-    row = (path, at, pixel, rows.part[begin], rows.inside[begin])
+    part, inside, runs = rows.part[begin], rows.inside[begin], rows.runs[begin]
+    row = (path, at, pixel, part, inside, runs)
     level, info, R = scratch.values[begin, 0], scratch.values[begin, 1], scratch.values[begin, 2]
     total, r1, r2 = scratch.sums[begin, 2], scratch.sums[begin, 3], scratch.sums[begin, 4]
     r3, r4 = scratch.sums[begin, 5], scratch.sums[begin, 6]
+    for x in range(w):
+        at[x] = np.float32(x)
     for y in range(begin, end):
         M, moments = out.M[y], out.moments[y]
-        at_y = np.float32(y) * half - np.float32(0.25)
-        for x in range(w):
-            at[x] = np.float32(x)
-            interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
+        interpolate_row(p, y, rows.nodes[begin], path)
         for k in range(count):
             locate_points(np.float32(y), images.s[k], (h, w), w, row)
-            read_image(images.pixels[k], pixel, row[3], level[k], info[k])
-            fill_information(info[k], row[4], cost.floor, info[k])
+            read_bilinear(images.L[k], pixel, part, runs, level[k])
+            read_bilinear(images.V[k], pixel, part, runs, info[k])
+            fill_information(info[k], inside, cost.floor, info[k])
         robust_means(level, info, images.near, cost.robust, (R, M, scratch.sums[begin, :2]))
-        total[:], r1[:], r2[:], r3[:], r4[:] = half * 0, half * 0, half * 0, half * 0, half * 0
-        moments[:] = np.float32(0)
-        for k in range(count):
-            s = images.s[k]
-            q = s * s
+        total[:], r1[:], r2[:], r3[:], r4[:] = zero, zero, zero, zero, zero
+        moments[:] = zero
+        for k in range(count):  # few sums at once: compilers compare the places of all of them
+            s, q, weight, e = images.s[k], images.s[k] * images.s[k], R[k], level[k]
             for x in range(w):
-                e = level[k, x] - M[x]
-                total[x] += R[k, x]
-                r1[x] += R[k, x] * s
-                r2[x] += R[k, x] * q
-                r3[x] += R[k, x] * (q * s)
-                r4[x] += R[k, x] * (q * q)
-                moments[3, x] += R[k, x] * s * e
-                moments[4, x] += R[k, x] * q * e
-                moments[5, x] += R[k, x] * e * e
+                e[x] -= M[x]
+                total[x] += weight[x]
+            _add_scaled(s, weight, r1)
+            _add_scaled(q, weight, r2)
+            _add_scaled(q * s, weight, r3)
+            _add_scaled(q * q, weight, r4)
+            for x in range(w):
+                weight[x] *= e[x]
+            _add_scaled(s, weight, moments[3])
+            _add_scaled(q, weight, moments[4])
+            _add_product(weight, e, moments[5])
         for x in range(w):
             moments[0, x] = r2[x] - r1[x] * r1[x] / total[x]
             moments[1, x] = r3[x] - r1[x] * r2[x] / total[x]
             moments[2, x] = r4[x] - r2[x] * r2[x] / total[x]
 
 
-def sum_instants(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> TrajectorySums:
-    """Sum what packed images show along trajectories.
+def sum_instants(images: InstantStack, p: NDArray[np.float32], cost: CostParams) -> TrajectorySums:
+    """Sum what images show along trajectories.
 
     Args:
-        images: The packed images.
+        images: The images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
         The sums of all pixels.
     """
-    count, h, w, _ = images.pixels.shape
+    count, h, w = images.L.shape
     out = TrajectorySums(empty(h, w), empty(h, 6, w))
     scratch = _SampleScratch.allocate(h, count, w)
-    run_over_rows(_sum_instants, h, (images, p, cost), scratch, out)
+    run_over_rows(_sum_instants, h, (images, p, cost), scratch, out, min_rows=MIN_ROWS)
     return out
-
-
-@njit_fastmath_inlined
-def _add_product(a, b, out):
-    for i in range(len(out)):
-        out[i] += a[i] * b[i]
 
 
 @njit_fastmath
@@ -349,11 +341,11 @@ def _weigh_differences(p, edge, horizon, cost, out):
                 out[turn, i, j] = weight
 
 
-def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> NormalEquations:
+def linearise(images: InstantStack, p: NDArray[np.float32], cost: CostParams) -> NormalEquations:
     """Set up the normal equations at some trajectories.
 
     Args:
-        images: The packed images.
+        images: The images.
         p: (rows, columns, 4) the trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
@@ -363,7 +355,7 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
     sums, shape = sum_instants(images, p, cost), p.shape[:2]
     entries = empty(*shape, 15)
     scratch = row_scratch(shape[0], 15, sums.M.shape[1])
-    run_over_rows(_fill_equations, shape[0], sums, scratch, entries)
+    run_over_rows(_fill_equations, shape[0], sums, scratch, entries, min_rows=MIN_ROWS)
     blurred = empty(*shape, 14)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
     horizon = max_instant_distance(images.s)
@@ -377,12 +369,6 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
 
 
 @njit_fastmath_inlined
-def _add_difference(weight, a, b, out):
-    for x in range(len(out)):
-        out[x] += weight[x] * (a[x] - b[x])
-
-
-@njit_fastmath_inlined
 def _scale_and_add(factor, a, out):
     """Write factor out + a."""
     for x in range(len(out)):
@@ -390,66 +376,52 @@ def _scale_and_add(factor, a, out):
 
 
 @njit_fastmath_inlined
-def _add_scaled(factor, a, out):
-    for x in range(len(out)):
-        out[x] += factor * a[x]
-
-
-@njit_fastmath_inlined
 def _multiply(N, i, q, out):
     """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors (4, columns)."""
-    for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
-        for x in range(out.shape[1]):
-            out[c, x] = np.float32(0)
-        for e in range(len(out)):
-            low, high = min(c, e), max(c, e)
-            _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    for c in range(len(out)):  # a number that is not known is not unrolled: less to compile
+        a, b = N[SYMMETRIC[c, 0], i], N[SYMMETRIC[c, 1], i]
+        d, e, product = N[SYMMETRIC[c, 2], i], N[SYMMETRIC[c, 3], i], out[c]
+        for j in range(len(product)):
+            product[j] = a[j] * x[j] + b[j] * y[j] + d[j] * z[j] + e[j] * w[j]
 
 
 @njit_fastmath_inlined
-def _laplacian(q, across, down, i, out):
-    """Write the weighted graph Laplacian (columns,) of a row; all are padded by a node."""
-    width = len(out)
-    here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
-    out[:] = np.float32(0)
-    _add_difference(across[i, :width], here, left, out)
-    _add_difference(across[i, 1:], here, right, out)
-    _add_difference(down[i], here, q[i, 1:-1], out)
-    _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
+def _add_pull(q, weights, i, smooth, ridge, out):
+    """Add smooth times the weighted graph Laplacian of a row, and ridge q; padded by a node."""
+    across, above, below = weights[0][i], weights[1][i], weights[1][i + 1]
+    up, here, down = q[i], q[i + 1], q[i + 2]
+    for j in range(len(out)):
+        value = here[j + 1]
+        rough = across[j] * (value - here[j]) + across[j + 1] * (value - here[j + 2])
+        rough += above[j] * (value - up[j + 1]) + below[j] * (value - down[j + 1])
+        out[j] += smooth * rough + ridge * value
 
 
 @njit_fastmath_inlined
-def _invert(N, added, scratch, out):
+def _invert(N, added, out):
     """Write the inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
-    # Cholesky, in double precision: nodes without texture are nearly singular.
-    A, C, inverse = scratch[0], scratch[1], scratch[2]
-    entry = 0
-    for i in range(4):
-        for j in range(i, 4):
-            A[i, j] = N[entry]
-            A[j, i] = N[entry]
-            entry += 1
-        A[i, i] += added[i]
-    for i in range(4):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= C[i, k] * C[j, k]
-            C[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / C[j, j]
-    for j in range(4):  # the inverse of C
-        for i in range(j, 4):
-            total = 1.0 if i == j else 0.0
-            for k in range(j, i):
-                total -= C[i, k] * inverse[k, j]
-            inverse[i, j] = total / C[i, i]
-    entry = 0
-    for i in range(4):
-        for j in range(i, 4):
-            total = 0.0
-            for k in range(j, 4):
-                total += inverse[k, i] * inverse[k, j]
-            out[entry] = total
-            entry += 1
+    one = np.float32(1)
+    # The matrix is C D C^T, C a unit lower triangle.
+    e0 = one / (N[0] + added[0])
+    c10, c20, c30 = N[1] * e0, N[2] * e0, N[3] * e0
+    e1 = one / (N[4] + added[1] - c10 * N[1])
+    b21, b31 = N[5] - c10 * N[2], N[6] - c10 * N[3]
+    c21, c31 = b21 * e1, b31 * e1
+    e2 = one / (N[7] + added[2] - c20 * N[2] - c21 * b21)
+    b32 = N[8] - c20 * N[3] - c21 * b31
+    c32 = b32 * e2
+    e3 = one / (N[9] + added[3] - c30 * N[3] - c31 * b31 - c32 * b32)
+    # The inverse of C, then that of the whole.
+    m10, m21, m32 = -c10, -c21, -c32
+    m20, m31 = -c20 - c21 * m10, -c31 - c32 * m21
+    m30 = -c30 - c31 * m10 - c32 * m20
+    out[0] = e0 + e1 * m10 * m10 + e2 * m20 * m20 + e3 * m30 * m30
+    out[1] = e1 * m10 + e2 * m20 * m21 + e3 * m30 * m31
+    out[2], out[3] = e2 * m20 + e3 * m30 * m32, e3 * m30
+    out[4] = e1 + e2 * m21 * m21 + e3 * m31 * m31
+    out[5], out[6] = e2 * m21 + e3 * m31 * m32, e3 * m31
+    out[7], out[8], out[9] = e2 + e3 * m32 * m32, e3 * m32, e3
 
 
 class _SolverScratch(NamedTuple):
@@ -460,19 +432,17 @@ class _SolverScratch(NamedTuple):
     below: NDArray[np.float32]  # (rows + 1, columns), the same between rows
     q: NDArray[np.float32]  # (4, rows + 2, columns + 2), the direction, 0 around the nodes
     vectors: NDArray[np.float32]  # (4, rows, 4, columns)
-    lines: NDArray[np.float32]  # (2, columns)
+    sums: NDArray[np.float32]  # (columns,)
     node: NDArray[np.float32]  # (14,)
-    inverse: NDArray[np.float64]  # (3, 4, 4)
 
     @classmethod
     def zeros(cls, rows: int, columns: int) -> "_SolverScratch":
         """Allocate zeros."""
         shapes = (
             (2, 10, rows, columns), (rows, columns + 1), (rows + 1, columns),
-            (4, rows + 2, columns + 2), (4, rows, 4, columns), (2, columns), (14,),
+            (4, rows + 2, columns + 2), (4, rows, 4, columns), (columns,), (14,),
         )  # fmt: skip
-        single = [np.zeros(shape, np.float32) for shape in shapes]
-        return cls._make([*single, np.zeros((3, 4, 4))])
+        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
 def solve_normal_equations(
@@ -500,7 +470,7 @@ def _solve(eq, p, iterations, scratch, d):
     smooth, ridge, beside, below, q = eq.smooth, eq.ridge, scratch.beside, scratch.below, scratch.q
     A, P, vectors, node = scratch.blocks[0], scratch.blocks[1], scratch.vectors, scratch.node
     r, found, Aq, z = vectors[0], vectors[1], vectors[2], vectors[3]
-    rough, sums, added, block = scratch.lines[0], scratch.lines[1], node[:4], node[4:]
+    sums, added, block, weights = scratch.sums, node[:4], node[4:], (beside, below)
     for i in range(rows):
         for j in range(columns):
             beside[i, j + 1] = eq.across[i, j] if j < columns - 1 else np.float32(0)
@@ -509,15 +479,14 @@ def _solve(eq, p, iterations, scratch, d):
                 q[c, i + 1, j + 1] = p[i, j, c]
     for i in range(rows):
         for c in range(channels):
-            _laplacian(q[c], beside, below, i, rough)
             for j in range(columns):
-                pull = smooth[c] * rough[j] + ridge[c] * p[i, j, c]
-                r[i, c, j] = eq.b[i, j, c] - pull
+                r[i, c, j] = eq.b[i, j, c]
+            _add_pull(q[c], weights, i, -smooth[c], -ridge[c], r[i, c])
         for j in range(columns):
             degree = beside[i, j] + beside[i, j + 1] + below[i, j] + below[i + 1, j]
             for c in range(channels):
                 added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
-            _invert(eq.N[i, j], added, scratch.inverse, block)
+            _invert(eq.N[i, j], added, block)
             for c in range(10):
                 P[c, i, j] = block[c]
                 A[c, i, j] = eq.N[i, j, c]
@@ -546,9 +515,7 @@ def _solve(eq, p, iterations, scratch, d):
         for i in range(rows):
             _multiply(A, i, q[:, i + 1, 1:-1], Aq[i])
             for c in range(channels):
-                _laplacian(q[c], beside, below, i, rough)
-                _add_scaled(smooth[c], rough, Aq[i, c])
-                _add_scaled(ridge[c], q[c, i + 1, 1:-1], Aq[i, c])
+                _add_pull(q[c], weights, i, smooth[c], ridge[c], Aq[i, c])
                 _add_product(q[c, i + 1, 1:-1], Aq[i, c], sums)
         curvature = 0.0
         for j in range(columns):

@@ -132,9 +132,9 @@ def activity_range(layout: InstantLayout) -> tuple[Numeric, Numeric]:
     which takes part.
     """
     a, b, target = layout.before, layout.after, layout.target
-    last = layout.s[a] <= 0  # no frame follows
-    low = jnp.where((a == b) & ~last, target - 1, a)
-    return low, jnp.where((a == b) & last, target + 1, b)
+    follows = layout.s[a] > 0  # no frame is before
+    low = a + (a == b) * follows * (target - 1 - a)
+    return low, b + (a == b) * (1 - follows) * (target + 1 - b)
 
 
 def robust_mean_jax(
@@ -302,8 +302,8 @@ def blur_images(images: NDArray[np.float32], sigma_px: float) -> NDArray[np.floa
     """
     taps, (_, h, w) = half_taps(sigma_px), images.shape
     half, out = empty(*images.shape), empty(*images.shape)
-    run_over_rows(_blur_across, h, images, taps, row_scratch(h, w + 12), half)
-    run_over_rows(_blur_down, h, half, taps, out)
+    run_over_rows(_blur_across, h, images, taps, row_scratch(h, w + 12), half, min_rows=32)
+    run_over_rows(_blur_down, h, half, taps, out, min_rows=32)
     return out
 
 

@@ -29,11 +29,10 @@ from numpy.typing import NDArray
 from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
-    PackedImages,
+    InstantStack,
     fill_information,
     linearise,
     max_instant_distance,
-    read_image,
     robust_means,
     solve_normal_equations,
     sum_instants,
@@ -50,6 +49,7 @@ from jaxevent.reconstruction.compensated.warp import (
     blend_nodes,
     interpolate_paths,
     locate_points,
+    read_bilinear,
     resize_nodes,
 )
 
@@ -66,25 +66,13 @@ MIN_COST_GAIN = np.float32(0.1)
 MIN_PATH_DIFFERENCE_PX = np.float32(0.5)  # at the farthest instant, between paths to compare
 
 
-class PathSearch(NamedTuple):
-    """One pass over an image in which pixels compare their paths with those nearby."""
-
-    spacing: int  # px, between the pixels that are compared
-    distance: int  # to the paths that are tried, in units of the spacing
-    sigma: float  # of the Gaussian over which costs are gathered, in units of the spacing
-
-
+# Factor on the images' curvature in a search. Set on simulated objects and pans of seeds that are
+# not scored: with 1 fewer fast things are found in as many steps, with 0.4 noise is followed.
+SEARCH_CURVATURE = 0.6
 CHOICE_SIGMA = 2.0  # of the Gaussian over which costs of trajectories are compared, in nodes
-# Set on objects of seeds that are not scored, and on the first half of slider_depth.
-PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
-BORROWING = (PathSearch(1, 4, 1.0),)
-
-
-def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
-    """Pack images and their variances, each (K, h, w): (K, h, w, 2)."""
-    out = empty(*L.shape, 2)
-    out[..., 0], out[..., 1] = L, V
-    return out
+# Paths that a pixel tries are that far away, and costs are gathered over a Gaussian. Set on objects
+# of seeds that are not scored, and on the first half of slider_depth.
+PATH_DISTANCE_PX, PATH_SIGMA_PX = 4, 1.0
 
 
 @njit_fastmath
@@ -109,33 +97,29 @@ def halve_resolution(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur images (K, h, w) and keep every second pixel: half the resolution, rounded up."""
     count, h, w = images.shape
     out = empty(count, (h + 1) // 2, (w + 1) // 2)
-    run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out)
+    run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out, min_rows=32)
     return out
 
 
 class ImagePyramid:
-    """Packed images at full, half, quarter ... resolution, made when first needed.
+    """Images at full, half, quarter ... resolution, made when first needed.
 
     Args:
-        L: (K, h, w) log intensity.
-        V: (K, h, w) its variance, (ln I)^2.
+        L: (K, h, w) float32, log intensity.
+        V: (K, h, w) float32, its variance, (ln I)^2.
         variance_factor: Factor on the blurred variance from one resolution to half of it.
     """
 
     def __init__(self, L: NDArray, V: NDArray, variance_factor: float):
-        self._levels = [(np.asarray(L, np.float32), np.asarray(V, np.float32))]
-        self._packed: dict[int, NDArray[np.float32]] = {}
-        self._factor = np.float32(variance_factor)
-        self.image_shape: tuple[int, int] = self._levels[0][0].shape[1:]
+        self._levels, self._factor = [(L, V)], np.float32(variance_factor)
+        self.image_shape: tuple[int, int] = L.shape[1:]
 
-    def __getitem__(self, level: int) -> NDArray[np.float32]:
-        """Return the packed images of a level; 0 is full resolution."""
+    def __getitem__(self, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return log intensity and variance at a level, (K, h, w) each; 0 is full resolution."""
         while len(self._levels) <= level:
             L, V = self._levels[-1]
             self._levels.append((halve_resolution(L), halve_resolution(V) * self._factor))
-        if level not in self._packed:
-            self._packed[level] = pack_images(*self._levels[level])
-        return self._packed[level]
+        return self._levels[level]
 
 
 @njit_fastmath_inlined
@@ -177,19 +161,25 @@ def _move(p, d, longest, scratch, out):
 
 
 def gauss_newton_step(
-    images: PackedImages, p: NDArray[np.float32], cost: CostParams
+    images: InstantStack,
+    p: NDArray[np.float32],
+    cost: CostParams,
+    curvature: float = 1.0,
 ) -> NDArray[np.float32]:
     """Improve trajectories by one Gauss-Newton step, followed by a median over 3 x 3 nodes.
 
     Args:
-        images: Packed images.
+        images: Images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
+        curvature: Factor on the images' normal matrix. Steps below 1 are longer; where they end
+            does not depend on it.
 
     Returns:
         (rows, columns, 4) the new trajectories, px.
     """
-    d = solve_normal_equations(linearise(images, p, cost), p)
+    equations = linearise(images, p, cost)
+    d = solve_normal_equations(equations._replace(N=np.float32(curvature) * equations.N), p)
     rows, columns, channels = p.shape
     out, flat, horizon = (
         np.empty_like(p),
@@ -202,11 +192,11 @@ def gauss_newton_step(
     return out
 
 
-def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> float:
+def robust_cost(images: InstantStack, p: NDArray[np.float32], cost: CostParams) -> float:
     """Return the mean weighted squared difference of images along trajectories.
 
     Args:
-        images: Packed images.
+        images: Images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
@@ -217,7 +207,7 @@ def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) 
 
 
 def choose_trajectories(
-    images: PackedImages,
+    images: InstantStack,
     several: Sequence[NDArray[np.float32]],
     cost: CostParams,
     shares: Sequence[float],
@@ -225,7 +215,7 @@ def choose_trajectories(
     """Choose for every node the trajectories along which images agree best around it.
 
     Args:
-        images: Packed images.
+        images: Images.
         several: Trajectories of nodes, each (rows, columns, 4), px.
         cost: Parameters of the cost, float32.
         shares: By which the cost of each is divided, above 0.
@@ -352,12 +342,12 @@ def estimate_trajectories(
     for stage in plan:
         chosen = np.abs(s) <= stage.horizon * 1.001
         for level in stage.levels:
-            p, pixels = found.at_level(level, (h, w)).p, pyramid[level]
+            p, (L, V) = found.at_level(level, (h, w)).p, pyramid[level]
             if not chosen.all():
-                pixels = np.ascontiguousarray(pixels[chosen])
-            images = PackedImages.of(pixels, s[chosen])
+                L, V = L[chosen], V[chosen]
+            images = InstantStack.of(L, V, s[chosen])
             for _ in range(stage.steps):
-                p = gauss_newton_step(images, p, cost)
+                p = gauss_newton_step(images, p, cost, SEARCH_CURVATURE)
             found = NodeTrajectories(p, level)
     return found
 
@@ -389,7 +379,7 @@ def advect_nodes(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.fl
         (rows, columns, 4) trajectories of the points visible at s, on the new clock, px.
     """
     out = np.empty_like(p)
-    run_over_rows(_advect, len(p), p, np.float32(s), out)
+    run_over_rows(_advect, len(p), p, np.float32(s), out, min_rows=32)
     return out * np.array([unit, unit, unit**2, unit**2], np.float32)
 
 
@@ -420,9 +410,8 @@ class _SearchScratch(NamedTuple):
 class _SearchInputs(NamedTuple):
     """One pass of `select_paths`."""
 
-    images: PackedImages
-    paths: NDArray[np.float32]  # (h, w, 4), of every `spacing`-th pixel
-    spacing: int
+    images: InstantStack
+    paths: NDArray[np.float32]  # (h, w, 4)
     offsets: NDArray[np.int64]  # (n, 2), of the pixels whose paths are tried
     cost: CostParams
     taps: NDArray[np.float32]
@@ -436,16 +425,17 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
     Their paths and places at the target stand in `scratch.rows`.
     """
     images, nu = inputs.images, inputs.cost.robust
-    h, w = images.pixels.shape[1:3]
+    h, w = images.L.shape[1:]
     s, rows, lines = images.s, scratch.rows, scratch.lines[begin]
     path, pixel, part = rows.path[begin], rows.pixel[begin], rows.part[begin]
-    x, inside = rows.x[begin], rows.inside[begin]
+    x, inside, runs = rows.x[begin], rows.inside[begin], rows.runs[begin]
     level, W, R = scratch.values[begin, 0], scratch.values[begin, 1], scratch.values[begin, 2]
     means, costs = lines[2, :count], lines[3]
     total, product = scratch.logs[begin, 0], scratch.logs[begin, 1]
     for k in range(len(s)):
-        locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside))
-        read_image(images.pixels[k], pixel, part, level[k, :count], W[k])
+        locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside, runs))
+        read_bilinear(images.L[k], pixel, part, runs, level[k])
+        read_bilinear(images.V[k], pixel, part, runs, W[k])
         fill_information(W[k, :count], inside, inputs.cost.floor, W[k])
     robust_means(level, W, images.near, nu, (R, means, lines[:2]))
     for i in range(count):
@@ -498,7 +488,7 @@ def _list_pixels(y, n, inputs, begin, scratch):
             wanted = own[x] >= inputs.min_gain and difference >= MIN_PATH_DIFFERENCE_PX
         if wanted:
             scratch.chosen[begin, count] = x
-            rows.x[begin, count] = np.float32(x * inputs.spacing)
+            rows.x[begin, count] = np.float32(x)
             for c in range(4):
                 rows.path[begin, c, count] = paths[i, j, c]
             count += 1
@@ -518,7 +508,7 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
         own[:] = np.float32(0)
         for n in range(len(inputs.offsets)):
             count = _list_pixels(y, n, inputs, begin, scratch)
-            _evaluate_cost(count, begin, np.float32(y * inputs.spacing), inputs, scratch)
+            _evaluate_cost(count, begin, np.float32(y), inputs, scratch)
             for x in range(len(own)):
                 other[x] = own[x]
             for m in range(count):
@@ -529,75 +519,61 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
 
 
 @njit_fastmath
-def _select(begin, end, inputs, found, scratch, out):
-    """Write the paths that pixels take, by costs that are blurred along x, and the present ones."""
-    costs, path_index = found
-    h, w = path_index.shape
-    lines, spacing = scratch.lines[begin], inputs.spacing
+def _select(begin, end, inputs, costs, scratch, out):
+    """Write the pixels whose paths are taken, by costs that are blurred along x."""
+    h, w = out.shape
+    lines = scratch.lines[begin]
     cost, least, best = lines[0], lines[1], lines[2]
-    for row in range(begin, end):
+    for y in range(begin, end):
         for n in range(len(costs)):
-            blur_along_y(costs[n], row, inputs.taps, cost)
+            blur_along_y(costs[n], y, inputs.taps, cost)
             more = inputs.min_gain if n else np.float32(0)
-            for i in range(len(cost)):
-                if n == 0 or cost[i] + more < least[i]:
-                    least[i], best[i] = cost[i] + more, np.float32(n)
-        for y in range(row * spacing, min((row + 1) * spacing, h)):
             for x in range(w):
-                move = inputs.offsets[int(best[x // spacing])]
-                i = min(max(y + move[0] * spacing, 0), h - 1)
-                out[y, x] = path_index[i, min(max(x + move[1] * spacing, 0), w - 1)]
+                if n == 0 or cost[x] + more < least[x]:
+                    least[x], best[x] = cost[x] + more, np.float32(n)
+        for x in range(w):
+            move = inputs.offsets[int(best[x])]
+            i, j = min(max(y + move[0], 0), h - 1), min(max(x + move[1], 0), w - 1)
+            out[y, x] = i * w + j
 
 
 def select_paths(
-    images: PackedImages,
-    paths: NDArray[np.float32],
-    cost: CostParams,
-    searches: tuple[PathSearch, ...] = PATH_SEARCHES,
+    images: InstantStack, paths: NDArray[np.float32], cost: CostParams
 ) -> NDArray[np.int32]:
     """Select for each pixel the path of a nearby pixel along which the images agree best.
 
     Args:
-        images: Packed images of full resolution.
+        images: Images.
         paths: (h, w, 4) paths of all pixels, px.
         cost: Parameters of the cost, float32.
-        searches: The passes over the image, in order.
 
     Returns:
         (h, w) flat indices of the pixels whose paths are taken, row by row.
     """
-    h, w, _ = paths.shape
+    (h, w, _), offsets = paths.shape, NEIGHBOUR_OFFSETS * PATH_DISTANCE_PX
     min_gain = np.float32(MIN_COST_GAIN * len(images.s))
-    path_index = np.arange(h * w, dtype=np.int32).reshape(h, w)
-    for spacing, distance, sigma in searches:
-        some = paths.reshape(-1, 4)[path_index[::spacing, ::spacing]]
-        taps, shape = half_taps(sigma), some.shape[:2]
-        inputs = _SearchInputs(
-            images, some, spacing, NEIGHBOUR_OFFSETS * distance, cost, taps, min_gain
-        )
-        costs = empty(len(NEIGHBOUR_OFFSETS), *shape)
-        scratch = _SearchScratch.allocate(shape, len(images.s))
-        run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
-        out = np.empty_like(path_index)
-        run_over_rows(_select, shape[0], inputs, (costs, path_index), scratch, out)
-        path_index = out
-    return path_index
+    inputs = _SearchInputs(images, paths, offsets, cost, half_taps(PATH_SIGMA_PX), min_gain)
+    costs, out = empty(len(offsets), h, w), np.empty((h, w), np.int32)
+    scratch = _SearchScratch.allocate((h, w), len(images.s))
+    run_over_rows(_evaluate_paths, h, inputs, scratch, costs)
+    run_over_rows(_select, h, inputs, costs, scratch, out)
+    return out
 
 
 def borrow_paths(
-    images: PackedImages, p: NDArray[np.float32], cost: CostParams
+    images: InstantStack, p: NDArray[np.float32], cost: CostParams
 ) -> NDArray[np.float32]:
     """Let nodes take the trajectories of others nearby along which images agree better.
 
     Args:
-        images: Packed images of full resolution.
+        images: Images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
         (rows, columns, 4) the trajectories, px.
     """
-    size = images.pixels.shape[1:3]
-    index = select_paths(images, interpolate_paths(p, size), cost, BORROWING)
+    size = images.L.shape[1:]
+    index = select_paths(images, interpolate_paths(p, size), cost)
     y, x = np.divmod(index[::2, ::2], size[1])
     return p[y // 2, x // 2]
