@@ -28,11 +28,11 @@ test: .venv/test.stamp
 	@$(MAKE) --no-print-directory -j 2 suite lint
 
 suite: .venv/test.stamp
-	$(suite)
+	$(suite) $(chosen)
 
 # For the edit loop: none of the tests that take long.
-quick: lint
-	$(suite) -m "not slow"
+quick: .venv/test.stamp
+	@$(MAKE) --no-print-directory -j 2 suite lint chosen='-m "not slow"'
 
 lint: .venv/test.stamp
 	$(bin)/ruff check

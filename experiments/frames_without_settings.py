@@ -154,7 +154,7 @@ def main() -> None:
     kind, cells = ("beyond", beyond) if arguments.beyond else ("table", between_and_after)
     kind = "strata" if arguments.strata else kind
     store = Store(out / ("rows.json" if kind == "table" else f"{kind}.json"))
-    methods = {n: (jaxevent.METHODS[n], None) for n in arguments.methods}
+    methods: dict[str, Any] = {n: (jaxevent.METHODS[n], None) for n in arguments.methods}
     if arguments.strata:
         methods = {n: pair for n, pair in methods.items() if pair[0].has_covariance}
     for name in arguments.recordings:

@@ -34,14 +34,14 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     """Convert times to microseconds: integers are microseconds already, floats are seconds.
 
     Args:
-        time: Times of any shape.
+        time: One time, or a list of them.
         what: Name of the times for messages.
 
     Returns:
         Times as int64 us, of the same shape.
 
     Raises:
-        InputError: The times are of another type, not finite, or too large for int64.
+        InputError: The times are of another type or shape, not finite, or too large for int64.
     """
     try:
         time = np.asarray(time)
@@ -51,6 +51,8 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
         raise InputError(
             f"{what} are {time.dtype}; give integers (microseconds) or floats (seconds)"
         )
+    if time.ndim > 1:
+        raise InputError(f"{what} have the shape {time.shape}; give a list of times")
     if not np.all(np.isfinite(time)):
         raise InputError(f"{what} contain a value that is not finite; remove it")
     scaled = np.rint(time.astype(np.float64) * 1e6) if time.dtype.kind == "f" else time
@@ -905,6 +907,12 @@ class Recording(HtmlRepr):
         t0 = self.start if span.start is None else int(microseconds(span.start))
         t1 = self.stop + 1 if span.stop is None else int(microseconds(span.stop))
 
+        if t1 < t0 and span.start is not None and span.stop is not None:
+            raise InputError(
+                f"{self.name}: the part from {t0} to {t1} us ends before it begins; give the "
+                "earlier time first"
+            )
+
         def cut(part):
             if part is None:
                 return None
@@ -929,6 +937,29 @@ class Recording(HtmlRepr):
                 f"reaches from {self.start} to {self.stop} us"
             )
         return part
+
+    def require_camera(self, camera: PinholeCamera | None, what: str) -> PinholeCamera:
+        """Return a camera that is given, or the recording's.
+
+        Args:
+            camera: The camera; None takes the recording's.
+            what: Name of what needs it, for the message.
+
+        Returns:
+            The camera.
+
+        Raises:
+            InputError: There is none; the message says how to give one.
+        """
+        camera = self.camera if camera is None else camera
+        if camera is None:
+            raise InputError(
+                f"{self.name}: has no calibration, which {what} needs"
+                f"{self.describe_left_out('camera')}; give "
+                "camera=jaxevent.camera.PinholeCamera(fx, fy, cx, cy) in px, here or to "
+                "jaxevent.load, which reads calibrations from YAML, too"
+            )
+        return camera
 
     def describe_left_out(self, field: str) -> str:
         """Return the end of a message that misses a field: the entry of `left_out`."""

@@ -49,9 +49,10 @@ hypothesis.settings.register_profile(
     "any", hypothesis.settings.get_profile("tests"), phases=(hypothesis.Phase.generate,)
 )
 
-# They take over 20 s of CPU each with nothing kept. Begun first, they leave no worker waiting for
+# They take about 20 s of CPU each with nothing kept. Begun first, they leave no worker waiting for
 # another at the end.
 LONGEST = (
+    "test_batch_evaluate.py",
     "test_blob_filters.py",
     "test_blob_fused.py",
     "test_blob_tracker.py",
@@ -63,6 +64,7 @@ LONGEST = (
     "test_egomotion_flow.py",
     "test_egomotion_patches.py",
     "test_egomotion_voting.py",
+    "test_evaluate.py",
     "test_evaluate_scores.py",
     "test_events_only.py",
     "test_extremes.py",

@@ -19,7 +19,7 @@ def make_up(monkeypatch: Any) -> None:
     monkeypatch.setattr(storage, "_memory", type(storage._memory)())
 
 
-def made_up(recording: Recording, I0: float = 1.0) -> Calibration:
+def made_up(recording: Recording, I0: float = 1.0, sample: object = None) -> Calibration:
     """Values that depend on all frames, the events' number and `I0`; none without two frames."""
     hot = np.zeros((recording.height, recording.width), bool)
     hot[2, 1] = True

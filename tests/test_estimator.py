@@ -95,6 +95,7 @@ def test_other_arguments_are_refused_by_every_method(name, recording):
         refuses("times", method.prepare, recording, times)
 
 
+@pytest.mark.slow
 def test_second_derivatives_through_a_kernel_name_the_compiler_that_has_them(recording):
     with jax.enable_x64(False):
         params = jaxevent.akf.Params()

@@ -50,6 +50,7 @@ def test_variance_of_images_is_judged_up_to_their_scale(script):
     assert script.honesty(image, variance, truth) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["slider", "objects"])
 def test_brightness_is_constant_along_the_true_flow(script, name):
     source, t, step = script.make_source(name, 7), 0.3, 2e-3
@@ -64,6 +65,7 @@ def test_brightness_is_constant_along_the_true_flow(script, name):
     assert np.median(rest) < 0.3 * np.median(change)
 
 
+@pytest.mark.slow
 def test_scenes_are_deterministic_and_have_no_frames(script):
     scene, again = script.make_scene("turn", 7), script.make_source("turn", 7)
     at = scene.times[-1] / 1e6

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import texture
-from together import in_child
+from together import assert_equal, in_child
 
 import jaxevent
 from jaxevent import codegen, progress
@@ -28,11 +28,6 @@ pytestmark = [
 def parent(float32):
     """Has computed with JAX and with kernels, on several threads."""
     (jnp.arange(3) + 1).block_until_ready()
-
-
-def assert_equal(found, true):
-    for one, other in zip(found, true, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("name", ["akf", "aks"])

@@ -1,28 +1,15 @@
 """Names and docstrings of the package keep the rules that `experiments/code_counts.py` counts."""
 
 import ast
-import importlib.util
-import sys
 import textwrap
-from pathlib import Path
-from typing import Any
 
 import pytest
+from scripts import script
 
 MOST_LONG_SIGNATURES = 20
 
 
-def load_script() -> Any:
-    path = Path(__file__).parents[1] / "experiments" / "code_counts.py"
-    spec = importlib.util.spec_from_file_location("code_counts", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["code_counts"] = module  # where dataclasses look for the types of fields
-    spec.loader.exec_module(module)
-    return module
-
-
-code_counts = load_script()
+code_counts = script("code_counts")
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,15 @@
 """Samples of the table of misuse; `python tests/misuse.py` tries all of it."""
 
+import dataclasses
 import functools
 import inspect
 
 import pytest
-from misuse import EQUAL, REFUSED, Case, constructions, estimates, is_right, outcome, run
+from misuse import EQUAL, REFUSED, Case, clean, constructions, estimates, is_right, outcome, run
 
 import jaxevent
 from jaxevent import InputError
+from jaxevent.show.images import video_writer
 
 
 def wrong_of(told: dict[str, str], tried: list[Case]) -> dict[str, str]:
@@ -72,3 +74,34 @@ def test_functions_of_a_recording_refuse_what_is_none(function):
 def test_functions_of_events_refuse_a_path(name, more):
     with pytest.raises(InputError, match="takes events or a recording, not a path; give jaxevent"):
         unchecked(getattr(jaxevent.events, name))("a.h5", *more)
+
+
+@pytest.fixture(scope="module")
+def bar() -> jaxevent.Recording:
+    columns = (clean()[name] for name in "txyp")
+    return jaxevent.Recording.from_arrays(*columns, width=64, height=48)
+
+
+def test_a_list_of_lists_of_times_is_refused(bar):
+    for read in (jaxevent.high_pass.estimate(bar), jaxevent.flow_from_events(bar)):
+        with pytest.raises(InputError, match=r"times have the shape \(1, 2\); give a list"):
+            read([[0.07, 0.08]])
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda r: unchecked(jaxevent.events.crop)(r, 0.0, 0, 10, 10), "^x is 0.0; give a whole"),
+        (lambda r: r[0.1:0.05], "from 100000 to 50000 us ends before it begins"),
+        (lambda r: jaxevent.load(None), r"the path is None; call jaxevent.load\(path\)"),
+        (lambda r: jaxevent.load("a.h5", size="60x45"), "size = '60x45' must be two positive"),
+        (lambda r: jaxevent.load("a.h5", size=(60.0, 45)), "must be two positive whole numbers"),
+        (lambda r: jaxevent.save("a.h5", r), r"the path is a Recording; .*save\(recording, path"),
+        (lambda r: jaxevent.flow_from_events(
+            dataclasses.replace(r, events=jaxevent.Events.empty())), "holds no events"),
+        (lambda r: video_writer("a.gif", 30).__enter__(), "a.gif: .* end the name in .mp4"),
+    ],
+)  # fmt: skip
+def test_likely_slips_are_refused(call, said, bar):
+    with pytest.raises(InputError, match=said):
+        call(bar)

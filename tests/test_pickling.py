@@ -15,6 +15,7 @@ import own_filter
 import points
 import pytest
 import texture
+from together import assert_equal
 
 import jaxevent
 from jaxevent.errors import InputError
@@ -38,11 +39,6 @@ COPIES = {
 def again(request, float32):
     """A function that makes a thing anew."""
     return COPIES[request.param]
-
-
-def assert_equal(found, true):
-    for one, other in zip(found, true, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def assert_same(one, other):

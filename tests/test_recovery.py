@@ -1,24 +1,17 @@
 """Parameters that data were drawn with are found by the likelihood alone."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+from scripts import script
 
 import jaxevent
 from jaxevent.runs.reconstruction import Objective, Problem, cut_windows
 from jaxevent.tuning import Settings
 
-SCRIPT = Path(__file__).parents[1] / "experiments" / "recovery.py"
-
 
 @pytest.fixture(scope="module")
 def recovery():
-    spec = importlib.util.spec_from_file_location("recovery", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("recovery")
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import numpy as np
 import points
 import pytest
 import texture
-from together import THREADS, at_once
+from together import THREADS, assert_equal, at_once
 
 import jaxevent
 from jaxevent.codegen import module as kernel_module
@@ -37,11 +37,6 @@ RESULTS = [
 @pytest.fixture(autouse=True)
 def precision(float32):
     """As users have it."""
-
-
-def assert_equal(found, true):
-    for one, other in zip(found, true, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow

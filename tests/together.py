@@ -14,8 +14,15 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+import numpy as np
 
 THREADS = 8
+
+
+def assert_equal(found: Any, true: Any) -> None:
+    """Arrays, one after another, are equal to the bit."""
+    for one, other in zip(found, true, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def at_once(job: Callable[[random.Random], Any], threads: int = THREADS) -> list[Any]:

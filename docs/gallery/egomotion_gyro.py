@@ -74,5 +74,25 @@ truth = egomotion.known_motion(recording, "rotation", "poses")
 jaxevent.show.plot_motion(motion, times, truth)
 
 # %% [markdown]
+# A gyro may have axes of its own. `plot_motion` then warns, as `score_motion` does, and
+# `find_gyro_axes` names those in which gyro and estimate agree. jAER's have y upwards:
+
+# %%
+turned = dataclasses.replace(
+    recording, imu=Imu(t, gyro * [1, -1, -1], np.zeros_like(gyro)), poses=None
+)
+by_gyro = egomotion.known_motion(turned, "rotation")
+axes = egomotion.scores.find_gyro_axes(motion, by_gyro)
+by_gyro = egomotion.known_motion(turned, "rotation", bias=bias * [1, -1, -1], rotation=axes)
+print(axes, np.abs(omega - by_gyro(times)).mean(0))  # rad/s
+
+# %% [markdown]
+# A recording without a calibration gets one as `jaxevent.load(path, camera=lens)`, or later:
+
+# %%
+lens = jaxevent.camera.PinholeCamera(fx=100.0, fy=100.0, cx=59.5, cy=44.5)  # px
+dataclasses.replace(turned, camera=lens)
+
+# %% [markdown]
 # On the command line `jaxevent motion recording.h5 --model rotation --truth` compares with the
 # recording's gyro, and `--imu-rotation` names its axes.

@@ -6,6 +6,7 @@
 Every method is used in this way, each with its own `Params`.
 """
 
+from jaxevent.blob import quantities
 from jaxevent.blob.filter import Filter
 from jaxevent.blob.filters.chi2 import chi2, chi2_split
 from jaxevent.blob.filters.constant_velocity import constant_velocity
@@ -35,6 +36,7 @@ __all__ = [
     "negative_log_likelihood",
     "position_error",
     "prepare_positions",
+    "quantities",
 ]
 
 __getattr__ = renamed_names(__name__)

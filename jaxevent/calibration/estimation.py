@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.correspondence import measure_correspondence
 from jaxevent.calibration.events_alone import (
     CONFIDENCE_Z,
     estimate_dead_time,
@@ -37,6 +38,8 @@ from jaxevent.recording import Recording, check_recording
 OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
 MIN_PEAK_RATIO = 2.0  # of the highest correlation to those far from it
+MIN_NEAR_SHARE = 0.95  # of the correlation within an interval of the stamps to the highest
+MIN_SIGNIFICANCE = 6.0  # as of the checks for faults
 MIN_POLARITY_SHARE = 0.05  # of the rarer polarity
 EARLIER_STARTS_S = (0.0, 3e-3, 8e-3)  # counts of whole events are late
 MAX_FIRST_PIXELS = 10_000  # of the fits that choose among starts
@@ -92,11 +95,28 @@ def find_offset(sample: Sample, I0: float) -> Clock:
     far = found[known & (np.abs(tried - tried[top]) > 2 * max(interval, OFFSET_STEP_US))]
     others = float(np.quantile(np.abs(far), 0.9)) if len(far) else 0.0
     why = ""
-    if found[top] < max(MIN_CORRELATION, MIN_PEAK_RATIO * others):
+    if found[top] < MIN_CORRELATION:
         why = f"events and frames agree at no offset (correlation {found[top]:.2f})"
+    elif found[top] < MIN_PEAK_RATIO * others:
+        # What moves periodically agrees after every period. Stamps are rarely off by more than an
+        # interval, so a peak as high within it is the right one, if it is no chance.
+        near = np.where(known & (np.abs(tried) <= interval), found, -np.inf)
+        if near.max() >= MIN_NEAR_SHARE * found[top] and _is_significant(sample):
+            top = int(near.argmax())
+        else:
+            why = (
+                f"events and frames agree nearly as well at far offsets (correlation {others:.2f}) "
+                f"as at {1e-6 * tried[top]:.3g} s ({found[top]:.2f})"
+            )
     if -np.nanmin(found) > found[top]:
         why = f"events show the opposite of frames (correlation {np.nanmin(found):.2f})"
     return Clock(tried * 1e-6, found, math.nan if why else float(tried[top]) * 1e-6, why)
+
+
+def _is_significant(sample: Sample) -> bool:
+    """Return whether events agree with frames at the stamps beyond chance, tile by tile."""
+    found = measure_correspondence(sample)
+    return found is not None and float(found.significance[0].max()) > MIN_SIGNIFICANCE
 
 
 def _interval(value: float, error: float, unit: str, note: str = "") -> CalibrationValue:

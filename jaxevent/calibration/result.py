@@ -123,7 +123,10 @@ class Calibration:
             for name, one in self.values().items()
             if one.is_identifiable
         ]
-        return f"<Calibration: {', '.join([*known, f'{int(self.hot_pixels.sum())} hot pixels'])}>"
+        known.append(f"{int(self.hot_pixels.sum())} hot pixels")
+        if not self.c_on.is_identifiable:
+            known.append(f"no thresholds: {self.c_on.note}")
+        return f"<Calibration: {', '.join(known)}>"
 
     def values(self) -> dict[str, CalibrationValue]:
         """Return all values with intervals, by name."""

@@ -134,7 +134,7 @@ class _RecycledMemory:
         if memory is None:
             memory = np.empty(size + ALIGNMENT_BYTES, np.uint8)
         offset = -memory.ctypes.data % ALIGNMENT_BYTES
-        block = (ctypes.c_char * size).from_buffer(memory, offset)
+        block = (ctypes.c_char * size).from_buffer(memory.data, offset)
         weakref.finalize(block, self._release, size, memory).atexit = False
         return block
 

@@ -181,11 +181,8 @@ class MotionEstimator(Estimator[P]):
         if model is None:
             model = next(one for one in MODELS.values() if self.supports(one))
         found, camera = self.find_model(model), camera or recording.camera
-        if found.needs_camera and camera is None:
-            raise InputError(
-                f"{recording.name}: has no calibration, which {found.title} needs"
-                f"{recording.describe_left_out('camera')}; give a camera"
-            )
+        if found.needs_camera:
+            camera = recording.require_camera(camera, found.title)
         self.check(recording)
         return found, camera
 

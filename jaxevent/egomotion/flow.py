@@ -33,7 +33,6 @@ from jaxevent.egomotion.candidates import Candidates, CandidateSampler, pixel_co
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.errors import InputError
 from jaxevent.parameters import Count, Number, Parameters, Positive
 from jaxevent.progress import bar
 from jaxevent.recording import Recording, Times, microseconds
@@ -196,13 +195,9 @@ def _required_camera(
     recording: Recording, motion: MotionEstimate, camera: PinholeCamera | None
 ) -> PinholeCamera | None:
     """Return the camera, by default the recording's; `InputError` if it is needed and missing."""
-    camera = camera or recording.camera
-    if motion.model.needs_camera and camera is None:
-        raise InputError(
-            f"{recording.name}: has no calibration, which the flow of {motion.model.title} needs"
-            f"{recording.describe_left_out('camera')}; give a camera"
-        )
-    return camera
+    if motion.model.needs_camera:
+        return recording.require_camera(camera, f"the flow of {motion.model.title}")
+    return camera or recording.camera
 
 
 def _age_range(

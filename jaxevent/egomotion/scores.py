@@ -7,6 +7,7 @@ Errors follow the egomotion thesis, 5.20 to 5.21 and 6.22 to 6.29.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -14,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.egomotion.models import Model, unit_vectors
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.egomotion.truth import KnownMotion
-from jaxevent.errors import InputError
+from jaxevent.egomotion.truth import KnownMotion, find_imu_axes
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.metrics import MEASURE_MEANINGS
 
 OUTLIER_RELATIVE_ERROR = (
@@ -220,6 +221,39 @@ class MotionScores:
         ]
 
 
+def find_gyro_axes(motion: MotionEstimate, truth: KnownMotion) -> str | None:
+    """Find other axes in which a gyro agrees with an estimate, where its own were not given.
+
+    Args:
+        motion: The estimate.
+        truth: Angular velocity of the gyro.
+
+    Returns:
+        The axes, see `find_imu_axes`; None if the camera's fit, or were given.
+    """
+    if not truth.guesses_axes:
+        return None
+    estimated = motion(truth.t, centred=True, extrapolate=True)
+    rows = estimated.valid & np.isfinite(estimated.mean).all(1)
+    return find_imu_axes(estimated.mean[rows], truth.values[rows]) if rows.any() else None
+
+
+def warn_of_gyro_axes(motion: MotionEstimate, truth: KnownMotion) -> None:
+    """Warn with an `InputWarning` of a gyro that agrees with an estimate in other axes.
+
+    Args:
+        motion: The estimate.
+        truth: The known motion.
+    """
+    if (axes := find_gyro_axes(motion, truth)) is not None:
+        warnings.warn(
+            f"{motion.recording}: the gyro is like the estimate in other axes; give known_motion "
+            f"rotation={axes!r} if they are its own",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
 def score_motion(
     motion: MotionEstimate,
     truth: KnownMotion,
@@ -240,8 +274,9 @@ def score_motion(
         description: The truth in words.
 
     Returns:
-        The errors.
+        The errors. An `InputWarning` tells of a gyro that agrees in other axes.
     """
+    warn_of_gyro_axes(motion, truth)
     times = times[truth.covers(times)]
     estimate = motion(times, centred=centred, extrapolate=True)
     start = int(times[0]) if start is None and len(times) else start or 0

@@ -134,14 +134,15 @@ def _is_rotation(R: NDArray[np.float64]) -> bool:
 
 
 def from_gyro(
-    imu: Imu, bias: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
+    imu: Imu, bias: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | str | None = None
 ) -> Twists:
     """Convert a gyro's rates to twists without T: Omega = rotation (gyro - bias).
 
     Args:
         imu: The samples; those at one time are averaged.
         bias: (3,) bias in the gyro's axes, rad/s; see `gyro_bias`.
-        rotation: (3, 3) from the gyro's axes to the camera's; by default the identity.
+        rotation: (3, 3) from the gyro's axes to the camera's, or a name of `IMU_AXES`; by default
+            the identity.
 
     Returns:
         The twists.
@@ -150,6 +151,8 @@ def from_gyro(
         InputError: There is no sample, one is not finite, or the matrix is no rotation.
     """
     bias = np.asarray(bias, np.float64)
+    if isinstance(rotation, str):
+        rotation = imu_rotation(rotation)
     R = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
     if bias.shape != (3,) or not np.isfinite(bias).all():
         raise InputError(
@@ -267,11 +270,13 @@ class KnownMotion:
         model: The motion model, of d components.
         t: (n,) times, us.
         values: (n, d) motions.
+        guesses_axes: Whether they are a gyro's rates, whose axes are taken for the camera's.
     """
 
     model: type[Model]
     t: NDArray[np.int64]
     values: NDArray[np.float64]
+    guesses_axes: bool = False
 
     def __call__(self, times: Times) -> NDArray[np.float64]:
         """Interpolate the motion (times, d) linearly, at integers (us) or floats (s).
@@ -303,7 +308,7 @@ def known_motion(
     bias: ArrayLike = (0.0, 0.0, 0.0),
     span: float | int = 0.02,
     *,
-    rotation: ArrayLike | None = None,
+    rotation: ArrayLike | str | None = None,
     depth: float | int | None = None,
 ) -> KnownMotion:
     """Return the true motion of a recording.
@@ -314,7 +319,8 @@ def known_motion(
         source: "poses", "gyro", "auto" (poses, else the gyro), a table, or the path of one.
         bias: (3,) bias of the gyro, rad/s.
         span: Time over which velocities are measured from poses, s.
-        rotation: (3, 3) from the gyro's axes to the camera's; see `from_gyro`.
+        rotation: (3, 3) from the gyro's axes to the camera's, or a name of `IMU_AXES`. None takes
+            them to be the same; `score_motion` and `plot_motion` warn where others fit far better.
         depth: Depth of the scene, m. With it poses determine an image velocity too.
 
     Returns:
@@ -342,20 +348,20 @@ def known_motion(
             f"with the columns {', '.join(('t', *model.components))}"
             f"{', or the depth' if model.fits_depth else ''}"
         )
-    poses, imu = recording.poses, recording.imu
+    poses, imu, guesses = recording.poses, recording.imu, False
     by_gyro = imu is not None and len(imu) > 0 and "gyro" in model.truth_sources
     by_poses = poses is not None and len(poses) > 0 and "poses" in model.truth_sources
     if source != "gyro" and by_poses and poses is not None:
         twists = from_poses(poses, span)
     elif source != "poses" and by_gyro and imu is not None:
-        twists = from_gyro(imu, bias, rotation)
+        twists, guesses = from_gyro(imu, bias, rotation), rotation is None
     else:
         missing = {"auto": "neither poses nor an IMU", "poses": "no poses", "gyro": "no IMU"}
         what = missing[str(source)]
         if source != "poses" and imu is not None and "gyro" not in model.truth_sources:
             what = f"no poses, and its gyro does not determine {parts}"
         raise InputError(f"{recording.name}: holds {what}; give a table of the true motion")
-    return KnownMotion(model, twists.t, model.from_twist(twists.T, twists.Omega))
+    return KnownMotion(model, twists.t, model.from_twist(twists.T, twists.Omega), guesses)
 
 
 def _planar_at_depth(

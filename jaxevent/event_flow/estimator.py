@@ -290,9 +290,11 @@ def flow_from_events(
         The flow: `mean, covariance, valid = flow(times)`.
 
     Raises:
-        InputError: The parameters are of another method.
+        InputError: There are no events, or the parameters are of another method.
     """
     check_recording(recording, "flow_from_events")
+    if not len(recording.events):
+        raise InputError(f"{recording.name}: holds no events; give a recording with some")
     params = FlowParams() if params is None else params
     if not isinstance(params, FlowParams):
         raise InputError(f"params are {type(params).__name__}; give FlowParams")

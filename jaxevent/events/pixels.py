@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import shorten_value
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit
 from jaxevent.errors import InputError
@@ -97,9 +98,13 @@ def crop(part: Part, x: int, y: int, width: int, height: int, *, size: Size | No
         The same type.
 
     Raises:
-        InputError: The region is not inside the sensor.
+        InputError: The region is no whole number of pixels, or not inside the sensor.
     """
     across, down = size_of(part, size)
+    region = {"x": x, "y": y, "width": width, "height": height}
+    for name, pixels in region.items():
+        if not isinstance(pixels, int | np.integer) or isinstance(pixels, bool):
+            raise InputError(f"{name} is {shorten_value(pixels)}; give a whole number of pixels")
     if not (0 <= x < x + width <= across and 0 <= y < y + height <= down):
         raise InputError(
             f"the region of {width}x{height} pixels from ({x}, {y}) is not inside the "
@@ -208,8 +213,8 @@ def undistort(recording: Recording) -> Recording:
     camera, width, height = recording.camera, recording.width, recording.height
     if camera is None:
         raise InputError(
-            f"{recording.name}: holds no calibration, which undistorting needs; give its camera"
-            f"{recording.describe_left_out('camera')}"
+            f"{recording.name}: holds no calibration, which undistorting needs"
+            f"{recording.describe_left_out('camera')}; give it to jaxevent.load(path, camera=...)"
         )
     y, x = (axis.ravel() for axis in np.mgrid[:height, :width])
     ideal = camera.undistorted

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxevent import arrays
 from jaxevent.arrays import times
+from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
@@ -79,7 +80,7 @@ def load(
     frames: str | None = None,
     time_unit: str | None = None,
     repair: str | None = None,
-    camera: str | os.PathLike[str] | None = None,
+    camera: str | os.PathLike[str] | PinholeCamera | None = None,
 ) -> Recording:
     """Read and check a recording; its format is inferred from its content, not from its name.
 
@@ -103,13 +104,14 @@ def load(
             topic of a bag, the number of a stream of AEDAT 4. "none" leaves frames out, in any
             format.
         time_unit: The unit of the event times, "s", "ms", "us" or "ns", of formats that do not
-            state it; None infers it (`time_units`), with an `InputWarning` in doubt.
+            state it; None infers it (`jaxevent.time_units`), with an `InputWarning` in doubt.
         repair: Repairs of event times that go back: "sort" late events, "drop" outliers, "unwrap"
             a counter, keep a "part" between resets, or several of them, as in "unwrap,sort"; see
             `jaxevent.io.disorder`. None refuses such times, and the message names the repairs that
             would help.
-        camera: A calibration instead of the recording's: camchain.yaml of Kalibr or camera_info of
-            ROS or OpenCV in YAML, or FILE:NAME, a camera of several; see `jaxevent.io.calibration`.
+        camera: A calibration instead of the recording's: a `PinholeCamera`, or camchain.yaml of
+            Kalibr or camera_info of ROS or OpenCV in YAML, or FILE:NAME, a camera of several; see
+            `jaxevent.io.calibration`.
 
     Returns:
         The recording.
@@ -118,11 +120,11 @@ def load(
         InputError: The file is missing, damaged or of another format, or what it holds is not a
             valid recording; the message names the place and the remedy.
     """
-    path = Path(path)
-    if size is not None and not 1 <= min(size) <= max(size) <= arrays.MAX_SIDE_PX:
+    path = _as_path(path, "load")
+    if size is not None and not _is_size(size):
         raise InputError(
-            f"size = {size} must be two positive numbers of pixels, (width, height), of at most "
-            f"{arrays.MAX_SIDE_PX}"
+            f"size = {arrays.shorten_value(size)} must be two positive whole numbers of pixels, "
+            f"(width, height), of at most {arrays.MAX_SIDE_PX}"
         )
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE
@@ -157,14 +159,43 @@ def load(
     if isinstance(images, np.ndarray) and (doubt := arrays.doubt_levels(images)):
         warnings.warn(f"{path}: {doubt}", InputWarning, stacklevel=3)
     if camera is not None:
-        from jaxevent.io.calibration import read_camera
-
-        lens = read_camera(camera, (recording.width, recording.height))
+        lens = _as_camera(camera, recording)
         left_out = {name: why for name, why in recording.left_out.items() if name != "camera"}
         recording = dataclasses.replace(recording, camera=lens, left_out=left_out)
     if options.notes:
         recording = dataclasses.replace(recording, notes=(*recording.notes, *options.notes))
     return recording
+
+
+def _as_path(path: Any, call: str) -> Path:
+    """Return a path; raise `InputError` for what is none."""
+    if not isinstance(path, str | os.PathLike):
+        order = {"load": "load(path)", "save": "save(recording, path)"}[call]
+        raise InputError(f"the path is {describe_type(path)}; call jaxevent.{order}")
+    return Path(path)
+
+
+def _is_size(size: Any) -> bool:
+    """Return whether an object is a width and a height that a sensor may have."""
+    if isinstance(size, str) or np.shape(size) != (2,):
+        return False
+    return all(
+        isinstance(side, int | np.integer) and 1 <= side <= arrays.MAX_SIDE_PX for side in size
+    )
+
+
+def _as_camera(camera: Any, recording: Recording) -> PinholeCamera:
+    """Return a camera, as given or of a file; raise `InputError` for what is neither."""
+    if isinstance(camera, PinholeCamera):
+        return camera
+    if not isinstance(camera, str | os.PathLike):
+        raise InputError(
+            f"camera is {describe_type(camera)}; give the path of a calibration, or "
+            "jaxevent.camera.PinholeCamera(fx, fy, cx, cy), px"
+        )
+    from jaxevent.io.calibration import read_camera
+
+    return read_camera(camera, (recording.width, recording.height))
 
 
 def _drop_frames(recording: Recording) -> Recording:
@@ -198,7 +229,7 @@ def save(
     from jaxevent.io import hdf5
     from jaxevent.io.output import check_recording_name
 
-    path = Path(path)
+    path = _as_path(path, "save")
     if not isinstance(recording, Recording):
         raise InputError(
             f"{path}: save writes recordings, not {describe_type(recording)}; write flow by "

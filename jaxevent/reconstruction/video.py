@@ -18,6 +18,7 @@ from jaxevent.devices import has_accelerator
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
+from jaxevent.events.blocks import read_blocks
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
@@ -254,10 +255,9 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         Returns:
             `mean`, `covariance` and `valid`, each (T, H, W). `mean` is intensity, 0 black and 1 the
             frames' white, and goes beyond. `covariance` is the variance of log intensity ln(I +
-                I0), NaN
-            of methods that estimate none. `valid` is false outside the recording and where the
-                intensity
-            is not a finite number.
+            I0), NaN of methods that estimate none. `valid` is false outside the recording and where
+            the intensity is not a finite number. Where a method of events and frames gets none of
+            these, it is false before a pixel's first event, and an `InputWarning` says so.
 
         Raises:
             InputError: A time is not finite, or outside the recording.
@@ -275,6 +275,30 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
                     array[rows] = values
                 done += len(batch)
         return whole
+
+    @property
+    def _lacks_frames(self) -> bool:
+        """Whether the method fuses frames with events, and there are none."""
+        return self.estimator.fuses and self.recording.frames is None
+
+    def _doubt(self) -> str | None:
+        """Return why images are doubtful, for a warning."""
+        if not self._lacks_frames:
+            return events_contradict_frames(self.recording, self.params)
+        return (
+            f"{self.recording.name}: holds no frames, so images of {self.estimator.name} are "
+            "changes from grey, valid from a pixel's first event on; take jaxevent.events_only"
+        )
+
+    @functools.cached_property
+    def _first_events(self) -> NDArray[np.int64]:
+        """Times (H, W) of each pixel's first event, us."""
+        height, width = self.recording.height, self.recording.width
+        first = np.full(height * width, np.iinfo(np.int64).max)
+        for events in read_blocks(self.recording.events):
+            place = events.y.astype(np.intp) * width + events.x
+            np.minimum.at(first, place, events.t)
+        return first.reshape(height, width)
 
     def carry(
         self, images: NDArray[np.floating], at: NDArray[np.int64], to: int
@@ -336,10 +360,8 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
             self.estimator.check_span(self.recording, times, self.params)
         with self._turns:
             compared, self._compared = self._compared, True
-        if not compared:
-            contradiction = events_contradict_frames(self.recording, self.params)
-            if contradiction is not None:
-                warnings.warn(contradiction, InputWarning, stacklevel=2)
+        if not compared and (doubt := self._doubt()) is not None:
+            warnings.warn(doubt, InputWarning, stacklevel=2)
         start, stop = time_span(self.recording, self.params.clock_offset)
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
             for batch, images in self._turns.iterate(self._read(times)):
@@ -350,6 +372,8 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
                 inside = (start <= batch) & (batch <= stop)
                 if not inside.all():
                     valid = valid & inside[:, None, None]
+                if self._lacks_frames:
+                    valid = valid & (self._first_events <= batch[:, None, None])
                 yield batch, Estimate(image, variance, valid)
                 shown.update(len(batch))
 

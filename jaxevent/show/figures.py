@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from jaxevent.blob.tracks import Tracks
 from jaxevent.display import describe_type, plural
 from jaxevent.egomotion.motion import MotionEstimate
+from jaxevent.egomotion.scores import warn_of_gyro_axes
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError, require
 from jaxevent.events import event_image
@@ -245,7 +246,7 @@ def plot_motion(
         centred: Whether estimates count for the middle of the events that they use.
 
     Returns:
-        A `matplotlib.figure.Figure`.
+        A `matplotlib.figure.Figure`. An `InputWarning` tells of a gyro that agrees in other axes.
 
     Raises:
         InputError: This is no motion, the truth is none, there is no estimate and no time, or the
@@ -263,6 +264,8 @@ def plot_motion(
         us = np.linspace(motion.t[0], motion.t[-1], 2000).round().astype(np.int64)
     else:
         us = np.atleast_1d(microseconds(times))
+    if truth is not None:
+        warn_of_gyro_axes(motion, truth)
     return motion_figure(motion, np.unique(us), truth, centred=centred)
 
 

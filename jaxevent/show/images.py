@@ -219,9 +219,11 @@ def video_writer(
         The function that appends a frame.
 
     Raises:
-        InputError: The extra "video" is missing, a frame is unfit, there is none, or encoding
-            fails.
+        InputError: The name ends otherwise, the extra "video" is missing, a frame is unfit, there
+            is none, or encoding fails.
     """
+    if Path(path).suffix.lower() != ".mp4":
+        raise InputError(f"{path}: videos are stored as MP4; end the name in .mp4")
     program = require("imageio_ffmpeg", "video").get_ffmpeg_exe()
     if not 0 < fps < math.inf:
         raise InputError(f"{path}: {fps} frames per second are not possible; give a positive rate")

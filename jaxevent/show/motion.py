@@ -17,10 +17,9 @@ from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import MotionEstimate, is_observable, table_columns
-from jaxevent.egomotion.scores import MotionScores, score_motion
+from jaxevent.egomotion.scores import MotionScores, find_gyro_axes, score_motion
 from jaxevent.egomotion.truth import (
     KnownMotion,
-    find_imu_axes,
     fit_gyro_bias,
     from_poses,
     known_motion,
@@ -215,9 +214,7 @@ class Truth(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def measured_rotation(
-    truth: KnownMotion, motion: MotionEstimate, unbiased: bool, turned: bool
-) -> Truth:
+def measured_rotation(truth: KnownMotion, motion: MotionEstimate, unbiased: bool) -> Truth:
     """Prepare the angular velocity of a gyro for the comparison with an estimate.
 
     Without a known bias the constant that fits the estimate is subtracted. Without a known rotation
@@ -227,7 +224,6 @@ def measured_rotation(
         truth: Angular velocity of the gyro.
         motion: The estimate.
         unbiased: Whether the bias is known and subtracted.
-        turned: Whether the rotation to the camera is known and applied.
     """
     estimated = motion(truth.t, centred=True, extrapolate=True)
     rows = estimated.valid & np.isfinite(estimated.mean).all(1)
@@ -235,7 +231,8 @@ def measured_rotation(
     if not rows.any():
         return Truth(truth, words)
     estimate, measured = estimated.mean[rows], truth.values[rows]
-    axes = None if turned else find_imu_axes(estimate, measured)
+    axes = find_gyro_axes(motion, truth)
+    truth = dataclasses.replace(truth, guesses_axes=False)  # the note is enough
     if axes is not None:
         notes.append(
             f"the gyro is like the estimate in other axes: give --imu-rotation {axes} if they are "
@@ -326,9 +323,7 @@ class Output:
         truth = known_motion(recording, model, "auto", zero, rotation=rotation)
         if recording.poses is not None:
             return lambda motion: Truth(truth, "poses")
-        return lambda motion: measured_rotation(
-            truth, motion, bias is not None, rotation is not None
-        )
+        return lambda motion: measured_rotation(truth, motion, bias is not None)
 
     def write(
         self,

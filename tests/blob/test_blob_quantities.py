@@ -535,3 +535,7 @@ def test_panels_hold_the_tracks_that_are_seen_longest():
     valid = np.arange(10)[:, None] >= np.arange(8)
     shown = pictures._choose_longest(valid, [7])
     assert shown.tolist() == [True] * 6 + [False, True]
+
+
+def test_the_package_has_the_quantities():
+    assert blob.quantities is quantities and "quantities" in blob.__all__

@@ -1,11 +1,8 @@
 """Blob tracking on real recordings, short slices, against references made without the tracker."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from scripts import script
 
 import jaxevent
 from jaxevent.blob import Tracks, moment
@@ -13,18 +10,11 @@ from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.blob.run import XlaRunner, run_compiled
 from jaxevent.recording import Events, Recording
 
-SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_real.py"
-
 
 @pytest.fixture(scope="module")
 def real():
     """The experiment; its references are what these tests compare with."""
-    spec = importlib.util.spec_from_file_location("blob_real", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["blob_real"] = module
-    spec.loader.exec_module(module)
-    return module
+    return script("blob_real")
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,14 @@
 """The likelihood of events finds process noises that track as well as the best of a grid."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path
 
 import pytest
-
-SCRIPT = Path(__file__).parents[2] / "experiments" / "blob_tuning.py"
+from scripts import script
 
 
 @pytest.fixture(scope="module")
 def tuning():
-    spec = importlib.util.spec_from_file_location("blob_tuning", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("blob_tuning")
 
 
 @pytest.mark.slow

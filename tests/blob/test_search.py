@@ -31,7 +31,6 @@ from jaxevent.blob.search.paths import (
 from jaxevent.blob.search.polarity import drop_lamps
 from jaxevent.blob.search.search import (
     TargetSearchResult,
-    _drop_unsettled_start,
     _is_persistent,
     max_events_per_step,
 )
@@ -179,15 +178,6 @@ def test_two_that_begin_together_and_part_are_two():
     apart = ends[:, :, None] - truth(t)[:, None, :, :2]
     near = np.hypot(apart[..., 0], apart[..., 1]).min(1)
     assert (near < 2).all()
-
-
-def test_beginnings_from_which_a_target_leaps_are_left_out():
-    t = np.arange(0, 30_000, 1000)
-    x = 20 + 5e-3 * t
-    path = _path(t, x, 30.0, 3.0, 30)
-    assert _drop_unsettled_start(path) is path
-    leaping = _path(t, np.where(np.arange(30) == 2, x + 25, x), 30.0, 3.0, 30)
-    np.testing.assert_array_equal(_drop_unsettled_start(leaping).t, t[3:])
 
 
 def test_what_is_seen_shortly_and_goes_no_way_is_left_out():

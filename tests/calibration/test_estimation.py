@@ -47,6 +47,38 @@ def moved(recording, us):
     )
 
 
+def test_a_grating_that_repeats_itself_has_the_clock_of_its_stamps():
+    """Half of its period of 1/3 s away events are the opposite of frames, as clearly."""
+    rng, y, x = np.random.default_rng(0), *np.mgrid[:48, :64]
+    places, c, late = np.stack([x.ravel(), y.ravel()]), 0.03, 20_000
+
+    def image(t):
+        wave = np.sin(2 * np.pi * (x - 60 * t) / 20) * np.cos(2 * np.pi * y / 30)
+        return 0.5 + 0.3 * wave + 0.1 * np.cos(x / 7)
+
+    level, rows = np.log(image(0) + 1) + rng.uniform(-c, c, x.shape), []
+    for t in np.arange(0, 0.5, 5e-4):
+        change = np.log(image(t) + 1) - level
+        on = change > 0
+        hit = np.abs(change) >= c  # at most one each: brightness changes by less in a step
+        level = np.where(hit, level + np.where(on, c, -c), level)
+        times = rng.uniform(t, t + 5e-4, hit.sum())
+        rows.append(np.column_stack([times, places[:, hit.ravel()].T, on[hit]]))
+    t, x_of, y_of, p = (events := np.concatenate(rows))[np.argsort(events[:, 0])].T
+    stamps = np.arange(50_000, 451_000, 50_000)
+    grey = [np.round(255 * image(1e-6 * stamp)) for stamp in stamps]
+    found = jaxevent.calibrate(
+        Recording.from_arrays(
+            (1e6 * t).astype(np.int64), x_of.astype(int), y_of.astype(int), p > 0,
+            width=64, height=48, frames=np.array(grey, np.uint8), frame_times=stamps + late,
+        )
+    )  # fmt: skip
+    assert found.clock_offset.low < -1e-6 * late < found.clock_offset.high
+    for one in (found.c_on, found.c_off):
+        assert one.low < c < one.high
+    assert np.nanmin(found.correlations) < -0.8 * np.nanmax(found.correlations)
+
+
 @pytest.mark.slow
 def test_simulated_truth(found):
     truth = {

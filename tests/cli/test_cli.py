@@ -195,6 +195,18 @@ def test_bad_ways_to_reconstruct(folder, capsys):
         ["simulate", "--out", "b"],
         ["simulate", "a.mp4", "--scene", "lake", "--out", "b"],
         ["simulate", "--scene", "lake"],
+        ["motion", "a", "--model", "planar", "--out", "b", "--still", "1"],
+        ["motion", "a", "--model", "planar", "--out", "b", "--seed", "x"],
+        ["simulate", "--motion", "wall", "--scene", "lake", "--out", "b"],
+        ["track"],
+        ["track", "a", "--out", "b", "--seed", "1,2"],
+        ["track", "a", "--out", "b", "--seed", "1,2,x"],
+        ["track", "a", "--out", "b", "--pair", "1"],
+        ["track", "a", "--out", "b", "--pair", "1,2.5"],
+        ["track", "a", "--out", "b", "--rate", "9", "--at", "events"],
+        ["track", "a", "--out", "b", "--at", "frames"],
+        ["track", "a", "--out", "b", "--background", "black"],
+        ["simulate", "--blobs", "disc", "--scene", "lake", "--out", "b"],
     ],
 )
 def test_bad_arguments(argv, capsys):
@@ -218,6 +230,13 @@ def test_wrong_names_are_told_by_the_command_that_was_meant(argv, usage, said, c
         cli.main(argv.split())
     told = capsys.readouterr().err
     assert usage in told and said in told
+
+
+@pytest.mark.parametrize("command", ["motion", "track"])
+def test_help_has_examples(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([command, "--help"])
+    assert stop.value.code == 0 and f"\nexamples:\n  jaxevent {command}" in capsys.readouterr().out
 
 
 def test_help_and_version(capsys, monkeypatch):

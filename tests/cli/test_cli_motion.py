@@ -43,6 +43,11 @@ SEEN: dict[str, Any] = {"size": (WIDTH, HEIGHT), "focal": 80.0}
 SIMULATE = ["simulate", "--size", f"{WIDTH},{HEIGHT}", "--duration", "0.3", "--seed", "1"]
 
 
+@pytest.fixture(autouse=True)
+def precision(float32):
+    """As users have it; kernels compute in single precision."""
+
+
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory) -> Path:
     """planar.h5 and turn.h5 with tables of the truth, mine.toml."""
@@ -468,27 +473,6 @@ def test_without_matplotlib_the_tables_are_written(folder, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "pictures are left out: this needs the package 'matplotlib'" in said
     assert install_command("plot") in said and "planar motion by voting" in said
-
-
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["motion", "a", "--model", "planar", "--out", "b", "--still", "1"],
-        ["motion", "a", "--model", "planar", "--out", "b", "--seed", "x"],
-        ["simulate", "--motion", "wall", "--scene", "lake", "--out", "b"],
-    ],
-)
-def test_bad_arguments(argv, capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(argv)
-    assert stop.value.code == 2
-    assert capsys.readouterr().err.startswith("usage: jaxevent")
-
-
-def test_help(capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["motion", "--help"])
-    assert stop.value.code == 0 and "\nexamples:\n  jaxevent motion" in capsys.readouterr().out
 
 
 def test_simulated_motion_and_its_truth(folder, capsys):

@@ -393,33 +393,6 @@ def test_without_extras_the_tables_are_written(folder, capsys, monkeypatch):
     assert told["params"] == tomllib.loads((folder / "out" / "params.toml").read_text())
 
 
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["track"],
-        ["track", "a", "--out", "b", "--seed", "1,2"],
-        ["track", "a", "--out", "b", "--seed", "1,2,x"],
-        ["track", "a", "--out", "b", "--pair", "1"],
-        ["track", "a", "--out", "b", "--pair", "1,2.5"],
-        ["track", "a", "--out", "b", "--rate", "9", "--at", "events"],
-        ["track", "a", "--out", "b", "--at", "frames"],
-        ["track", "a", "--out", "b", "--background", "black"],
-        ["simulate", "--blobs", "disc", "--scene", "lake", "--out", "b"],
-    ],
-)
-def test_bad_arguments(argv, capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(argv)
-    assert stop.value.code == 2
-    assert capsys.readouterr().err.startswith("usage: jaxevent")
-
-
-def test_help(capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["track", "--help"])
-    assert stop.value.code == 0 and "\nexamples:\n  jaxevent track" in capsys.readouterr().out
-
-
 def test_simulated_blobs_and_their_truth(tmp_path, capsys):
     truth, out = tmp_path / "truth.csv", tmp_path / "dot.h5"
     argv = f"simulate --blobs dropout --seed 3 --truth {truth} --out {out}"

@@ -7,7 +7,7 @@ import pytest
 from points import recorded
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import batch, contrast, find_model, truth, voting
+from jaxevent.egomotion import batch, contrast, find_model, scores, truth, voting
 from jaxevent.egomotion.bundle.hypotheses import WindowTest, combine_z
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, B, rotation_basis
@@ -23,7 +23,7 @@ from jaxevent.egomotion.patches import (
     flow_consistency,
     measure_image_speed,
 )
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
 from jaxevent.show.motion import WrittenMotion
 from jaxevent.show.motion_figures import motion_figure
@@ -323,6 +323,31 @@ def test_a_gyro_in_other_axes_and_with_a_bias():
     for wrong in ("y_up", "1,2", "1,0,0,0,1,0,0,0,-1"):
         with pytest.raises(InputError, match="imu-rotation"):
             truth.imu_rotation(wrong)
+
+
+@pytest.mark.parametrize("name", ["camera", "y-up", "turned"])
+def test_comparisons_tell_of_a_gyro_in_other_axes(name):
+    t = np.linspace(0, 1_000_000, 50).astype(np.int64)
+    Omega = np.stack([np.sin(7e-6 * t), np.cos(5e-6 * t), 0.5 + np.sin(9e-6 * t)], 1)
+    zeros = np.zeros((50, 3))
+    imu = Imu(t, Omega @ truth.IMU_AXES[name], zeros)
+    recording = Recording("r", WIDTH, HEIGHT, Events.empty(), camera=CAMERA, imu=imu)
+    motion = MotionEstimate(
+        find_model("rotation"),
+        t,
+        Omega,
+        np.tile(np.eye(3), (50, 1, 1)),
+        np.ones(50, bool),
+        *np.zeros((3, 50)),
+    )
+    known = truth.known_motion(recording, "rotation", bias=zeros[0])
+    if name == "camera":
+        assert scores.score_motion(motion, known, t).figures["AME"] < 1e-9
+    else:
+        with pytest.warns(InputWarning, match=f"in other axes; give .* rotation='{name}'"):
+            scores.score_motion(motion, known, t)
+    known = truth.known_motion(recording, "rotation", bias=zeros[0], rotation=name)
+    assert scores.score_motion(motion, known, t).figures["vector_error"] < 1e-9
 
 
 def test_image_velocity_from_poses_and_a_depth():

@@ -1,5 +1,6 @@
 """Calibrations in YAML: Kalibr's camchain, camera_info of ROS, for recordings and rigs."""
 
+import pickle
 import sys
 
 import numpy as np
@@ -73,6 +74,18 @@ def stored(tmp_path):
     for name, text in {"chain": CHAIN, "three": CHAIN + THIRD, "info": INFO}.items():
         (tmp_path / f"{name}.yaml").write_text(text)
     return tmp_path
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_a_recording_takes_a_camera_of_numbers(stored, in_memory):
+    lens = PinholeCamera(40, 40, 9, 6)
+    made = jaxevent.load(stored / "a.h5", camera=lens, in_memory=in_memory)
+    assert made.camera == lens and pickle.loads(pickle.dumps(made)).camera == lens
+    with pytest.raises(InputError, match="camera is a tuple; give .*PinholeCamera.fx"):
+        jaxevent.load(stored / "a.h5", camera=(40, 40, 9, 6))
+    bare = jaxevent.load(stored / "a.h5")
+    with pytest.raises(InputError, match="needs; give camera=jaxevent.camera.PinholeCamera"):
+        jaxevent.egomotion.contrast.estimate(bare, model="rotation")
 
 
 def test_a_recording_takes_the_camera_of_its_size(stored, capsys):

@@ -4,28 +4,17 @@ The files are made from numbers alone, so that those that once failed stay here.
 """
 
 import contextlib
-import importlib.util
 import os
-from pathlib import Path
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scripts import script
 
 pytestmark = pytest.mark.slow
 
-SCRIPT = Path(__file__).parents[2] / "experiments" / "fuzz.py"
 NEEDS = {"evt3": "evt3", "aedat4": "aedat", "bag": "rosbags", "mcap": "rosbags", "db3": "rosbags"}
-
-
-def _script():
-    spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-fuzz = _script()
+fuzz = script("fuzz")
 
 
 @pytest.mark.filterwarnings("ignore::jaxevent.InputWarning")  # of damaged times

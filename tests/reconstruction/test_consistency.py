@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 import jaxevent
+from jaxevent.errors import InputWarning
+from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.consistency import change_ratio, events_contradict_frames
+from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Events, Frames, Recording
 
 C, I0, WIDTH, HEIGHT = 0.2, 0.003, 40, 30
@@ -95,3 +98,29 @@ def test_real_recordings_agree_with_the_defaults(name, data):
     recording = jaxevent.load(data / name)
     assert events_contradict_frames(recording, Params()) is None
     assert events_contradict_frames(recording, Params(c_on=C, c_off=C)) is not None
+
+
+class Flat(ImageSequence):
+    """Images of one grey, which no kernel makes."""
+
+    dtype = np.dtype(np.float32)
+
+    def _read(self, times):
+        shape = len(times), HEIGHT * WIDTH
+        yield times, Estimate(*np.ones((2, *shape), np.float32), np.ones(shape, bool))
+
+
+@pytest.mark.parametrize("has_frames", [True, False])
+def test_without_frames_images_are_valid_from_the_first_event_on(has_frames):
+    recording = recorded() if has_frames else dataclasses.replace(recorded(), frames=None)
+    video = Flat(jaxevent.akf, recording, Params(c_on=C, c_off=C, I0=I0))
+    times = np.array([30_000, 60_000])
+    if has_frames:
+        assert video(times).valid.all()
+        return
+    with pytest.warns(InputWarning, match="holds no frames, .*; take jaxevent.events_only"):
+        valid = video(times).valid
+    for t, found in zip(times, valid, strict=True):
+        seen, e = np.zeros((HEIGHT, WIDTH), bool), recording.events
+        seen[e.y[e.t <= t], e.x[e.t <= t]] = True
+        assert np.array_equal(found, seen) and 0 < seen.mean() < 1

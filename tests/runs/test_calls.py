@@ -29,6 +29,11 @@ from jaxevent.simulate import blob_scene, motion_scene
 blend, last_frame = METHODS["blend"], METHODS["last-frame"]
 
 
+@pytest.fixture(autouse=True)
+def precision(float32):
+    """As users have it; kernels compute in single precision."""
+
+
 def noisier(seed: int, **fields) -> Recording:
     """`small` with other images."""
     frames = small().frames

@@ -56,7 +56,7 @@ def test_blend_is_scored_as_by_hand(offset):
 
 
 @pytest.mark.slow
-def test_hidden_frames_are_never_seen(monkeypatch):
+def test_hidden_frames_are_never_seen(monkeypatch, float32):
     frames = small().frames
     assert frames is not None
     images = frames.images.copy()
@@ -105,7 +105,7 @@ def test_recordings_that_cannot_be_scored(recording, said):
 
 
 @pytest.mark.slow
-def test_results_of_a_configuration(folder, monkeypatch):
+def test_results_of_a_configuration(folder, monkeypatch, float32):
     (folder / "sub").mkdir()
     jaxevent.save(small(name="b"), folder / "sub" / "b.h5")
     jaxevent.save(small(name="a"), folder / "sub" / "a.h5")
@@ -195,7 +195,7 @@ def test_configurations_are_refused(folder, text, said):
     assert not (folder / "out").exists()
 
 
-def test_a_failure_leaves_earlier_results(folder):
+def test_a_failure_leaves_earlier_results(folder, float32):
     out = folder / "out"
     evaluate(write_config(folder, ONE), out)
 
@@ -488,7 +488,7 @@ def test_further_metrics_are_those_of_each_image(folder, monkeypatch):
 
 
 @pytest.mark.slow
-def test_results_against_references_show_their_columns(folder):
+def test_results_against_references_show_their_columns(folder, float32):
     jaxevent.save(hdr_recording(), folder / "hdr.h5")
     text = 'protocol = "reference"\n' + ONE.replace("small", "hdr")
     (row,) = evaluate(write_config(folder, text), folder / "out")

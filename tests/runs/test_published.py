@@ -19,13 +19,6 @@ from jaxevent.camera import SCurve
 from jaxevent.runs.evaluate import evaluate
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(autouse=True)
-def precision(float32):
-    """As users have it."""
-
-
 SCRIPT = runpy.run_path(str(ROOT / "experiments" / "published.py"))
 
 
@@ -56,7 +49,7 @@ def as_mat(path: Path, **more: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_the_ijrr_table_fills_where_files_are(tmp_path, monkeypatch, capsys):
+def test_the_ijrr_table_fills_where_files_are(tmp_path, monkeypatch, capsys, float32):
     monkeypatch.setenv("IJRR", str(tmp_path))
     monkeypatch.setitem(jaxevent.runs.scores.MEASURE_FUNCTIONS, "lpips", metrics.mse)
     monkeypatch.setattr(jaxevent.runs.scores, "lpips_weights", lambda: None)
@@ -121,7 +114,7 @@ def test_the_authors_files(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_rigs_are_registered_and_evaluated(tmp_path, monkeypatch):
+def test_rigs_are_registered_and_evaluated(tmp_path, monkeypatch, float32):
     """The same camera twice: the identity brings its frames onto the events' pixels."""
     for name in ("plain", "hdr"):
         folder = tmp_path / "recorded" / name

@@ -26,6 +26,7 @@ class SearchConfig(NamedTuple):
 
     # Selection of the scale
     max_scored_events: int = 2000  # events of a window that are scored
+    free_shape_gain: float = 0.07  # share of the score that free shapes gain over ellipses at most
     split_loss: float = 0.2  # share of the score lost if all events are in touching blobs
     min_split_events: int = 3  # events of a blob that may be split
     min_windows: int = 8  # windows in a recording
@@ -36,9 +37,6 @@ class SearchConfig(NamedTuple):
     dropped_sigmas: float = 2.0  # ... by so many standard deviations of the difference
     equal_score_loss: float = 0.03  # share of the best score that an equally good scale may lose,
     equal_window_loss: float = 0.005  # and among windows of one cell size
-    max_merged_share: float = 0.3  # share of events that smaller cells separate from a blob
-    sharp_score: float = 0.9  # share of a cell size's best score at which its blobs are sharp
-    max_gap_blobs: int = 200  # blobs of a window in which gaps are sought
 
     # Tracking from window to window
     gate_sigmas: float = 3.0  # standard deviations
@@ -61,13 +59,6 @@ class SearchConfig(NamedTuple):
     free_share: float = 0.7  # unassigned share of a blob where a track begins
     min_confirm_windows: int = 4  # windows with events until a track is confirmed,
     min_confirm_share: float = 0.5  # and their share of the track's windows
-    young_windows: int = 3  # windows of age in which contact may mean a part of an object
-    part_windows: int = 5  # windows of common motion that make two tracks one, or a blob two
-    split_aspect: float = 2.0  # aspect from which a blob is tested for a split
-    split_min_share: float = 0.15  # share of a blob's events in the smaller half
-    split_growth: float = 1.3  # size of a blob that splits, in its least size
-    split_separation: float = 1.5  # distance of its halves, in their first distance
-    split_valley: float = 0.05  # share of its events between the halves; of a disc it is over 0.2
     max_squared_innovation: float = (
         16.0  # variances; larger ones count so much for the velocity noise
     )
@@ -96,7 +87,6 @@ class SearchConfig(NamedTuple):
     erratic_sizes: float = 0.4  # sizes by which it leaves its way in a window
     persistent_share: float = 0.5  # share of a path's windows in which the target is seen
     velocity_windows: int = 8  # windows from which the velocity at an end of a path is measured
-    max_leap_sizes: float = 6.0  # sizes from its fitted way at which a path's row is no beginning
     whole_share: float = 0.8  # share of its median size and events at which a target is seen whole
     duplicate_share: float = 0.5  # share of a path near one of an earlier pass: a duplicate
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from jaxevent.blob.search.stream import PixelCounts, WindowEvents
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _cells = ZeroedScratch(np.int32)
+N_SPLIT_STEPS = 6  # expectation and maximisation, for two targets in a blob
 MAX_EXHAUSTIVE_EVENTS = 1000  # so many events are compared with the clutter wherever they are
 
 
@@ -32,11 +34,13 @@ class Scale:
         cell: Side of cells, px, a power of 2.
         dispersion: (rows, columns) variance over mean of clutter counts in such windows, in cells
             of 16 px.
+        compact: Whether ellipses describe the targets as well as free shapes do.
     """
 
     window: float | int
     cell: int
     dispersion: NDArray[np.float64]
+    compact: bool = False
 
     def dispersion_at(self, x: Any, y: Any) -> Any:
         """Return the dispersion of counts in 3x3 cells, in which flicker adds up, at pixels."""
@@ -289,9 +293,7 @@ def _measure_blobs(x: Any, y: Any, weights: Any, labels: Any, blobs: Any) -> Non
 @njit_noalloc_inlined
 def sum_blobs(x: Any, y: Any, weights: Any, labels: Any, number: int, blobs: Any) -> None:
     """Fill in the first `number` of `blobs`, of pixels with so many events each."""
-    for k in range(number):
-        blobs.n[k] = blobs.p[k, 0] = blobs.p[k, 1] = 0.0
-        blobs.C[k, 0, 0] = blobs.C[k, 0, 1] = blobs.C[k, 1, 1] = 0.0
+    _clear_blobs(blobs, number)
     # One pass: sums of whole numbers are exact.
     for i in range(len(x)):
         k = labels[i] - 1
@@ -325,35 +327,79 @@ def finish_moments(blobs: Any, number: int) -> None:
         C[k, 1, 1] = C[k, 1, 1] * over - p[k, 1] * p[k, 1] + 1 / 12
 
 
-def split_blob(x: NDArray, y: NDArray, C: NDArray) -> Blobs | None:
-    """Split a blob of covariance C at a gap across its longer axis.
+@njit_noalloc
+def split_blob(events: Any, owner: Any, k: int, two: Any) -> float:
+    """Split the events of one owner across their longer axis, and return nats for two targets.
 
-    In a gap few of the events lie within the halves' sizes of the middle between them, and the
-    halves are not in contact.
+    Two Gaussians of one size are fitted along that axis. The density between the targets is then
+    less than at either of them, while that of one body, a bar or a light with a tail, is no less
+    there than at its dimmer end. Events in both places tell, by their likelihood.
 
-    Returns:
-        The two halves, the one with more events first; None if there is no gap.
+    Args:
+        events: N events.
+        owner: (N,) owners of the events.
+        k: The owner.
+        two: Two blobs, filled in with the one of more events first.
     """
-    if len(x) < 8:
-        return None
-    p = np.stack([x, y], 1).astype(float)
-    along = p @ np.linalg.eigh(C)[1][:, 1]
-    middle = along.mean()
-    for _ in range(4):  # iterations of two means
-        upper = along > middle
-        if upper.all() or not upper.any():
-            return None
-        middle = (along[upper].mean() + along[~upper].mean()) / 2
-    halves = sorted((upper, ~upper), key=lambda half: -half.sum())
-    between = sum(along[half].std() for half in halves) / 2
-    if (abs(along - middle) < between).mean() > CONFIG.split_valley:
-        return None
-    two = Blobs.empty(2)
-    for k, half in enumerate(halves):
-        two.n[k], two.p[k] = half.sum(), p[half].mean(0)
-        two.C[k] = np.cov(p[half].T, ddof=0) + np.eye(2) / 12
-    apart = contact_distance(two.p[0], two.C[0], two.p[1], two.C[1])
-    return two if apart >= CONFIG.contact_distance else None
+    x, y, (n, p, C) = events.x, events.y, two
+    _clear_blobs(two, 2)
+    for i in range(len(owner)):
+        if owner[i] == k:
+            add_moments(two, 0, 1.0, float(x[i]), float(y[i]))
+    finish_moments(two, 1)
+    number, most = n[0], larger_variance_of(C[0])
+    if number < 2 * CONFIG.min_split_events:
+        return -np.inf
+    turn = 0.5 * np.arctan2(2 * C[0, 0, 1], C[0, 0, 0] - C[0, 1, 1])
+    ux, uy = np.cos(turn), np.sin(turn)
+    middle, square, share = ux * p[0, 0] + uy * p[0, 1], C[0, 0, 0] + C[0, 1, 1] - most, 0.5
+    # Means of the halves of a Gaussian.
+    low, high = middle - 0.8 * np.sqrt(most), middle + 0.8 * np.sqrt(most)
+    for _ in range(N_SPLIT_STEPS):
+        weight = a = b = squares = 0.0
+        for i in range(len(owner)):
+            if owner[i] == k:
+                s = ux * x[i] + uy * y[i]
+                odds = ((s - low) ** 2 - (s - high) ** 2) / 2 / square
+                part = 1 / (1 + np.exp(odds) * (1 - share) / share)
+                weight += part
+                a += part * s
+                b += (1 - part) * s
+                squares += part * (s - low) ** 2 + (1 - part) * (s - high) ** 2
+        if min(weight, number - weight) < CONFIG.min_split_events:
+            return -np.inf
+        share, square = weight / number, squares / number + 1 / 12
+        low, high = a / weight, b / (number - weight)
+    # A third of the distance about the middle between both, and as much about the dimmer one.
+    near, dim = (high - low) / 6, low if share < 0.5 else high
+    middle, deviation = (low + high) / 2, np.sqrt(2 * square)
+    expected_between = expected = between = about = 0.0
+    for mean, part in ((low, share), (high, 1 - share)):
+        a, b = (middle - near - mean) / deviation, (middle + near - mean) / deviation
+        expected_between += part * (math.erf(b) - math.erf(a))
+        a, b = (dim - near - mean) / deviation, (dim + near - mean) / deviation
+        expected += part * (math.erf(b) - math.erf(a))
+    _clear_blobs(two, 2)
+    first = 0 if share >= 0.5 else 1
+    for i in range(len(owner)):
+        if owner[i] == k:
+            s = ux * x[i] + uy * y[i]
+            between += abs(s - middle) < near
+            about += abs(s - dim) < near
+            add_moments(two, first if s < middle else 1 - first, 1.0, float(x[i]), float(y[i]))
+    finish_moments(two, 2)
+    ratio = expected_between / max(expected, 1e-9)
+    if ratio >= 1 or min(n[0], n[1]) < CONFIG.min_split_events:
+        return -np.inf
+    return between * np.log(2 * ratio / (1 + ratio)) + about * np.log(2 / (1 + ratio))
+
+
+@njit_noalloc_inlined
+def _clear_blobs(blobs: Any, number: int) -> None:
+    """Set the moments of the first `number` blobs to zero."""
+    for k in range(number):
+        blobs.n[k] = blobs.p[k, 0] = blobs.p[k, 1] = 0.0
+        blobs.C[k, 0, 0] = blobs.C[k, 0, 1] = blobs.C[k, 1, 1] = 0.0
 
 
 def contact_distance(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:

@@ -76,11 +76,11 @@ def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
     # Pieces slide along an edge, but less far than they go with it.
     far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
     changed, way = np.ptp(np.quantile(apart, (0.02, 0.98))), CONFIG.common_way_sizes
-    if not near:
-        return bool(far > way * large and changed < CONFIG.rigid_change * far)
     both = [_interpolate(path, t) for path in (one, other)]
     if not edge and _separate_nats(both) > CONFIG.log_bayes_factor:
         return False
+    if not near:
+        return bool(far > way * large and changed < CONFIG.rigid_change * far)
     return bool(far > way * small and changed < max(large, far if edge else far / 2))
 
 

@@ -71,6 +71,7 @@ class PredictionScore(NamedTuple):
 
     raw: float
     penalised: float  # less a share for blobs in contact
+    ellipses: float  # penalised, by ellipses alone
     parts: NDArray[np.float64]  # (windows,) contributions to `raw`
 
 
@@ -149,7 +150,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
     number = sum(one.number for one in scored)
     ends = np.cumsum([0, *(len(one.pixels) for one in scored)])
     if not ends[-1]:
-        return PredictionScore(0.0, 0.0, np.zeros(len(predictions)))
+        return PredictionScore(0.0, 0.0, 0.0, np.zeros(len(predictions)))
     density = np.concatenate([one.density for one in predictions])
     b = np.concatenate([one.background for one in scored])
     most = CONFIG.max_scored_events
@@ -158,12 +159,14 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
         np.array([getattr(one, name) for one in predictions])
         for name in ("expected", "large", "split")
     )
-    gains, shares = np.zeros(len(predictions)), np.full((2, 1 + N_KERNELS), 1 / (1 + N_KERNELS))
-    _sum_gains(density, b, weight, ends, (np.empty(len(b), np.int64), shares), gains)
+    gains, near = np.zeros(len(predictions)), np.empty(len(b), np.int64)
+    shares = np.full((2, 1 + N_KERNELS), 1 / (1 + N_KERNELS))
+    _sum_gains(density, b, weight, ends, (near, shares), gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
+    ellipses = float(weight @ np.log1p(density[:, 0] / b) - expected.sum()) / number
     lost = CONFIG.split_loss * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
-    return PredictionScore(raw, raw - lost, parts)
+    return PredictionScore(raw, raw - lost, ellipses - lost, parts)
 
 
 @njit_noalloc

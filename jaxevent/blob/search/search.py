@@ -379,9 +379,8 @@ def _search_section(
             passes.append(SearchPass(selection, 0))
             break
         with stage(f"{name}: beginnings", progress):
-            settled = [_drop_unsettled_start(path) for path in confirmed]
-            rest = stream.without(confirmed, gate, max(path.begin for path in settled))
-            whole = [_extend_backwards(one, rest, background, selection.scale) for one in settled]
+            rest = stream.without(confirmed, gate, max(path.begin for path in confirmed))
+            whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
         near = whole = merge_parts(whole)
         if background.scene is not None:
             whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
@@ -411,21 +410,6 @@ def _is_persistent(path: TargetPath, duration: float | int) -> bool:
     windows = (path.t[-1] - path.t[0]) / path.window + 1
     enough = seen >= CONFIG.persistent_share * windows
     return bool(size > 2 * CONFIG.min_size_px**2 and enough)
-
-
-def _drop_unsettled_start(path: TargetPath) -> TargetPath:
-    """Drop the first rows of a path, up to the last that lies far from the rows after it.
-
-    A new track's first positions are unreliable.
-    """
-    rows = CONFIG.velocity_windows
-    for k in range(min(rows, len(path.t) - 2))[::-1]:
-        later = slice(k + 1, k + 1 + rows)
-        step = path.mean_velocity(later) * (path.t[k + 1] - path.t[k]) * 1e-6
-        apart = np.hypot(*(path.p[k] - (path.p[k + 1] - step)))
-        if apart > CONFIG.max_leap_sizes * np.median(path.size[later, 0]):
-            return path.take(slice(k + 1, None))
-    return path
 
 
 def _extend_backwards(

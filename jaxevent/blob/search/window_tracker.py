@@ -83,6 +83,7 @@ class TrackGates(NamedTuple):
     penalty: NDArray[np.float64]  # (n,) added to the squared distance of an event
     events: NDArray[np.float64]  # (n,) expected events
     shared: NDArray[np.bool_]  # (n,) whether events are shared with a track in contact
+    compact: bool  # whether ellipses describe the targets
 
 
 class Assignments(NamedTuple):
@@ -128,11 +129,7 @@ class WindowTracker:
         self.tracks = init_tracks(np.zeros(0, np.int64), 0.0, Blobs.empty(0), scale.window)
         self.next_id = 0
         self.rows: list[_WindowRows] = []
-        # Of two tracks in contact: since when, their difference then, and the shorter travel.
-        self.contacts: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
-        self.min_sizes: dict[int, float] = {}
-        # Of a track whose blob has a gap: first and last distance of its halves, and windows.
-        self.gaps: dict[int, tuple[float, float, int]] = {}
+        self.evidence: dict[int, float] = {}  # nats for two targets, of some tracks
         self.confirmed: set[int] = set()
         self.parts: dict[int, int] = {}  # the track of the whole, by that of a part
         tests = stream.width * stream.height * stream.duration / scale.window
@@ -181,12 +178,12 @@ class WindowTracker:
         events = self.stream.window(begin, begin + w)
         clutter = clutter_model(self.background, self.scale, shape, t)
         labels, blobs = detect(events, clutter, shape)
-        gates = predict_gates(self.tracks, t, w)
+        gates = predict_gates(self.tracks, t, w, self.scale.compact)
         assignments = assign(gates, events, labels, blobs)
         if len(self.tracks.id):
             self._update(gates, clutter, assignments)
-            self._split_tracks(events, t, assignments.owner, labels)
-            self._merge_parts(t)
+            if self.scale.compact:
+                self._split_tracks(events, gates, assignments)
             self._remove(self._find_ended())
         new = (assignments.free >= 3) & (assignments.free >= CONFIG.free_share * assignments.counts)
         if new.any():
@@ -205,99 +202,33 @@ class WindowTracker:
             enough = tracks.hits >= CONFIG.min_confirm_windows
             enough &= tracks.hits >= CONFIG.min_confirm_share * age
             enough &= tracks.nats > self.log_threshold
-            enough &= ~np.isin(tracks.id, [newer for newer, _ in self.contacts])
             tracks.confirmed[now & enough] = True
         t, m = np.full(len(now), gates.t), gates.p + measured.z
         columns = (t, tracks.id, tracks.p, tracks.v, tracks.C, measured.n, m, measured.R)
         self.rows.append(_WindowRows._make(value[now] for value in columns))
 
-    def _split_tracks(
-        self, events: WindowEvents, t: float | int, owner: NDArray, labels: NDArray
-    ) -> None:
-        """Split a track of which two halves go their own ways.
+    def _split_tracks(self, events: WindowEvents, gates: TrackGates, assigned: Assignments) -> None:
+        """Split each track whose events are likelier those of two targets than of one.
 
-        The distance of parts of one object, such as both sides of an outline, stays. The distance
-        is measured along the longer axis, since coarse cells see no gap.
+        The evidence of windows is summed while it is positive. A part has the history of the whole.
         """
-        tracks, square = self.tracks, larger_variance(self.tracks.C)
-        long = square > CONFIG.split_aspect**2 * np.linalg.det(tracks.C) / square
-        before, self.gaps, others = self.gaps, {}, []
-        for i in np.flatnonzero(long & tracks.confirmed & (tracks.misses == 0)):
-            key, size = int(tracks.id[i]), float(np.sqrt(square[i]))
-            self.min_sizes[key] = min(self.min_sizes.get(key, size), size)
-            if size < CONFIG.split_growth * self.min_sizes[key]:
-                continue
-            at = (owner == i) & (labels > 0)
-            two = split_blob(events.x[at], events.y[at], tracks.C[i])
-            if two is None or two.n[1] < CONFIG.split_min_share * at.sum():
-                continue
-            distance = float(np.hypot(*(two.p[0] - two.p[1])))
-            wide = float(np.sqrt(larger_variance(two.C)).sum())
-            first, last, windows = before.get(key, (distance, distance, 0))
-            if abs(distance - last) > 0.5 * wide:
-                first, windows = distance, 0
-            apart = max(first + wide, CONFIG.split_separation * first)
-            if windows < CONFIG.part_windows or distance < apart:
-                self.gaps[key] = first, distance, windows + 1
-                continue
-            tracks.p[i], tracks.C[i], tracks.n[i] = two.p[0], two.C[0], two.n[0]
-            del self.min_sizes[key]
-            others.append(Blobs(two.n[1:], two.p[1:], two.C[1:]))
-        for other in others:
-            self._start_tracks(t, other)
-
-    def _merge_parts(self, t: float | int) -> None:
-        """Merge two tracks that are in contact and move together."""
-        if len(self.tracks.id) < 2:
-            self.contacts = {}
-            return
-        tracks, w = self.tracks, self.scale.window
-        size = tracks.size
-        reach = size[:, None] + size
-        apart = tracks.p[:, None] - tracks.p
-        near = np.hypot(apart[..., 0], apart[..., 1]) < CONFIG.contact_distance * reach
-        detected = (tracks.misses == 0) & ~tracks.merged
-        now: dict[tuple[int, int], tuple[float, NDArray, float]] = {}
-        young = t - tracks.born < (CONFIG.young_windows - 0.5) * w
-        for newer, older in zip(*np.nonzero(np.tril(near, -1)), strict=True):
-            key = int(tracks.id[newer]), int(tracks.id[older])
-            shorter = float(min(tracks.travel[newer], tracks.travel[older]))
-            if key not in self.contacts and not young[newer]:
-                continue  # they came from apart
-            if not (detected[newer] and detected[older]):
-                if key in self.contacts:
-                    now[key] = self.contacts[key]
-                continue
-            since, then, travel = self.contacts.get(key, (t, apart[newer, older], shorter))
-            changed = abs(np.hypot(*apart[newer, older]) - np.hypot(*then))
-            if changed >= 0.5 * reach[newer, older]:
-                since, then, travel = t, apart[newer, older], shorter
-            now[key] = since, then, travel
-            long = (t - since) / w >= CONFIG.part_windows - 0.5
-            # Slow neighbours look rigid for a few windows; those that went their own size do not.
-            if long and shorter - travel > 2 * reach[newer, older]:
-                self._merge_pair(int(newer), int(older))
-                detected = detected & ~tracks.merged
-        self.contacts = now
-
-    def _merge_pair(self, one: int, other: int) -> None:
-        """Merge the lighter of two tracks into the other one."""
-        tracks = self.tracks
-
-        def weight(i: int) -> tuple[bool, float]:
-            return bool(tracks.confirmed[i]), float(tracks.n[i] * tracks.hits[i])
-
-        big, small = (one, other) if weight(one) >= weight(other) else (other, one)
-        share = tracks.n[big] / (tracks.n[big] + tracks.n[small])
-        p = share * tracks.p[big] + (1 - share) * tracks.p[small]
-        C = np.zeros((2, 2))
-        for i, part in ((big, share), (small, 1 - share)):
-            C += part * (tracks.C[i] + np.outer(tracks.p[i] - p, tracks.p[i] - p))
-        tracks.p[big], tracks.C[big] = p, C
-        tracks.n[big] += tracks.n[small]
-        tracks.hits[big] = max(tracks.hits[big], tracks.hits[small])
-        tracks.merged[small] = True
-        self.parts[int(tracks.id[small])] = int(tracks.id[big])
+        tracks, before, two = self.tracks, self.evidence, Blobs.empty(2)
+        self.evidence, parts = {}, []
+        for i in np.flatnonzero(tracks.confirmed & (tracks.misses == 0) & ~gates.shared):
+            nats = split_blob(events, assigned.owner, int(i), two)
+            key = int(tracks.id[i])
+            nats += before.get(key, 0.0)
+            if nats > self.log_threshold:
+                part = tracks.take(np.array([i]))
+                for k, one in enumerate((tracks, part)):
+                    at = i if k == 0 else 0
+                    one.p[at], one.C[at], one.n[at] = two.p[k], two.C[k], two.n[k]
+                part.id[0], self.next_id = self.next_id, self.next_id + 1
+                parts.append(part)
+            elif nats > 0:
+                self.evidence[key] = nats
+        for part in parts:
+            self._append_tracks(part, gates.t)
 
     def _find_ended(self) -> NDArray[np.bool_]:
         """Find tracks that are merged, outside, or without events for too long."""
@@ -317,17 +248,19 @@ class WindowTracker:
             return
         over, self.tracks = self.tracks.take(ended), self.tracks.take(~ended)
         self.confirmed |= set(over.id[over.confirmed].tolist())
-        for one in over.id.tolist():
-            self.min_sizes.pop(one, None)
 
     def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
         """Start a track at each blob, at a time (s)."""
-        n, p, C = blobs
-        ids = np.arange(self.next_id, self.next_id + len(n))
-        self.next_id += len(n)
-        self.tracks = self.tracks.append(init_tracks(ids, t, blobs, self.scale.window))
-        R, at = larger_variance(C) / 2 / n, np.full(len(n), t)
-        self.rows.append(_WindowRows(at, ids, p, np.zeros_like(p), C, n, p, R))
+        ids = np.arange(self.next_id, self.next_id + len(blobs.n))
+        self.next_id += len(ids)
+        self._append_tracks(init_tracks(ids, t, blobs, self.scale.window), t)
+
+    def _append_tracks(self, new: TrackTable, t: float | int) -> None:
+        """Append tracks, and their states at a time (s) to the rows."""
+        self.tracks = self.tracks.append(new)
+        R, at = larger_variance(new.C) / 2 / new.n, np.full(len(new.n), t)
+        columns = at, new.id, new.p, new.v, new.C, new.n, new.p, R
+        self.rows.append(_WindowRows._make(value.copy() for value in columns))
 
 
 def init_tracks(ids: NDArray, t: float | int, blobs: Blobs, window: float | int) -> TrackTable:
@@ -352,16 +285,24 @@ def init_tracks(ids: NDArray, t: float | int, blobs: Blobs, window: float | int)
     )  # fmt: skip
 
 
-def predict_gates(tracks: TrackTable, t: float | int, window: float | int) -> TrackGates:
+def predict_gates(
+    tracks: TrackTable, t: float | int, window: float | int, compact: bool = False
+) -> TrackGates:
     """Predict all tracks to the middle t (s) of a window, and compute their gates.
 
     A known target leaves its way by about its size in a window: what is farther is another one.
     Known targets in contact share the events between them.
+
+    Args:
+        tracks: Tracks.
+        t: Middle of the window, s.
+        window: Its length, s.
+        compact: Whether ellipses describe the targets: their sizes then follow shared events too.
     """
     n = len(tracks.n)
     gates = TrackGates(
         float(t), float(window), np.empty((n, 2)), np.empty((n, 3)), tracks.v, np.empty((n, 4)),
-        np.empty(n), tracks.n, np.zeros(n, bool),
+        np.empty(n), tracks.n, np.zeros(n, bool), compact,
     )  # fmt: skip
     _predict_gates(tracks, gates)
     return gates
@@ -638,7 +579,7 @@ def _update_detected(tracks: Any, gates: Any, clutter: Any, k: int, measurement:
     tracks.P[k, 2] = P[2] - b * P[1]
     tracks.t[k], tracks.misses[k] = gates.t, 0
     newer, C = 1 / (tracks.hits[k] + 1), tracks.C[k]
-    if alone and in_blob:
+    if (alone or gates.compact) and in_blob:
         gain = max(CONFIG.update_gain * min(1.0, n / tracks.n[k]), newer)
         for i in range(2):
             for j in range(2):

@@ -149,6 +149,12 @@ class WindowFit(NamedTuple):
 Hypothesis = tuple[Scene, FitReport]
 
 
+def finite_cost(hypothesis: Hypothesis) -> float:
+    """Return the cost of a hypothesis per event, C^2; infinite where it is not known."""
+    value = hypothesis[1].cost
+    return value if np.isfinite(value) else np.inf
+
+
 def error_inflation(inliers: float) -> float:
     """Return the factor of squared errors by which independent cells underestimate them.
 
@@ -162,7 +168,11 @@ def error_inflation(inliers: float) -> float:
 class WindowFitter(Windows):
     """Windows of a recording, and the fit of each."""
 
-    def rotation(self, centre: int) -> NDArray[np.float64]:
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.rotation = functools.lru_cache(2)(self._rotation)
+
+    def _rotation(self, centre: int) -> NDArray[np.float64]:
         """Return the rotation (3,), rad/s, at the middle of a window, by a gyro if there is one."""
         if self.gyro is None:
             return sharpest_rotation(self.sample_events(centre, self.half / 3, MAX_FLOW_EVENTS))
@@ -184,7 +194,7 @@ class WindowFitter(Windows):
         flow_max = float(params.flow_max)
         for flows in map_parallel(lambda cut: measure_patch_flows(cut, Omega, flow_max), cuts):
             if flows is not None:
-                best = search_headings(flows, self.f, Omega, params.starts, self.omega_weight)
+                best = search_headings(flows, self.f, Omega, params.starts)
                 found += [one.path(window, flows) for one in best]
 
         return self._align(window, centre, found, (0, 4, 6), (0, 1, 6))[:MAX_INITIAL_PATHS]
@@ -206,7 +216,7 @@ class WindowFitter(Windows):
         def align(path: Path) -> tuple[float, Path]:
             for degree, blurs, steps in passes:
                 path = align_segments(window, path, prior, degree=degree, blurs=blurs, steps=steps)
-            return contrast_score(window, path) - self.rotation_prior(path), path
+            return contrast_score(window, path), path
 
         scored = [pair for pair in map_parallel(align, paths) if np.isfinite(pair[0])]
         scored.sort(key=lambda pair: -pair[0])
@@ -279,8 +289,8 @@ class WindowFitter(Windows):
                 self.refine_coarse_to_fine(centre, series, paths, COARSE_TO_FINE_STAGES)
             )
             ratio, margin = MAX_COST_RATIO, COST_MARGIN
-        limit = ratio * self.cost(*found[0]) + margin if found else 0.0
-        return [one for one in found if self.cost(*one) < limit]
+        limit = ratio * finite_cost(found[0]) + margin if found else 0.0
+        return [one for one in found if finite_cost(one) < limit]
 
     def refine_coarse_to_fine(
         self, centre: int, series: PixelSeries, paths: list[Path], stages: tuple[Stage, ...]
@@ -350,8 +360,8 @@ class WindowFitter(Windows):
         uncertain = (
             floor > 0 or parallax < MIN_WINDOW_PARALLAX_PX or report.inliers < MIN_INLIER_SHARE
         )
-        limit = np.inf if uncertain else MAX_SIMILAR_COST_RATIO * self.cost(*ranked[0])
-        close = [one for one in ranked if self.cost(*one) <= limit]
+        limit = np.inf if uncertain else MAX_SIMILAR_COST_RATIO * finite_cost(ranked[0])
+        close = [one for one in ranked if finite_cost(one) <= limit]
         test = self.held_out_test(centre) if uncertain or len(close) > 1 else None
         # A single hypothesis has converged: more steps than its map takes hardly change z.
         alone = len(close) == 1
@@ -410,17 +420,8 @@ class WindowFitter(Windows):
 
     def rank(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Sort hypotheses by cost, without those near to a better one."""
-        ranked = sorted(hypotheses, key=lambda one: self.cost(*one))
+        ranked = sorted(hypotheses, key=finite_cost)
         return _drop_near(ranked, lambda one: one[0].path)
-
-    def cost(self, scene: Scene, report: FitReport) -> float:
-        """Return the cost of a hypothesis per event, with the prior of |Omega|, C^2."""
-        value = report.cost + self.rotation_prior(scene.path)
-        return value if np.isfinite(value) else np.inf
-
-    def rotation_prior(self, path: Path) -> float:
-        """Return the cost of the prior of |Omega|, per event."""
-        return 0.5 * self.omega_weight * float((path.O[0] ** 2).sum()) / MAX_SCORED_EVENTS
 
 
 def _without_heading(

@@ -424,7 +424,7 @@ class InitialMotion(NamedTuple):
 
 
 def search_headings(
-    flows: PatchFlows, f: float, Omega: NDArray, number: int, omega_weight: float
+    flows: PatchFlows, f: float, Omega: NDArray, number: int
 ) -> list[InitialMotion]:
     """Search the headings that explain the flows of patches best, at least 32 degrees apart.
 
@@ -437,7 +437,6 @@ def search_headings(
         f: Focal length, px.
         Omega: (3,) rotation that was taken off, rad/s.
         number: Most motions.
-        omega_weight: Weight of |Omega|^2, 1 / (rad/s)^2.
     """
     k = np.arange(N_SEARCHED_HEADINGS) + 0.5
     z, azimuth = k / N_SEARCHED_HEADINGS, np.pi * (1 + 5**0.5) * k
@@ -452,14 +451,14 @@ def search_headings(
     target = np.einsum("tki,ki->tk", across, flows.U)
     basis = np.einsum("tki,kij->tkj", across, turn)
     more = np.zeros((N_SEARCHED_HEADINGS, 3))
-    damping = (1e-6 * f * f + omega_weight) * np.eye(3)
+    damping = 1e-6 * f * f * np.eye(3)
     for turn_number in range(10):
         left = target - np.einsum("tkj,tj->tk", basis, more)
         limit = 4.0 * 4.0 ** max(0, 5 - turn_number)
         weight = 1 / variance / (1 + left**2 / variance / limit) ** 2
         weighted = (weight[..., None] * basis).swapaxes(1, 2)
         H = weighted @ basis + damping
-        side = (weighted @ target[..., None])[..., 0] - omega_weight * Omega
+        side = (weighted @ target[..., None])[..., 0]
         more = np.linalg.solve(H, side[..., None])[..., 0]
     rest = flows.U - np.einsum("kij,tj->tki", turn, more)
     information = np.linalg.inv(flows.covariance)
@@ -470,7 +469,7 @@ def search_headings(
         rho = np.maximum(sign * towards / np.maximum(along, 1e-12), 0)
         miss = rest - sign * rho[..., None] * a
         e = np.einsum("tki,kij,tkj->tk", miss, information, miss)
-        cost = (e / (1 + e / 4)).sum(1) + omega_weight * ((more + Omega) ** 2).sum(1)
+        cost = (e / (1 + e / 4)).sum(1)
         found += list(zip(cost, sign * T, more + Omega, rho, along, strict=True))
     found.sort(key=lambda one: one[0])
     best: list[InitialMotion] = []

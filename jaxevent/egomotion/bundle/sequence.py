@@ -147,8 +147,7 @@ def _refit_backwards(
         if old is None or later is None or is_near(later.path, old.path):
             break
         new[row] = later
-        gained += old.cost + windows.rotation_prior(old.path)
-        gained -= later.cost + windows.rotation_prior(later.path)
+        gained += old.cost - later.cost
         if gained > 0:
             for at, fit in new.items():
                 fits[at] = fit

@@ -390,7 +390,6 @@ class Prior(NamedTuple):
     smooth: float
     relief: float
     change: float
-    omega: float  # 1 / (rad/s)^2
     gyro: NDArray[np.float64]  # (N_SEGMENTS, 3) Omega, rad/s, at the segments' middles
     gyro_weight: float  # 1 / (rad/s)^2, 0: none
     bond: float
@@ -489,7 +488,7 @@ def row_priors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Return the cost of the priors on rows t as t' K t / 2 - b' t + c.
 
-    They are on Omega, its changes and the gyro; Omega(tau) = O0 + O1 tau + O2 tau^2 / 2 + ...
+    They are on changes of the twist and the gyro; Omega(tau) = O0 + O1 tau + O2 tau^2 / 2 + ...
 
     Args:
         prior: Weights, and Omega by the gyro.
@@ -505,7 +504,6 @@ def row_priors(
     powers = np.stack([times**m / math.factorial(m) for m in range(k)], 1)
     weight, gyro = float(prior.gyro_weight) / N_WINDOW_SEGMENTS, np.asarray(prior.gyro, np.float64)
     of_O = weight * powers.T @ powers
-    of_O[0, 0] += float(prior.omega)
     K, b = np.zeros((n, n)), np.zeros(n)
     K[: 3 * k, : 3 * k] = np.kron(of_O, np.eye(3))
     b[: 3 * k] = weight * (powers.T @ gyro).ravel()

@@ -28,7 +28,7 @@ from jaxevent.egomotion.bundle.warp import N_WINDOW_SEGMENTS, Prior, segment_tim
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.motion import lens_error
 from jaxevent.egomotion.truth import Twists
-from jaxevent.parameters import Choice, Count, Number, Parameters, Positive
+from jaxevent.parameters import Choice, Count, Parameters, Positive
 from jaxevent.recording import Recording
 
 DEPTH_NODE_SPACING_PX = 4  # between nodes of depth
@@ -99,9 +99,6 @@ class Params(Parameters):
     )
     alike: Positive = Positive(
         10.0, "", "number of events that count as one, as their errors are alike"
-    )
-    omega_scale: Number = Number(
-        0.0, "rad/s", "standard deviation of |Omega| by a prior; 0: no prior"
     )
     gyro_std: Positive = Positive(0.03, "rad/s", "standard deviation of a gyro, if one is given")
     frames: Choice = Choice((True, False), "whether frames are fitted beside the events")
@@ -311,12 +308,6 @@ class Windows:
         """Half the length of a whole window, s."""
         return float(self.params.half_window)
 
-    @property
-    def omega_weight(self) -> float:
-        """Weight of |Omega|^2, 1 / (rad/s)^2."""
-        scale = float(self.params.omega_scale)
-        return 1 / scale**2 if scale > 0 else 0.0
-
     def _read_frame_pixels(self, first: int, last: int) -> FramePixels | None:
         return read_frame_pixels(self.recording, first, last, self.frame_delay_us)
 
@@ -353,7 +344,7 @@ class Windows:
         skew, skew_weight = self.skew(centre, half)
         return Prior(
             smooth=float(params.smooth), relief=float(params.relief), change=float(params.change),
-            omega=self.omega_weight, gyro=gyro, gyro_weight=weight, bond=float(params.bond),
+            gyro=gyro, gyro_weight=weight, bond=float(params.bond),
             flat=float(params.flat), alike=float(params.alike), skew=skew, skew_weight=skew_weight,
         )  # fmt: skip
 
