@@ -146,7 +146,7 @@ class _RecycledMemory:
 
 
 ALIGNMENT_BYTES, MIN_RECYCLED_BYTES = 64, 1 << 18
-_recycled_memory = _RecycledMemory(256 << 20)
+_recycled_memory = _RecycledMemory(512 << 20)
 
 
 def empty(*shape: int) -> NDArray[np.float32]:

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from jaxevent.codegen import empty
 from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
@@ -131,8 +132,9 @@ class InstantImages:
                 self._cache[t] = Estimate(*(np.array(v[n], np.float32) for v in part))
         while len(self._cache) > max(N_CACHED_IMAGES, len(times)):
             self._cache.popitem(last=False)
-        chosen = [self._cache[t] for t in times.tolist()]
-        L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
+        L, V, clear = (empty(len(times), *self.image_shape) for _ in range(3))
+        for k, t in enumerate(times.tolist()):
+            L[k], V[k], clear[k] = self._cache[t]
         return L, V, clear
 
 

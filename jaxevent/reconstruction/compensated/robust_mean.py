@@ -1,7 +1,7 @@
 """Robust mean of images along trajectories: in numba loops, and in JAX for derivatives."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -125,7 +125,7 @@ def squared_gradient(image: Array) -> Array:
     return gy**2 + gx**2
 
 
-def activity_range(layout: InstantLayout) -> tuple[Numeric, Numeric]:
+def activity_range(layout: InstantLayout) -> tuple[Any, Any]:
     """Return the indices between which changes are summed: the frames next to the target.
 
     Both are left out. Where frames are on one side alone, the range is from there to the target,
