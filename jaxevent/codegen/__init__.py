@@ -3,13 +3,10 @@
 The other modules of the package compile functions that JAX traces (docs/codegen.md).
 """
 
-import ctypes
 import functools
 import inspect
-import math
 import os
 import threading
-import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
@@ -113,56 +110,12 @@ N_THREADS = (
 )
 
 
-class _RecycledMemory:
-    """Blocks of memory that are used again once no array is left that uses them.
-
-    A page that a process writes for the first time costs more than to fill it.
-    """
-
-    def __init__(self, max_kept_bytes: int):
-        self._max, self._kept, self._lock = max_kept_bytes, 0, threading.Lock()
-        self._free: dict[int, list[NDArray[np.uint8]]] = {}
-
-    def __call__(self, n_bytes: int) -> Any:
-        """Return a block of at least so many bytes, in multiples of 1/8 of a power of two."""
-        step = max(1 << max(n_bytes.bit_length() - 4, 0), ALIGNMENT_BYTES)
-        size = -(-n_bytes // step) * step
-        with self._lock:
-            free = self._free.get(size)
-            memory = free.pop() if free else None
-            self._kept -= size if free is not None and memory is not None else 0
-        if memory is None:
-            memory = np.empty(size + ALIGNMENT_BYTES, np.uint8)
-        offset = -memory.ctypes.data % ALIGNMENT_BYTES
-        block = (ctypes.c_char * size).from_buffer(memory.data, offset)
-        weakref.finalize(block, self._release, size, memory).atexit = False
-        return block
-
-    def _release(self, size: int, memory: NDArray[np.uint8]) -> None:
-        with self._lock:
-            if self._kept + size <= self._max:
-                self._free.setdefault(size, []).append(memory)
-                self._kept += size
-
-
-ALIGNMENT_BYTES, MIN_RECYCLED_BYTES = 64, 1 << 18
-_recycled_memory = _RecycledMemory(512 << 20)
-
-
-def empty(*shape: int) -> NDArray[np.float32]:
-    """Return an array (float32); a large one has memory that others have used before."""
-    count = math.prod(shape)
-    if 4 * count < MIN_RECYCLED_BYTES:
-        return np.empty(shape, np.float32)
-    return np.frombuffer(_recycled_memory(4 * count), np.float32, count).reshape(shape)
-
-
 def row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
     """Return scratch (rows, ...) for kernels of `run_over_rows`: parts use that of their first row.
 
     Memory is taken by what is written alone.
     """
-    return empty(n_rows, *shape)
+    return np.empty((n_rows, *shape), np.float32)
 
 
 @functools.cache
@@ -170,13 +123,12 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(N_THREADS)
 
 
-def run_over_rows(kernel: Callable, n_rows: int, *args: Any, min_rows: int = 1) -> None:
+def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
     """Call `kernel(begin, end, *args)` for parts of the rows, each on a thread of its own.
 
-    Kernels release the interpreter's lock. What they compute must not depend on the parts, each of
-    which has `min_rows` rows or more.
+    Kernels release the interpreter's lock. What they compute must not depend on the parts.
     """
-    parts = min(N_THREADS, n_rows // min_rows)
+    parts = min(N_THREADS, n_rows)
     if parts <= 1:
         kernel(0, n_rows, *args)
         return

@@ -26,8 +26,8 @@ from jaxevent.reconstruction.compensated import (
 )
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
-    InstantStack,
     NormalEquations,
+    PackedImages,
     solve_normal_equations,
 )
 from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
@@ -146,8 +146,8 @@ def test_pixels_take_the_path_of_their_side():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     x = np.arange(56)
     still, moving = moved((0, 0), (0, 0), s), moved((6.0, -3.0), (0, 0), s)
-    L, V = np.float32(np.where(x < 28, still, moving)), np.full(still.shape, 1e-3, np.float32)
-    images = InstantStack.of(L, V, s)
+    packed = trajectories.pack_images(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
+    images = PackedImages.of(packed, s)
     # Between both motions a ramp, 12 px wide, as nodes leave it.
     part = np.clip((x - 21.5) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
     paths = (part * [6.0, -3, 0, 0]).astype(np.float32)
@@ -163,8 +163,7 @@ def test_pixels_take_the_path_of_their_side():
     # What moves has left the image's other half, so that some pixels see it in few instants.
     assert wrong(before) > 0.5 and wrong(chosen) < 0.25
     # Steps from paths of others leave fewer wrong ones than steps alone; sizes may be odd.
-    odd, p = (np.ascontiguousarray(part[:, :39, :55]) for part in (L, V)), paths[::2, ::2]
-    odd = InstantStack.of(*odd, s)
+    odd, p = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), s), paths[::2, ::2]
     step = trajectories.gauss_newton_step
     refined = step(odd, trajectories.borrow_paths(odd, step(odd, p, COST), COST), COST)
     plain = step(odd, step(odd, p, COST), COST)
@@ -178,7 +177,7 @@ def test_pixels_take_the_path_of_their_side():
     # What noise prefers is not chosen: here nothing but noise tells paths apart.
     rng = np.random.default_rng(4)
     noise = rng.normal(0, 0.05, still.shape).astype(np.float32)
-    images = InstantStack.of(noise, np.full_like(noise, 0.01), s)
+    images = PackedImages.of(trajectories.pack_images(noise, np.full_like(still, 0.01)), s)
     rough = rng.normal(0, 1, paths.shape).astype(np.float32)
     assert (trajectories.select_paths(images, rough, COST) != own).mean() < 0.05
 
@@ -237,7 +236,7 @@ def test_robust_mean_is_that_of_jax():
     activity = ((3, 1, 0, 2), 0), ((3, 2, 0, 0), L[2] - L[1]), ((3, 0, 2, 2), L[1] - L[0])
     for numbers, change in activity:
         at = make_layout(*numbers)
-        one = robust_mean.robust_mean(robust_mean.MeanParams.of(Params()), L, along, at)
+        one = robust_mean.robust_mean(Params(), L, along, at)
         other = purely(Params(), L, along, at)
         for name, quick, pure in zip(robust_mean.RobustMean._fields, one, other, strict=True):
             np.testing.assert_allclose(quick, pure, rtol=3e-5, atol=3e-5, err_msg=name)
@@ -846,7 +845,7 @@ def motion_problem():
 @pytest.mark.slow
 def test_equations_are_those_of_the_steps():
     p, (L, V, s, _), numbers = jax.tree.map(np.asarray, motion_problem())
-    images = InstantStack.of(L, V, s)
+    images = PackedImages.of(trajectories.pack_images(L, V), s)
     cost = CostParams(*map(np.float32, numbers))
     quick = normal_equations.linearise(images, p, cost)
     found = jax.jit(normal_equations.linearise_jax)(*motion_problem())
@@ -860,12 +859,12 @@ def test_equations_are_those_of_the_steps():
 
 
 def test_equations_do_not_depend_on_the_turns_of_threads():
-    """Nodes at the border of two threads read rows of both, here at nearly the same time."""
+    """Rows at the border of two threads are sampled by both, here at nearly the same time."""
     rng = np.random.default_rng(8)
     s = np.linspace(-1, 1, 5).astype(np.float32)
     L = moved((1.0, -0.5), (0.2, 0.1), s, 8, 200) + rng.normal(0, 0.02, (5, 8, 200))
     V = np.full(L.shape, 5e-4, np.float32)
-    images = InstantStack.of(L.astype(np.float32), V, s)
+    images = PackedImages.of(trajectories.pack_images(L.astype(np.float32), V), s)
     p = np.float32([1, -0.5, 0.2, 0.1]) + rng.normal(0, 0.02, (4, 100, 4)).astype(np.float32)
     cost = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
     first = normal_equations.linearise(images, p, cost)

@@ -65,21 +65,21 @@ from jaxevent.reconstruction.compensated.instants import (
 )
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
-    InstantStack,
     MotionImages,
+    PackedImages,
     implicit_trajectories,
 )
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import (
     InstantLayout,
-    MeanParams,
+    RobustMean,
     make_layout,
     robust_mean,
     visibility,
 )
 from jaxevent.reconstruction.compensated.thresholds import learn_thresholds
 from jaxevent.reconstruction.compensated.trajectories import (
-    SEARCH_CURVATURE,
+    PATH_SEARCHES,
     ImagePyramid,
     NodeTrajectories,
     advect_nodes,
@@ -89,6 +89,7 @@ from jaxevent.reconstruction.compensated.trajectories import (
     estimate_trajectories,
     gauss_newton_step,
     node_shape,
+    pack_images,
     plan_stages,
     robust_cost,
     select_paths,
@@ -220,8 +221,7 @@ class Anchor(NamedTuple):
     is_steady: bool  # no smooth part was subtracted from L
 
 
-@dataclasses.dataclass(frozen=True)
-class TrajectoryEstimate:
+class TrajectoryEstimate(NamedTuple):
     """A target, the images at its instants, and the motion of its points."""
 
     instants: TargetInstants
@@ -234,7 +234,7 @@ class TrajectoryEstimate:
     smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
     noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `fusion.ReferenceImages`
 
-    @functools.cached_property
+    @property
     def paths(self) -> NDArray[np.float32]:
         """Paths of all pixels, (h, w, 4), px."""
         paths = interpolate_paths(self.p, self.L.shape[1:])
@@ -322,7 +322,6 @@ class TrajectoryEstimator:
         self._anchor, self._sought_motion = cached(self._make_anchor), cached(self._seek_motion)
         self._frame_motion = cached(self._seek_by_frames)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
-        self._mean = MeanParams.of(params)
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         """Return L, V and clear at instants, and the smooth part that is subtracted from L."""
@@ -370,7 +369,7 @@ class TrajectoryEstimator:
         doubt = 1 - self.event_noise.trust(at) ** 4
         other = self._motion_of_frames(at) if doubt > MIN_DOUBT else None
         if other is not None:
-            images, several = InstantStack.of(*pyramid[1], instants.s), (p, other.carry(instants))
+            images, several = PackedImages.of(pyramid[1], instants.s), (p, other.carry(instants))
             p = choose_trajectories(images, several, self._cost, (1.0, doubt))
         return self._improve(pyramid[1], NodeMotion(instants, p))
 
@@ -406,47 +405,39 @@ class TrajectoryEstimator:
         """Refine motion at half resolution with the image that it gives."""
         instants, p = motion
         L, V, clear, smooth = self._images(instants)
-        t = int(instants.t[instants.target])
-        estimate = TrajectoryEstimate(
-            instants, L, V, clear, self._at_full_resolution(p), noise=self._noise(t)
-        )
-        fused = self.fuse(estimate)
+        t, size = int(instants.t[instants.target]), self.images.image_shape
+        p = NodeTrajectories(p, 1).at_level(0, size).p
+        estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=self._noise(t))
+        fused = fuse_target(self.params, estimate)
         image, P = np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
-        images = InstantStack.of(*self._pyramid(estimate, image, P)[1], instants.s)
-        p = borrow_paths(images, gauss_newton_step(images, p, self._cost), self._cost)
+        packed = self._pack(estimate, image, P)
+        p = borrow_paths(packed, gauss_newton_step(packed, p, self._cost), self._cost)
         return Anchor(NodeMotion(instants, p), image, P, smooth is None)
 
-    def _at_full_resolution(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Interpolate nodes at half resolution to those at full resolution."""
-        return NodeTrajectories(p, 1).at_level(0, self.images.image_shape).p
-
-    def _pyramid(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> ImagePyramid:
-        """Return the images of a target, its own replaced by one with less noise."""
+    def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
+        """Pack the images of a target, its own replaced by one with less noise."""
         L, V = target.L.copy(), self._cautious(target.V, target.clear)
         L[target.instants.target] = image
         V[target.instants.target] = FUSED_VARIANCE_FACTOR * P + self._cost.floor
-        return ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)
+        return PackedImages.of(pack_images(L, V), target.instants.s)
 
-    def _improve(self, images: tuple[NDArray, NDArray], motion: NodeMotion) -> NodeMotion:
+    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> NodeMotion:
         """Take a few steps at half resolution, on the clock on which frames agree better.
 
         Images from events have the faults of their clock, so that they do not judge it.
         """
-        (L, V), (instants, p) = images, motion
+        instants, p = motion
         judges = np.isin(instants.t, self.schedule.frames)
         if judges.sum() <= 2:  # agree on any clock
             judges[:] = True
 
         def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
             for _ in range(N_ANCHOR_STEPS):
-                images = InstantStack.of(L, V, clock.s)
-                p = gauss_newton_step(images, p, self._cost, SEARCH_CURVATURE)
+                p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
             return p
 
         def cost(clock: TargetInstants, p: NDArray[np.float32]) -> float:
-            return robust_cost(
-                InstantStack.of(L[judges], V[judges], clock.s[judges]), p, self._cost
-            )
+            return robust_cost(PackedImages.of(pixels[judges], clock.s[judges]), p, self._cost)
 
         found = improved(instants, p)
         if not instants.clock.event_share:
@@ -476,25 +467,32 @@ class TrajectoryEstimator:
         if not anchor.motion.instants.clock.event_share:
             instants = instants.with_clock(TIME_CLOCK)
         p = anchor.motion.carry(instants)
-        target = TrajectoryEstimate(
-            instants, L, V, clear, self._at_full_resolution(p), smooth=smooth, noise=noise
-        )
-        pyramid = self._pyramid(target, *self._carry_image(anchor, target))
-        images = InstantStack.of(*pyramid[1], instants.s)
+        target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
+        packed = self._pack(target, *self._carry_image(anchor, target))
         for at in others:
-            several = (p, self._sought_motion(at).carry(instants))
-            p = choose_trajectories(images, several, self._cost, (1.0, 1.0))
-        images = InstantStack.of(*pyramid[0], instants.s)
-        p = gauss_newton_step(images, self._at_full_resolution(p), self._cost)
-        path_index = select_paths(images, interpolate_paths(p, size), self._cost)
-        return dataclasses.replace(target, p=p, path_index=path_index)
+            p = self._choose(packed, p, self._sought_motion(at).carry(instants))
+        p = gauss_newton_step(packed, p, self._cost)
+        # Nodes of the anchor have taken paths from farther away.
+        path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
+        return target._replace(p=p, path_index=path_index)
+
+    def _choose(
+        self, images: PackedImages, p: NDArray[np.float32], other: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Choose between trajectories and others at half resolution, where images agree better."""
+        size = self.images.image_shape
+        L, V = images.pixels[..., 0], images.pixels[..., 1]
+        half = PackedImages.of(ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)[1], images.s)
+        own = NodeTrajectories(p, 0).at_level(1, size).p
+        change = choose_trajectories(half, (own, other), self._cost, (1.0, 1.0)) - own
+        return p + NodeTrajectories(change, 1).at_level(0, size).p
 
     def _carry_image(
         self, anchor: Anchor, target: TrajectoryEstimate
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Carry the image of an anchor to a target: log intensity and variance, each (h, w)."""
         if anchor.is_steady != (target.smooth is None):
-            fused = self.fuse(target)
+            fused = fuse_target(self.params, target)
             return np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
         there, here = anchor.motion.instants, target.instants
         at = here.to_relative_times(there.t[[there.target]]).astype(np.float32)
@@ -509,36 +507,41 @@ class TrajectoryEstimator:
             np.where(inside, warped.V[0], self._caution * target.V[own]),
         )
 
-    def fuse(self, target: TrajectoryEstimate) -> FusedImage:
-        """Fuse a target's images along trajectories, without the smooth part that was subtracted.
 
-        Args:
-            target: The target.
-
-        Returns:
-            The image.
-        """
-        L, V, paths = target.L, target.V, target.paths
-        warped = warp_images(L, V, target.clear, target.instants.s, paths)
-        layout = make_layout(target.instants, target.clear, len(L))
-        mean = robust_mean(self._mean, L, warped, layout)
-        # The images that it is compared with are few, and are all that is handed over.
-        names = ("target", "before", "after", "other")
-        rows = [int(getattr(layout, name)) for name in names]
-        places = {name: np.int32(rows.index(k)) for name, k in zip(names, rows, strict=True)}
-        warped = WarpedImages(*(part[rows] for part in warped))
-        layout = InstantLayout(*(part[rows] for part in layout[:4]), **places, rest=layout.rest)
-        compared = _compare(mean, (L[rows], V[rows], warped, layout), paths, target.noise)
-        return _blend(self.params, compared)
+@jax.jit
+def _fuse(
+    params: Params,
+    mean: RobustMean,
+    images: tuple[Numeric, Numeric, WarpedImages, InstantLayout],
+    paths: Numeric,
+    noise: Numeric | float,
+) -> FusedImage:
+    compared = reference_images(*images, squared_reach(paths), noise=noise)
+    return fuse_candidates(params, fusion_features(mean, compared))
 
 
-# Compiled in one, both would take half as long again.
-_compare = jax.jit(
-    lambda mean, images, paths, noise: fusion_features(
-        mean, reference_images(*images, squared_reach(paths), noise=noise)
-    )
-)
-_blend = jax.jit(fuse_candidates)
+def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
+    """Fuse the images at a target's instants along trajectories.
+
+    Args:
+        params: Parameters of `mc`.
+        target: The target.
+
+    Returns:
+        The image, without the smooth part that was subtracted.
+    """
+    instants, L, V, clear, *_ = target
+    paths = target.paths
+    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
+    layout = make_layout(instants, clear, len(instants))
+    mean = robust_mean(params, L, warped, layout)
+    # The images that it is compared with are few, and are all that is handed over.
+    names = ("target", "before", "after", "other")
+    rows = [int(getattr(layout, name)) for name in names]
+    places = {name: np.int32(rows.index(k)) for name, k in zip(names, rows, strict=True)}
+    warped = WarpedImages(*(part[rows] for part in warped))
+    layout = InstantLayout(*(part[rows] for part in layout[:4]), **places, rest=layout.rest)
+    return _fuse(params, mean, (L[rows], V[rows], warped, layout), paths, target.noise)
 
 
 def add_smooth_part(
@@ -583,7 +586,7 @@ def make_trajectory_estimator(
     trajectories = made(None)
 
     def fused(t: int) -> tuple[NDArray, NDArray]:
-        found = trajectories.fuse(trajectories(t))
+        found = fuse_target(params, trajectories(t))
         return np.asarray(found.L), np.asarray(found.P)
 
     factors = learn_thresholds(recording, params, trajectories.schedule.span, fused)
@@ -666,7 +669,7 @@ class CompensatedVideo(ImageSequence[Params]):
 
     def _fuse(self, t: int, target: TrajectoryEstimate) -> FusedImage:
         """Fuse a target's images, and fit the result to the frames next to it."""
-        fused, brightness = self.trajectories.fuse(target), self.trajectories.brightness.prior(t)
+        fused, brightness = fuse_target(self.params, target), self.trajectories.brightness.prior(t)
         exposures = self.trajectories.exposures
         samples = exposures.samples
         if target.smooth is not None:

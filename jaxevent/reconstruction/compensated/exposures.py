@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_fastmath, run_over_rows
+from jaxevent.codegen import njit_noalloc, run_over_rows
 from jaxevent.reconstruction.augment import (
     clipped_side,
     clipping_bound,
@@ -171,7 +171,7 @@ def blur_by_motion_adjoint_jax(error: Array, shares: Array, D: Array) -> Array:
     return sample_bilinear(parts, Y, X).sum(0)
 
 
-@njit_fastmath
+@njit_noalloc
 def _smear(begin, end, L, D, B, shares):
     n, count, h, w, _ = D.shape
     one = np.float32(1)
@@ -191,7 +191,7 @@ def _smear(begin, end, L, D, B, shares):
                 B[k, y, x] = np.log(total / np.float32(count))
 
 
-@njit_fastmath
+@njit_noalloc
 def _smear_adjoint(begin, end, error, shares, D, out):
     n, count, h, w, _ = D.shape
     one = np.float32(1)

@@ -26,7 +26,6 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from jaxevent.codegen import empty
 from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
@@ -84,7 +83,7 @@ class InstantSmoother(Smoother[Params]):
         return FrameLevels(z, V, measured.clear)
 
     def readout(self, params: Params, state: Gaussian, info: FrameLevels, here: Array) -> Estimate:
-        L = jnp.maximum(state.m, jnp.log(params.I0))  # no intensity is below 0
+        L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
         shown = here & (info.clear > 0.5)
         V = jnp.where(shown, jnp.minimum(state.P, info.V), state.P)
         return Estimate(jnp.where(shown, info.z, L), V, shown)
@@ -132,9 +131,8 @@ class InstantImages:
                 self._cache[t] = Estimate(*(np.array(v[n], np.float32) for v in part))
         while len(self._cache) > max(N_CACHED_IMAGES, len(times)):
             self._cache.popitem(last=False)
-        L, V, clear = (empty(len(times), *self.image_shape) for _ in range(3))
-        for k, t in enumerate(times.tolist()):
-            L[k], V[k], clear[k] = self._cache[t]
+        chosen = [self._cache[t] for t in times.tolist()]
+        L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
         return L, V, clear
 
 

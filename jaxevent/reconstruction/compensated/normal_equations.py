@@ -22,27 +22,24 @@ from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     RowScratch,
+    bilinear_weights,
     gradient_at_pixel,
     gradient_jax,
+    interpolate_path,
     interpolate_paths_jax,
-    interpolate_row,
     is_in_image,
     locate_points,
     pad_edges,
     path_positions,
-    read_bilinear,
     sample_bilinear,
 )
 from jaxevent.reconstruction.features import Numeric
 
-MIN_ROWS = 32  # of pixels or nodes, which are worth a thread
-# Places of a symmetric matrix's entries among those of its upper triangle.
-SYMMETRIC = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
 OUTSIDE_INFORMATION = np.float32(1e-6)  # of values outside the image
 # Iterations for derivatives: of conjugate gradients with the normal matrix, and of the whole.
 CG_ITERATIONS, BICGSTAB_ITERATIONS = 30, 8
@@ -83,27 +80,25 @@ class NormalEquations(NamedTuple):
     ridge: Float[Numeric, " 4"]
 
 
-class InstantStack(NamedTuple):
-    """Images at K instants."""
+class PackedImages(NamedTuple):
+    """Images at K instants with their gradients."""
 
-    L: NDArray[np.float32]  # (K, h, w), log intensity
-    V: NDArray[np.float32]  # (K, h, w), its variance, (ln I)^2
+    pixels: NDArray[np.float32]  # (K, h, w, 4): log intensity, its variance, gradient along x, y
     s: NDArray[np.float32]  # (K,), times relative to the target, -1..1
     near: NDArray[np.float32]  # (K,), weights with which a robust mean begins
 
     @classmethod
-    def of(cls, L: NDArray, V: NDArray, s: NDArray[np.float32]) -> "InstantStack":
+    def of(cls, pixels: NDArray[np.float32], s: NDArray[np.float32]) -> "PackedImages":
         """Add the weights, which fall with the distance from the target.
 
         Args:
-            L: (K, h, w) float32, log intensity.
-            V: (K, h, w) float32, its variance, (ln I)^2.
+            pixels: (K, h, w, 4) packed images; see `trajectories.pack_images`.
             s: (K,) times relative to the target, -1..1.
 
         Returns:
             Images with weights.
         """
-        return cls(L, V, s, np.exp(-2 * (s / max_instant_distance(s)) ** 2).astype(np.float32))
+        return cls(pixels, s, np.exp(-2 * (s / max_instant_distance(s)) ** 2).astype(np.float32))
 
 
 def max_instant_distance(s: NDArray[np.float32]) -> np.float32:
@@ -111,16 +106,14 @@ def max_instant_distance(s: NDArray[np.float32]) -> np.float32:
     return np.float32(max(float(np.abs(s).max()), 1e-3))
 
 
-class TrajectorySums(NamedTuple):
-    """Sums over instants of what images show along the trajectories of pixels."""
+class TrajectorySamples(NamedTuple):
+    """Packed images read along the trajectories of pixels."""
 
-    M: NDArray[np.float32]  # (h, w), the robust mean
-    # (h, 6, w): sums of R s'^2, R s' q', R q'^2, R e s, R e q and R e^2, of q = s^2, robust weights
-    # R and residuals e. s' and q' differ from s and q by the means that R gives.
-    moments: NDArray[np.float32]
+    points: NDArray[np.float32]  # (h, 4, K, w): log intensity, robust weight, gradient along x, y
+    M: NDArray[np.float32]  # (h, w), their robust mean
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def fill_information(variances, inside, variance_floor, out_information):
     """Write the information of values.
 
@@ -137,7 +130,7 @@ def fill_information(variances, inside, variance_floor, out_information):
         )
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def robust_means(values, information, initial_weights, nu, out_means):
     """Write robust means of values.
 
@@ -171,139 +164,164 @@ def robust_means(values, information, initial_weights, nu, out_means):
             means[i] = mean[i] / total[i]
 
 
-@njit_fastmath_inlined
-def _add_product(a, b, out):
-    for i in range(len(out)):
-        out[i] += a[i] * b[i]
-
-
-@njit_fastmath_inlined
-def _add_scaled(factor, a, out):
-    for x in range(len(out)):
-        out[x] += factor * a[x]
+@njit_noalloc_inlined
+def _read_channels(image, pixel, part, k, points):
+    """Write an image's channels at points, bilinear: (4, K, points)."""
+    h, w, _ = image.shape
+    for i in range(pixel.shape[1]):
+        x0, y0 = pixel[0, i], pixel[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
+        for q in range(4):
+            points[q, k, i] = (
+                a * upper[x0, q] + b * upper[x1, q] + c * lower[x0, q] + d * lower[x1, q]
+            )
 
 
 class _SampleScratch(NamedTuple):
     """Scratch memory for each row that a kernel begins with."""
 
     rows: RowScratch
-    values: NDArray[np.float32]  # (rows, 3, K, w), log intensity, information, robust weight
-    sums: NDArray[np.float32]  # (rows, 7, w)
+    information: NDArray[np.float32]  # (rows, K, w)
+    sums: NDArray[np.float32]  # (rows, 2, w)
 
     @classmethod
     def allocate(cls, rows: int, instants: int, width: int) -> "_SampleScratch":
         """Allocate scratch memory for `run_over_rows`."""
-        shapes = (3, instants, width), (7, width)
+        shapes = (instants, width), (2, width)
         return cls(RowScratch.allocate(rows, width), *(row_scratch(rows, *s) for s in shapes))
 
 
-@njit_fastmath
-def _sum_instants(begin, end, inputs, scratch, out):
-    """Write the `TrajectorySums` of some rows."""
+@njit_noalloc_inlined
+def _sample_row(y, begin, inputs, scratch, points, means):
+    """Write what images show along the trajectories of a row: (4, K, w), and their means (w,)."""
     images, p, cost = inputs
-    count, h, w = images.L.shape
-    rows, zero = scratch.rows, np.float32(0)
+    count, h, w, _ = images.pixels.shape
+    rows, info = scratch.rows, scratch.information[begin]
     path, at, pixel = rows.path[begin], rows.x[begin], rows.pixel[begin]
-    part, inside, runs = rows.part[begin], rows.inside[begin], rows.runs[begin]
-    row = (path, at, pixel, part, inside, runs)
-    level, info, R = scratch.values[begin, 0], scratch.values[begin, 1], scratch.values[begin, 2]
-    total, r1, r2 = scratch.sums[begin, 2], scratch.sums[begin, 3], scratch.sums[begin, 4]
-    r3, r4 = scratch.sums[begin, 5], scratch.sums[begin, 6]
+    part, inside, half = rows.part[begin], rows.inside[begin], np.float32(0.5)
+    at_y = np.float32(y) * half - np.float32(0.25)
     for x in range(w):
         at[x] = np.float32(x)
+        interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
+    for k in range(count):
+        row = (path, at, pixel, part, inside)
+        locate_points(np.float32(y), images.s[k], (h, w), w, row)
+        _read_channels(images.pixels[k], pixel, part, k, points)
+        fill_information(points[1, k], inside, cost.floor, info[k])
+    found = (points[1], means, scratch.sums[begin])
+    robust_means(points[0], info, images.near, cost.robust, found)
+
+
+@njit_noalloc
+def _sample(begin, end, inputs, scratch, out):
     for y in range(begin, end):
-        M, moments = out.M[y], out.moments[y]
-        interpolate_row(p, y, rows.nodes[begin], path)
-        for k in range(count):
-            locate_points(np.float32(y), images.s[k], (h, w), w, row)
-            read_bilinear(images.L[k], pixel, part, runs, level[k])
-            read_bilinear(images.V[k], pixel, part, runs, info[k])
-            fill_information(info[k], inside, cost.floor, info[k])
-        robust_means(level, info, images.near, cost.robust, (R, M, scratch.sums[begin, :2]))
-        total[:], r1[:], r2[:], r3[:], r4[:] = zero, zero, zero, zero, zero
-        moments[:] = zero
-        for k in range(count):  # few sums at once: compilers compare the places of all of them
-            s, q, weight, e = images.s[k], images.s[k] * images.s[k], R[k], level[k]
-            for x in range(w):
-                e[x] -= M[x]
-                total[x] += weight[x]
-            _add_scaled(s, weight, r1)
-            _add_scaled(q, weight, r2)
-            _add_scaled(q * s, weight, r3)
-            _add_scaled(q * q, weight, r4)
-            for x in range(w):
-                weight[x] *= e[x]
-            _add_scaled(s, weight, moments[3])
-            _add_scaled(q, weight, moments[4])
-            _add_product(weight, e, moments[5])
-        for x in range(w):
-            moments[0, x] = r2[x] - r1[x] * r1[x] / total[x]
-            moments[1, x] = r3[x] - r1[x] * r2[x] / total[x]
-            moments[2, x] = r4[x] - r2[x] * r2[x] / total[x]
+        _sample_row(y, begin, inputs, scratch, out.points[y], out.M[y])
 
 
-def sum_instants(images: InstantStack, p: NDArray[np.float32], cost: CostParams) -> TrajectorySums:
-    """Sum what images show along trajectories.
+def sample_trajectories(
+    images: PackedImages, p: NDArray[np.float32], cost: CostParams
+) -> TrajectorySamples:
+    """Read packed images along trajectories.
 
     Args:
-        images: The images.
+        images: The packed images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
-        The sums of all pixels.
+        What the images show along the trajectories of pixels.
     """
-    count, h, w = images.L.shape
-    out = TrajectorySums(empty(h, w), empty(h, 6, w))
+    count, h, w, _ = images.pixels.shape
+    points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
+    samples = TrajectorySamples(points, M)
     scratch = _SampleScratch.allocate(h, count, w)
-    run_over_rows(_sum_instants, h, (images, p, cost), scratch, out, min_rows=MIN_ROWS)
-    return out
+    run_over_rows(_sample, h, (images, p, cost), scratch, samples)
+    return samples
 
 
-@njit_fastmath
-def _fill_equations(begin, end, sums, scratch, out):
+@njit_noalloc_inlined
+def _add_product(a, b, out):
+    for i in range(len(out)):
+        out[i] += a[i] * b[i]
+
+
+@njit_noalloc_inlined
+def _add_pixels(points, M, s, grad_M, scratch, sums):
+    """Add the equations of each pixel of a row to sums (14, w): N (10) and b (4).
+
+    `points` are the row's, as of `TrajectorySamples`, and M (w,) are their means.
+
+    The derivative of values by a path's four numbers is J = g (s, s^2). The gradient g along
+    trajectories and that of the mean, `grad_M` (2, w), are both that of the scene; the mean of the
+    two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
+    """
+    J, total, means, r = scratch[:4], scratch[4], scratch[5:9], scratch[9]
+    total[:] = np.float32(0)
+    means[:] = np.float32(0)
+    for k in range(len(s)):
+        R = points[1, k]
+        for c in range(2):
+            for i in range(len(M)):
+                J[c, i] = (points[2 + c, k, i] + grad_M[c, i]) * np.float32(0.5) * s[k]
+            for i in range(len(M)):
+                J[2 + c, i] = J[c, i] * s[k]
+        for i in range(len(M)):
+            total[i] += R[i]
+        entry = 0
+        for c in range(4):
+            for i in range(len(M)):
+                r[i] = R[i] * J[c, i]
+                means[c, i] += r[i]
+                sums[10 + c, i] -= r[i] * (points[0, k, i] - M[i])
+            for e in range(c, 4):
+                _add_product(r, J[e], sums[entry])
+                entry += 1
+    entry = 0
+    for c in range(4):
+        for i in range(len(M)):
+            r[i] = -means[c, i] / total[i]
+        for e in range(c, 4):
+            _add_product(r, means[e], sums[entry])
+            entry += 1
+
+
+@njit_noalloc
+def _linearise(begin, end, inputs, scratch, M, out):
     """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each.
 
-    The derivative of values by a path's four numbers is J = g (s, s^2), with the scene's gradient
-    g, for which that of the mean stands. M, the mean of the values by R, is eliminated exactly: J
-    is J - sum R J / sum R. So N is the product of g g^T with the moments of s and s^2.
+    Samples of four rows of pixels are kept: memory does not grow with the image. Rows at the border
+    of two threads are sampled by both, so a row of M is written when its means are final.
     """
-    h, w = sums.M.shape
-    rows = scratch[begin]
+    h, w = M.shape
+    samples, lines, recent = scratch
+    own, grad_M, sums = lines[begin, :10], lines[begin, 10:12], lines[begin, 12:27]
+    means = lines[begin, 27]
+    points, sampled = recent[begin], max(2 * begin - 2, 0)
     for i in range(begin, end):
-        rows[:] = np.float32(0)
+        sums[:] = np.float32(0)
         below = min(2 * i + 2, h)
-        for y in range(2 * i, below):
-            moments = sums.moments[y]
+        while sampled < min(2 * i + 4, h):
+            _sample_row(sampled, begin, inputs, samples, points[sampled % 4], means)
             for x in range(w):
-                gx, gy = gradient_at_pixel(sums.M, y, x)
-                xx, xy, yy = gx * gx, gx * gy, gy * gy
-                ss, sq, qq = moments[0, x], moments[1, x], moments[2, x]
-                rows[0, x] += xx * ss
-                rows[1, x] += xy * ss
-                rows[2, x] += xx * sq
-                rows[3, x] += xy * sq
-                rows[4, x] += yy * ss
-                rows[6, x] += yy * sq
-                rows[7, x] += xx * qq
-                rows[8, x] += xy * qq
-                rows[9, x] += yy * qq
-                rows[10, x] -= gx * moments[3, x]
-                rows[11, x] -= gy * moments[3, x]
-                rows[12, x] -= gx * moments[4, x]
-                rows[13, x] -= gy * moments[4, x]
-                rows[14, x] += np.sqrt(xx + yy)
-        for x in range(w):
-            rows[5, x] = rows[3, x]
+                M[sampled, x] = means[x]
+            sampled += 1
+        for y in range(2 * i, below):
+            for x in range(w):
+                gx, gy = gradient_at_pixel(M, y, x)
+                grad_M[0, x], grad_M[1, x] = gx, gy
+                sums[14, x] += np.sqrt(gx * gx + gy * gy)
+            _add_pixels(points[y % 4], M[y], inputs[0].s, grad_M, own, sums)
         for j in range(out.shape[1]):
             left, right = 2 * j, min(2 * j + 1, w - 1)
             both = np.float32(right - left)  # 0 or 1
             share = np.float32(1) / (np.float32(below - 2 * i) * (np.float32(1) + both))
             for c in range(15):
-                out[i, j, c] = (rows[c, left] + both * rows[c, right]) * share
+                out[i, j, c] = (sums[c, left] + both * sums[c, right]) * share
 
 
-@njit_fastmath
+@njit_noalloc
 def _smooth_nodes(values, row, out):
     """Blur nodes by (1, 6, 1) / 8: by a Gaussian of 1 px."""
     rows, columns, channels = out.shape
@@ -322,7 +340,7 @@ def _smooth_nodes(values, row, out):
                 ) / np.float32(8)
 
 
-@njit_fastmath
+@njit_noalloc
 def _weigh_differences(p, edge, horizon, cost, out):
     """Write the weights of differences between neighbouring nodes, across and down."""
     rows, columns, _ = p.shape
@@ -341,22 +359,23 @@ def _weigh_differences(p, edge, horizon, cost, out):
                 out[turn, i, j] = weight
 
 
-def linearise(images: InstantStack, p: NDArray[np.float32], cost: CostParams) -> NormalEquations:
+def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> NormalEquations:
     """Set up the normal equations at some trajectories.
 
     Args:
-        images: The images.
+        images: The packed images.
         p: (rows, columns, 4) the trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
         The equations, N as the 10 entries of its upper triangle.
     """
-    sums, shape = sum_instants(images, p, cost), p.shape[:2]
-    entries = empty(*shape, 15)
-    scratch = row_scratch(shape[0], 15, sums.M.shape[1])
-    run_over_rows(_fill_equations, shape[0], sums, scratch, entries, min_rows=MIN_ROWS)
-    blurred = empty(*shape, 14)
+    shape, (count, h, w, _) = p.shape[:2], images.pixels.shape
+    entries, M = np.empty((*shape, 15), np.float32), np.empty((h, w), np.float32)
+    samples = _SampleScratch.allocate(shape[0], count, w)
+    scratch = samples, row_scratch(shape[0], 12 + 15 + 1, w), row_scratch(shape[0], 4, 4, count, w)
+    run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
+    blurred = np.empty((*shape, 14), np.float32)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
     horizon = max_instant_distance(images.s)
     weights = np.zeros((2, *shape), np.float32)
@@ -368,60 +387,80 @@ def linearise(images: InstantStack, p: NDArray[np.float32], cost: CostParams) ->
     return NormalEquations(blurred[..., :10], blurred[..., 10:], *weights, smooth, ridge)
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
+def _add_difference(weight, a, b, out):
+    for x in range(len(out)):
+        out[x] += weight[x] * (a[x] - b[x])
+
+
+@njit_noalloc_inlined
 def _scale_and_add(factor, a, out):
     """Write factor out + a."""
     for x in range(len(out)):
         out[x] = factor * out[x] + a[x]
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
+def _add_scaled(factor, a, out):
+    for x in range(len(out)):
+        out[x] += factor * a[x]
+
+
+@njit_noalloc_inlined
 def _multiply(N, i, q, out):
     """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors (4, columns)."""
-    x, y, z, w = q[0], q[1], q[2], q[3]
-    for c in range(len(out)):  # a number that is not known is not unrolled: less to compile
-        a, b = N[SYMMETRIC[c, 0], i], N[SYMMETRIC[c, 1], i]
-        d, e, product = N[SYMMETRIC[c, 2], i], N[SYMMETRIC[c, 3], i], out[c]
-        for j in range(len(product)):
-            product[j] = a[j] * x[j] + b[j] * y[j] + d[j] * z[j] + e[j] * w[j]
+    for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
+        for x in range(out.shape[1]):
+            out[c, x] = np.float32(0)
+        for e in range(len(out)):
+            low, high = min(c, e), max(c, e)
+            _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
 
 
-@njit_fastmath_inlined
-def _add_pull(q, weights, i, smooth, ridge, out):
-    """Add smooth times the weighted graph Laplacian of a row, and ridge q; padded by a node."""
-    across, above, below = weights[0][i], weights[1][i], weights[1][i + 1]
-    up, here, down = q[i], q[i + 1], q[i + 2]
-    for j in range(len(out)):
-        value = here[j + 1]
-        rough = across[j] * (value - here[j]) + across[j + 1] * (value - here[j + 2])
-        rough += above[j] * (value - up[j + 1]) + below[j] * (value - down[j + 1])
-        out[j] += smooth * rough + ridge * value
+@njit_noalloc_inlined
+def _laplacian(q, across, down, i, out):
+    """Write the weighted graph Laplacian (columns,) of a row; all are padded by a node."""
+    width = len(out)
+    here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
+    out[:] = np.float32(0)
+    _add_difference(across[i, :width], here, left, out)
+    _add_difference(across[i, 1:], here, right, out)
+    _add_difference(down[i], here, q[i, 1:-1], out)
+    _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
 
 
-@njit_fastmath_inlined
-def _invert(N, added, out):
+@njit_noalloc_inlined
+def _invert(N, added, scratch, out):
     """Write the inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
-    one = np.float32(1)
-    # The matrix is C D C^T, C a unit lower triangle.
-    e0 = one / (N[0] + added[0])
-    c10, c20, c30 = N[1] * e0, N[2] * e0, N[3] * e0
-    e1 = one / (N[4] + added[1] - c10 * N[1])
-    b21, b31 = N[5] - c10 * N[2], N[6] - c10 * N[3]
-    c21, c31 = b21 * e1, b31 * e1
-    e2 = one / (N[7] + added[2] - c20 * N[2] - c21 * b21)
-    b32 = N[8] - c20 * N[3] - c21 * b31
-    c32 = b32 * e2
-    e3 = one / (N[9] + added[3] - c30 * N[3] - c31 * b31 - c32 * b32)
-    # The inverse of C, then that of the whole.
-    m10, m21, m32 = -c10, -c21, -c32
-    m20, m31 = -c20 - c21 * m10, -c31 - c32 * m21
-    m30 = -c30 - c31 * m10 - c32 * m20
-    out[0] = e0 + e1 * m10 * m10 + e2 * m20 * m20 + e3 * m30 * m30
-    out[1] = e1 * m10 + e2 * m20 * m21 + e3 * m30 * m31
-    out[2], out[3] = e2 * m20 + e3 * m30 * m32, e3 * m30
-    out[4] = e1 + e2 * m21 * m21 + e3 * m31 * m31
-    out[5], out[6] = e2 * m21 + e3 * m31 * m32, e3 * m31
-    out[7], out[8], out[9] = e2 + e3 * m32 * m32, e3 * m32, e3
+    # Cholesky, in double precision: nodes without texture are nearly singular.
+    A, C, inverse = scratch[0], scratch[1], scratch[2]
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            A[i, j] = N[entry]
+            A[j, i] = N[entry]
+            entry += 1
+        A[i, i] += added[i]
+    for i in range(4):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= C[i, k] * C[j, k]
+            C[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / C[j, j]
+    for j in range(4):  # the inverse of C
+        for i in range(j, 4):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= C[i, k] * inverse[k, j]
+            inverse[i, j] = total / C[i, i]
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            total = 0.0
+            for k in range(j, 4):
+                total += inverse[k, i] * inverse[k, j]
+            out[entry] = total
+            entry += 1
 
 
 class _SolverScratch(NamedTuple):
@@ -432,17 +471,19 @@ class _SolverScratch(NamedTuple):
     below: NDArray[np.float32]  # (rows + 1, columns), the same between rows
     q: NDArray[np.float32]  # (4, rows + 2, columns + 2), the direction, 0 around the nodes
     vectors: NDArray[np.float32]  # (4, rows, 4, columns)
-    sums: NDArray[np.float32]  # (columns,)
+    lines: NDArray[np.float32]  # (2, columns)
     node: NDArray[np.float32]  # (14,)
+    inverse: NDArray[np.float64]  # (3, 4, 4)
 
     @classmethod
     def zeros(cls, rows: int, columns: int) -> "_SolverScratch":
         """Allocate zeros."""
         shapes = (
             (2, 10, rows, columns), (rows, columns + 1), (rows + 1, columns),
-            (4, rows + 2, columns + 2), (4, rows, 4, columns), (columns,), (14,),
+            (4, rows + 2, columns + 2), (4, rows, 4, columns), (2, columns), (14,),
         )  # fmt: skip
-        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
+        single = [np.zeros(shape, np.float32) for shape in shapes]
+        return cls._make([*single, np.zeros((3, 4, 4))])
 
 
 def solve_normal_equations(
@@ -463,14 +504,14 @@ def solve_normal_equations(
     return d
 
 
-@njit_fastmath
+@njit_noalloc
 def _solve(eq, p, iterations, scratch, d):
     # Channels come first here, and rows of nodes are what loops go over at once.
     rows, columns, channels = p.shape
     smooth, ridge, beside, below, q = eq.smooth, eq.ridge, scratch.beside, scratch.below, scratch.q
     A, P, vectors, node = scratch.blocks[0], scratch.blocks[1], scratch.vectors, scratch.node
     r, found, Aq, z = vectors[0], vectors[1], vectors[2], vectors[3]
-    sums, added, block, weights = scratch.sums, node[:4], node[4:], (beside, below)
+    rough, sums, added, block = scratch.lines[0], scratch.lines[1], node[:4], node[4:]
     for i in range(rows):
         for j in range(columns):
             beside[i, j + 1] = eq.across[i, j] if j < columns - 1 else np.float32(0)
@@ -479,14 +520,15 @@ def _solve(eq, p, iterations, scratch, d):
                 q[c, i + 1, j + 1] = p[i, j, c]
     for i in range(rows):
         for c in range(channels):
+            _laplacian(q[c], beside, below, i, rough)
             for j in range(columns):
-                r[i, c, j] = eq.b[i, j, c]
-            _add_pull(q[c], weights, i, -smooth[c], -ridge[c], r[i, c])
+                pull = smooth[c] * rough[j] + ridge[c] * p[i, j, c]
+                r[i, c, j] = eq.b[i, j, c] - pull
         for j in range(columns):
             degree = beside[i, j] + beside[i, j + 1] + below[i, j] + below[i + 1, j]
             for c in range(channels):
                 added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
-            _invert(eq.N[i, j], added, block)
+            _invert(eq.N[i, j], added, scratch.inverse, block)
             for c in range(10):
                 P[c, i, j] = block[c]
                 A[c, i, j] = eq.N[i, j, c]
@@ -515,7 +557,9 @@ def _solve(eq, p, iterations, scratch, d):
         for i in range(rows):
             _multiply(A, i, q[:, i + 1, 1:-1], Aq[i])
             for c in range(channels):
-                _add_pull(q[c], weights, i, smooth[c], ridge[c], Aq[i, c])
+                _laplacian(q[c], beside, below, i, rough)
+                _add_scaled(smooth[c], rough, Aq[i, c])
+                _add_scaled(ridge[c], q[c, i + 1, 1:-1], Aq[i, c])
                 _add_product(q[c, i + 1, 1:-1], Aq[i, c], sums)
         curvature = 0.0
         for j in range(columns):
@@ -578,7 +622,8 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
     count, h, w = L.shape
     Y, X = (one.astype(p.dtype) for one in path_positions(interpolate_paths_jax(p, h, w), s))
     inside = is_in_image(Y, X, h, w)
-    L, V = sample_bilinear(L, Y, X), sample_bilinear(V, Y, X)
+    gx, gy = gradient_jax(L)
+    L, V, gx, gy = (sample_bilinear(image, Y, X) for image in (L, V, gx, gy))
     W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
     s = s[:, None, None]
     R = W * jnp.exp(-2 * s**2)
@@ -587,7 +632,7 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
         R = W / (1 + (L - M) ** 2 * W / cost.robust)
         M = (R * L).sum(0) / R.sum(0)
     mx, my = gradient_jax(M)
-    J = jnp.stack([mx * s, my * s])
+    J = jnp.stack([(gx + mx) / 2 * s, (gy + my) / 2 * s])
     J = jnp.concatenate([J, J * s])
     J = J - (R * J).sum(1, keepdims=True) / R.sum(0)
     N = jnp.einsum("khw,akhw,bkhw->hwab", R, J, J)

@@ -1,7 +1,7 @@
 """Robust mean of images along trajectories: in numba loops, and in JAX for derivatives."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -25,7 +25,6 @@ OUTSIDE_VARIANCE = 1e6  # (ln I)^2, beyond the image's border
 # Squared difference of an image from the mean, in units of its variance.
 EXPECTED_SQUARED_RESIDUAL = 0.6
 RESIDUAL_SIGMA_PX, SCATTER_SIGMA_PX = 1.5, 2.0  # of the Gaussians that gather them
-N_HALF_TAPS = 7  # of filters of loops
 N_NEAR_INSTANTS = 5  # instants without frame next to the target
 
 
@@ -125,16 +124,16 @@ def squared_gradient(image: Array) -> Array:
     return gy**2 + gx**2
 
 
-def activity_range(layout: InstantLayout) -> tuple[Any, Any]:
+def activity_range(layout: InstantLayout) -> tuple[Numeric, Numeric]:
     """Return the indices between which changes are summed: the frames next to the target.
 
     Both are left out. Where frames are on one side alone, the range is from there to the target,
     which takes part.
     """
     a, b, target = layout.before, layout.after, layout.target
-    follows = layout.s[a] > 0  # no frame is before
-    low = a + (a == b) * follows * (target - 1 - a)
-    return low, b + (a == b) * (1 - follows) * (target + 1 - b)
+    last = layout.s[a] <= 0  # no frame follows
+    low = jnp.where((a == b) & ~last, target - 1, a)
+    return low, jnp.where((a == b) & last, target + 1, b)
 
 
 def robust_mean_jax(
@@ -224,104 +223,76 @@ def visibility(
     return warped.inside / (1 + (residual / p.tolerance) ** 2)
 
 
-def half_taps(sigma_px: float) -> NDArray[np.float32]:
-    """Return the taps of `gaussian_taps` from the middle on, of at most 2 px, filled with zeros."""
-    taps = gaussian_taps(sigma_px)
-    out = np.zeros(N_HALF_TAPS, np.float32)
-    out[: len(taps) // 2 + 1] = taps[len(taps) // 2 :]
-    return out
-
-
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def blur_along_x(row, taps, padded_scratch, out_row):
     """Blur a row; the image's border goes on.
 
     Args:
         row: (w,) the row.
-        taps: (7,) half of the filter, of `half_taps`.
-        padded_scratch: (w + 12,) scratch.
+        taps: (n,) the filter, n odd.
+        padded_scratch: (w + n,) scratch.
         out_row: (w,) output.
     """
-    w, padded, t = len(row), padded_scratch, taps
-    for x in range(6):
-        padded[x], padded[w + 6 + x] = row[0], row[w - 1]
+    w, reach = len(row), len(taps) // 2
+    for x in range(reach):
+        padded_scratch[x] = row[0]
+        padded_scratch[w + reach + x] = row[w - 1]
     for x in range(w):
-        padded[6 + x] = row[x]
-    t0, t1, t2, t3, t4, t5, t6 = t[0], t[1], t[2], t[3], t[4], t[5], t[6]
-    for x in range(w):
-        near = t0 * padded[x + 6] + t1 * (padded[x + 5] + padded[x + 7])
-        near += t2 * (padded[x + 4] + padded[x + 8]) + t3 * (padded[x + 3] + padded[x + 9])
-        far = t4 * (padded[x + 2] + padded[x + 10]) + t5 * (padded[x + 1] + padded[x + 11])
-        out_row[x] = near + far + t6 * (padded[x] + padded[x + 12])
+        padded_scratch[reach + x] = row[x]
+        out_row[x] = np.float32(0)
+    for i in range(len(taps)):
+        tap = taps[i]
+        for x in range(w):
+            out_row[x] += tap * padded_scratch[i + x]
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def blur_along_y(image, y, taps, out_row):
     """Blur an image along y, for one of its rows.
 
     Args:
         image: (h, w) the image.
         y: The row.
-        taps: (7,) half of the filter, of `half_taps`.
+        taps: (n,) the filter, n odd.
         out_row: (w,) output.
     """
     h, w = image.shape
     for x in range(w):
-        out_row[x] = taps[0] * image[y, x]
-    for i in range(1, 7, 2):  # few rows at once: compilers compare the places of all of them
-        a, b = image[max(y - i, 0)], image[min(y + i, h - 1)]
-        c, d = image[max(y - i - 1, 0)], image[min(y + i + 1, h - 1)]
-        t, u = taps[i], taps[i + 1]
+        out_row[x] = np.float32(0)
+    for i in range(len(taps)):
+        row, tap = image[min(max(y + i - len(taps) // 2, 0), h - 1)], taps[i]
         for x in range(w):
-            out_row[x] += t * (a[x] + b[x]) + u * (c[x] + d[x])
+            out_row[x] += tap * row[x]
 
 
-@njit_fastmath
-def _blur_across(begin, end, images, taps, scratch, out):
-    for k in range(len(images)):
-        for y in range(begin, end):
-            blur_along_x(images[k, y], taps, scratch[begin], out[k, y])
+@njit_noalloc
+def _blur_across(begin, end, image, taps, scratch, out):
+    for y in range(begin, end):
+        blur_along_x(image[y], taps, scratch[begin], out[y])
 
 
-@njit_fastmath
-def _blur_down(begin, end, images, taps, out):
-    for k in range(len(images)):
-        for y in range(begin, end):
-            blur_along_y(images[k], y, taps, out[k, y])
+@njit_noalloc
+def _blur_down(begin, end, image, taps, out):
+    for y in range(begin, end):
+        blur_along_y(image, y, taps, out[y])
 
 
-def blur_images(images: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
-    """Blur images by a Gaussian, in loops.
+def blur_image(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """Blur an image by a Gaussian, in loops.
 
     Args:
-        images: (n, h, w).
-        sigma_px: Standard deviation, px, at most 2.
+        image: (h, w).
+        sigma_px: Standard deviation, px.
 
     Returns:
-        (n, h, w).
+        (h, w).
     """
-    taps, (_, h, w) = half_taps(sigma_px), images.shape
-    half, out = empty(*images.shape), empty(*images.shape)
-    run_over_rows(_blur_across, h, images, taps, row_scratch(h, w + 12), half, min_rows=32)
-    run_over_rows(_blur_down, h, half, taps, out, min_rows=32)
+    taps = gaussian_taps(sigma_px)
+    half, out = np.empty_like(image), np.empty_like(image)
+    scratch = row_scratch(len(image), image.shape[1] + len(taps))
+    run_over_rows(_blur_across, len(image), image, taps, scratch, half)
+    run_over_rows(_blur_down, len(image), half, taps, out)
     return out
-
-
-class MeanParams(NamedTuple):
-    """Parameters of the robust mean, float32; `Params` has their meanings."""
-
-    information: np.float32
-    floor: np.float32
-    place_variance: np.float32  # px^2, of the place of points
-    between_variance: np.float32  # (ln I)^2, between pixels
-    tolerance: np.float32
-
-    @classmethod
-    def of(cls, params: Params) -> "MeanParams":
-        """Take the parameters of the robust mean from those of `mc`."""
-        p = params
-        numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
-        return cls(*(np.float32(number) for number in numbers))
 
 
 class _MeanInputs(NamedTuple):
@@ -334,31 +305,35 @@ class _MeanInputs(NamedTuple):
     taps: NDArray[np.float32]
     low: int  # range of activity
     high: int
-    params: MeanParams
+    information: np.float32
+    floor: np.float32
+    place_variance: np.float32  # px^2, of the place of points
+    between_variance: np.float32  # (ln I)^2, between pixels
+    tolerance: np.float32
 
 
 class _MeanScratch(NamedTuple):
     """Arrays that the kernels of `robust_mean` exchange, and scratch memory."""
 
+    residuals: NDArray[np.float32]  # (K, h, w), blurred along x
     steepness: NDArray[np.float32]  # (h, w), |grad M|^2
-    excess: NDArray[np.float32]  # (2, h, w), of squared differences, and what it is divided by
-    rows: NDArray[np.float32]  # (h, 13 + 2 K, w)
-    padded: NDArray[np.float32]  # (h, w + 12)
+    excess: NDArray[np.float32]  # (h, w), of squared differences
+    weight: NDArray[np.float32]  # (h, w), that it is divided by
+    rows: NDArray[np.float32]  # (h, 10 + 2 K, w)
+    padded: NDArray[np.float32]  # (h, w + taps)
 
 
-@njit_fastmath_inlined
-def _fill_information(inputs, k, y, steepness, out):
-    """Write the inverse of the variance of an instant's values."""
-    V, inside, p = inputs.warped.V[k, y], inputs.warped.inside[k, y], inputs.params
-    one, out_variance = np.float32(1), np.float32(OUTSIDE_VARIANCE)
-    moved = np.float32(0 if k == inputs.layout.target else 1)
+@njit_noalloc_inlined
+def _fill_variance(inputs, k, y, steepness, out):
+    V, inside = inputs.warped.V[k, y], inputs.warped.inside[k, y]
+    here = k == inputs.layout.target
     for x in range(len(V)):
-        added = moved * (p.place_variance * steepness[x] + p.between_variance)
-        base = V[x] + p.floor if inside[x] > 0 else out_variance
-        out[x] = one / (base + added)
+        added = inputs.place_variance * steepness[x] + inputs.between_variance
+        base = V[x] + inputs.floor if inside[x] > 0 else np.float32(OUTSIDE_VARIANCE)
+        out[x] = base if here else base + added
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def _fill_visibility(residual, tolerance, most, out):
     one = np.float32(1)
     for x in range(len(residual)):
@@ -366,19 +341,13 @@ def _fill_visibility(residual, tolerance, most, out):
         out[x] = one / (one + ratio * ratio)
 
 
-@njit_fastmath
-def _update_mean(begin, end, inputs, scratch, turn, images, residuals):
-    """Update the mean M of some rows, and the squared differences from it.
-
-    `images` are the mean to begin from and that to write, `residuals` (K, h, w) squared differences
-    in units of their variances, blurred along x: those from the mean before, and those to write.
-    """
+@njit_noalloc
+def _update_mean(begin, end, inputs, scratch, turn, means):
+    """Update the mean M of some rows; `means` holds the image to begin from and that to write."""
     warped, rows, one = inputs.warped, scratch.rows[begin], np.float32(1)
     count, h, w = warped.L.shape
-    before, M = images
-    known, found = residuals
-    residual, visible, total, mean, info = rows[0], rows[1], rows[2], rows[3], rows[4 : 4 + count]
-    least, padded = inputs.params.information, scratch.padded[begin]
+    before, M = means
+    variance, residual, visible, total, mean = rows[0], rows[1], rows[2], rows[3], rows[4]
     for y in range(begin, end):
         steepness = scratch.steepness[y]
         for x in range(w):
@@ -389,26 +358,36 @@ def _update_mean(begin, end, inputs, scratch, turn, images, residuals):
             if turn == 0:
                 visible[:] = inputs.weights[k]
             else:
-                blur_along_y(known[k], y, inputs.taps, residual)
+                blur_along_y(scratch.residuals[k], y, inputs.taps, residual)
                 most = np.float32(1 if turn == 1 and k == inputs.layout.target else np.inf)
-                _fill_visibility(residual, inputs.params.tolerance, most, visible)
-            _fill_information(inputs, k, y, steepness, info[k])
+                _fill_visibility(residual, inputs.tolerance, most, visible)
+            _fill_variance(inputs, k, y, steepness, variance)
             L, clear = warped.L[k, y], warped.clear[k, y]
             for x in range(w):
-                R = (least + (one - least) * clear[x]) * info[k, x] * visible[x]
+                eta = inputs.information + (one - inputs.information) * clear[x]
+                R = eta / variance[x] * visible[x]
                 total[x] += R
                 mean[x] += R * L[x]
         for x in range(w):
             M[y, x] = mean[x] / total[x]
+
+
+@njit_noalloc
+def _fill_residuals(begin, end, inputs, scratch, M):
+    """Write squared differences from M in units of their variances, blurred along x."""
+    count, h, w = inputs.warped.L.shape
+    variance, ratio, padded = scratch.rows[begin, 0], scratch.rows[begin, 1], scratch.padded[begin]
+    for y in range(begin, end):
         for k in range(count):
+            _fill_variance(inputs, k, y, scratch.steepness[y], variance)
+            L = inputs.warped.L[k, y]
             for x in range(w):
-                e = warped.L[k, y, x] - M[y, x]
-                residual[x] = e * e * info[k, x]
-            blur_along_x(residual, inputs.taps, padded, found[k, y])
+                ratio[x] = (L[x] - M[y, x]) * (L[x] - M[y, x]) / variance[x]
+            blur_along_x(ratio, inputs.taps, padded, scratch.residuals[k, y])
 
 
-@njit_fastmath_inlined
-def _add_instant(inputs, k, y, visible, info, sums):
+@njit_noalloc_inlined
+def _add_instant(inputs, k, y, visible, variance, sums):
     """Add an instant to the sums (9, w) that means are made of."""
     one, zero, layout, warped = np.float32(1), np.float32(0), inputs.layout, inputs.warped
     near, framed = layout.near[k], layout.framed[k]
@@ -419,9 +398,9 @@ def _add_instant(inputs, k, y, visible, info, sums):
     total, mean, near_total, near_mean = sums[0], sums[1], sums[2], sums[3]
     frames, from_before, from_after, from_rest = sums[4], sums[5], sums[6], sums[7]
     image_variance = sums[8]
-    least = inputs.params.information
     for x in range(len(L)):
-        W = (least + (one - least) * clear[x]) * info[x]
+        eta = inputs.information + (one - inputs.information) * clear[x]
+        W = eta / variance[x]
         R = W * visible[x]
         total[x] += R
         mean[x] += R * L[x]
@@ -435,37 +414,38 @@ def _add_instant(inputs, k, y, visible, info, sums):
         image_variance[x] += R * (one - clear[x]) * V[x]
 
 
-@njit_fastmath_inlined
-def _add_excess(inputs, k, y, residual, info, sums):
+@njit_noalloc_inlined
+def _add_excess(inputs, k, y, residual, variance, sums):
     """Add an instant to the excess of squared differences (w,), and to its weight."""
     M, excess, weight = sums
     one, tolerance = np.float32(1), np.float32(SCATTER_TOLERANCE)
     L, clear = inputs.warped.L[k, y], inputs.warped.clear[k, y]
-    expected, least = np.float32(EXPECTED_SQUARED_RESIDUAL), inputs.params.information
+    expected = np.float32(EXPECTED_SQUARED_RESIDUAL)
     for x in range(len(L)):
+        eta = inputs.information + (one - inputs.information) * clear[x]
         ratio = residual[x] / tolerance
-        plain = one / (one + ratio * ratio)
+        plain = one / variance[x] / (one + ratio * ratio)
         e = L[x] - M[x]
-        excess[x] += plain * (e * e * info[x] - expected)
-        weight[x] += plain * info[x] * (least + (one - least) * clear[x])
+        excess[x] += plain * (e * e - expected * variance[x])
+        weight[x] += plain * eta
 
 
-@njit_fastmath
-def _finish(begin, end, inputs, scratch, residuals, out):
+@njit_noalloc
+def _finish(begin, end, inputs, scratch, out):
     """Write all but the scatter of some rows, and what the scatter is gathered from."""
     layout, warped = inputs.layout, inputs.warped
     count, _, w = warped.L.shape
     rows, zero = scratch.rows[begin], np.float32(0)
     visible, sums = rows[0], rows[1:10]
-    residual, info = rows[10 : 10 + count], rows[10 + count :]
+    residual, variance = rows[10 : 10 + count], rows[10 + count :]
     for y in range(begin, end):
-        excess, weight, activity = scratch.excess[0, y], scratch.excess[1, y], out.activity[y]
+        excess, weight, activity = scratch.excess[y], scratch.weight[y], out.activity[y]
         sums[:], excess[:], weight[:], activity[:] = zero, zero, zero, zero
         for k in range(count):
-            blur_along_y(residuals[k], y, inputs.taps, residual[k])
-            _fill_visibility(residual[k], inputs.params.tolerance, np.float32(np.inf), visible)
-            _fill_information(inputs, k, y, scratch.steepness[y], info[k])
-            _add_instant(inputs, k, y, visible, info[k], sums)
+            blur_along_y(scratch.residuals[k], y, inputs.taps, residual[k])
+            _fill_visibility(residual[k], inputs.tolerance, np.float32(np.inf), visible)
+            _fill_variance(inputs, k, y, scratch.steepness[y], variance[k])
+            _add_instant(inputs, k, y, visible, variance[k], sums)
             for side in range(2):
                 if k == (layout.before if side == 0 else layout.after):
                     for x in range(w):
@@ -485,16 +465,16 @@ def _finish(begin, end, inputs, scratch, residuals, out):
                 out.shares[n, y, x] = sums[5 + n, x] / total
         for k in range(count):
             found = (out.M[y], excess, weight)
-            _add_excess(inputs, k, y, residual[k], info[k], found)
+            _add_excess(inputs, k, y, residual[k], variance[k], found)
 
 
 def robust_mean(
-    params: MeanParams, L: NDArray, warped: WarpedImages, layout: InstantLayout
+    params: Params, L: NDArray, warped: WarpedImages, layout: InstantLayout
 ) -> RobustMean:
     """Compute the robust mean as `robust_mean_jax` does, of instants that are all present.
 
     Args:
-        params: Its parameters.
+        params: Parameters of `mc`.
         L: (K, h, w) float32, log intensity in place.
         warped: The images along trajectories.
         layout: Their instants.
@@ -502,24 +482,31 @@ def robust_mean(
     Returns:
         The mean and its evidence.
     """
+    p = params
     count, h, w = L.shape
-    target, taps = int(layout.target), half_taps(RESIDUAL_SIGMA_PX)
+    target, taps = int(layout.target), gaussian_taps(RESIDUAL_SIGMA_PX)
     weights = np.exp(-2 * layout.s**2).astype(np.float32)
     low, high = (int(k) for k in activity_range(layout))
     layout = layout._replace(target=target, before=int(layout.before), after=int(layout.after))
-    inputs = _MeanInputs(L, warped, layout, weights, taps, low, high, params)
-    rows, padded = row_scratch(h, 13 + 2 * count, w), row_scratch(h, w + 12)
-    images, means = empty(3, h, w), empty(2, h, w)
-    scratch = _MeanScratch(images[0], images[1:], rows, padded)
-    residuals = empty(2, count, h, w)
-    before = blur_images(L[target : target + 1], 1.0)[0]
-    # No row reads what another one writes at the same time.
+    numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
+    numbers = [np.float32(v) for v in numbers]
+    inputs = _MeanInputs(L, warped, layout, weights, taps, low, high, *numbers)
+    rows, padded = row_scratch(h, 10 + 2 * count, w), row_scratch(h, w + len(taps))
+    images = np.empty((3, h, w), np.float32)
+    scratch = _MeanScratch(np.empty((count, h, w), np.float32), *images, rows, padded)
+    out = RobustMean(
+        *np.empty((7, h, w), np.float32),
+        np.empty((3, h, w), np.float32),
+        np.empty((2, h, w), np.float32),
+        np.empty((h, w), np.float32),
+    )
+    before = blur_image(np.ascontiguousarray(L[target]), 1.0)
     for turn in range(3):
-        now, last = turn % 2, 1 - turn % 2
-        given = (before, means[now]), (residuals[last], residuals[now])
-        run_over_rows(_update_mean, h, inputs, scratch, turn, *given)
-        before = means[now]
-    out = RobustMean(*(empty(h, w) for _ in range(7)), empty(3, h, w), empty(2, h, w), empty(h, w))
-    run_over_rows(_finish, h, inputs, scratch, residuals[0], out)
-    excess, weight = blur_images(scratch.excess, SCATTER_SIGMA_PX)
+        run_over_rows(_update_mean, h, inputs, scratch, turn, (before, out.M))
+        run_over_rows(_fill_residuals, h, inputs, scratch, out.M)
+        before = out.M.copy()
+    run_over_rows(_finish, h, inputs, scratch, out)
+    excess, weight = (
+        blur_image(part, SCATTER_SIGMA_PX) for part in (scratch.excess, scratch.weight)
+    )
     return out._replace(scatter=np.maximum(excess / weight, 0))

@@ -26,30 +26,31 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
-    InstantStack,
+    PackedImages,
     fill_information,
     linearise,
     max_instant_distance,
     robust_means,
+    sample_trajectories,
     solve_normal_equations,
-    sum_instants,
 )
 from jaxevent.reconstruction.compensated.robust_mean import (
     blur_along_x,
     blur_along_y,
-    blur_images,
-    half_taps,
+    blur_image,
+    gaussian_taps,
 )
 from jaxevent.reconstruction.compensated.warp import (
     RowScratch,
     bilinear_cell,
+    bilinear_weights,
     blend_nodes,
+    gradient_at_pixel,
     interpolate_paths,
     locate_points,
-    read_bilinear,
     resize_nodes,
 )
 
@@ -66,16 +67,46 @@ MIN_COST_GAIN = np.float32(0.1)
 MIN_PATH_DIFFERENCE_PX = np.float32(0.5)  # at the farthest instant, between paths to compare
 
 
-# Factor on the images' curvature in a search. Set on simulated objects and pans of seeds that are
-# not scored: with 1 fewer fast things are found in as many steps, with 0.4 noise is followed.
-SEARCH_CURVATURE = 0.6
+class PathSearch(NamedTuple):
+    """One pass over an image in which pixels compare their paths with those nearby."""
+
+    spacing: int  # px, between the pixels that are compared
+    distance: int  # to the paths that are tried, in units of the spacing
+    sigma: float  # of the Gaussian over which costs are gathered, in units of the spacing
+
+
 CHOICE_SIGMA = 2.0  # of the Gaussian over which costs of trajectories are compared, in nodes
-# Paths that a pixel tries are that far away, and costs are gathered over a Gaussian. Set on objects
-# of seeds that are not scored, and on the first half of slider_depth.
-PATH_DISTANCE_PX, PATH_SIGMA_PX = 4, 1.0
+# Set on objects of seeds that are not scored, and on the first half of slider_depth.
+PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
 
 
-@njit_fastmath
+def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
+    """Pack images with their gradients.
+
+    Args:
+        L: (K, h, w) log intensity.
+        V: (K, h, w) its variance, (ln I)^2.
+
+    Returns:
+        (K, h, w, 4) L, V, and the gradient of L along x and y, 1/px.
+    """
+    out = np.empty((*L.shape, 4), np.float32)
+    run_over_rows(_pack, L.shape[1], np.asarray(L, np.float32), np.asarray(V, np.float32), out)
+    return out
+
+
+@njit_noalloc
+def _pack(begin, end, L, V, out):
+    count, h, w = L.shape
+    for k in range(count):
+        for y in range(begin, end):
+            for x in range(w):
+                out[k, y, x, 0] = L[k, y, x]
+                out[k, y, x, 1] = V[k, y, x]
+                out[k, y, x, 2], out[k, y, x, 3] = gradient_at_pixel(L[k], y, x)
+
+
+@njit_noalloc
 def _halve(begin, end, images, scratch, out):
     count, h, w = images.shape
     column = scratch[begin]
@@ -96,38 +127,42 @@ def _halve(begin, end, images, scratch, out):
 def halve_resolution(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur images (K, h, w) and keep every second pixel: half the resolution, rounded up."""
     count, h, w = images.shape
-    out = empty(count, (h + 1) // 2, (w + 1) // 2)
-    run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out, min_rows=32)
+    out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
+    run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out)
     return out
 
 
 class ImagePyramid:
-    """Images at full, half, quarter ... resolution, made when first needed.
+    """Packed images at full, half, quarter ... resolution, made when first needed.
 
     Args:
-        L: (K, h, w) float32, log intensity.
-        V: (K, h, w) float32, its variance, (ln I)^2.
+        L: (K, h, w) log intensity.
+        V: (K, h, w) its variance, (ln I)^2.
         variance_factor: Factor on the blurred variance from one resolution to half of it.
     """
 
     def __init__(self, L: NDArray, V: NDArray, variance_factor: float):
-        self._levels, self._factor = [(L, V)], np.float32(variance_factor)
-        self.image_shape: tuple[int, int] = L.shape[1:]
+        self._levels = [(np.asarray(L, np.float32), np.asarray(V, np.float32))]
+        self._packed: dict[int, NDArray[np.float32]] = {}
+        self._factor = np.float32(variance_factor)
+        self.image_shape: tuple[int, int] = self._levels[0][0].shape[1:]
 
-    def __getitem__(self, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return log intensity and variance at a level, (K, h, w) each; 0 is full resolution."""
+    def __getitem__(self, level: int) -> NDArray[np.float32]:
+        """Return the packed images of a level; 0 is full resolution."""
         while len(self._levels) <= level:
             L, V = self._levels[-1]
             self._levels.append((halve_resolution(L), halve_resolution(V) * self._factor))
-        return self._levels[level]
+        if level not in self._packed:
+            self._packed[level] = pack_images(*self._levels[level])
+        return self._packed[level]
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def _median(a, b, c):
     return max(min(a, b), min(max(a, b), c))
 
 
-@njit_fastmath
+@njit_noalloc
 def _move(p, d, longest, scratch, out):
     """Write p + d, each channel of d cut to `longest`, then the median of 3 x 3 nodes.
 
@@ -161,25 +196,19 @@ def _move(p, d, longest, scratch, out):
 
 
 def gauss_newton_step(
-    images: InstantStack,
-    p: NDArray[np.float32],
-    cost: CostParams,
-    curvature: float = 1.0,
+    images: PackedImages, p: NDArray[np.float32], cost: CostParams
 ) -> NDArray[np.float32]:
     """Improve trajectories by one Gauss-Newton step, followed by a median over 3 x 3 nodes.
 
     Args:
-        images: Images.
+        images: Packed images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
-        curvature: Factor on the images' normal matrix. Steps below 1 are longer; where they end
-            does not depend on it.
 
     Returns:
         (rows, columns, 4) the new trajectories, px.
     """
-    equations = linearise(images, p, cost)
-    d = solve_normal_equations(equations._replace(N=np.float32(curvature) * equations.N), p)
+    d = solve_normal_equations(linearise(images, p, cost), p)
     rows, columns, channels = p.shape
     out, flat, horizon = (
         np.empty_like(p),
@@ -192,22 +221,23 @@ def gauss_newton_step(
     return out
 
 
-def robust_cost(images: InstantStack, p: NDArray[np.float32], cost: CostParams) -> float:
+def robust_cost(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> float:
     """Return the mean weighted squared difference of images along trajectories.
 
     Args:
-        images: Images.
+        images: Packed images.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
         The mean over pixels and instants.
     """
-    return float(sum_instants(images, p, cost).moments[:, 5].mean()) / len(images.s)
+    points, M = sample_trajectories(images, p, cost)
+    return float(((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).mean())
 
 
 def choose_trajectories(
-    images: InstantStack,
+    images: PackedImages,
     several: Sequence[NDArray[np.float32]],
     cost: CostParams,
     shares: Sequence[float],
@@ -215,7 +245,7 @@ def choose_trajectories(
     """Choose for every node the trajectories along which images agree best around it.
 
     Args:
-        images: Images.
+        images: Packed images.
         several: Trajectories of nodes, each (rows, columns, 4), px.
         cost: Parameters of the cost, float32.
         shares: By which the cost of each is divided, above 0.
@@ -225,12 +255,13 @@ def choose_trajectories(
     """
     costs = []
     for p, share in zip(several, shares, strict=True):
-        squares = sum_instants(images, p, cost).moments[:, 5]
+        points, M = sample_trajectories(images, p, cost)
+        squares = ((points[:, 0] - M[:, None]) ** 2 * points[:, 1]).sum(1)
         rows, columns = p.shape[:2]
         unpaired = [(0, 2 * rows - len(squares)), (0, 2 * columns - squares.shape[1])]
         padded = np.pad(squares, unpaired, mode="edge")
         nodes = padded.reshape(rows, 2, columns, 2).mean((1, 3))
-        costs.append(blur_images(nodes[None], CHOICE_SIGMA)[0] / np.float32(share))
+        costs.append(blur_image(nodes, CHOICE_SIGMA) / np.float32(share))
     best = np.argmin(costs, 0)
     return np.take_along_axis(np.stack(several), best[None, ..., None], 0)[0]
 
@@ -342,17 +373,17 @@ def estimate_trajectories(
     for stage in plan:
         chosen = np.abs(s) <= stage.horizon * 1.001
         for level in stage.levels:
-            p, (L, V) = found.at_level(level, (h, w)).p, pyramid[level]
+            p, pixels = found.at_level(level, (h, w)).p, pyramid[level]
             if not chosen.all():
-                L, V = L[chosen], V[chosen]
-            images = InstantStack.of(L, V, s[chosen])
+                pixels = np.ascontiguousarray(pixels[chosen])
+            images = PackedImages.of(pixels, s[chosen])
             for _ in range(stage.steps):
-                p = gauss_newton_step(images, p, cost, SEARCH_CURVATURE)
+                p = gauss_newton_step(images, p, cost)
             found = NodeTrajectories(p, level)
     return found
 
 
-@njit_fastmath
+@njit_noalloc
 def _advect(begin, end, p, s, out):
     rows, columns, _ = p.shape
     half = np.float32(0.5)  # nodes per px
@@ -379,7 +410,7 @@ def advect_nodes(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.fl
         (rows, columns, 4) trajectories of the points visible at s, on the new clock, px.
     """
     out = np.empty_like(p)
-    run_over_rows(_advect, len(p), p, np.float32(s), out, min_rows=32)
+    run_over_rows(_advect, len(p), p, np.float32(s), out)
     return out * np.array([unit, unit, unit**2, unit**2], np.float32)
 
 
@@ -391,10 +422,10 @@ class _SearchScratch(NamedTuple):
     lines: NDArray[np.float32]  # (rows, 6, w), sums (2), means, costs of points, of pixels (2)
     logs: NDArray[np.float64]  # (rows, 2, w), sums of logarithms, and products to take them of
     chosen: NDArray[np.int32]  # (rows, w), pixels of a row
-    padded: NDArray[np.float32]  # (rows, w + 12)
+    padded: NDArray[np.float32]  # (rows, w + taps)
 
     @classmethod
-    def allocate(cls, shape: tuple[int, int], instants: int) -> "_SearchScratch":
+    def allocate(cls, shape: tuple[int, int], instants: int, taps: int) -> "_SearchScratch":
         """Allocate scratch memory for `run_over_rows`."""
         rows, columns = shape
         return cls(
@@ -403,39 +434,52 @@ class _SearchScratch(NamedTuple):
             row_scratch(rows, 6, columns),
             np.empty((rows, 2, columns)),
             np.empty((rows, columns), np.int32),
-            row_scratch(rows, columns + 12),
+            row_scratch(rows, columns + taps),
         )
 
 
 class _SearchInputs(NamedTuple):
     """One pass of `select_paths`."""
 
-    images: InstantStack
-    paths: NDArray[np.float32]  # (h, w, 4)
+    images: PackedImages
+    paths: NDArray[np.float32]  # (h, w, 4), of every `spacing`-th pixel
+    spacing: int
     offsets: NDArray[np.int64]  # (n, 2), of the pixels whose paths are tried
     cost: CostParams
     taps: NDArray[np.float32]
     min_gain: np.float32
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
+def _read_levels(image, pixel, part, level, V):
+    """Write log intensity and variance of a packed image at points, bilinear."""
+    h, w, _ = image.shape
+    for i in range(len(level)):
+        x0, y0 = pixel[0, i], pixel[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
+        level[i] = a * upper[x0, 0] + b * upper[x1, 0] + c * lower[x0, 0] + d * lower[x1, 0]
+        V[i] = a * upper[x0, 1] + b * upper[x1, 1] + c * lower[x0, 1] + d * lower[x1, 1]
+
+
+@njit_noalloc_inlined
 def _evaluate_cost(count, begin, y, inputs, scratch):
     """Write the robust costs of a row's first points into `scratch.lines[begin, 3]`.
 
     Their paths and places at the target stand in `scratch.rows`.
     """
     images, nu = inputs.images, inputs.cost.robust
-    h, w = images.L.shape[1:]
+    h, w = images.pixels.shape[1:3]
     s, rows, lines = images.s, scratch.rows, scratch.lines[begin]
     path, pixel, part = rows.path[begin], rows.pixel[begin], rows.part[begin]
-    x, inside, runs = rows.x[begin], rows.inside[begin], rows.runs[begin]
+    x, inside = rows.x[begin], rows.inside[begin]
     level, W, R = scratch.values[begin, 0], scratch.values[begin, 1], scratch.values[begin, 2]
     means, costs = lines[2, :count], lines[3]
     total, product = scratch.logs[begin, 0], scratch.logs[begin, 1]
     for k in range(len(s)):
-        locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside, runs))
-        read_bilinear(images.L[k], pixel, part, runs, level[k])
-        read_bilinear(images.V[k], pixel, part, runs, W[k])
+        locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside))
+        _read_levels(images.pixels[k], pixel, part, level[k, :count], W[k])
         fill_information(W[k, :count], inside, inputs.cost.floor, W[k])
     robust_means(level, W, images.near, nu, (R, means, lines[:2]))
     for i in range(count):
@@ -453,14 +497,14 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
         costs[i] = nu * np.float32(total[i])
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def _path_difference(own, other):
     """Return an upper bound (px) of the difference of two paths at the farthest instant."""
     x = abs(other[0] - own[0]) + abs(other[2] - own[2])
     return max(x, abs(other[1] - own[1]) + abs(other[3] - own[3]))
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def _paths_are_alike(paths, y, x, offsets):
     """Return whether no path nearby differs from a pixel's own."""
     h, w, _ = paths.shape
@@ -472,7 +516,7 @@ def _paths_are_alike(paths, y, x, offsets):
     return True
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def _list_pixels(y, n, inputs, begin, scratch):
     """Write the pixels of a row to compare along the `n`th path, with it; return their number."""
     paths, offsets, rows = inputs.paths, inputs.offsets, scratch.rows
@@ -488,14 +532,14 @@ def _list_pixels(y, n, inputs, begin, scratch):
             wanted = own[x] >= inputs.min_gain and difference >= MIN_PATH_DIFFERENCE_PX
         if wanted:
             scratch.chosen[begin, count] = x
-            rows.x[begin, count] = np.float32(x)
+            rows.x[begin, count] = np.float32(x * inputs.spacing)
             for c in range(4):
                 rows.path[begin, c, count] = paths[i, j, c]
             count += 1
     return count
 
 
-@njit_fastmath
+@njit_noalloc
 def _evaluate_paths(begin, end, inputs, scratch, out):
     """Write the costs (n, h, w) of the paths at all offsets, blurred along x; the first is its own.
 
@@ -508,7 +552,7 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
         own[:] = np.float32(0)
         for n in range(len(inputs.offsets)):
             count = _list_pixels(y, n, inputs, begin, scratch)
-            _evaluate_cost(count, begin, np.float32(y), inputs, scratch)
+            _evaluate_cost(count, begin, np.float32(y * inputs.spacing), inputs, scratch)
             for x in range(len(own)):
                 other[x] = own[x]
             for m in range(count):
@@ -518,62 +562,76 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
             blur_along_x(other, inputs.taps, padded, out[n, y])
 
 
-@njit_fastmath
-def _select(begin, end, inputs, costs, scratch, out):
-    """Write the pixels whose paths are taken, by costs that are blurred along x."""
-    h, w = out.shape
-    lines = scratch.lines[begin]
+@njit_noalloc
+def _select(begin, end, inputs, found, scratch, out):
+    """Write the paths that pixels take, by costs that are blurred along x, and the present ones."""
+    costs, path_index = found
+    h, w = path_index.shape
+    lines, spacing = scratch.lines[begin], inputs.spacing
     cost, least, best = lines[0], lines[1], lines[2]
-    for y in range(begin, end):
+    for row in range(begin, end):
         for n in range(len(costs)):
-            blur_along_y(costs[n], y, inputs.taps, cost)
+            blur_along_y(costs[n], row, inputs.taps, cost)
             more = inputs.min_gain if n else np.float32(0)
+            for i in range(len(cost)):
+                if n == 0 or cost[i] + more < least[i]:
+                    least[i], best[i] = cost[i] + more, np.float32(n)
+        for y in range(row * spacing, min((row + 1) * spacing, h)):
             for x in range(w):
-                if n == 0 or cost[x] + more < least[x]:
-                    least[x], best[x] = cost[x] + more, np.float32(n)
-        for x in range(w):
-            move = inputs.offsets[int(best[x])]
-            i, j = min(max(y + move[0], 0), h - 1), min(max(x + move[1], 0), w - 1)
-            out[y, x] = i * w + j
+                move = inputs.offsets[int(best[x // spacing])]
+                i = min(max(y + move[0] * spacing, 0), h - 1)
+                out[y, x] = path_index[i, min(max(x + move[1] * spacing, 0), w - 1)]
 
 
 def select_paths(
-    images: InstantStack, paths: NDArray[np.float32], cost: CostParams
+    images: PackedImages,
+    paths: NDArray[np.float32],
+    cost: CostParams,
+    searches: tuple[PathSearch, ...] = PATH_SEARCHES,
 ) -> NDArray[np.int32]:
     """Select for each pixel the path of a nearby pixel along which the images agree best.
 
     Args:
-        images: Images.
+        images: Packed images of full resolution.
         paths: (h, w, 4) paths of all pixels, px.
         cost: Parameters of the cost, float32.
+        searches: The passes over the image, in order.
 
     Returns:
         (h, w) flat indices of the pixels whose paths are taken, row by row.
     """
-    (h, w, _), offsets = paths.shape, NEIGHBOUR_OFFSETS * PATH_DISTANCE_PX
+    h, w, _ = paths.shape
     min_gain = np.float32(MIN_COST_GAIN * len(images.s))
-    inputs = _SearchInputs(images, paths, offsets, cost, half_taps(PATH_SIGMA_PX), min_gain)
-    costs, out = empty(len(offsets), h, w), np.empty((h, w), np.int32)
-    scratch = _SearchScratch.allocate((h, w), len(images.s))
-    run_over_rows(_evaluate_paths, h, inputs, scratch, costs)
-    run_over_rows(_select, h, inputs, costs, scratch, out)
-    return out
+    path_index = np.arange(h * w, dtype=np.int32).reshape(h, w)
+    for spacing, distance, sigma in searches:
+        some = paths.reshape(-1, 4)[path_index[::spacing, ::spacing]]
+        taps, shape = gaussian_taps(sigma), some.shape[:2]
+        inputs = _SearchInputs(
+            images, some, spacing, NEIGHBOUR_OFFSETS * distance, cost, taps, min_gain
+        )
+        costs = np.empty((len(NEIGHBOUR_OFFSETS), *shape), np.float32)
+        scratch = _SearchScratch.allocate(shape, len(images.s), len(taps))
+        run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
+        out = np.empty_like(path_index)
+        run_over_rows(_select, shape[0], inputs, (costs, path_index), scratch, out)
+        path_index = out
+    return path_index
 
 
 def borrow_paths(
-    images: InstantStack, p: NDArray[np.float32], cost: CostParams
+    images: PackedImages, p: NDArray[np.float32], cost: CostParams
 ) -> NDArray[np.float32]:
     """Let nodes take the trajectories of others nearby along which images agree better.
 
     Args:
-        images: Images.
+        images: Packed images of full resolution.
         p: (rows, columns, 4) trajectories of nodes, px.
         cost: Parameters of the cost, float32.
 
     Returns:
         (rows, columns, 4) the trajectories, px.
     """
-    size = images.L.shape[1:]
-    index = select_paths(images, interpolate_paths(p, size), cost)
+    size = images.pixels.shape[1:3]
+    index = select_paths(images, interpolate_paths(p, size), cost, PATH_SEARCHES[:1])
     y, x = np.divmod(index[::2, ::2], size[1])
     return p[y // 2, x // 2]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import empty, njit_fastmath, njit_fastmath_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
@@ -23,7 +23,7 @@ CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
 class WarpedImages(NamedTuple):
     """Images at K instants, read at the target's points."""
 
-    L: Float[Numeric, "k h w"]  # log intensity; of frames bicubic, else bilinear
+    L: Float[Numeric, "k h w"]  # log intensity, bicubic
     V: Float[Numeric, "k h w"]  # its variance, (ln I)^2, bilinear
     clear: Float[Numeric, "k h w"]  # 1 where a frame shows the point unclipped, bilinear
     inside: Float[Numeric, "k h w"]  # 1, or 0 beyond the image's border
@@ -37,21 +37,16 @@ class RowScratch(NamedTuple):
     pixel: NDArray[np.int32]  # (rows, 2, points), x and y of the pixel before each point
     part: NDArray[np.float32]  # (rows, 2, points), distance from that pixel, px
     inside: NDArray[np.float32]  # (rows, points), 1, or 0 beyond the image's border
-    # (rows, points + 2), numbers of runs, and the first point of each: its points lie between
-    # pixels that are next to each other.
-    runs: NDArray[np.int32]
-    nodes: NDArray[np.float32]  # (rows, 2 * points + 2), paths of a row of nodes
 
     @classmethod
     def allocate(cls, rows: int, points: int) -> "RowScratch":
         """Allocate scratch memory for `run_over_rows`."""
         path, part = row_scratch(rows, 4, points), row_scratch(rows, 2, points)
         x, inside = row_scratch(rows, points), row_scratch(rows, points)
-        pixel, runs = (row_scratch(rows, *n).view(np.int32) for n in ((2, points), (points + 2,)))
-        return cls(path, x, pixel, part, inside, runs, row_scratch(rows, 2 * points + 2))
+        return cls(path, x, np.empty((rows, 2, points), np.int32), part, inside)
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def gradient_at_pixel(image, y, x):
     """Return the gradient along x and y at a pixel; five taps, exact up to degree 4."""
     h, w = image.shape
@@ -81,7 +76,7 @@ def gradient_jax(images: Array) -> tuple[Array, Array]:
     return along(images.ndim - 1), along(images.ndim - 2)
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def bilinear_cell(X, Y, h, w):
     """Return the four pixels around a point, or at the border: x0, y0, x1, y1, and fx, fy in it."""
     zero = np.float32(0)
@@ -92,7 +87,14 @@ def bilinear_cell(X, Y, h, w):
     return x0, y0, x1, y1, X - np.float32(x0), Y - np.float32(y0)
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
+def bilinear_weights(fx, fy):
+    """Return the weights of the pixels (y0, x0), (y0, x1), (y1, x0) and (y1, x1) of a cell."""
+    one = np.float32(1)
+    return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
+
+
+@njit_noalloc_inlined
 def blend_nodes(p, cell, out_path):
     """Write the four numbers of a path between the nodes (rows, columns, 4) of a cell."""
     j, i, j1, i1, fx, fy = cell
@@ -102,8 +104,8 @@ def blend_nodes(p, cell, out_path):
         out_path[c] = top + fy * (bottom - top)
 
 
-@njit_fastmath_inlined
-def _interpolate_path(p, node_y, node_x, out_path):
+@njit_noalloc_inlined
+def interpolate_path(p, node_y, node_x, out_path):
     """Write the path at a place between nodes, which is given in units of nodes."""
     rows, columns, _ = p.shape
     node_y = min(max(node_y, np.float32(0)), np.float32(rows - 1))
@@ -113,44 +115,13 @@ def _interpolate_path(p, node_y, node_x, out_path):
     blend_nodes(p, (j, i, j1, i1, node_x - np.float32(j), node_y - np.float32(i)), out_path)
 
 
-@njit_fastmath_inlined
-def interpolate_row(p, y, nodes_scratch, out_path):
-    """Write the paths (4, w) of a row of pixels; nodes lie in the middle of 2 x 2 of them."""
-    rows, columns, channels = p.shape
-    w, quarter = out_path.shape[1], np.float32(0.25)
-    # Of the two rows of nodes around, the nearer one counts three times as much.
-    near, far = p[y // 2], p[min(max(y // 2 + (1 if y % 2 else -1), 0), rows - 1)]
-    for j in range(columns):
-        for c in range(channels):
-            nodes_scratch[j * channels + c] = near[j, c] + quarter * (far[j, c] - near[j, c])
-    for c in range(channels):
-        path, last = out_path[c], (columns - 1) * channels + c
-        for j in range(columns):
-            here = nodes_scratch[j * channels + c]
-            left = nodes_scratch[max((j - 1) * channels + c, c)]
-            right = nodes_scratch[min((j + 1) * channels + c, last)]
-            path[2 * j] = here + quarter * (left - here)
-            if 2 * j + 1 < w:
-                path[2 * j + 1] = here + quarter * (right - here)
-
-
-@njit_fastmath
-def _interpolate(begin, end, p, scratch, out):
-    path, nodes = scratch.path[begin], scratch.nodes[begin]
-    for y in range(begin, end):
-        interpolate_row(p, y, nodes, path)
-        for x in range(out.shape[1]):
-            for c in range(4):
-                out[y, x, c] = path[c, x]
-
-
-@njit_fastmath
+@njit_noalloc
 def _resample(begin, end, p, scale, factor, out):
     ratio, half = np.float32(1) / scale, np.float32(0.5)
     for i in range(begin, end):
         at_y = (np.float32(i) + half) * ratio - half
         for j in range(out.shape[1]):
-            _interpolate_path(p, at_y, (np.float32(j) + half) * ratio - half, out[i, j])
+            interpolate_path(p, at_y, (np.float32(j) + half) * ratio - half, out[i, j])
             for c in range(4):
                 out[i, j, c] *= factor
 
@@ -165,9 +136,8 @@ def interpolate_paths(p: NDArray[np.float32], image_shape: tuple[int, int]) -> N
     Returns:
         (h, w, 4) paths of pixels, px.
     """
-    out = empty(*image_shape, 4)
-    h, w = image_shape
-    run_over_rows(_interpolate, h, p, RowScratch.allocate(h, w), out)
+    out = np.empty((*image_shape, 4), np.float32)
+    run_over_rows(_resample, image_shape[0], p, np.float32(2), np.float32(1), out)
     return out
 
 
@@ -184,8 +154,8 @@ def resize_nodes(
     Returns:
         (*shape, 4) paths, in pixels of the new resolution.
     """
-    out, scale = empty(*shape, 4), np.float32(2 if finer else 0.5)
-    run_over_rows(_resample, shape[0], p, scale, scale, out, min_rows=32)
+    out, scale = np.empty((*shape, 4), np.float32), np.float32(2 if finer else 0.5)
+    run_over_rows(_resample, shape[0], p, scale, scale, out)
     return out
 
 
@@ -196,14 +166,14 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
     return jnp.moveaxis(sample_bilinear(jnp.moveaxis(p, -1, 0), Y, X), 0, -1)
 
 
-@njit_fastmath_inlined
+@njit_noalloc_inlined
 def locate_points(y, s, image_shape, n_points, scratch_row):
-    """Locate the first points of a row at an instant: write `pixel`, `part`, `inside` and `runs`.
+    """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
 
     `scratch_row` holds the parts of a `RowScratch` for one row.
     """
     h, w = image_shape
-    path, x, pixel, part, inside, runs = scratch_row
+    path, x, pixel, part, inside = scratch_row
     one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     right, bottom = np.float32(w - 1), np.float32(h - 1)
     last_x, last_y = np.int32(max(w - 2, 0)), np.int32(max(h - 2, 0))
@@ -218,91 +188,59 @@ def locate_points(y, s, image_shape, n_points, scratch_row):
         x0, y0 = min(np.int32(X), last_x), min(np.int32(Y), last_y)
         pixel[0, i], pixel[1, i] = x0, y0
         part[0, i], part[1, i] = X - np.float32(x0), Y - np.float32(y0)
-    count = 0
-    for i in range(n_points):
-        x0, edge = pixel[0, i], max(i - 1, 0)
-        here = (x0 < 1) | (x0 > w - 3)  # so that the others have two pixels on either side
-        goes_on = (x0 - pixel[0, edge] == 1) & (pixel[1, i] == pixel[1, edge])
-        if i == 0 or here or not goes_on or pixel[0, edge] < 1:
-            count += 1
-            runs[count] = i
-    runs[0], runs[count + 1] = count, n_points
 
 
-@njit_fastmath_inlined
-def read_bilinear(image, pixel, part, runs, out):
-    """Write an image at points, bilinear.
+@njit_noalloc_inlined
+def _cubic_weights(part, out):
+    """Write the weights (4, points) of the four pixels around each point along an axis."""
+    a, one, two, three = np.float32(CUBIC_SLOPE), np.float32(1), np.float32(2), np.float32(3)
+    for i in range(len(part)):
+        f = part[i]
+        far, rest = one + f, one - f
+        first = ((a * far - np.float32(5) * a) * far + np.float32(8) * a) * far
+        out[0, i] = first - np.float32(4) * a
+        out[1, i] = ((a + two) * f - (a + three)) * f * f + one
+        out[2, i] = ((a + two) * rest - (a + three)) * rest * rest + one
+        out[3, i] = one - out[0, i] - out[1, i] - out[2, i]
 
-    Args:
-        image: (h, w) the image.
-        pixel: (2, points) x and y of the pixels before the points.
-        part: (2, points) distance from those, px.
-        runs: Runs of points, as of `RowScratch`.
-        out: (points,) output.
-    """
+
+@njit_noalloc_inlined
+def _read_bilinear(image, pixel, part, out):
     h, w = image.shape
-    for r in range(1, runs[0] + 1):
-        a, b = runs[r], runs[r + 1]
-        x, y = pixel[0, a], pixel[1, a]
-        upper, lower = image[y, x:], image[min(y + 1, h - 1), x:]
-        fx, fy, values, right = part[0, a:b], part[1, a:b], out[a:b], min(1, w - 1)
-        for i in range(b - a):
-            top = upper[i] + fx[i] * (upper[i + right] - upper[i])
-            bottom = lower[i] + fx[i] * (lower[i + right] - lower[i])
-            values[i] = top + fy[i] * (bottom - top)
+    for i in range(len(out)):
+        x0, y0 = pixel[0, i], pixel[1, i]
+        x1 = min(x0 + 1, w - 1)
+        upper, lower = image[y0], image[min(y0 + 1, h - 1)]
+        a, b, c, d = bilinear_weights(part[0, i], part[1, i])
+        out[i] = a * upper[x0] + b * upper[x1] + c * lower[x0] + d * lower[x1]
 
 
-@njit_fastmath_inlined
-def _cubic_weights(f):
-    """Return the weights of the four pixels around a point along an axis."""
-    a, one = np.float32(CUBIC_SLOPE), np.float32(1)
-    g = one - f
-    before = a * f * g * g
-    here = ((a + np.float32(2)) * f - (a + np.float32(3))) * f * f + one
-    after = ((a + np.float32(2)) * g - (a + np.float32(3))) * g * g + one
-    return before, here, after, a * g * f * f
-
-
-@njit_fastmath_inlined
-def _blend_four(weights, a, b, c, d):
-    return weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
-
-
-@njit_fastmath_inlined
-def _read_bicubic(image, pixel, part, runs, out):
+@njit_noalloc_inlined
+def _read_bicubic(image, pixel, weights, out):
     h, w = image.shape
-    for r in range(1, runs[0] + 1):
-        a, b = runs[r], runs[r + 1]
-        x, y = pixel[0, a] - 1, pixel[1, a] - 1
-        fx, fy, values = part[0, a:b], part[1, a:b], out[a:b]
+    for i in range(len(out)):
+        x, y, total = int(pixel[0, i]) - 1, int(pixel[1, i]) - 1, np.float32(0)
         if 0 <= x < w - 3 and 0 <= y < h - 3:
-            A, B, C, D = image[y, x:], image[y + 1, x:], image[y + 2, x:], image[y + 3, x:]
-            for i in range(b - a):
-                X, Y = _cubic_weights(fx[i]), _cubic_weights(fy[i])
-                values[i] = _blend_four(
-                    X,
-                    _blend_four(Y, A[i], B[i], C[i], D[i]),
-                    _blend_four(Y, A[i + 1], B[i + 1], C[i + 1], D[i + 1]),
-                    _blend_four(Y, A[i + 2], B[i + 2], C[i + 2], D[i + 2]),
-                    _blend_four(Y, A[i + 3], B[i + 3], C[i + 3], D[i + 3]),
-                )
+            for n in range(4):
+                row = image[y + n]
+                part = weights[0, i] * row[x] + weights[1, i] * row[x + 1]
+                part = part + weights[2, i] * row[x + 2] + weights[3, i] * row[x + 3]
+                total += weights[4 + n, i] * part
         else:  # the image's border goes on
-            for i in range(b - a):
-                X, Y, total = _cubic_weights(fx[i]), _cubic_weights(fy[i]), np.float32(0)
-                for n in range(4):
-                    row, value = image[min(max(y + n, 0), h - 1)], np.float32(0)
-                    for m in range(4):
-                        value += X[m] * row[min(max(x + i + m, 0), w - 1)]
-                    total += Y[n] * value
-                values[i] = total
+            for n in range(4):
+                row, part = image[min(max(y + n, 0), h - 1)], np.float32(0)
+                for m in range(4):
+                    part += weights[m, i] * row[min(max(x + m, 0), w - 1)]
+                total += weights[4 + n, i] * part
+        out[i] = total
 
 
-@njit_fastmath
-def _warp(begin, end, inputs, scratch, out):
+@njit_noalloc
+def _warp(begin, end, inputs, scratch, cubic, out):
     L, V, clear, shown, s, paths = inputs
     count, h, w = L.shape
     path, pixel, part = scratch.path[begin], scratch.pixel[begin], scratch.part[begin]
-    at, runs = scratch.x[begin], scratch.runs[begin]
+    at, weights = scratch.x[begin], cubic[begin]
     for x in range(w):
         at[x] = np.float32(x)
     for y in range(begin, end):
@@ -310,14 +248,15 @@ def _warp(begin, end, inputs, scratch, out):
             for c in range(4):
                 path[c, x] = paths[y, x, c]
         for k in range(count):
-            row = (path, at, pixel, part, out.inside[k, y], runs)
+            row = (path, at, pixel, part, out.inside[k, y])
             locate_points(np.float32(y), s[k], (h, w), w, row)
-            read_bilinear(V[k], pixel, part, runs, out.V[k, y])
+            _cubic_weights(part[0], weights[:4])
+            _cubic_weights(part[1], weights[4:])
+            _read_bicubic(L[k], pixel, weights, out.L[k, y])
+            _read_bilinear(V[k], pixel, part, out.V[k, y])
             if shown[k]:
-                _read_bicubic(L[k], pixel, part, runs, out.L[k, y])
-                read_bilinear(clear[k], pixel, part, runs, out.clear[k, y])
+                _read_bilinear(clear[k], pixel, part, out.clear[k, y])
             else:
-                read_bilinear(L[k], pixel, part, runs, out.L[k, y])
                 out.clear[k, y] = np.float32(0)
 
 
@@ -335,9 +274,9 @@ def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArr
         The images at the target's points.
     """
     _, h, w = L.shape
-    out = WarpedImages(*(empty(*L.shape) for _ in range(4)))
+    out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
     inputs = (L, V, clear, clear.any((1, 2)), s, paths)
-    run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), out)
+    run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
 
 
@@ -383,8 +322,7 @@ def warp_images_jax(L: Array, V: Array, clear: Array, s: Array, paths: Array) ->
     _, h, w = L.shape
     Y, X = path_positions(paths, s)
     inside = is_in_image(Y, X, h, w)
-    sharp = (clear > 0).any((1, 2))[:, None, None]
-    bilinear, V, clear = (sample_bilinear(part, Y, X) for part in (L, V, clear))
+    V, clear = sample_bilinear(V, Y, X), sample_bilinear(clear, Y, X)
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
     y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
     x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
@@ -404,4 +342,4 @@ def warp_images_jax(L: Array, V: Array, clear: Array, s: Array, paths: Array) ->
     # Around the points: (rows, columns, k, h, w).
     taps = L[k, jnp.stack(row)[:, None], jnp.stack(column)]
     bicubic = (cubic(fy)[:, None] * cubic(fx) * taps).sum((0, 1))
-    return WarpedImages(jnp.where(sharp, bicubic, bilinear), V, clear, inside.astype(L.dtype))
+    return WarpedImages(bicubic, V, clear, inside.astype(L.dtype))

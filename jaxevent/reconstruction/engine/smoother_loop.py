@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import empty, njit_noalloc, njit_noalloc_inlined
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.reconstruction.engine.bands import (
     BandLayout,
@@ -476,9 +476,9 @@ class SmootherPasses:
     def memory(self, n_bands: int, n_frames: int) -> NDArray:
         """Make memory for so many bands and frames of each, [bands, ...]."""
         places = self.places
-        shape = n_bands, (places.work + n_frames * places.row) * places.stride
-        memory = empty(*shape) if self.dtype == np.float32 else np.empty(shape, self.dtype)
-        memory[:] = 0
+        memory = np.zeros(
+            (n_bands, (places.work + n_frames * places.row) * places.stride), self.dtype
+        )
         for name in (*IMAGE_FIELDS, *STATE_FIELDS, *LATER_FIELDS):
             self.field(memory, f"{name}.0")[:] = 0.5  # where there are no pixels, too
         return memory
