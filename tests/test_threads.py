@@ -22,7 +22,10 @@ from jaxevent.reconstruction.engine import filter_loop, filter_program, smoother
 from jaxevent.reconstruction.engine import images as image_module
 
 # The default thresholds are not those of the texture.
-pytestmark = pytest.mark.filterwarnings("ignore:moving. events contradict frames")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:moving. events contradict frames"),
+    pytest.mark.filterwarnings("ignore:moving. holds no frames"),
+]
 
 WINDOWS = {"window_events": 3000}  # of 8,000
 RESULTS = [

@@ -473,7 +473,7 @@ def test_info(tmp_path, capsys, monkeypatch):
     assert cli.main(["info", str(tmp_path / "known.h5")]) == 0
     assert capsys.readouterr().out.splitlines()[1:] == first.splitlines()[1:]
     lines = dict(re.split(r"  +", line, maxsplit=1) for line in first.splitlines())
-    assert lines.pop("fault").startswith("clipped frames: 12 % of the frames' pixels are white")
+    assert lines.pop("fault").startswith("clipped frames: 12.5 % of the frames' pixels are white")
     assert lines == {
         "file": str(path),
         "name": "known",

@@ -154,7 +154,9 @@ def test_faults_are_reported(path, tmp_path, capsys, monkeypatch):
         Fault("inverted polarity", -0.76, -0.3, "ON and OFF are exchanged", "invert the polarity"),
         Fault("missing events", 900.0, 50.0, "50 ms hold no event", "leave that part out"),
     ]
-    monkeypatch.setattr("jaxevent.calibration.check_consistency", lambda recording: faults)
+    monkeypatch.setattr(
+        "jaxevent.calibration.check_consistency", lambda recording, sample=None: faults
+    )
     out = tmp_path / "out.h5"
     words = ("reconstruct", path, "--method", "high-pass", "--rate", 20, "--out", out)
     _, error = run(capsys, *words)

@@ -83,7 +83,7 @@ def linearised(
     series, plane = some_tracks(), normal is not None
     log_rho = np.log(rays_of_nodes(series) @ normal) if plane else smooth(series)
     gyro = np.full((N_WINDOW_SEGMENTS, 3), 0.2)
-    prior = Prior(1.0, 1.0, 0.3, 0.7, gyro, 2.0, 0.8, 0.05, 10.0)
+    prior = Prior(1.0, 1.0, 0.3, gyro, 2.0, 0.8, 0.05, 10.0)
     problem = fit.Problem(series, prior, 0.7, plane, 0.5)
     seen = fit.evaluate(problem, some_scene(series, log_rho), np.ones(PIXELS * EACH))
     assert (seen.samples.inside == 1).all()

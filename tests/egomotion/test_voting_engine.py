@@ -62,7 +62,7 @@ def test_kernel_equals_run(model):
 
 def test_weights_between_nodes_are_within_the_bound():
     """For all particles of each batch of a filter that runs."""
-    params, kind, c, noise, state = prepared("planar", off=0.03)
+    params, kind, c, noise, state = prepared("planar", off=0.03, noise=0.2)
     exact = eqx.tree_at(lambda p: p.raw["off"], params, jnp.asarray(-jnp.inf))
     by_nodes, by_all = CompiledFilter(params, kind), CompiledFilter(exact, kind)
     errors = []

@@ -130,8 +130,6 @@ def test_causal_flow_uses_no_later_events():
 
 def still(kind: str) -> Recording:
     rng = np.random.default_rng(5)
-    if kind == "empty":
-        return record([], [], [], [])
     if kind == "one":
         return record([5000], [3], [4], [True])
     n = 4000
@@ -149,7 +147,7 @@ def still(kind: str) -> Recording:
 
 
 @pytest.mark.parametrize(
-    "kind", ["empty", "one", "pixel", "noise", "all ON", "one time", "burst", "hot pixels"]
+    "kind", ["one", "pixel", "noise", "all ON", "one time", "burst", "hot pixels"]
 )
 def test_what_shows_no_motion_is_finite_and_not_valid(kind):
     flow = flow_from_events(still(kind))

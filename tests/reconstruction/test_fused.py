@@ -39,6 +39,8 @@ from jaxevent.reconstruction.engine.images import FilterVideo, KernelImages, Smo
 from jaxevent.reconstruction.video import Video
 from jaxevent.recording import ColumnSource
 
+pytestmark = pytest.mark.filterwarnings("ignore:random. holds no frames")
+
 # Of the same choices, so that the functions are traced once; conditions on numbers choose the way.
 DEAD = {**PARAMS, "rho_ref": 0.0008, "clock_offset": 0.0007}
 ALL = {**OPTIONS, "clock_offset": -0.0021}

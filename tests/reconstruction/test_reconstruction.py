@@ -22,6 +22,8 @@ from jaxevent.reconstruction.estimator import PixelEstimator
 from jaxevent.reconstruction.filtering import Event, Observation, PixelState
 from jaxevent.recording import Events, Frames, Recording
 
+pytestmark = pytest.mark.filterwarnings("ignore:random. holds no frames")
+
 PARAMS = {
     "c_on": 0.13,
     "c_off": 0.09,
