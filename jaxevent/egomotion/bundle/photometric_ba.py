@@ -49,9 +49,10 @@ from jaxevent.egomotion.bundle.normal_equations import (
 )
 from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, subtract_mean
 
-# A step that costs more is taken back and damped, first by FIRST_DAMPING, then by DAMPING_GROWTH
-# times more, until no step helps. One that costs less leaves DAMPING_DECAY of the damping, and is
-# the last if it gains less than MIN_RELATIVE_GAIN of the objective.
+# A step that costs more is taken back and damped, first by INITIAL_DAMPING, then by
+# DAMPING_GROWTH_FACTOR times more, until no step helps. One that costs less leaves
+# DAMPING_DECAY_FACTOR of the damping, and is the last if it gains less than MIN_RELATIVE_GAIN of
+# the objective.
 INITIAL_DAMPING = 0.1
 DAMPING_GROWTH_FACTOR = 5
 MAX_DAMPING = 50
