@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.models import Model, find_model, in_words, unit_vectors
 from jaxevent.errors import InputError
+from jaxevent.io.tables import read_table
 from jaxevent.recording import Imu, Poses, Recording, Times, check_recording, microseconds
 
 # Rotations from the axes of an IMU to the camera's, x to the right, y down, z forward, by name.
@@ -397,13 +398,7 @@ def read_motion(path: str | Path, model: str | type[Model]) -> KnownMotion:
         InputError: The file cannot be read, columns or numbers are missing, or times do not rise.
     """
     model = find_model(model)
-    path = Path(path)
-    try:
-        table = pd.read_csv(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:
-        raise InputError(f"{path}: is no table ({error}); give columns t and components") from None
+    table = read_table(Path(path), "give columns t and components")
     return motion_from_table(table, model, str(path), "line", 2)
 
 
