@@ -360,7 +360,7 @@ def estimate_trajectories(
 
     Args:
         pyramid: Images of the target's instants.
-        s: (K,) times of the instants relative to the target, -1..1.
+        s: (K,) sorted times of the instants relative to the target, -1..1.
         plan: The stages.
         cost: Parameters of the cost, float32.
 
@@ -371,12 +371,11 @@ def estimate_trajectories(
     first = plan[0].levels[0]
     found = NodeTrajectories(np.zeros((*node_shape(h, w, first), 4), np.float32), first)
     for stage in plan:
-        chosen = np.abs(s) <= stage.horizon * 1.001
+        # Instants are sorted, so that these follow each other.
+        chosen = slice(*np.searchsorted(s, stage.horizon * np.array([-1.001, 1.001])))
         for level in stage.levels:
-            p, pixels = found.at_level(level, (h, w)).p, pyramid[level]
-            if not chosen.all():
-                pixels = np.ascontiguousarray(pixels[chosen])
-            images = PackedImages.of(pixels, s[chosen])
+            p = found.at_level(level, (h, w)).p
+            images = PackedImages.of(pyramid[level][chosen], s[chosen])
             for _ in range(stage.steps):
                 p = gauss_newton_step(images, p, cost)
             found = NodeTrajectories(p, level)
