@@ -293,7 +293,9 @@ class Clock(NamedTuple):
 
     def rate(self, t: float) -> float:
         """Return how fast s goes at a time (us), 1/s."""
-        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
+        # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
+        rates = np.gradient(self.s, self.t, edge_order=min(len(self.t) - 1, 2))
+        rates = np.pad(rates, 2, mode="reflect", reflect_type="odd")
         smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
         return float(np.interp(t, self.t, smooth)) * 1e6
 
