@@ -23,8 +23,7 @@ own motion, and other depths, are outliers of the fit:
     min_m  sum w (u + d - m)^T H (u + d - m),    w = 1 / (1 + |u - m|^2 / edge^2)               (4)
 
 The covariance of a displacement is that of an estimate from the nodes within a Gaussian of reach r,
-which have the information I_r together, are n_r in effect, and differ from their neighbours by D_r
-in the mean square, weighted by information:
+which have the information I_r together, are n_r in effect, and differ by D_r in the mean square:
 
     C = min_r  I_r^-1 + beta D_r / n_r                                                          (5)
 
@@ -58,7 +57,7 @@ OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it i
 NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
 POOLING = (1, 2, 4)  # nodes, the reaches r of (5)
-SCATTER = 7.0  # beta of (5)
+SCATTER = 9.0  # beta of (5)
 UNKNOWN_VARIANCE = 6.0  # px^2, without events
 FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
@@ -397,8 +396,7 @@ class Alignment:
                 gaussian_filter(one, reach, mode="constant") for one in (trace, trace**2)
             )
             n = 4 * np.pi * reach**2 * pooled**2 / squares
-            D = gaussian_filter(trace * _mean_square_difference(u, reach), reach, mode="constant")
-            C = C + (SCATTER * D / (n * pooled))[..., None, None] * np.eye(2)
+            C = C + (SCATTER / n * _mean_square_difference(u, reach))[..., None, None] * np.eye(2)
             less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
             best = np.where(less[..., None, None], C, best)
         return best
