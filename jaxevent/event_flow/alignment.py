@@ -23,11 +23,13 @@ own motion, and other depths, are outliers of the fit:
     min_m  sum w (u + d - m)^T H (u + d - m),    w = 1 / (1 + |u - m|^2 / edge^2)               (4)
 
 The covariance of a displacement is that of an estimate from the nodes within a Gaussian of reach r,
-which have the information I_r together, are n_r in effect, and differ by D_r in the mean square:
+which have the information I_r together, are n_r in effect, and differ from their neighbours by D_r
+in the mean square, weighted by information:
 
     C = min_r  I_r^-1 + beta D_r / n_r                                                          (5)
 
-The first term is the noise of events, the second what smoothness and unequal motion add.
+The first term is the noise of events, the second what smoothness and unequal motion add. A velocity
+is uncertain by its clock, too: by the mean square of what smoothing takes from the clock's rates.
 """
 
 from typing import Any, NamedTuple
@@ -56,7 +58,7 @@ OWN_NUMBER = 0.12  # part of an event in the blurred number of events where it i
 NOISE = 0.055  # variance of the gradient of an image of events without order, per event
 # The covariance of a displacement, set by experiments/event_flow.py on simulated scenes.
 POOLING = (1, 2, 4)  # nodes, the reaches r of (5)
-SCATTER = 9.0  # beta of (5)
+SCATTER = 7.0  # beta of (5)
 UNKNOWN_VARIANCE = 6.0  # px^2, without events
 FIRST_INFORMATION = 1.0  # 1/px^2, at which half of a component is kept for the next window
 MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
@@ -257,6 +259,11 @@ def _quadratic_basis(x: NDArray, y: NDArray) -> NDArray[np.float64]:
     return np.array([along_x, [zero, zero, zero, one, x, y, x * y, y * y]])
 
 
+def _smooth(values: NDArray) -> NDArray[np.float64]:
+    """Return binomial means over five values, four fewer than there are."""
+    return np.convolve(values, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
+
+
 class Clock(NamedTuple):
     """Relative times s of a window, linear between some times."""
 
@@ -291,11 +298,14 @@ class Clock(NamedTuple):
         """Mean rate of s over the window, 1/s."""
         return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
 
-    def rate(self, t: float) -> float:
-        """Return how fast s goes at a time (us), 1/s."""
-        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
-        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
-        return float(np.interp(t, self.t, smooth)) * 1e6
+    def rate(self, t: float) -> tuple[float, float]:
+        """Return how fast s goes at a time (us), 1/s, and the variance of that, 1/s^2."""
+        rates = np.gradient(self.s, self.t, edge_order=min(len(self.t) - 1, 2))
+        # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
+        smooth = _smooth(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
+        variance = _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))
+        rate, spread = (float(np.interp(t, self.t, one)) for one in (smooth, variance))
+        return rate * 1e6, spread * 1e12
 
 
 class WindowEvents(NamedTuple):
@@ -387,7 +397,8 @@ class Alignment:
                 gaussian_filter(one, reach, mode="constant") for one in (trace, trace**2)
             )
             n = 4 * np.pi * reach**2 * pooled**2 / squares
-            C = C + (SCATTER / n * _mean_square_difference(u, reach))[..., None, None] * np.eye(2)
+            D = gaussian_filter(trace * _mean_square_difference(u, reach), reach, mode="constant")
+            C = C + (SCATTER * D / (n * pooled))[..., None, None] * np.eye(2)
             less = np.trace(C, axis1=-2, axis2=-1) < np.trace(best, axis1=-2, axis2=-1)
             best = np.where(less[..., None, None], C, best)
         return best

@@ -376,10 +376,15 @@ def estimate_trajectories(
             p, pixels = found.at_level(level, (h, w)).p, pyramid[level]
             if not chosen.all():
                 pixels = np.ascontiguousarray(pixels[chosen])
-            images = PackedImages.of(pixels, s[chosen])
+            images, starts = PackedImages.of(pixels, s[chosen]), [p]
+            if stage is plan[0] and level == stage.levels[-1]:
+                # A pattern finer than the pixels of the coarse levels has misled these.
+                starts.append(np.zeros_like(p))
             for _ in range(stage.steps):
-                p = gauss_newton_step(images, p, cost)
-            found = NodeTrajectories(p, level)
+                starts = [gauss_newton_step(images, p, cost) for p in starts]
+            if len(starts) > 1:
+                starts = [choose_trajectories(images, starts, cost, (1.0, 1.0))]
+            found = NodeTrajectories(starts[0], level)
     return found
 
 
