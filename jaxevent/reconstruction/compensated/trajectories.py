@@ -76,6 +76,7 @@ class PathSearch(NamedTuple):
 
 
 CHOICE_SIGMA = 2.0  # of the Gaussian over which costs of trajectories are compared, in nodes
+FINE_SHARE = 2.0  # by which the cost of a search without coarse levels is divided
 # Set on objects of seeds that are not scored, and on the first half of slider_depth.
 PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
 
@@ -375,10 +376,15 @@ def estimate_trajectories(
         chosen = slice(*np.searchsorted(s, stage.horizon * np.array([-1.001, 1.001])))
         for level in stage.levels:
             p = found.at_level(level, (h, w)).p
-            images = PackedImages.of(pyramid[level][chosen], s[chosen])
+            images, starts = PackedImages.of(pyramid[level][chosen], s[chosen]), [p]
+            if stage is plan[0] and level == stage.levels[-1]:
+                # A pattern finer than the pixels of the coarse levels has misled these.
+                starts.append(np.zeros_like(p))
             for _ in range(stage.steps):
-                p = gauss_newton_step(images, p, cost)
-            found = NodeTrajectories(p, level)
+                starts = [gauss_newton_step(images, p, cost) for p in starts]
+            if len(starts) > 1:
+                starts = [choose_trajectories(images, starts, cost, (1.0, FINE_SHARE))]
+            found = NodeTrajectories(starts[0], level)
     return found
 
 
