@@ -11,7 +11,8 @@ repeated. With --methods only those are fitted and scored, and nothing is fitted
 tunable. The tables are those of all recordings, of slow and of fast ones, and the calibration of
 each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have its quality Q too, of
 every sixth image. "Outside" are pixels brighter or darker than frames see; "levels" is the
-part of their log MSE that the right mean of each connected region would take away.
+part of their log MSE that the right mean of each connected region would take away. With --known
+the simulated sensor's own numbers take the place of fitted ones.
 """
 
 import importlib.util
@@ -119,7 +120,14 @@ def choose(labels: list[str], fitted: Path) -> list[tuple]:
     return methods
 
 
-def rows_of(paths: list[Path], methods: list[tuple], out: Path) -> list[dict]:
+def numbers_of_sensor(recording: jaxevent.Recording) -> dict[str, float]:
+    """Return what the simulated sensor has in the place of fitted thresholds, clock and so on."""
+    names = {"I0": "dark_offset", "rho_ref": "refractory"}
+    wanted = ("c_on", "c_off", "clock_offset", *names)
+    return {name: float(recording.extra[names.get(name, name)]) for name in wanted}
+
+
+def rows_of(paths: list[Path], methods: list[tuple], out: Path, known: bool) -> list[dict]:
     """Score methods on the recordings; rows are kept in a file."""
     rows = json.loads(out.read_text()) if out.exists() else []
     done = {(row["method"], row["recording"]) for row in rows}
@@ -129,6 +137,9 @@ def rows_of(paths: list[Path], methods: list[tuple], out: Path) -> list[dict]:
         for label, method, params in methods:
             if (label, recording.name) in done:
                 continue
+            if known:
+                own = numbers_of_sensor(recording)
+                params = params.replace(**{k: own[k] for k in params.settings() if k in own})
             row = score(recording, method, params, "reference", metrics=metrics)
             del row["per_frame"]
             row["Q"] = quality(recording, method, params)
@@ -218,6 +229,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sensor", choices=list(SENSORS), default="davis")
     parser.add_argument("--methods", nargs="+", choices=LABELS, default=LABELS, metavar="LABEL")
+    parser.add_argument("--known", action="store_true", help="thresholds etc. of the sensor itself")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
     paths = record(out / "test", TESTING_SCENES, range(2, 2 + arguments.seeds), arguments.sensor)
@@ -232,7 +244,12 @@ def main() -> None:
         config = out / "fit.toml"
         config.write_text(toml.dump(plan))
         fit(config, fitted, resume=(fitted / "checkpoint").exists(), progress=sys.stderr.isatty())
-    rows = rows_of(paths, choose(arguments.methods, fitted / "params.toml"), out / "scores.json")
+    rows = rows_of(
+        paths,
+        choose(arguments.methods, fitted / "params.toml"),
+        out / "scores.json",
+        arguments.known,
+    )
     text = table(rows)
     for speed in SECONDS:
         own = [row for row in rows if f"_{speed}_" in row["recording"]]
