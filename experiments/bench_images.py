@@ -76,7 +76,8 @@ def stream(
 def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
     """Run the whole AKF event by event: calibration per frame, then event after event.
 
-    Double precision, one core, exposures not known; the arithmetic of the library's filter.
+    Double precision, one core, exposures not known; the arithmetic of the library's filter with
+    hard limits of the ratio (`ratio_width` 0).
     """
     frames, height, width = grey.shape
     L, P = np.log(grey[0] + 1), np.full((height, width), 0.09)
@@ -85,6 +86,9 @@ def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
     S, total = np.zeros((height, width)), np.zeros((height, width))
     base, ratio = np.log(grey[0] + 1), np.ones((height, width))
     end, k = base, -1
+    for i in range(np.searchsorted(t, mid[0])):  # events before the first frame lead up to it
+        total[y[i], x[i]] += c if p[i] else -c
+    L -= total
     for i in range(len(t)):
         while k + 1 < frames and t[i] >= mid[k + 1]:
             k += 1
@@ -109,7 +113,8 @@ def program(t, x, y, p, grey, mid, c, Q_proc, Q_iso, Q_ref, rho, kappa, w_min):
             for column in range(max(b - 1, 0), min(b + 2, width)):
                 near = max(near, last[row, column])
         if k < 0:
-            u, bright, R = base[a, b] + S[a, b], grey[0, a, b], density[0, a, b]
+            u = base[a, b] - (total[a, b] - S[a, b])
+            bright, R = grey[0, a, b], density[0, a, b]
         elif k + 1 == frames:
             u, bright, R = base[a, b] + S[a, b], grey[k, a, b], density[k, a, b]
         else:
@@ -280,7 +285,7 @@ def check_program(recording: Recording, grey: np.ndarray) -> None:
     assert isinstance(e, Events) and frames is not None
     L, _ = program(e.t, e.x, e.y, e.p, grey, frames.t, *NUMBERS)
     features, _ = jaxevent.akf.prepare(recording, [recording.stop])
-    _, end = jax.jit(jaxevent.akf.run)(jaxevent.akf.Params(), features)
+    _, end = jax.jit(jaxevent.akf.run)(jaxevent.akf.Params(ratio_width=0), features)
     assert np.abs(end.L.reshape(L.shape) - L).max() < 1e-3, "the program is another filter"
 
 

@@ -61,7 +61,8 @@ axes[1].legend()
 # A blob that grows comes nearer. `blob.quantities.growth` gives the inverse of its time to contact,
 # which is defined at rest, and its variance. `inverse_ttc` compares two blobs at one depth, and
 # `size_range` gives the range of one of known size. This blob comes from 17 m at 8 m/s. Errors of
-# sizes last, those of smoothed tracks longer, so take filtered ones and give `Q_lambda`.
+# sizes last, those of smoothed tracks longer, so take filtered ones. Given `Q_lambda`, `growth`
+# undoes the filter's lag and knows how long its errors last.
 
 # %%
 scene, _ = jaxevent.simulate.blob_scene("growing", seed=100, rate=20_000)
@@ -73,7 +74,17 @@ inverse, variance = jaxevent.blob.quantities.growth(
 )
 grown = near.to_dataframe(times, ids=near.id[:1])
 grown = grown.assign(inverse_ttc=inverse, sigma_inverse_ttc=np.sqrt(variance))
-grown.assign(true=8 / (17 - 8 * times))[["t", "inverse_ttc", "sigma_inverse_ttc", "true"]].tail()
+grown = grown.assign(true_inverse=8 / (17 - 8 * times))
+grown[["t", "inverse_ttc", "sigma_inverse_ttc", "true_inverse"]].tail()
+
+# %% [markdown]
+# The time to contact is the inverse, with the deviation $\sigma_g / g^2$ to first order, where the
+# inverse is some deviations above zero. Rows at close times share their error.
+
+# %%
+g, sigma_g = grown["inverse_ttc"], grown["sigma_inverse_ttc"]
+grown = grown.assign(ttc=1 / g, sigma_ttc=sigma_g / g**2, true_ttc=1 / grown["true_inverse"])
+grown[["t", "ttc", "sigma_ttc", "true_ttc"]].tail()
 
 # %% [markdown]
 # States at other times: `tracks([0.02, 0.03])` returns mean, covariance and validity. On the

@@ -37,18 +37,26 @@ omega, covariance, valid = motion(times)
 motion
 
 # %% [markdown]
-# The gyro's bias is the mean difference of the two. What is left is the error.
+# The gyro's bias is the mean difference of the two, as far as the estimate has no offset of its
+# own. A recording cannot tell them apart. In this simulation the truth can.
 
 # %%
 measured = np.stack([np.interp(times, t * 1e-6, column) for column in gyro.T], axis=1)
-bias = np.median(measured - omega, axis=0)
-error = omega - (measured - bias)
+truth = np.stack([np.interp(times, t * 1e-6, column) for column in true.T], axis=1)
+bias = np.mean(measured - omega, axis=0)
 names = ["about x", "about y", "about z"]
 for k, name in enumerate(names):
-    print(f"{name}: bias {bias[k]:+.3f} (true {BIAS[k]:+.3f}) rad/s, "
-          f"error {error[:, k].std(ddof=1):.3f} rad/s standard deviation")  # fmt: skip
-relative = np.linalg.norm(error, axis=1) / np.linalg.norm(measured - bias, axis=1)
-print(f"relative error: median {100 * np.median(relative):.1f} %")
+    error = omega[:, k] - truth[:, k]
+    print(f"{name}: gyro less estimate {bias[k]:+.3f} rad/s; bias {BIAS[k]:+.3f}, the estimate's "
+          f"error {error.mean():+.3f} +- {error.std(ddof=1):.3f} rad/s")  # fmt: skip
+
+
+def relative_error(reference):
+    return np.median(np.linalg.norm(omega - reference, axis=1) / np.linalg.norm(truth, axis=1))
+
+
+print(f"median error: {100 * relative_error(truth):.1f} % of the true rotation, "
+      f"{100 * relative_error(measured - bias):.1f} % beside the gyro less its bias")  # fmt: skip
 
 # %%
 deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -70,8 +78,8 @@ axis.legend(ncols=2)
 # against it.
 
 # %%
-truth = egomotion.known_motion(recording, "rotation", "poses")
-jaxevent.show.plot_motion(motion, times, truth)
+by_poses = egomotion.known_motion(recording, "rotation", "poses")
+jaxevent.show.plot_motion(motion, times, by_poses)
 
 # %% [markdown]
 # A gyro may have axes of its own. `plot_motion` then warns, as `score_motion` does, and

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.calibration.sampling import Sample, SampledSegment, log_changes
+from jaxevent.codegen import njit_noalloc
 
 I0 = 0.1  # inside the logarithm: between the filters' 1 and the dark offset of sensors
 MAX_PAIRS = 16  # pairs of frames that are compared
@@ -24,6 +25,7 @@ MIN_PIXELS = 50  # clear in both frames
 MIN_EVENTS = 4
 N_PARTS = 8  # of the pairs, each left out in turn for the error of the offset
 FAR_STEPS = 12  # lag at which events belong to other frames
+MIN_SIGNIFICANCE = 6.0  # of a relation that is no chance, among some hundred that are tried
 
 # What brings events to the frames' pixels, and the same of the frames' changes, taken back.
 TRANSFORMS: Mapping[str, Callable[[NDArray], NDArray]] = MappingProxyType(
@@ -92,20 +94,50 @@ def _lag_counts(
     Returns:
         (active,) pixels with events, and net and total counts (m, active).
     """
-    edges = np.concatenate([stretch.frame_t[row] + lags, stretch.frame_t[row + 1] + lags])
-    order = np.argsort(edges, kind="stable")
-    first, last = np.searchsorted(stretch.t, [edges.min(), edges.max()])
-    part = slice(first, last)
-    bins = np.searchsorted(edges[order], stretch.t[part], side="right") - 1
-    active, place = np.unique(stretch.pixel[part], return_inverse=True)
-    counted = []
-    for weights in (np.where(stretch.p[part], 1.0, -1.0), None):
-        shape = len(edges), len(active)
-        sums = np.bincount(bins * shape[1] + place, weights, shape[0] * shape[1]).reshape(shape)
-        before = np.empty(shape, np.float32)
-        before[order] = np.cumsum(sums, 0) - sums  # events before each edge
-        counted.append(before[len(lags) :] - before[: len(lags)])
+    first, last = (np.searchsorted(stretch.t, stretch.frame_t[row + k] + lags) for k in (0, 1))
+    part = slice(first[0], last[-1])
+    counts = np.bincount(stretch.pixel[part])
+    active, rank = np.flatnonzero(counts), np.cumsum(counts > 0) - 1
+    place = rank[stretch.pixel[part]]
+    sign = np.where(stretch.p[part], np.float32(1), np.float32(-1))
+    counted = np.zeros((2, len(lags), len(active)), np.float32)
+    _count_in_windows(place, sign, first - first[0], last - first[0], counted)
     return active, counted[0], counted[1]
+
+
+@njit_noalloc
+def _count_in_windows(place, sign, first, last, out):
+    """Write net and total counts (2, windows, n) of events first <= i < last, both ascending."""
+    begin = end = 0
+    for k in range(len(first)):
+        if k > 0:
+            for pixel in range(out.shape[2]):
+                out[0, k, pixel] = out[0, k - 1, pixel]
+                out[1, k, pixel] = out[1, k - 1, pixel]
+        for i in range(end, last[k]):
+            out[0, k, place[i]] += sign[i]
+            out[1, k, place[i]] += 1
+        for i in range(begin, first[k]):
+            out[0, k, place[i]] -= sign[i]
+            out[1, k, place[i]] -= 1
+        begin, end = first[k], last[k]
+
+
+def _sum_by_tile(
+    counts: NDArray[np.floating], weights: NDArray[np.floating], tile: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """Return sums (lags, tiles, kinds) of counts (lags, n) times weights (kinds, n)."""
+    out = np.zeros((len(counts), tile.max() + 1, len(weights)))
+    _add_by_tile(counts, np.ascontiguousarray(weights.T), tile, out)
+    return out
+
+
+@njit_noalloc
+def _add_by_tile(counts, weights, tile, out):
+    for j in range(counts.shape[0]):
+        for i in range(counts.shape[1]):
+            for k in range(weights.shape[1]):
+                out[j, tile[i], k] += counts[j, i] * weights[i, k]
 
 
 def measure_correspondence(sample: Sample) -> Correspondence | None:
@@ -151,13 +183,11 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
         active, S, N = _lag_counts(stretch, row, lags)
         S, N = S * inside[:, None], N * inside[:, None]
         tile = sample.tile[active]
-        order = np.argsort(tile, kind="stable")
-        for at in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
-            products = moved[:, active[at]] @ S[:, at].T
-            total += products
-            squares += products**2
-            above = _contrast(size[active[at]] @ N[:, at].T, inside)
-            contrast += above, above**2
+        products = _sum_by_tile(S, moved[:, active], tile)
+        total += products.sum(1).T
+        squares += (products**2).sum(1).T
+        above = _contrast(_sum_by_tile(N, size[None, active], tile)[..., 0], inside)
+        contrast += above.sum(1), (above**2).sum(1)
         S2 += seen[:, active] @ (S**2).T
         d2 += (moved**2).sum(1)[:, None] * inside
         used += inside
@@ -212,33 +242,45 @@ def _pair(stretch: SampledSegment, row: int) -> SampledSegment:
 
 
 def _contrast(curve: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return a curve over lags above the mean of those at which events belong to other frames."""
-    out = np.zeros(len(curve))
+    """Return curves (lags, n) above the mean of lags at which events belong to other frames."""
+    out = np.zeros(curve.shape)
     near = np.arange(FAR_STEPS, len(curve) - FAR_STEPS)
     known = inside[near] & inside[near - FAR_STEPS] & inside[near + FAR_STEPS]
     beside = (curve[near - FAR_STEPS] + curve[near + FAR_STEPS]) / 2
-    out[near] = np.where(known, curve[near] - beside, 0)
+    out[near] = np.where(known[:, None], curve[near] - beside, 0)
     return out
 
 
-def _fit_window(sums: list[_Sums], window: slice) -> tuple[float, float]:
-    """Fit d to S averaged over a window of lags, of which half of the pairs know all events.
+def _fit_windows(
+    sums: list[_Sums], first: NDArray[np.integer], stop: NDArray[np.integer]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fit d to S averaged over windows of lags, of which half of the pairs know all events.
 
     Returns:
-        The correlation, minus infinity where it is not known, and the change per event.
+        The correlations, minus infinity where they are not known, and the changes per event.
     """
-    known = [s for s in sums if s.inside[window].all()]
-    S2 = sum(s.S2[window, window].sum() for s in known)
-    d2 = sum(s.d2 for s in known)
-    if 2 * len(known) < len(sums) or S2 * d2 <= 0:
-        return -np.inf, np.nan
-    Sd = sum(s.Sd[window].sum() for s in known)
-    return float(Sd / np.sqrt(S2 * d2)), float(Sd / S2 * (window.stop - window.start))
+    # Sums over windows are differences of sums from the first lag on.
+    inside, Sd = (
+        np.pad(np.cumsum([getattr(s, name) for s in sums], 1), ((0, 0), (1, 0)))
+        for name in ("inside", "Sd")
+    )
+    S2 = np.cumsum(np.cumsum([s.S2 for s in sums], 1), 2)
+    S2 = np.pad(S2, ((0, 0), (1, 0), (1, 0)))
+    known = inside[:, stop] - inside[:, first] == stop - first
+    S2 = S2[:, stop, stop] - S2[:, first, stop] - S2[:, stop, first] + S2[:, first, first]
+    S2 = (S2 * known).sum(0)
+    Sd = ((Sd[:, stop] - Sd[:, first]) * known).sum(0)
+    d2 = (np.array([s.d2 for s in sums])[:, None] * known).sum(0)
+    fitted = (2 * known.sum(0) >= len(sums)) & (S2 * d2 > 0)
+    S2, d2 = np.where(fitted, S2, 1), np.where(fitted, d2, 1)
+    change = np.where(fitted, Sd / S2 * (stop - first), np.nan)
+    return np.where(fitted, Sd / np.sqrt(S2 * d2), -np.inf), change
 
 
 def _find_offset(sums: list[_Sums], step: int) -> float:
     """Find the lag of the highest correlation (us), by a parabola through three."""
-    curve = np.array([_fit_window(sums, slice(k, k + 1))[0] for k in range(2 * N_STEPS + 1)])
+    lags = np.arange(2 * N_STEPS + 1)
+    curve, _ = _fit_windows(sums, lags, lags + 1)
     if not np.isfinite(curve).any():
         return np.nan
     top = int(curve.argmax())
@@ -250,13 +292,12 @@ def _find_offset(sums: list[_Sums], step: int) -> float:
 
 def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float]:
     """Find exposure (us) and dilution, see `Correspondence`."""
-    fits = [
-        (*_fit_window(sums, slice(middle - half, middle + half + 1)), 2.0 * half * step)
-        for half in range(N_STEPS - 1)
-        for middle in range(half, 2 * N_STEPS + 1 - half)
-    ]
-    best = max(fits)
-    short = max(fit for fit in fits if fit[2] <= interval)
-    if not np.isfinite(best[0] + short[0]):
+    half, middle = np.mgrid[: N_STEPS - 1, : 2 * N_STEPS + 1].reshape(2, -1)
+    whole = (middle >= half) & (middle + half <= 2 * N_STEPS)
+    half, middle = half[whole], middle[whole]
+    r, change = _fit_windows(sums, middle - half, middle + half + 1)
+    exposure = 2.0 * half * step
+    best, short = np.argmax(r), np.argmax(np.where(exposure <= interval, r, -np.inf))
+    if not np.isfinite(r[best] + r[short]):
         return np.nan, np.nan
-    return best[2], best[1] / short[1]
+    return float(exposure[best]), float(change[best] / change[short])

@@ -59,6 +59,30 @@ def decode(data: bytes, source: str) -> NDArray[np.uint16] | None:
     return image.reshape((height, width, channels)[: 2 + (channels > 1)])
 
 
+def encode(image: NDArray[np.uint16]) -> bytes:
+    """Encode a PNG image of 16 bits.
+
+    Args:
+        image: (height, width), or (height, width, 3) with red first.
+
+    Returns:
+        The bytes of the file.
+    """
+    height, width = image.shape[:2]
+    raw = image.astype(">u2").reshape(height, -1).view(np.uint8)
+    # Each row begins with its filter, 2: what is stored is the difference to the row above.
+    rows = np.concatenate([raw[:1], raw[1:] - raw[:-1]])
+    filtered = np.concatenate([np.full((height, 1), 2, np.uint8), rows], 1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
+
+    header = struct.pack(_HEADER, width, height, 16, 2 if image.ndim == 3 else 0, 0, 0, 0)
+    data = zlib.compress(filtered.tobytes(), 6)
+    return _MAGIC + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
 @njit
 def _without_filters(rows, step):
     """Return the bytes (height, n) of filtered rows (height, 1 + n), of `step` bytes a pixel."""

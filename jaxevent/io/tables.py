@@ -39,7 +39,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,9 @@ from jaxevent.io.columns import (
 from jaxevent.io.decoded import Columns, read_events
 from jaxevent.recording import Frames, Imu, Recording
 from jaxevent.time_units import SAMPLE_EVENTS, numbers_of_dates, split_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NUMPY_MAGIC = b"\x93NUMPY"
 _TEXT_BLOCK_BYTES = 1 << 24  # of text parsed together: about a million events
@@ -595,3 +598,26 @@ class _Feather:
 
     def read(self, number: int, names: list[str]) -> Any:
         return self._table.from_batches([self._file.get_batch(number)]).select(names)
+
+
+def read_table(path: Path, wanted: str) -> "pd.DataFrame":
+    """Read a CSV table with named columns.
+
+    Args:
+        path: The file.
+        wanted: What to do where it is no table, for the message.
+
+    Returns:
+        The table.
+
+    Raises:
+        InputError: The file cannot be read or is no table.
+    """
+    import pandas as pd  # the import takes a third of a second
+
+    try:
+        return pd.read_csv(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is no table ({error}); {wanted}") from None

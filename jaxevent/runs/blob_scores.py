@@ -51,6 +51,7 @@ from jaxevent.blob.scores import score_tracks
 from jaxevent.blob.track import MIN_THETA_AXIS_RATIO
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
+from jaxevent.io.tables import read_table
 from jaxevent.recording import Recording
 from jaxevent.runs.config import (
     FLAG_CHECK,
@@ -112,13 +113,7 @@ def read_positions(path: str | Path) -> KnownPositions:
 
     Raises `InputError` for a file that cannot be read and for missing columns or numbers.
     """
-    path = Path(path)
-    try:
-        table = pd.read_csv(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:
-        raise InputError(f"{path}: is no table ({error}); give columns t, x, y") from None
+    table = read_table(Path(path), "give columns t, x, y")
     return positions_of(table, str(path), "line", 2)
 
 

@@ -1,7 +1,5 @@
 """Files of dense optical flow: HDF5, PNG images of DSEC's kind, and a video in colours."""
 
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -100,9 +98,13 @@ def write_flow_images(
         progress: Whether to show a progress bar; by default in a terminal.
 
     Raises:
-        InputError: There are fewer than two times.
+        InputError: There are fewer than two times, or they do not rise.
     """
     us = _stamps(times)
+    if (np.diff(us) <= 0).any():
+        raise InputError(
+            f"{out}: images show displacements from one time to a later; sort the times"
+        )
     if len(us) < 2:
         raise InputError(
             f"{out}: images show displacements from one time to the next, of which there are "
@@ -137,22 +139,7 @@ def encode_flow(displacement: NDArray[np.floating], valid: NDArray[np.bool_]) ->
     code = np.rint(displacement * PNG_SCALE + PNG_ZERO)
     known = valid & ((code >= 0) & (code < 2**16)).all(-1)
     planes = np.where(known[..., None], code, PNG_ZERO), known[..., None]
-    pixels = np.concatenate(planes, -1).astype(">u2")
-    h, w = valid.shape
-    raw = pixels.view(np.uint8).reshape(h, -1)
-    # Each row begins with its filter, 2: what is stored is the difference to the row above.
-    rows = np.concatenate([raw[:1], raw[1:] - raw[:-1]])
-    filtered = np.concatenate([np.full((h, 1), 2, np.uint8), rows], 1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        crc = zlib.crc32(kind + data)
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
-
-    header = struct.pack(">IIBBBBB", w, h, 16, 2, 0, 0, 0)
-    data = zlib.compress(filtered.tobytes(), 6)
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-    )
+    return png.encode(np.concatenate(planes, -1).astype(np.uint16))
 
 
 def decode_flow(image: bytes | str | Path) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

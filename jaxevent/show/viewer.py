@@ -15,6 +15,7 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError, require
 from jaxevent.io.images import is_series, read_series
 from jaxevent.io.output import complete
+from jaxevent.io.tables import read_table
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, microseconds
 from jaxevent.show.export import default_tone, display_images, evenly_spaced_times
@@ -225,10 +226,7 @@ def _layer(result: Any, recording: Recording) -> _Layer:
 
 def _layer_of_table(path: Path) -> _Layer:
     """Return the name of a CSV table and the function that sends it."""
-    try:
-        table = pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no table ({error}); write it again") from error
+    table = read_table(path, "write it again")
     if {"t", "id", *STATE_COLUMNS[:2], *STATE_COLUMNS[4:7]} <= set(table.columns):
         return path.stem, lambda send, _: send.tracks(table)
     if "t" in table.columns and len(table.columns) > 1 and "id" not in table.columns:
