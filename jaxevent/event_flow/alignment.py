@@ -299,7 +299,8 @@ class Clock(NamedTuple):
 
     def rate(self, t: float) -> tuple[float, float]:
         """Return how fast s goes at a time (us), 1/s, and the variance of that, 1/s^2."""
-        rates = np.gradient(self.s, self.t, edge_order=min(len(self.t) - 1, 2))
+        order = 1 if len(self.t) < 3 else 2
+        rates = np.gradient(self.s, self.t, edge_order=order)
         # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
         smooth = _smooth(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
         variance = _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))
