@@ -1,7 +1,7 @@
 """Motion by voting on simulated sequences with known motion, the thesis' literal likelihood beside.
 
     python experiments/egomotion_voting.py --out egomotion_voting [--seeds 10] [--first 100]
-        [--only planar frames rotation penalty situations live]
+        [--only planar frames rotation penalty situations slow live]
 
 An ideal event camera of 160 x 120 pixels, f = 200 px, and the thesis' generator of frames 50 us
 apart on 32 x 32 pixels. Parameters are the defaults and the presets of `voting.Params`, which were
@@ -37,7 +37,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize
 
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion import batch, frames, voting
+from jaxevent.egomotion import batch, contrast, frames, voting
 from jaxevent.egomotion.bundle.hypotheses import WindowFitter
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.model_selection import ModelSelection, select_model
@@ -372,7 +372,7 @@ def situation(name: str, seed: int) -> tuple[Recording, str, Callable[[NDArray],
 
     def truth(t: NDArray) -> NDArray:
         if name == "pause of 2 s":
-            paused = (t >= PAUSE_AT_US) & (t < PAUSE_AT_US + PAUSE_US)
+            paused = (t > PAUSE_AT_US) & (t < PAUSE_AT_US + PAUSE_US)
             t = np.where(t >= PAUSE_AT_US + PAUSE_US, t - PAUSE_US, np.minimum(t, PAUSE_AT_US))
             return np.where(paused[:, None], 0, source.twist(np.clip(t, 0, last))[1])
         t = np.clip(t, 0, last)
@@ -560,6 +560,30 @@ def part_situations(seeds: range) -> Table:
     return "situations: as the command estimates by default, and causal", rows
 
 
+def part_slow(seeds: range) -> Table:
+    """Errors and honesty of `frames` and `contrast` where the image is slow."""
+    rows = []
+    for model, change, speed, duration in (
+        ("planar", "constant", 20.0, 1.5), ("planar", "varying", 20.0, 1.5),
+        ("planar", "varying", 200.0, 0.5), ("rotation", "varying", 0.1, 1.5),
+    ):  # fmt: skip
+        row: Row = {"motion": f"{model}, {change}", "speed": speed}
+        for method in (frames, contrast):
+            runs = []
+            for seed in seeds:
+                recording, source = motion_scene(
+                    model, change, seed, size=SIZE, sensor=IDEAL, speed=speed, duration=duration
+                )
+                times = np.arange(recording.start, recording.stop, 2000)
+                true = source.velocity(times) if model == "planar" else source.twist(times)[1]
+                runs.append(score_rows(method.estimate(recording, model=model)(times), true)[0])
+            for key in runs[0]:
+                row[f"{method.name}: {key}"] = float(np.mean([run[key] for run in runs]))
+        rows.append(row)
+        print(f"slow {time.process_time():.0f} s {row}", file=sys.stderr, flush=True)
+    return "frames and contrast where the image is slow", rows
+
+
 def part_live(seeds: range) -> Table:
     """Memory of live motion while a sequence is repeated, and what an hour at its rate takes."""
     recording, _ = planar("constant", seeds[0], "noise")
@@ -601,6 +625,7 @@ PARTS: dict[str, Callable[[range], Table]] = {
     "rotation": part_rotation,
     "penalty": part_penalty,
     "situations": part_situations,
+    "slow": part_slow,
     "live": part_live,
 }
 

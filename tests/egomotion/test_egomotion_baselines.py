@@ -435,6 +435,23 @@ def test_lone_window_measures_the_change_of_the_motion():
 
 
 @pytest.mark.slow
+def test_changes_that_windows_average_are_in_sigma():
+    """A speed that oscillates once in a window has means that are alike, as a constant one has."""
+    ends = np.zeros(2)
+    for k, swing in enumerate((0.0, 60.0)):
+        speeds = iter(150 + swing * np.sin(2 * np.pi * np.arange(450) / 150))
+
+        def uneven(at, speeds=speeds):
+            return np.tile([next(speeds), 0.0], (len(at), 1))
+
+        motion = contrast.estimate(moved(uneven, 0.18, 500, size=SIZE), SMALL)
+        inner = motion.valid[1:-1]
+        assert inner.sum() > 3
+        ends[k] = np.sqrt(np.median(motion.covariance[1:-1][inner][:, 0, 0]))
+    assert ends[0] < 0.05 * 150 and 0.3 * 60 < ends[1] < 1.2 * 60
+
+
+@pytest.mark.slow
 def test_silence_and_noise_are_lost_and_the_motion_found_again(straight, optimised):
     recording, truth = straight[0][0.0:0.1], straight[1]
     e, rng = recording.events, np.random.default_rng(0)

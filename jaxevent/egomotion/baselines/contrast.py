@@ -66,6 +66,7 @@ WINDOW_DURATION_RANGE_S = (0.002, 2.0)
 COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.09)
 SYSTEMATIC_ERROR_PX = 0.25  # of the displacement in a window, from events at pixels' middles
 N_NEIGHBOURS = 3  # estimates, up to which halves of windows show how the motion changes
+N_HALVED_WINDOWS = 5  # of more, whose halves show changes that neighbours do not
 RELATIVE_NOISE = 0.5  # 1/sqrt(s), change of a motion that few windows do not show
 INITIAL_VARIANCE_PX2 = 2.0  # px^2, inverse curvature relative to the objective, at the start
 
@@ -498,7 +499,9 @@ class WindowSequence:
             self.model, self.shape, self.offset, self.box,
         )  # fmt: skip
 
-    def measure_change(self, part: EventRange, motion: NDArray[np.floating]) -> NDArray[np.float64]:
+    def measure_change(
+        self, part: EventRange, motion: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Measure the change of the motion in a window, by its halves.
 
         Args:
@@ -506,7 +509,7 @@ class WindowSequence:
             motion: (d,) motion of the whole window.
 
         Returns:
-            (d,) change; 0 if a half is lost.
+            (d,) change and its covariance (d, d); 0 if a half is lost.
         """
         quarter = self.half_length(part) / 2
         middles = [part.middle + round(1e6 * side * quarter) for side in (-1, 1)]
@@ -514,9 +517,40 @@ class WindowSequence:
             refine(self.params, self.crop(part._replace(middle=middle), quarter), motion)
             for middle in middles
         )
-        if min(first.contrast, second.contrast) < float(self.params.contrast):
-            return np.zeros(len(motion))
-        return 2 * (second.motion - first.motion)
+        is_sharp = min(first.contrast, second.contrast) >= float(self.params.contrast)
+        if not is_sharp or first.covariance is None or second.covariance is None:
+            return np.zeros(len(motion)), np.zeros((len(motion), len(motion)))
+        common = Fit(second.motion - first.motion, first.covariance + second.covariance)
+        error = np.sqrt(2) * SYSTEMATIC_ERROR_PX
+        noise = common.with_systematic_error(error, self.length(part) / 2, self.pixel_scale)
+        return 2 * noise.mean, 4 * noise.covariance
+
+    def unseen_change(
+        self, parts: list[EventRange], spans: NDArray[np.floating], estimate: MotionEstimate
+    ) -> NDArray[np.float64]:
+        """Return the mean square (d, d) of changes in windows that their neighbours do not show.
+
+        A motion that turns several times within a window has means that are alike.
+
+        Args:
+            parts: Windows of the estimate.
+            spans: Their lengths, s.
+            estimate: Motions of the windows.
+
+        Returns:
+            The mean square, without that of errors.
+        """
+        valid = np.flatnonzero(estimate.valid)
+        t, found = estimate.t[valid], estimate.mean[valid]
+        squares = []
+        for k in valid[np.linspace(0, len(valid) - 1, N_HALVED_WINDOWS).round().astype(int)]:
+            change, covariance = self.measure_change(parts[k], estimate.mean[k])
+            at = estimate.t[k] + 5e5 * spans[k] * np.array([-1, 1])
+            before, after = np.stack([np.interp(at, t, column) for column in found.T], 1)
+            far = change - (after - before)
+            squares.append(np.outer(far, far) - covariance)
+        values, vectors = np.linalg.eigh(np.mean(squares, 0))
+        return vectors * np.maximum(values, 0) @ vectors.T
 
     def search(self, part: EventRange) -> NDArray[np.float64]:
         """Search all motions for that of a window.
@@ -629,7 +663,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     if 0 < len(valid) <= N_NEIGHBOURS:
         change = np.zeros_like(estimate.mean)
         for k in valid:
-            change[k] = windows.measure_change(parts[k], estimate.mean[k])
+            change[k] = windows.measure_change(parts[k], estimate.mean[k])[0]
     if change is not None and len(valid) == 1:
         k = int(valid[0])
         rate = np.outer(change[k], change[k]) / max(1e6 * spans[k], 1) ** 2
@@ -640,6 +674,10 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         # Each window that is there shows as much of the changes as is expected beforehand.
         square = RELATIVE_NOISE**2 * (estimate.mean**2).sum(1) * spans / (6 * len(valid))
         added = square[:, None, None] * np.eye(estimate.mean.shape[1])
+        estimate = dataclasses.replace(estimate, covariance=estimate.covariance + added)
+    elif len(valid):
+        # A change d along a window is off its mean by d / sqrt(12).
+        added = windows.unseen_change(parts, spans, estimate) / 12
         estimate = dataclasses.replace(estimate, covariance=estimate.covariance + added)
     before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))
     return estimate.extended_to(int(t[0]) - before, int(t[-1]) + after, rate)

@@ -78,6 +78,7 @@ PREDICTED_FINAL_STAGES = (Stage(0.02, 8, 3),)
 # Hypotheses remain whose cost is below so many times the least, plus so much (C^2): a search of
 # depths leaves up to 0.03 C.
 MAX_COST_RATIO, COST_MARGIN = 1.75, 5e-4
+MAX_SELECTIVE_SIGMA = 0.5  # C, of stages that select: before, the true motion may cost half more
 
 
 class PlanarStages(NamedTuple):
@@ -281,17 +282,15 @@ class WindowFitter(Windows):
         ]
         solutions = map_parallel(lambda cut: planar_solutions(homography_flow(cut, Omega)), cuts)
         planes = solutions[0] + solutions[1]
-        found, ratio, margin = self.planar_hypotheses(centre, planes), MAX_SIMILAR_COST_RATIO, 0.0
-        if not found:
-            series = self.series(centre, self.half, MAX_HYPOTHESIS_EVENTS)
-            aligned = self.align(centre, self.initial_paths(centre, Omega, planes))
-            paths += [self.interpolate_to_nodes(path, series) for path in aligned]
-            found = self.rank(
-                self.refine_coarse_to_fine(centre, series, paths, COARSE_TO_FINE_STAGES)
-            )
-            ratio, margin = MAX_COST_RATIO, COST_MARGIN
-        limit = ratio * finite_cost(found[0]) + margin if found else 0.0
-        return [one for one in found if finite_cost(one) < limit]
+        found = self.planar_hypotheses(centre, planes)
+        if found:
+            limit = MAX_SIMILAR_COST_RATIO * finite_cost(found[0])
+            return [one for one in found if finite_cost(one) < limit]
+        series = self.series(centre, self.half, MAX_HYPOTHESIS_EVENTS)
+        aligned = self.align(centre, self.initial_paths(centre, Omega, planes))
+        paths += [self.interpolate_to_nodes(path, series) for path in aligned]
+        found = self.refine_coarse_to_fine(centre, series, paths, COARSE_TO_FINE_STAGES)
+        return self.rank([one for one in found if np.isfinite(one[1].cost)])
 
     def refine_coarse_to_fine(
         self, centre: int, series: PixelSeries, paths: list[Path], stages: tuple[Stage, ...]
@@ -310,10 +309,14 @@ class WindowFitter(Windows):
                 return _settle_and_refine(series, scene, prior, (stage,), sigma_floor=floor)
 
             found = map_parallel(refine, scenes)
-            scenes = [scene for scene, _ in found]
             if stage.sigma == NOISE_STAGE_SIGMA and found:
                 noise = min(report.noise for _, report in found)
                 self.sigma_floor[centre] = noise if noise > MIN_RESIDUAL_NOISE else 0.0
+            if stage.sigma <= MAX_SELECTIVE_SIGMA:
+                least = min(map(finite_cost, found), default=0.0)
+                limit = MAX_COST_RATIO * least + COST_MARGIN
+                found = [one for one in found if finite_cost(one) <= limit]
+            scenes = [scene for scene, _ in found]
         return found
 
     def refine_from(self, centre: int, warm: Path) -> Hypothesis:
