@@ -10,7 +10,8 @@ deviation over the seeds of such a mean, in per cent. Done parts are kept in the
 repeated. With --methods only those are fitted and scored, and nothing is fitted where none is
 tunable. The tables are those of all recordings, of slow and of fast ones, and the calibration of
 each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have its quality Q too, of
-every sixth image.
+every sixth image. "Outside" are pixels brighter or darker than frames see; "levels" is the
+part of their log MSE that the right mean of each connected region would take away.
 """
 
 import importlib.util
@@ -20,11 +21,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import scipy.ndimage
 from common import command_line, markdown_table
 from tqdm import tqdm
 
 import jaxevent
 from jaxevent.io import toml
+from jaxevent.metrics import LOG_OFFSET
 from jaxevent.parameters import read_toml
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
@@ -68,6 +71,32 @@ def quality(recording: jaxevent.Recording, method, params) -> float | None:
     return float(np.mean(jaxevent.metrics.hdr_quality(images, truth)))
 
 
+def log_errors_outside(recording: jaxevent.Recording) -> list:
+    """Return metrics of pixels brighter or darker than frames see.
+
+    One is their part of the log MSE, the other the part of that which would be gone if each
+    connected region had the right mean.
+    """
+    low, high = recording.extra["clip"]
+
+    def outside(image, truth):
+        error = np.log(np.maximum(image, 0) + LOG_OFFSET) - np.log(truth + LOG_OFFSET)
+        return np.where((truth < low) | (truth > high), error, 0)
+
+    def outside_range(image, truth) -> float:
+        return float(np.mean(outside(image, truth) ** 2))
+
+    def levels_outside(image, truth) -> float:
+        error, total = outside(image, truth), 0.0
+        for mask in (truth < low, truth > high):
+            region, count = scipy.ndimage.label(mask)
+            sums = np.bincount(region.ravel(), error.ravel(), count + 1)[1:]
+            total += (sums**2 / np.bincount(region.ravel(), minlength=count + 1)[1:]).sum()
+        return float(total / truth.size)
+
+    return [outside_range, levels_outside]
+
+
 def choose(labels: list[str], fitted: Path) -> list[tuple]:
     """Return labels, methods and their parameters, fitted ones where there are any.
 
@@ -96,10 +125,11 @@ def rows_of(paths: list[Path], methods: list[tuple], out: Path) -> list[dict]:
     done = {(row["method"], row["recording"]) for row in rows}
     for path in tqdm(paths, desc="scoring"):
         recording = jaxevent.load(path)
+        metrics = log_errors_outside(recording)
         for label, method, params in methods:
             if (label, recording.name) in done:
                 continue
-            row = score(recording, method, params, "reference")
+            row = score(recording, method, params, "reference", metrics=metrics)
             del row["per_frame"]
             row["Q"] = quality(recording, method, params)
             rows.append({**row, "method": label, "seed": int(path.stem.rpartition("_")[2])})
@@ -142,10 +172,20 @@ def table(rows: list[dict]) -> str:
         mine = [row for row in rows if row["method"] == label]
         seen = [row["Q"] for row in mine]
         Q = "-" if None in seen else f"{np.mean(seen):.2f}"
-        quality_lines.append([label, calibration(mine), Q])
+        outside, levels = (
+            float(np.mean([row[name] for row in mine]))
+            for name in ("outside_range", "levels_outside")
+        )
+        whole = float(np.mean([row["log_mse"] for row in mine]))
+        shares = f"{100 * outside / whole:.0f}, {100 * levels / outside:.0f}"
+        quality_lines.append([label, calibration(mine), shares, Q])
     tables = (
         markdown_table(["method", *MEASURES], lines),
-        markdown_table(["method", "z2 bright, dark, well", "Q"], quality_lines, 2),
+        markdown_table(
+            ["method", "z2 bright, dark, well", "% of log MSE outside, of that levels", "Q"],
+            quality_lines,
+            3,
+        ),
     )
     return "\n\n".join(tables) + "\n"
 

@@ -10,7 +10,7 @@ the one depth that fits the estimate best) and as general motion (a pure transla
 and two cuts of 13 and 99 ms of rotation, without frames.
 
 Parameters are those that suit the recording by themselves, those of `literal` are the thesis'
-(`Params.presets`). Every estimate counts for the time that what it saw shows (`centred`). Errors
+(`Params.presets`), at once. Every estimate counts for the time that what it saw shows. Errors
 are those of `scores.motion_errors` from 0.2 s to 0.1 s before the end, where all methods tell
 something, means over seeds: `failed` counts sequences without any estimate there, which are not in
 the means.
@@ -135,7 +135,7 @@ METHODS: dict[str, tuple[MotionEstimator[Any], dict[str, Any] | None]] = {
 def estimate_motion(label: str, model: str, recording: Recording) -> MotionEstimate:
     method, given = METHODS[label]
     params = None if given is None else method.Params.of(given[model])
-    more = {"smooth": False} if "smooth" in method.options else {}
+    more = {} if given is None else {"smooth": False}
     return method.estimate(recording, params, model=model, **more)
 
 

@@ -80,6 +80,19 @@ def test_motion_is_found_from_nothing(v, a):
 
 
 @pytest.mark.slow
+def test_motion_of_a_pattern_finer_than_coarse_pixels():
+    """The search began at a level on which two pixels are a period, and found -5 px."""
+    s, (y, x) = np.linspace(-1, 1, 11, dtype=np.float32), np.mgrid[:48, :64]
+    wave = [np.sin(np.pi * (x - 12 * t) / 10) * np.cos(np.pi * y / 10) for t in s]
+    L = 0.8 * np.array(wave, np.float32)
+    L += np.random.default_rng(0).normal(0, 0.05, L.shape).astype(np.float32)
+    pyramid = trajectories.ImagePyramid(L, np.full_like(L, 2.5e-3), 0.35)
+    plan = trajectories.plan_stages(s, 0.2)
+    p = trajectories.estimate_trajectories(pyramid, s, plan, COST).p
+    np.testing.assert_allclose(2 * np.median(p, (0, 1))[:2], (12, 0), atol=0.3)
+
+
+@pytest.mark.slow
 def test_motion_of_half_the_image_alone():
     s = np.array([-1, -0.5, 0, 0.5, 1], np.float32)
     still, moving = moved((0, 0), (0, 0), s), moved((3.0, 0), (0, 0), s)

@@ -168,7 +168,12 @@ def error_inflation(inliers: float) -> float:
 class WindowFitter(Windows):
     """Windows of a recording, and the fit of each."""
 
-    def rotation(self, centre: int) -> NDArray[np.float64]:
+    @functools.cached_property
+    def rotation(self) -> Callable[[int], NDArray[np.float64]]:
+        """The function of a window's centre that returns its rotation; it keeps the latest two."""
+        return functools.lru_cache(2)(self._find_rotation)
+
+    def _find_rotation(self, centre: int) -> NDArray[np.float64]:
         """Return the rotation (3,), rad/s, at the middle of a window, by a gyro if there is one."""
         if self.gyro is None:
             return sharpest_rotation(self.sample_events(centre, self.half / 3, MAX_FLOW_EVENTS))

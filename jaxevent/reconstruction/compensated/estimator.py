@@ -180,11 +180,7 @@ def make_instant_schedule(
     lag = int(np.median(np.diff(frames)) / 4) if len(frames) > 1 else 5000
     inner = np.linspace(0, max(last - lag - first, 0), N_SPEED_PROBES + 2)[1:-1]
 
-    def logs(times: NDArray[np.int64]) -> NDArray:
-        order = np.argsort(times, kind="stable")
-        return images(times[order])[0][np.argsort(order, kind="stable")]
-
-    speed = measure_image_speed(logs, first + inner.astype(np.int64), max(lag, 400))
+    speed = measure_image_speed(images.logs, first + inner.astype(np.int64), max(lag, 400))
     if not math.isfinite(speed):
         raise InputError(
             f"{recording.name}: with these parameters images at single instants are not finite; "
@@ -322,11 +318,23 @@ class TrajectoryEstimator:
         self._anchor, self._sought_motion = cached(self._make_anchor), cached(self._seek_motion)
         self._frame_motion = cached(self._seek_by_frames)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
+        self._latest: tuple[NDArray[np.int64], Any] | None = None  # times, and images
 
     def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
-        """Return L, V and clear at instants, and the smooth part that is subtracted from L."""
+        """Return L, V and clear at instants, and the smooth part that is subtracted from L.
+
+        The latest ones are remembered: motion that was sought is next refined on them.
+        """
+        if self._latest is None or not np.array_equal(self._latest[0], instants.t):
+            self._latest = None  # so that two are never held at once
+            self._latest = instants.t, self._read_images(instants)
+        return self._latest[1]
+
+    def _read_images(
+        self, instants: TargetInstants
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         L, V, clear = self.images(instants.t)
-        V = self.event_noise.inflate(instants.t, V)
+        self.event_noise.inflate(instants.t, V)
         if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
             return L, V, clear, None
         smooth = gaussian_blur(L)
@@ -416,10 +424,11 @@ class TrajectoryEstimator:
 
     def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
         """Pack the images of a target, its own replaced by one with less noise."""
-        L, V = target.L.copy(), self._cautious(target.V, target.clear)
-        L[target.instants.target] = image
-        V[target.instants.target] = FUSED_VARIANCE_FACTOR * P + self._cost.floor
-        return PackedImages.of(pack_images(L, V), target.instants.s)
+        own, V = target.instants.target, self._cautious(target.V, target.clear)
+        pixels = pack_images(target.L, V)
+        V = FUSED_VARIANCE_FACTOR * P + self._cost.floor
+        pixels[own] = pack_images(image[None], V[None])[0]
+        return PackedImages.of(pixels, target.instants.s)
 
     def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> NodeMotion:
         """Take a few steps at half resolution, on the clock on which frames agree better.
@@ -725,7 +734,7 @@ class CompensatedVideo(ImageSequence[Params]):
         s = target.instants.to_relative_times(at).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
-        V = self.trajectories.event_noise.inflate(at, V)
+        self.trajectories.event_noise.inflate(at, V)
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
             L, M = L - gaussian_blur(L), M - gaussian_blur(M)
