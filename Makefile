@@ -10,9 +10,9 @@ bin := .venv/bin
 # A worker that dies is a failed test and the end: pytest-xdist would wait for it for ever.
 # BLAS's threads wait for each other by spinning, and each core has a worker of its own: the tests of
 # batch fits take 20 s of CPU in place of 55 to 64 beside another program.
-# glibc gives memory back to the system and takes it again, a page fault each 4 kB: 16 million
-# faults in all of the tests. Told to keep what it has, it makes a sixth of them, and tests that
-# compile much take a tenth less of CPU. Other systems ignore the variables.
+# glibc gives memory back to the system and takes it again, a page fault each 4 kB: 2.8 million in
+# test_reconstruction.py. Told to keep what it has, it makes 0.4 million, and the tests take a tenth
+# less of CPU. Other systems ignore the variables.
 suite := MALLOC_TRIM_THRESHOLD_=1073741824 MALLOC_MMAP_THRESHOLD_=1073741824 \
     MALLOC_TOP_PAD_=67108864 OPENBLAS_NUM_THREADS=1 \
     $(bin)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
