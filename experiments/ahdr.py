@@ -10,7 +10,9 @@ deviation over the seeds of such a mean, in per cent. Done parts are kept in the
 repeated. With --methods only those are fitted and scored, and nothing is fitted where none is
 tunable. The tables are those of all recordings, of slow and of fast ones, and the calibration of
 each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have its quality Q too, of
-every sixth image.
+every sixth image. "Outside" are pixels brighter or darker than frames see; "levels" is the
+part of their log MSE that the right mean of each connected region would take away. With --known
+the simulated sensor's own numbers take the place of fitted ones.
 """
 
 import importlib.util
@@ -20,11 +22,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import scipy.ndimage
 from common import command_line, markdown_table
 from tqdm import tqdm
 
 import jaxevent
 from jaxevent.io import toml
+from jaxevent.metrics import LOG_OFFSET
 from jaxevent.parameters import read_toml
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import PROTOCOLS, Reference, frame_times
@@ -68,6 +72,32 @@ def quality(recording: jaxevent.Recording, method, params) -> float | None:
     return float(np.mean(jaxevent.metrics.hdr_quality(images, truth)))
 
 
+def log_errors_outside(recording: jaxevent.Recording) -> list:
+    """Return metrics of pixels brighter or darker than frames see.
+
+    One is their part of the log MSE, the other the part of that which would be gone if each
+    connected region had the right mean.
+    """
+    low, high = recording.extra["clip"]
+
+    def outside(image, truth):
+        error = np.log(np.maximum(image, 0) + LOG_OFFSET) - np.log(truth + LOG_OFFSET)
+        return np.where((truth < low) | (truth > high), error, 0)
+
+    def outside_range(image, truth) -> float:
+        return float(np.mean(outside(image, truth) ** 2))
+
+    def levels_outside(image, truth) -> float:
+        error, total = outside(image, truth), 0.0
+        for mask in (truth < low, truth > high):
+            region, count = scipy.ndimage.label(mask)
+            sums = np.bincount(region.ravel(), error.ravel(), count + 1)[1:]
+            total += (sums**2 / np.bincount(region.ravel(), minlength=count + 1)[1:]).sum()
+        return float(total / truth.size)
+
+    return [outside_range, levels_outside]
+
+
 def choose(labels: list[str], fitted: Path) -> list[tuple]:
     """Return labels, methods and their parameters, fitted ones where there are any.
 
@@ -90,16 +120,27 @@ def choose(labels: list[str], fitted: Path) -> list[tuple]:
     return methods
 
 
-def rows_of(paths: list[Path], methods: list[tuple], out: Path) -> list[dict]:
+def numbers_of_sensor(recording: jaxevent.Recording) -> dict[str, float]:
+    """Return what the simulated sensor has in the place of fitted thresholds, clock and so on."""
+    names = {"I0": "dark_offset", "rho_ref": "refractory"}
+    wanted = ("c_on", "c_off", "clock_offset", *names)
+    return {name: float(recording.extra[names.get(name, name)]) for name in wanted}
+
+
+def rows_of(paths: list[Path], methods: list[tuple], out: Path, known: bool) -> list[dict]:
     """Score methods on the recordings; rows are kept in a file."""
     rows = json.loads(out.read_text()) if out.exists() else []
     done = {(row["method"], row["recording"]) for row in rows}
     for path in tqdm(paths, desc="scoring"):
         recording = jaxevent.load(path)
+        metrics = log_errors_outside(recording)
         for label, method, params in methods:
             if (label, recording.name) in done:
                 continue
-            row = score(recording, method, params, "reference")
+            if known:
+                own = numbers_of_sensor(recording)
+                params = params.replace(**{k: own[k] for k in params.settings() if k in own})
+            row = score(recording, method, params, "reference", metrics=metrics)
             del row["per_frame"]
             row["Q"] = quality(recording, method, params)
             rows.append({**row, "method": label, "seed": int(path.stem.rpartition("_")[2])})
@@ -142,10 +183,20 @@ def table(rows: list[dict]) -> str:
         mine = [row for row in rows if row["method"] == label]
         seen = [row["Q"] for row in mine]
         Q = "-" if None in seen else f"{np.mean(seen):.2f}"
-        quality_lines.append([label, calibration(mine), Q])
+        outside, levels = (
+            float(np.mean([row[name] for row in mine]))
+            for name in ("outside_range", "levels_outside")
+        )
+        whole = float(np.mean([row["log_mse"] for row in mine]))
+        shares = f"{100 * outside / whole:.0f}, {100 * levels / outside:.0f}"
+        quality_lines.append([label, calibration(mine), shares, Q])
     tables = (
         markdown_table(["method", *MEASURES], lines),
-        markdown_table(["method", "z2 bright, dark, well", "Q"], quality_lines, 2),
+        markdown_table(
+            ["method", "z2 bright, dark, well", "% of log MSE outside, of that levels", "Q"],
+            quality_lines,
+            3,
+        ),
     )
     return "\n\n".join(tables) + "\n"
 
@@ -178,6 +229,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sensor", choices=list(SENSORS), default="davis")
     parser.add_argument("--methods", nargs="+", choices=LABELS, default=LABELS, metavar="LABEL")
+    parser.add_argument("--known", action="store_true", help="thresholds etc. of the sensor itself")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
     paths = record(out / "test", TESTING_SCENES, range(2, 2 + arguments.seeds), arguments.sensor)
@@ -192,7 +244,12 @@ def main() -> None:
         config = out / "fit.toml"
         config.write_text(toml.dump(plan))
         fit(config, fitted, resume=(fitted / "checkpoint").exists(), progress=sys.stderr.isatty())
-    rows = rows_of(paths, choose(arguments.methods, fitted / "params.toml"), out / "scores.json")
+    rows = rows_of(
+        paths,
+        choose(arguments.methods, fitted / "params.toml"),
+        out / "scores.json",
+        arguments.known,
+    )
     text = table(rows)
     for speed in SECONDS:
         own = [row for row in rows if f"_{speed}_" in row["recording"]]

@@ -80,6 +80,13 @@ MUTATIONS = (
         "tests/reconstruction/test_own_filter.py -k gradients",
     ),
     Mutation(
+        "AKS: the likelihood forgets that the state is uncertain",
+        "jaxevent/reconstruction/smoother.py",
+        "s2 = state.P + row.r\n",
+        "s2 = row.r\n",
+        "tests/test_gallery.py -k fit_noise",
+    ),
+    Mutation(
         "threads read one video at the same time",
         "jaxevent/reconstruction/video.py",
         "self._turns.iterate(self._read(times))",

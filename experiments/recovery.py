@@ -265,10 +265,7 @@ def voting_recovery(seed: int, names: tuple[str, ...] = ("noise", "alpha")) -> R
 
 
 VOTES = {"r_t": 50.0}
-VOTES_SETTINGS: dict[str, Any] = {
-    "likelihood": "literal", "radius": 5, "per_pixel": 1, "tau_max": 0.15, "every": 1, "batch": 4,
-    "longest": 0.02, "candidates": 25, "d_max": 1e3, "noise": 0.6, "alpha_literal": 4.0,
-}  # fmt: skip
+VOTES_SETTINGS = {"radius": 5, "noise": 0.6, "alpha_literal": 4.0}
 
 
 def from_literal_votes(seed: int, seconds: float = 2.0) -> tuple[Recording, KnownMotion]:

@@ -15,16 +15,6 @@ def recovery():
 
 
 @pytest.mark.slow
-def test_intervals_hold_what_the_data_were_drawn_with(recovery, optimised):
-    """Of the smoother; of the other methods the script says it."""
-    true, told = recovery.model_recovery(0, size=(28, 24))
-    for name, value in true.items():
-        one = told[name]
-        assert one.holds(value) and not one.holds(one.start), (name, value, one)
-        assert 0.5 * value < one.low < one.high < 2 * value
-
-
-@pytest.mark.slow
 def test_intervals_hold_the_noises_of_the_akf(recovery, optimised):
     """The demonstration in small."""
     true, names = recovery.AKF, ["sigma_proc", "sigma_iso"]

@@ -61,7 +61,8 @@ axes[1].legend()
 # A blob that grows comes nearer. `blob.quantities.growth` gives the inverse of its time to contact,
 # which is defined at rest, and its variance. `inverse_ttc` compares two blobs at one depth, and
 # `size_range` gives the range of one of known size. This blob comes from 17 m at 8 m/s. Errors of
-# sizes last, those of smoothed tracks longer, so take filtered ones and give `Q_lambda`.
+# sizes last, those of smoothed tracks longer, so take filtered ones. Given `Q_lambda`, `growth`
+# undoes the filter's lag and knows how long its errors last.
 
 # %%
 scene, _ = jaxevent.simulate.blob_scene("growing", seed=100, rate=20_000)
@@ -78,8 +79,7 @@ grown[["t", "inverse_ttc", "sigma_inverse_ttc", "true_inverse"]].tail()
 
 # %% [markdown]
 # The time to contact is the inverse, with the deviation $\sigma_g / g^2$ to first order, where the
-# inverse is some deviations above zero. Rows at close times share their error: that all of these
-# are off to the same side is one draw, not five.
+# inverse is some deviations above zero. Rows at close times share their error.
 
 # %%
 g, sigma_g = grown["inverse_ttc"], grown["sigma_inverse_ttc"]

@@ -92,8 +92,8 @@ def growth(
 
     The scale w = 1 / sqrt(lambda1 lambda2) is proportional to depth, so that at constant speed it
     is a line in time and 1 / TTC = -w' / w: a Kalman filter of (w, w'), exactly linear, whose
-    measurements are the track's sizes. Before the second measurement the variance is that of the
-    prior, about 100 1/s^2.
+    measurements are the track's sizes, which lag where the track is filtered. Before the second
+    measurement the variance is that of the prior, about 100 1/s^2.
 
     Args:
         times: Sorted times (times,), s.
@@ -103,9 +103,9 @@ def growth(
             all.
         Q: Spectral density of the speed's changes relative to the depth, 1/s^3. 0 is constant
             speed: the least squares line.
-        Q_lambda: The filter's own `Q_lambda`, px^2/s. A track's errors at close times are
-            correlated; given it, sizes weigh as much as the events behind them. None: independent
-            errors.
+        Q_lambda: The filter's own `Q_lambda`, px^2/s, of a filtered track. Its errors at close
+            times are correlated, and its sizes lag; given it, they weigh as much as the events
+            behind them, and their lag is undone. None: independent errors without a lag.
         smooth: Whether all times are used for each (Rauch-Tung-Striebel), or those up to it.
 
     Returns:
@@ -120,20 +120,23 @@ def growth(
     w = jnp.exp(reference - logarithm)
     dt = jnp.diff(times, prepend=times[:1])
     R = w**2 * _relative_noise(times, relative, covariance, valid, Q_lambda)
+    lag = _lag(times, covariance, valid, Q_lambda)
 
     def product(a, b):
         return jnp.sum(a[:, :, None] * b[None], 1)  # faster to compile and run than a dot
 
     def forward(state, row):
         m, P = state
-        dt, w, R, valid = row
+        dt, w, R, lag, valid = row
         F = jnp.array([[1.0, dt], [0.0, 1.0]])
         noise = Q * m[0] ** 2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         predicted = jnp.sum(F * m, 1), product(product(F, P), F.T) + noise
         m, P = predicted
-        gain = jnp.where(valid, P[:, 0] / (P[0, 0] + R), 0)
-        m = m + gain * (w - m[0])
-        keep = jnp.eye(2, dtype=w.dtype).at[:, 0].add(-gain)
+        H = jnp.stack([jnp.ones_like(lag), -lag])  # the size of then
+        toward = jnp.sum(P * H, 1)
+        gain = jnp.where(valid, toward / (jnp.sum(H * toward) + R), 0)
+        m = m + gain * (w - jnp.sum(H * m))
+        keep = jnp.eye(2, dtype=w.dtype) - gain[:, None] * H
         fresh = gain[:, None] * gain * jnp.where(valid, R, 0)
         P = product(product(keep, P), keep.T) + fresh
         return (m, P), ((m, P), predicted, F)
@@ -150,7 +153,7 @@ def growth(
 
     first = w[jnp.argmax(valid)]
     prior = jnp.array([1.0, 0.0]) * first, 100 * first**2 * jnp.eye(2, dtype=w.dtype)
-    end, (state, predicted, F) = lax.scan(forward, prior, (dt, w, R, valid))
+    end, (state, predicted, F) = lax.scan(forward, prior, (dt, w, R, lag, valid))
     if smooth:
         # A last step of dt = 0 leads from the end to itself.
         F = jnp.concatenate([F[1:], F[:1]])
@@ -175,11 +178,30 @@ def _relative_noise(
     # is not. The mean of many samples whose errors have the correlation r^k, r = exp(-dt / tau),
     # has the variance of independent ones times (1 + r) / (1 - r) = coth(dt / (2 tau)). So samples
     # at dt << tau make P^2 / Q, the density of events' noise.
-    P_lambda = jnp.maximum((covariance[:, 4, 4] + covariance[:, 5, 5]) / 2, 1e-10)
+    P_lambda = _size_variance(covariance)
     last = jnp.max(jnp.where(valid, times, times[0]))
     span = last - jnp.min(jnp.where(valid, times, times[-1]))
     every = jnp.maximum(span, 0) / jnp.maximum(jnp.sum(valid) - 1, 1)
     return R / 2 / jnp.tanh(jnp.maximum(every * Q_lambda / (2 * P_lambda), 1e-6))
+
+
+def _size_variance(covariance: Array) -> Float[Array, " times"]:
+    """Return the mean variance of both sizes, px^2, not below what would be exact."""
+    return jnp.maximum((covariance[:, 4, 4] + covariance[:, 5, 5]) / 2, 1e-10)
+
+
+def _lag(
+    times: Array, covariance: Array, valid: Array, Q_lambda: Number | None
+) -> Float[Array, " times"]:
+    """Return by how much the sizes of a filter lag, s.
+
+    A settled filter forgets over P / Q. One that has not settled holds the mean since its start,
+    which lags by half of the time since then.
+    """
+    if Q_lambda is None:
+        return jnp.zeros_like(times)
+    age = times - jnp.min(jnp.where(valid, times, times[-1]))
+    return jnp.minimum(_size_variance(covariance) / Q_lambda, jnp.maximum(age, 0) / 2)
 
 
 def size_range(

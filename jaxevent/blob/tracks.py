@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaxevent.blob.lifecycle import END_REASONS, LifecycleLog
 from jaxevent.blob.prepare import ChunkPacker, PackingCursor, Segment
 from jaxevent.blob.run import count_numbers
+from jaxevent.blob.shape import N_SHAPE_TIMES, UsualSizes, fit_usual_sizes, shape_covariance
 from jaxevent.blob.track import TrackStates
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
@@ -109,6 +110,19 @@ def _concatenate_states(parts: Sequence[TrackStates]) -> TrackStates:
         for name in ("mean", "covariance", "valid", "idle")
     )
     return TrackStates(mean, covariance, valid, idle, parts[0].id)
+
+
+def _add_shape_covariance(
+    states: TrackStates, times: NDArray[np.int64], usual: list[UsualSizes | None]
+) -> None:
+    """Add what changes of shape tell of positions to the covariance of states, in place."""
+    for k, sizes in enumerate(usual):
+        alive = states.valid[:, k]
+        if sizes is not None and alive.any():
+            mean, covariance = states.mean[alive, k], states.covariance[alive, k]
+            more = shape_covariance(sizes, times[alive] * 1e-6, mean, covariance)
+            covariance[:, :2, :2] += more
+            states.covariance[alive, k] = covariance
 
 
 class Tracks(HtmlRepr):
@@ -223,8 +237,10 @@ class Tracks(HtmlRepr):
         def join_held() -> tuple[NDArray[np.int64], TrackStates]:
             return np.concatenate([t for t, _ in held]), _concatenate_states([s for _, s in held])
 
-        for piece in self._read_by_segment(times, ids, extrapolate):
-            held.append(piece)
+        usual = [self._usual_sizes[k] for k in self._indices_of(ids)]
+        for now, piece in self._read_by_segment(times, ids, extrapolate):
+            _add_shape_covariance(piece, now, usual)
+            held.append((now, piece))
             if sum(states.valid.size for _, states in held) >= MAX_STATES_PER_READOUT:
                 yield join_held()
                 held.clear()
@@ -331,6 +347,20 @@ class Tracks(HtmlRepr):
                 segment.row[valid][now], t[now], self._id_of[serial[valid][now]],
                 weight[valid][now],
             )  # fmt: skip
+
+    @functools.cached_property
+    def _usual_sizes(self) -> list[UsualSizes | None]:
+        """Usual sizes of the tracks of found targets, from filtered states; None where unknown."""
+        if self._packer.found_ends is None or not len(self):
+            return [None] * len(self)
+        times = np.linspace(self.start, self.stop - 1, N_SHAPE_TIMES).astype(np.int64)
+        pieces = list(self.filtered._read_by_segment(np.unique(times), None, False))
+        t = np.concatenate([now for now, _ in pieces])
+        states = _concatenate_states([states for _, states in pieces])
+        return [
+            fit_usual_sizes(t[alive] * 1e-6, states.mean[alive, k, 4:6])
+            for k, alive in enumerate(states.valid.T)
+        ]
 
     def _indices_of(self, ids: Sequence[int] | NDArray[np.integer] | None) -> NDArray[np.int64]:
         """Return the indices of tracks in the arrays."""

@@ -60,6 +60,7 @@ class Positions(NamedTuple):
     mean: NDArray[np.float32]  # over the exposure
     edges: NDArray[np.float32]  # mean of those at its begin and its end
     travel: NDArray[np.float32]  # from its begin to its end
+    spread: NDArray[np.float32]  # of errors of events, see `_spread`
 
 
 def sort_by_pixel(stretch: SampledSegment, clear: NDArray[np.bool_]) -> PixelEvents:
@@ -166,11 +167,48 @@ def _area(counts, bend, integral, k, channel, gap, u):
     return integral[k - 1, channel] + line - curve
 
 
+@njit_noalloc_inlined
+def _spread(t, k, m, u, v, length):
+    """Return how errors of events remain in the mean over an exposure of events k to m - 1.
+
+    An error of one event stands on the lines to its neighbours. So the mean has weights w of the
+    events k - 1 to m, and the mean of both ends has weights e. Returned are the sums over events of
+    w^2 and of w (e - w), and the same of errors that add up from event to event: of C (E - C), C
+    and E the sums of w and e from an event on, and of those before it.
+    """
+    squares = products = late = early = carried = before = ends_before = 0.0
+    for j in range(k, m + 2):
+        left = right = 0.0
+        if j <= m:
+            first, last = (u if j == k else 0.0), (v if j == m else 1.0)
+            right = (t[j] - t[j - 1]) * (last * last - first * first) / 2
+            left = (t[j] - t[j - 1]) * (last - first) - right
+        weight = (carried + left) / length
+        end = 0.0
+        if j == k:
+            end += (1 - u) / 2
+        if j == k + 1:
+            end += u / 2
+        if j == m:
+            end += (1 - v) / 2
+        if j == m + 1:
+            end += v / 2
+        squares += weight * weight
+        products += weight * (end - weight)
+        before += weight
+        ends_before += end
+        if j <= m:
+            late += (1 - before) * (before - ends_before)
+            early += before * (ends_before - before)
+        carried = right
+    return squares, products, late, early
+
+
 @njit_noalloc
 def _read(events, path, begin, end, longest, out):
     _, p, first, _, clear = events
     t, counts, bend, integral, _ = path
-    good, gaps, mean, edges, travel = out
+    good, gaps, mean, edges, travel, spread = out
     for i in range(len(first) - 1):
         low, high = first[i], first[i + 1]
         k = low  # the first event not before the time
@@ -190,6 +228,9 @@ def _read(events, path, begin, end, longest, out):
             good[i, f], gaps[i, f] = True, gap
             u = (begin[f] - t[k - 1]) / before if before > 0 else 1.0
             v = (end[f] - t[m - 1]) / after if after > 0 else 1.0
+            parts = _spread(t, k, m, u, v, end[f] - begin[f])
+            for part in range(4):
+                spread[i, f, part] = parts[part]
             for channel in range(4):
                 at_begin = _level(counts, bend, k, channel, before, u)
                 at_end = _level(counts, bend, m, channel, after, v)
@@ -225,6 +266,6 @@ def read_positions(
     begin = middle_us - length_us / 2
     shape = len(events.active), len(middle_us)
     good, gap = np.empty(shape, np.bool_), np.empty(shape, np.float32)
-    out = Positions(good, gap, *(np.empty((*shape, 4), np.float32) for _ in range(3)))
+    out = Positions(good, gap, *(np.empty((*shape, 4), np.float32) for _ in range(4)))
     _read(events, path, begin, begin + length_us, longest, out)
     return out

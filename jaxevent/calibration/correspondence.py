@@ -25,6 +25,7 @@ MIN_PIXELS = 50  # clear in both frames
 MIN_EVENTS = 4
 N_PARTS = 8  # of the pairs, each left out in turn for the error of the offset
 FAR_STEPS = 12  # lag at which events belong to other frames
+MIN_SIGNIFICANCE = 6.0  # of a relation that is no chance, among some hundred that are tried
 
 # What brings events to the frames' pixels, and the same of the frames' changes, taken back.
 TRANSFORMS: Mapping[str, Callable[[NDArray], NDArray]] = MappingProxyType(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.correspondence import measure_correspondence
+from jaxevent.calibration.correspondence import MIN_SIGNIFICANCE, measure_correspondence
 from jaxevent.calibration.events_alone import (
     CONFIDENCE_Z,
     estimate_dead_time,
@@ -18,11 +18,13 @@ from jaxevent.calibration.model import (
     DEGREES_OF_FREEDOM,
     GAUSSIAN_SCALE,
     MAX_EXPOSURE_INTERVALS,
+    MIN_CHANGES,
     SHORTEST_US,
     Fit,
     Model,
     Physics,
     cluster_sums,
+    sandwich,
 )
 from jaxevent.calibration.result import Calibration, CalibrationValue, not_identifiable
 from jaxevent.calibration.sampling import (
@@ -39,7 +41,6 @@ OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
 MIN_PEAK_RATIO = 2.0  # of the highest correlation to those far from it
 MIN_NEAR_SHARE = 0.95  # of the correlation within an interval of the stamps to the highest
-MIN_SIGNIFICANCE = 6.0  # as of the checks for faults
 MIN_POLARITY_SHARE = 0.05  # of the rarer polarity
 EARLIER_STARTS_S = (0.0, 3e-3, 8e-3)  # counts of whole events are late
 MAX_FIRST_PIXELS = 10_000  # of the fits that choose among starts
@@ -114,7 +115,7 @@ def find_offset(sample: Sample, I0: float) -> Clock:
 
 
 def _is_significant(sample: Sample) -> bool:
-    """Return whether events agree with frames at the stamps beyond chance, tile by tile."""
+    """Return whether events agree with frames at some lag beyond chance, tile by tile."""
     found = measure_correspondence(sample)
     return found is not None and float(found.significance[0].max()) > MIN_SIGNIFICANCE
 
@@ -278,7 +279,16 @@ def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     if (known > 0).all():
         length = float(np.median(known)) * 1e-6
         return CalibrationValue(length, length, length, "s", "as the recording says")
-    square, error = float(fit.physics.theta[4]), math.sqrt(float(fit.covariance[4, 4]))
+    # Within the time between two events a path's curvature is hardly known. So the step to a
+    # shorter exposure is taken from one as long as that.
+    theta, moves = fit.physics.theta.copy(), np.array([0, 1, 2, 4])
+    theta[4] = max(theta[4], _gap(fit, 4, 2))
+    changes = model.changes(theta)
+    if not fit.covariance[4, 4] > 0 or len(changes.loose) < MIN_CHANGES:
+        return not_identifiable("s", "too few pixels change brightness while frames are taken")
+    fit, move = model.step(Physics(theta, fit.physics.V), changes, moves)
+    covariance = sandwich(fit.terms.J[:, moves], fit.weight, fit.terms.residual, changes)
+    square, error = max(float(theta[4] + move[4]), 0.0), math.sqrt(float(covariance[3, 3]))
     # Interpolation smooths paths between events, as a longer exposure would.
     blur = _gap(fit, 4, 2)
     square += BLUR_OF_GAPS * blur
@@ -317,8 +327,8 @@ def _noises(fit: Fit) -> tuple[CalibrationValue, CalibrationValue]:
     score = 0.5 * part * (fit.weight * fit.terms.residual**2 - 1)[:, None]
     H = 0.5 * nu / (nu + 3) * part.T @ part
     inverse = np.linalg.pinv(H)
-    meat = np.max([cluster_sums(score, changes, by) for by in ("tile", "interval")], 0)
-    error = np.sqrt(np.diag(inverse @ meat @ inverse)) / 2
+    meats = [cluster_sums(score, changes, by) for by in ("tile", "interval")]
+    error = np.sqrt(np.max([np.diag(inverse @ meat @ inverse) for meat in meats], 0)) / 2
     sigma = GAUSSIAN_SCALE * np.sqrt(V)
     out = []
     for row, unit in ((0, "grey"), (2, "c")):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration.clipping import MAX_CLIPPED_SHARE, MIN_CLIPPED_SHARE, find_clipping
 from jaxevent.calibration.correspondence import (
     I0,
+    MIN_SIGNIFICANCE,
     TRANSFORMS,
     Correspondence,
     measure_correspondence,
@@ -31,12 +32,11 @@ MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
 MAX_BURST_SHARE = 0.05  # of the events
 MAX_POLARITY_SHARE, MIN_POLARITIES = 0.95, 1_000
-SIGMAS = 6.0  # of a correlation that is not chance, among some hundred that are tried
 MIN_ADVANTAGE = 2.0  # of a correlation over that of the recording as it is
 MIN_BUSY = 100  # pixels with several events between frames, which determine clock and exposure
 # Tiles with such pixels: where all of them agree, the significance is the root of their number,
 # and half of that is usual.
-MIN_RELATED = (2.5 * SIGMAS) ** 2
+MIN_RELATED = (2.5 * MIN_SIGNIFICANCE) ** 2
 MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half the interval
 MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
 MAX_DILUTION = 1.25  # of the change per event; slow scenes without blur reach 1.1
@@ -101,27 +101,22 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
 
 def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
     """Check the share of hot pixels, and that of their events."""
-    remedy = (
-        "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
-        "calibrate(recording).hot_pixels"
-    )
-    share = float(sample.hot.mean())
+    share, number = float(sample.hot.mean()), int(sample.hot.sum())
     events = sample.counts.sum(0)
     of_events = float(events[sample.hot].sum() / max(events.sum(), 1))
+    statistic, limit = of_events, MAX_HOT_EVENTS_SHARE
+    text = f"{number} hot {plural('pixel', number)} made {100 * of_events:.3g} % of the events"
     if share > MAX_HOT_SHARE:
-        yield Fault(
-            "hot pixels", share, MAX_HOT_SHARE,
+        statistic, limit = share, MAX_HOT_SHARE
+        text = (
             f"{100 * share:.3g} % of the pixels fire in all parts of the recording, unlike those "
-            "around them",
-            remedy,
-        )  # fmt: skip
-    else:
-        number = int(sample.hot.sum())
-        yield Fault(
-            "hot pixels", of_events, MAX_HOT_EVENTS_SHARE,
-            f"{number} hot {plural('pixel', number)} made {100 * of_events:.3g} % of the events",
-            remedy,
-        )  # fmt: skip
+            "around them"
+        )
+    yield Fault(
+        "hot pixels", statistic, limit, text,
+        "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
+        "calibrate(recording).hot_pixels",
+    )  # fmt: skip
 
 
 def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:
@@ -202,7 +197,7 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         sample = turn_events(sample, *turn)
         correspondence = measure_correspondence(sample) or correspondence
     has_polarity = not one_sign and (relation is None or turn is not None)
-    is_related = has_polarity and correspondence.significance[0].max() > SIGMAS
+    is_related = has_polarity and correspondence.significance[0].max() > MIN_SIGNIFICANCE
     yield from _check_brightness(sample, correspondence.offset if is_related else 0.0, has_polarity)
     if is_related:
         yield from _check_clock(correspondence)
@@ -231,7 +226,7 @@ def _check_relation(
     """
     r, z = correspondence.correlation, correspondence.significance
     here = max(float(r[0].max()), 0.0)
-    real = np.where(np.abs(z) > SIGMAS, r, 0)
+    real = np.where(np.abs(z) > MIN_SIGNIFICANCE, r, 0)
     kind, lag = np.unravel_index(np.argmax(np.abs(real)), real.shape)
     found, significance = float(real[kind, lag]), float(abs(z[kind, lag]))
     name = list(TRANSFORMS)[kind]
@@ -239,14 +234,16 @@ def _check_relation(
         inverse = "polarity inverted" if found < 0 else ""
         changed = " and ".join(part for part in (name, inverse) if part)
         return (name, found < 0), Fault(
-            "flipped or swapped axes" if kind else "inverted polarity", significance, SIGMAS,
+            "flipped or swapped axes" if kind else "inverted polarity",
+            significance, MIN_SIGNIFICANCE,
             f"events correlate with the changes of the frames by {here:.2f} at most, with "
             f"{changed} by {abs(found):.2f}",
-            f"make the recording of events with {changed}",
+            f"make the recording of events with {changed}"
+            + (", dataclasses.replace(events, p=~events.p)" if inverse else ""),
         )  # fmt: skip
-    if not found and correspondence.activity > SIGMAS:
+    if not found and correspondence.activity > MIN_SIGNIFICANCE:
         return None, Fault(
-            "lost polarity", correspondence.activity, SIGMAS,
+            "lost polarity", correspondence.activity, MIN_SIGNIFICANCE,
             f"events come where and when frames change, but their polarity says nothing about the "
             f"sign: the correlation is {float(np.abs(r[0]).max()):.2f} at most",
             "read the file again with the column or bit of its polarity; use methods without "
@@ -283,7 +280,8 @@ def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
             "clock offset", abs(offset), MAX_OFFSET_INTERVALS * interval * 1e-6,
             f"frames fit the events best {abs(offset) * 1e3:.1f} ms "
             f"{'later' if offset > 0 else 'earlier'} than their stamps",
-            f"set clock_offset = {offset:.4f}, or let calibrate(recording) find it",
+            f"add {round(1e6 * offset)} us to the frames' times, or leave them: calibration finds "
+            "the parameter clock_offset",
         )  # fmt: skip
 
 

@@ -69,7 +69,9 @@ class Changes(NamedTuple):
     by_clock: NDArray[np.float64]  # (2, n) derivatives, 1/s
     by_square: NDArray[np.float64]  # (2, n) derivatives by the exposure's square, 1/s^2
     travel: NDArray[np.float64]  # (2, 2, n) ON and OFF counts within both exposures
-    loose: NDArray[np.float64]  # (n,) 0 to 2, with the time between events around the frames
+    loose: NDArray[np.float64]  # (n,) 0 to 2, see `Positions.spread`
+    loose_by_square: NDArray[np.float64]  # (n,) derivative by the exposure's square, 1/s^2
+    sum_by_square: NDArray[np.float64]  # (n,) the same of errors that add up
     gap: NDArray[np.float64]  # (n,) that time's mean of both frames, s
     tile: NDArray[np.intp]  # (n,)
     interval: NDArray[np.intp]  # (n,) number of the pair of frames
@@ -83,6 +85,7 @@ class Terms(NamedTuple):
     residual: NDArray[np.float64]  # (n,) ln I
     J: NDArray[np.float64]  # (n, 5) derivatives of the predicted change by theta
     X: NDArray[np.float64]  # (3, n) factors of the three variances
+    X_by_square: NDArray[np.float64]  # (2, n) derivatives of the last two by exposure's square
     log_slope: NDArray[np.float64]  # (n,) mean ln(I + I0) of both frames
 
 
@@ -123,7 +126,8 @@ def make_terms(changes: Changes, theta: NDArray[np.float64], I0: float, noise: f
     residual = logs[1] - logs[0] - (bend[1] - bend[0]) - J[:, :2] @ theta[:2]
     of_events = theta[0] ** 2 * abs(n[0]) + theta[1] ** 2 * abs(n[1])
     X = np.stack([(relative**2).sum(0), theta[0] * theta[1] * changes.loose, of_events])
-    return Terms(residual, J, X, np.log(level).mean(0))
+    X_by_square = np.stack([changes.loose_by_square, changes.sum_by_square]) * theta[0] * theta[1]
+    return Terms(residual, J, X, X_by_square, np.log(level).mean(0))
 
 
 class Model:
@@ -202,7 +206,10 @@ class Model:
                 (e - m)[:2] / (2 * length[f] ** 2)
                 for e, m, f in zip(edges, mean, ends, strict=True)
             ]
-            loose = [1 / (1 + self.interval_s / 4 / at.gap[row, f]) for f in ends]
+            # The longer the time between events, the larger are errors of the interpolation. Of an
+            # instant two thirds remain on average.
+            loose = [1.5 / (1 + self.interval_s / 4 / at.gap[row, f]) for f in ends]
+            spread = [at.spread[row, f].astype(np.float64).T for f in ends]
             parts.append(
                 Changes(
                     np.stack([stretch.intensity[f, pixel] for f in ends]),
@@ -211,7 +218,12 @@ class Model:
                     slope[1] - slope[0],
                     square[1] - square[0],
                     np.stack([v[:2] for v in travel]),
-                    np.add(*loose),
+                    sum(a * s[0] for a, s in zip(loose, spread, strict=True)),
+                    sum(
+                        a * s[1] / length[f] ** 2
+                        for a, s, f in zip(loose, spread, ends, strict=True)
+                    ),
+                    spread[0][3] / length[pair] ** 2 + spread[1][2] / length[pair + 1] ** 2,
                     (at.gap[row, pair] + at.gap[row, pair + 1]).astype(np.float64) / 2,
                     self.sample.tile[pixel],
                     pair + interval,
@@ -274,8 +286,15 @@ class Model:
         A = (J * weight[:, None]).T @ J
         # A little damping keeps what the data do not determine where it is.
         H = A + np.diag(1e-6 * np.diag(A) + 1e-12)
+        # A longer exposure averages errors of events away, so that residuals fall without being
+        # nearer to the truth. What they fall by is taken from the gradient.
+        gradient = terms.J.T @ (weight * terms.residual)
+        gradient[4] += ((V[1:] @ terms.X_by_square) / (V @ terms.X)).sum() / 2
         move = np.zeros(5)
-        move[moves] = np.linalg.solve(H, J.T @ (weight * terms.residual))
+        move[moves] = np.linalg.solve(H, gradient[moves])
+        if move[4] < 0 and physics.theta[4] <= (1e-6 * SHORTEST_US) ** 2:
+            move[4], inner = 0, moves[moves != 4]
+            move[inner] = np.linalg.solve(H[moves != 4][:, moves != 4], gradient[inner])
         losses = losses_of(terms.residual, V @ terms.X)
         new = Physics(physics.theta, V)
         return Fit(new, np.zeros((5, 5)), losses, changes, terms, weight), move

@@ -18,6 +18,7 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.truth import KnownMotion, find_imu_axes
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.metrics import MEASURE_MEANINGS
+from jaxevent.recording import Times, microseconds
 
 OUTLIER_RELATIVE_ERROR = (
     0.05  # relative magnitude error from which a vector is an outlier in the thesis
@@ -257,7 +258,7 @@ def warn_of_gyro_axes(motion: MotionEstimate, truth: KnownMotion) -> None:
 def score_motion(
     motion: MotionEstimate,
     truth: KnownMotion,
-    times: NDArray[np.int64],
+    times: Times,
     *,
     start: int | None = None,
     centred: bool | None = None,
@@ -268,7 +269,8 @@ def score_motion(
     Args:
         motion: The estimate.
         truth: The known motion.
-        times: (n,) times, us; those at which the truth is unknown are left out.
+        times: (n,) times, integers in us or floats in s; those at which the truth is unknown are
+            left out.
         start: Time of the first event, us; by default the first of the times.
         centred: Whether to use fixed-lag estimates.
         description: The truth in words.
@@ -277,6 +279,7 @@ def score_motion(
         The errors. An `InputWarning` tells of a gyro that agrees in other axes.
     """
     warn_of_gyro_axes(motion, truth)
+    times = np.atleast_1d(microseconds(times))
     times = times[truth.covers(times)]
     estimate = motion(times, centred=centred, extrapolate=True)
     start = int(times[0]) if start is None and len(times) else start or 0

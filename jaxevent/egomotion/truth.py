@@ -162,7 +162,10 @@ def from_gyro(
             f"the gyro's bias {bias.tolist()} is not possible; give three rates, rad/s"
         )
     if not _is_rotation(R):
-        raise InputError("the rotation from the gyro to the camera is none; give a (3, 3) rotation")
+        raise InputError(
+            "the rotation from the gyro to the camera is no rotation; give an orthogonal matrix "
+            f"(3, 3), or a name, {', '.join(IMU_AXES)}"
+        )
     if not len(imu) or not np.isfinite(imu.gyro).all():
         raise InputError(
             f"an IMU of {len(imu)} samples, not all of them finite, determines no rotation; give a "
@@ -211,11 +214,13 @@ def imu_rotation(text: str) -> NDArray[np.float64]:
         R = np.array([float(part) for part in text.split(",")]).reshape(3, 3)
     except ValueError:
         raise InputError(
-            f"--imu-rotation {text!r} is not known; give {', '.join(IMU_AXES)}, or the "
-            "nine numbers of a rotation matrix, row by row"
+            f"the axes {text!r} of the gyro (rotation, --imu-rotation) are not known; give "
+            f"{', '.join(IMU_AXES)}, or the nine numbers of a rotation matrix, row by row"
         ) from None
     if not _is_rotation(R):
-        raise InputError(f"--imu-rotation {text} is no rotation; give an orthogonal matrix")
+        raise InputError(
+            f"{text} (rotation, --imu-rotation) is no rotation; give an orthogonal matrix"
+        )
     return R
 
 
@@ -335,6 +340,8 @@ def known_motion(
     """
     check_recording(recording, "known_motion")
     model = find_model(model)
+    if isinstance(rotation, str):
+        rotation = imu_rotation(rotation)
     if isinstance(source, pd.DataFrame):
         return motion_from_table(source, model, f"{recording.name}: the true motion")
     if source not in ("auto", "poses", "gyro"):

@@ -27,7 +27,8 @@ which have the information I_r together, are n_r in effect, and differ by D_r in
 
     C = min_r  I_r^-1 + beta D_r / n_r                                                          (5)
 
-The first term is the noise of events, the second what smoothness and unequal motion add.
+The first term is the noise of events, the second what smoothness and unequal motion add. A velocity
+is uncertain by its clock, too: by the mean square of what smoothing takes from the clock's rates.
 """
 
 from typing import Any, NamedTuple
@@ -257,6 +258,11 @@ def _quadratic_basis(x: NDArray, y: NDArray) -> NDArray[np.float64]:
     return np.array([along_x, [zero, zero, zero, one, x, y, x * y, y * y]])
 
 
+def _smooth(values: NDArray) -> NDArray[np.float64]:
+    """Return binomial means over five values, four fewer than there are."""
+    return np.convolve(values, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
+
+
 class Clock(NamedTuple):
     """Relative times s of a window, linear between some times."""
 
@@ -291,11 +297,15 @@ class Clock(NamedTuple):
         """Mean rate of s over the window, 1/s."""
         return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
 
-    def rate(self, t: float) -> float:
-        """Return how fast s goes at a time (us), 1/s."""
-        rates = np.pad(np.gradient(self.s, self.t), 2, mode="edge")
-        smooth = np.convolve(rates, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
-        return float(np.interp(t, self.t, smooth)) * 1e6
+    def rate(self, t: float) -> tuple[float, float]:
+        """Return how fast s goes at a time (us), 1/s, and the variance of that, 1/s^2."""
+        order = 1 if len(self.t) < 3 else 2
+        rates = np.gradient(self.s, self.t, edge_order=order)
+        # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
+        smooth = _smooth(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
+        variance = _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))
+        rate, spread = (float(np.interp(t, self.t, one)) for one in (smooth, variance))
+        return rate * 1e6, spread * 1e12
 
 
 class WindowEvents(NamedTuple):

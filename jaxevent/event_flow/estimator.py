@@ -57,7 +57,7 @@ class Anchor(NamedTuple):
     @property
     def rate(self) -> float:
         """Displacements per second."""
-        return self.aligned.clock.rate(self.t)
+        return self.aligned.clock.rate(self.t)[0]
 
 
 class Chain(NamedTuple):
@@ -198,8 +198,12 @@ class EventFlow:
             weights = np.interp(stamps, times, one)
             spread = anchor.aligned.covariance * anchor.rate**2
             for n in np.flatnonzero(weights > 0).tolist():
-                velocity[n] += weights[n] * anchor.aligned.clock.rate(stamps[n]) * anchor.aligned.u
-                covariance[n] += weights[n] * spread
+                u = anchor.aligned.u
+                rate, variance = anchor.aligned.clock.rate(stamps[n])
+                velocity[n] += weights[n] * rate * u
+                covariance[n] += weights[n] * (
+                    spread + variance * u[..., :, None] * u[..., None, :]
+                )
         return velocity, covariance
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from jaxevent.codegen import njit, njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events, Recording
 
+# Events that one stands for at most: of a pixel whose events follow each other within a dead time.
+MAX_EVENT_WEIGHT = 3.0
+
 
 class EventStream(NamedTuple):
     """Events in order of time, as compiled loops take them, of a sensor `width` pixels wide."""
@@ -96,7 +99,7 @@ def event_weight(gap_us, dead_time):
     if dead_time.rho == 0:
         return 1.0
     if gap_us <= 1.5 * dead_time.rho:
-        return 0.0 if dead_time.derivative else 3.0
+        return 0.0 if dead_time.derivative else MAX_EVENT_WEIGHT
     rest = gap_us - dead_time.rho
     return 1e6 * gap_us / (rest * rest) if dead_time.derivative else gap_us / rest
 

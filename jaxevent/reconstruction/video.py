@@ -268,7 +268,8 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
             `mean`, `covariance` and `valid`, each (T, H, W). `mean` is intensity, 0 black and 1 the
             frames' white, and goes beyond. `covariance` is the variance of log intensity ln(I +
             I0), NaN of methods that estimate none. `valid` is false outside the recording and where
-            the intensity is not a finite number. Where a method of events and frames gets none of
+            the intensity is not a finite number; `events-only` adds where its deviation is above
+            its parameter `vague`. Where a method of events and frames gets none of
             these, it is false before a pixel's first event, and an `InputWarning` says so.
 
         Raises:

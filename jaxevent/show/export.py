@@ -67,8 +67,8 @@ def within(
     if not len(chosen):
         span = f"from {times[0] / 1e6:g} to {times[-1] / 1e6:g} s" if len(times) else "none"
         raise InputError(
-            f"{name}: there is no image from --start to --stop; its times are {span}, so "
-            "choose others"
+            f"{name}: there is no image from --start {first / 1e6:g} s to --stop {end / 1e6:g} s; "
+            f"its times are {span}, so choose others"
         )
     return chosen
 

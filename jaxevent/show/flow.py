@@ -98,9 +98,13 @@ def write_flow_images(
         progress: Whether to show a progress bar; by default in a terminal.
 
     Raises:
-        InputError: There are fewer than two times.
+        InputError: There are fewer than two times, or they do not rise.
     """
     us = _stamps(times)
+    if (np.diff(us) <= 0).any():
+        raise InputError(
+            f"{out}: images show displacements from one time to a later; sort the times"
+        )
     if len(us) < 2:
         raise InputError(
             f"{out}: images show displacements from one time to the next, of which there are "

@@ -162,6 +162,19 @@ def test_growth_without_speed_changes_is_the_least_squares_line():
     np.testing.assert_allclose(variance, np.einsum("ti,ij,tj->t", g, C, g), rtol=5e-3)
 
 
+def test_growth_undoes_the_lag_of_a_filter():
+    """A settled filter of variance P and density Q shows what was true P / Q ago."""
+    times, lag, Q_lambda = np.linspace(0, 1.2, 60), 0.03, 1.6
+    late, _ = approach(times - lag)
+    _, true = approach(times)
+    P = np.zeros((60, 8, 8))
+    P[:, [4, 5], [4, 5]] = lag * Q_lambda
+    value, _ = grow(times, late, P, Q_lambda=Q_lambda)
+    np.testing.assert_allclose(value[5:], true[5:], rtol=3e-3)
+    without, _ = grow(times, late, P)
+    assert (np.abs(without / true - 1)[5:] > 5e-3).all()
+
+
 def test_growth_is_the_joint_gaussian():
     """Against conditioning the scales and rates at all times at once on three sizes."""
     times, Q, spread = np.linspace(0, 1, 50) ** 1.5, 0.4, 0.01

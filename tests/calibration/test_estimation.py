@@ -77,6 +77,7 @@ def test_a_grating_that_repeats_itself_has_the_clock_of_its_stamps():
     for one in (found.c_on, found.c_off):
         assert one.low < c < one.high
     assert np.nanmin(found.correlations) < -0.8 * np.nanmax(found.correlations)
+    assert found.exposure.low == 0  # frames are instantaneous, though a mean fits them better
 
 
 @pytest.mark.slow
@@ -92,7 +93,7 @@ def test_simulated_truth(found):
         one = getattr(found, name)
         wide = one.high - one.low
         assert one.low - wide / 2 < true < one.high + wide / 2, name
-        assert wide < (2.5 if name == "exposure" else 0.25) * abs(true), name
+        assert wide < (3 if name == "exposure" else 0.25) * abs(true), name
     noise = np.hypot(SENSOR.read_noise, 12**-0.5) / 255
     assert found.frame_noise.value == pytest.approx(noise, rel=0.4)
 

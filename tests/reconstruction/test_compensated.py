@@ -15,12 +15,12 @@ from jaxevent.errors import InputError
 from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
-    estimator,
     exposures,
     fusion,
     instants,
     normal_equations,
     robust_mean,
+    target_motion,
     trajectories,
     warp,
 )
@@ -77,6 +77,19 @@ def test_motion_is_found_from_nothing(v, a):
     assert np.abs(inner - inner.mean((0, 1)))[..., :2].max() < 0.6
     paths = warp.interpolate_paths(p, (40, 56))
     np.testing.assert_allclose(paths[12:-12, 12:-12].mean((0, 1)), [*v, *a], atol=0.15)
+
+
+@pytest.mark.slow
+def test_motion_of_a_pattern_finer_than_coarse_pixels():
+    """The search began at a level on which two pixels are a period, and found -5 px."""
+    s, (y, x) = np.linspace(-1, 1, 11, dtype=np.float32), np.mgrid[:48, :64]
+    wave = [np.sin(np.pi * (x - 12 * t) / 10) * np.cos(np.pi * y / 10) for t in s]
+    L = 0.8 * np.array(wave, np.float32)
+    L += np.random.default_rng(0).normal(0, 0.05, L.shape).astype(np.float32)
+    pyramid = trajectories.ImagePyramid(L, np.full_like(L, 2.5e-3), 0.35)
+    plan = trajectories.plan_stages(s, 0.2)
+    p = trajectories.estimate_trajectories(pyramid, s, plan, COST).p
+    np.testing.assert_allclose(2 * np.median(p, (0, 1))[:2], (12, 0), atol=0.3)
 
 
 @pytest.mark.slow
@@ -618,7 +631,7 @@ class Swirl:
 
 
 def test_motion_that_is_known_is_begun_with():
-    p = estimator.InitialMotion(Swirl())(500_000, 2_000, 0.2)
+    p = target_motion.InitialMotion(Swirl())(500_000, 2_000, 0.2)
     x = (np.arange(15) * 2 + 0.5)[None]
     u = 3.0 * x - 20  # px/s, and points accelerate by -40 + 3 u
     np.testing.assert_allclose(p[:-1, 1:-1, 0], np.repeat(0.2 * u, 10, 0)[:, 1:-1], rtol=1e-5)
@@ -784,10 +797,10 @@ def test_prepared_images_of_frames_that_are_not_steady(monkeypatch):
     times, value = prepared()
     sure = video()(times)
     # What is in doubt of brightness is in the variance, of steady frames too.
-    monkeypatch.setattr(estimator.FrameBrightness, "variance", lambda *_: 0.02)
+    monkeypatch.setattr(target_motion.FrameBrightness, "variance", lambda *_: 0.02)
     steady = mc.estimate(slide(), params(), progress=False)(times)
     np.testing.assert_allclose(steady.covariance, sure.covariance + 0.02, rtol=1e-5)
-    monkeypatch.setattr(estimator.FrameBrightness, "is_steady", lambda *_: False)
+    monkeypatch.setattr(target_motion.FrameBrightness, "is_steady", lambda *_: False)
     whole = mc.estimate(slide(), params(), progress=False)(times)
     assert (whole.mean != sure.mean).any() and whole.covariance.min() > 0.02
     _, out = mc.prepare(slide(), times, params())
@@ -801,7 +814,7 @@ def test_images_are_of_learned_thresholds(monkeypatch):
     """The video and prepared images take what is learned; tests/reconstruction/test_thresholds."""
     times, at = prepared()[0], params()
     factors = np.random.default_rng(2).uniform(1, 4, (2, 40 * 48)).astype(np.float32)
-    monkeypatch.setattr(estimator, "learn_thresholds", lambda *_: factors)
+    monkeypatch.setattr(target_motion, "learn_thresholds", lambda *_: factors)
     images = mc.estimate(slide(), at, progress=False)(times).mean
     assert np.abs(images - video()(times).mean).max() > 0.01
     features, out = mc.prepare(slide(), times, at)

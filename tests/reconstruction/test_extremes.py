@@ -36,7 +36,8 @@ def test_extreme_parameters_are_refused_or_give_finite_images(name, float32):
             count = len(number.default) if isinstance(number.default, tuple) else 0
             try:
                 params = method.Params(**{setting: [value] * count if count else value})
-                result = method.estimate(recording, params, progress=False, **options)(TIMES)
+                video = method.estimate(recording, params, progress=False, **options)
+                result = video(TIMES[[given % 2]])  # in turn
             except MissingExtra:
                 pytest.skip("needs an extra")
             except InputError as error:

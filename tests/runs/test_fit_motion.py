@@ -163,7 +163,7 @@ def test_settings_say_what_is_true():
     turned["gyro_bias"] = [0.1, 0.0, 0.0]
     found = egomotion.true_motion(recording, turned)
     np.testing.assert_allclose(found.values, np.tile([0.0, -0.2, -0.3], (len(t), 1)), atol=1e-12)
-    with pytest.raises(InputError, match="imu-rotation 'up'"):
+    with pytest.raises(InputError, match="'up' of the gyro"):
         egomotion.check_settings({**turned, "imu_rotation": "up"})
     with pytest.raises(InputError, match="or the depth"):
         egomotion.true_motion(recording, {"model": "planar", "truth": "poses"})

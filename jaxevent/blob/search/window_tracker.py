@@ -6,7 +6,6 @@ gives, size and position hold, and a target that has been silent for two windows
 events need motion.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +28,6 @@ from jaxevent.blob.search.detection import (
     measure_blobs,
     split_blob,
 )
-from jaxevent.blob.search.merge import merge_paths
 from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
 from jaxevent.blob.search.stream import Stream, WindowEvents
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
@@ -52,10 +50,8 @@ class TrackTable(NamedTuple):
     born: NDArray[np.float64]  # s
     hits: NDArray[np.int64]  # windows with a detection
     misses: NDArray[np.int64]  # windows without, since the last detection
-    travel: NDArray[np.float64]  # px, length of the way
     nats: NDArray[np.float64]  # evidence against clutter
     confirmed: NDArray[np.bool_]
-    merged: NDArray[np.bool_]  # whether the target is a part of another one
 
     def take(self, rows: NDArray) -> "TrackTable":
         """Return some of the tracks."""
@@ -131,7 +127,6 @@ class WindowTracker:
         self.rows: list[_WindowRows] = []
         self.evidence: dict[int, float] = {}  # nats for two targets, of some tracks
         self.confirmed: set[int] = set()
-        self.parts: dict[int, int] = {}  # the track of the whole, by that of a part
         tests = stream.width * stream.height * stream.duration / scale.window
         self.log_threshold = np.log(tests / CONFIG.false_alarms)
 
@@ -143,7 +138,7 @@ class WindowTracker:
             progress: Whether a bar is shown; None: in a terminal or notebook.
 
         Returns:
-            Paths of all tracks that were confirmed and are no part of another.
+            Paths of all tracks that were confirmed.
         """
         w = self.scale.window
         windows = int(self.stream.duration / w)
@@ -156,20 +151,16 @@ class WindowTracker:
             return []
         rows = _WindowRows._make(np.concatenate(column) for column in zip(*self.rows, strict=True))
         us = self.stream.start + np.rint(rows.t * 1e6).astype(np.int64)
-        paths = {}
-        for one in sorted(self.confirmed | set(self.parts)):
+        paths = []
+        for one in sorted(self.confirmed):
             at = np.flatnonzero(rows.id == one)
             own = _WindowRows._make(column[at] for column in rows)
             unit = np.median(larger_variance(own.C)) / w**3
             noise = fit_velocity_noise(own.t, own.m, own.R, unit)
-            paths[one] = TargetPath(
-                us[at], own.p, own.v, own.C, own.n, round(1e6 * w), velocity_noise=noise
+            paths.append(
+                TargetPath(us[at], own.p, own.v, own.C, own.n, round(1e6 * w), velocity_noise=noise)
             )
-        for part, whole in self.parts.items():  # in order of time: a whole may become a part
-            if whole in paths:
-                both, noise = merge_paths(paths[whole], paths[part]), paths[whole].velocity_noise
-                paths[whole] = dataclasses.replace(both, velocity_noise=noise)
-        return [paths[one] for one in sorted(self.confirmed - set(self.parts))]
+        return paths
 
     def _step(self, begin: float | int) -> None:
         """Track through the window that begins at a time (s)."""
@@ -231,7 +222,7 @@ class WindowTracker:
             self._append_tracks(part, gates.t)
 
     def _find_ended(self) -> NDArray[np.bool_]:
-        """Find tracks that are merged, outside, or without events for too long."""
+        """Find tracks that are outside, or without events for too long."""
         tracks, (rows, columns) = self.tracks, self.stream.shape
         x, y = tracks.p.T
         outside = (x <= -1) | (x >= columns) | (y <= -1) | (y >= rows)
@@ -240,7 +231,7 @@ class WindowTracker:
             longest = CONFIG.max_moving_coast_windows
         coast = np.minimum(longest, 2 * tracks.hits)
         coast = np.where(tracks.confirmed, coast, CONFIG.max_new_coast_windows)
-        return tracks.merged | outside | (tracks.misses > coast)
+        return outside | (tracks.misses > coast)
 
     def _remove(self, ended: NDArray) -> None:
         """Remove tracks that ended, and remember those that were confirmed."""
@@ -281,7 +272,7 @@ def init_tracks(ids: NDArray, t: float | int, blobs: Blobs, window: float | int)
     q = 0.3**2 * (square + 0.5) * 3 / window**3
     return TrackTable(
         ids, zero + t, p, np.zeros((number, 2)), P, C, n, n.copy(), q, zero + 1, zero + t,
-        none + 1, none, zero, zero.copy(), np.zeros(number, bool), np.zeros(number, bool),
+        none + 1, none, zero.copy(), np.zeros(number, bool),
     )  # fmt: skip
 
 
@@ -568,13 +559,10 @@ def _update_detected(tracks: Any, gates: Any, clutter: Any, k: int, measurement:
     if alone:
         nis = min((z[0] * z[0] + z[1] * z[1]) / 2 / total, 30.0)
         tracks.nis[k] += 0.15 * (nis - tracks.nis[k])
-    moved, a, b = 0.0, P[0] / total, P[1] / total
+    a, b = P[0] / total, P[1] / total
     for i in range(2):
-        p = gates.p[k, i] + a * z[i]
-        moved += (p - tracks.p[k, i]) ** 2
-        tracks.p[k, i] = p
+        tracks.p[k, i] = gates.p[k, i] + a * z[i]
         tracks.v[k, i] += b * z[i]
-    tracks.travel[k] += np.sqrt(moved)
     tracks.P[k, 0], tracks.P[k, 1] = (1 - a) * P[0], (1 - a) * P[1]
     tracks.P[k, 2] = P[2] - b * P[1]
     tracks.t[k], tracks.misses[k] = gates.t, 0

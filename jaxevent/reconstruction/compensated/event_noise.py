@@ -115,15 +115,13 @@ class EventNoise:
         """Return the trust in the events at a time (us), 0..1."""
         return float(self(int(self.locate(np.array([t])).interval[0])).trust)
 
-    def inflate(self, times: NDArray[np.int64], V: NDArray) -> NDArray[np.float32]:
-        """Inflate the variances (K, h, w) of images at times (us)."""
-        inflated = V.astype(np.float32)
+    def inflate(self, times: NDArray[np.int64], V: NDArray[np.float32]) -> None:
+        """Inflate the variances (K, h, w), float32, of images at times (us) in place."""
         for k, (interval, shape) in enumerate(zip(*self.locate(times), strict=True)):
             if shape > 0:
                 noise = self(int(interval))
-                inflated[k] *= noise.factor
-                inflated[k] += shape * noise.excess
-        return inflated
+                V[k] *= noise.factor
+                V[k] += shape * noise.excess
 
     def _measure(self, interval: int) -> IntervalNoise:
         size = self._images.image_shape

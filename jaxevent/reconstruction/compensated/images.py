@@ -34,6 +34,7 @@ from jaxevent.reconstruction.compensated.warp import path_positions, sample_bili
 from jaxevent.reconstruction.features import FrameFeatures, Numeric
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
+from jaxevent.reconstruction.stream import count_events_per_pixel
 from jaxevent.recording import Recording
 
 N_CACHED_IMAGES = 96  # of instants, in a video
@@ -122,6 +123,15 @@ class InstantImages:
 
     def __call__(self, times: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
         """Return L, V and clear, each (times, h, w) float32, at sorted times (us)."""
+        chosen = self._read(times)
+        L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
+        return L, V, clear
+
+    def logs(self, times: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return L alone (times, h, w) at sorted times (us)."""
+        return np.stack([one.mean for one in self._read(times)])
+
+    def _read(self, times: NDArray[np.int64]) -> list[Estimate]:
         missing = np.array([t for t in times.tolist() if t not in self._cache], np.int64)
         for t in times.tolist():
             if t in self._cache:
@@ -131,9 +141,7 @@ class InstantImages:
                 self._cache[t] = Estimate(*(np.array(v[n], np.float32) for v in part))
         while len(self._cache) > max(N_CACHED_IMAGES, len(times)):
             self._cache.popitem(last=False)
-        chosen = [self._cache[t] for t in times.tolist()]
-        L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
-        return L, V, clear
+        return [self._cache[t] for t in times.tolist()]
 
 
 @functools.cache
@@ -265,8 +273,8 @@ class FrameBrightness:
         black, white = UNCLIPPED_GREY_RANGE
         unclipped = ((grey > black) & (grey < white)).all(0).reshape(size)
         events = source[begin:end]
-        counts = np.zeros(size, np.float32)
-        np.add.at(counts, (events.y, events.x), 1)
+        counts = count_events_per_pixel(events.x, events.y, size[1], size[0] * size[1])
+        counts = counts.reshape(size).astype(np.float32)
         quiet = unclipped & (uniform_filter(counts, 3) < 1 / 18)
         change = np.diff(np.log(intensity + self._I0), axis=0).reshape(size)
         h, w = (length // MEDIAN_BLOCK_PX for length in size)

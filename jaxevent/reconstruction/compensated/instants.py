@@ -305,7 +305,7 @@ def measure_image_speed(
     squared change. The lag is halved until the flow is below 2 px.
 
     Args:
-        images: A function from times (T,), us, to images (T, h, w) of log intensity.
+        images: A function from sorted times (T,), us, to images (T, h, w) of log intensity.
         times_us: (times,) us.
         lag_us: Time between the images of a pair, us.
 
@@ -313,16 +313,8 @@ def measure_image_speed(
         The speed, px/s.
     """
     while True:
-        both = images(np.concatenate([times_us, times_us + lag_us]))
-        early, late = both[: len(times_us)], both[len(times_us) :]
-        mean = np.pad((early + late) / 2, [(0, 0), (1, 1), (1, 1)], mode="edge")
-        gx = (mean[:, 1:-1, 2:] - mean[:, 1:-1, :-2]) / 2
-        gy = (mean[:, 2:, 1:-1] - mean[:, :-2, 1:-1]) / 2
-        change = np.abs(late - early)
-        gradient2 = gx**2 + gy**2
-        product, steepness, weight = (
-            _block_means(part) for part in (change * np.sqrt(gradient2), gradient2, change**2)
-        )
+        pairs = (images(np.array([t, t + lag_us])) for t in times_us)
+        product, steepness, weight = np.stack([_change_and_steepness(*pair) for pair in pairs], 1)
         weight = weight * (steepness > 1e-4)  # of blocks steeper than 1 % per px
         flow = product / np.maximum(steepness, 1e-4)
         moved = float((weight * flow).sum() / max(float(weight.sum()), 1e-12))
@@ -331,9 +323,15 @@ def measure_image_speed(
         lag_us //= 2
 
 
-def _block_means(images: NDArray) -> NDArray:
-    h, w = (size // 4 * 4 for size in images.shape[1:])
-    return images[:, :h, :w].reshape(len(images), h // 4, 4, w // 4, 4).mean((2, 4))
+def _change_and_steepness(early: NDArray, late: NDArray) -> NDArray:
+    """Return means over blocks: of |dL| |grad L|, |grad L|^2 and |dL|^2, each (h / 4, w / 4)."""
+    mean = np.pad((early + late) / 2, 1, mode="edge")
+    gx = (mean[1:-1, 2:] - mean[1:-1, :-2]) / 2
+    gy = (mean[2:, 1:-1] - mean[:-2, 1:-1]) / 2
+    change, gradient2 = np.abs(late - early), gx**2 + gy**2
+    h, w = (size // 4 * 4 for size in early.shape)
+    parts = np.stack([change * np.sqrt(gradient2), gradient2, change**2])[:, :h, :w]
+    return parts.reshape(3, h // 4, 4, w // 4, 4).mean((2, 4))
 
 
 def pad_instant_count(count: int) -> int:

@@ -271,9 +271,13 @@ def _add_pixels(points, M, s, grad_M, scratch, sums):
             total[i] += R[i]
         entry = 0
         for c in range(4):
+            # LLVM takes several pixels at once only in loops over few arrays, where it can check
+            # quickly that none overlap.
             for i in range(len(M)):
                 r[i] = R[i] * J[c, i]
+            for i in range(len(M)):
                 means[c, i] += r[i]
+            for i in range(len(M)):
                 sums[10 + c, i] -= r[i] * (points[0, k, i] - M[i])
             for e in range(c, 4):
                 _add_product(r, J[e], sums[entry])

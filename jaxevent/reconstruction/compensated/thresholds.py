@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.stream import DeadTime, EventStream, count_before_edges, event_weights
+from jaxevent.reconstruction.stream import (
+    MAX_EVENT_WEIGHT,
+    DeadTime,
+    EventStream,
+    count_before_edges,
+    event_weights,
+)
 from jaxevent.recording import Recording
 
 N_IMAGE_PAIRS = 8  # between pairs of images that are evenly spaced over a recording
@@ -136,7 +142,11 @@ def learn_thresholds(
     c_on, c_off = float(params.c_on), float(params.c_off)
     if not params.learn or span_us[1] - span_us[0] < N_IMAGE_PAIRS:
         return None
-    times = _change_times(recording, span_us)
+    times, source = _change_times(recording, span_us), recording.events
+    pixels = recording.width * recording.height
+    n_events = sum(source.index(end) - source.index(begin) for begin, end in times)
+    if n_events * MAX_EVENT_WEIGHT < MIN_EVENTS_PER_PIXEL * pixels:
+        return None
     rho = 1e6 * float(params.rho_ref)  # us
     counts = np.stack([count_events(recording, *pair, rho) for pair in times], 1)
     if counts.sum((0, 1)).mean() < MIN_EVENTS_PER_PIXEL:

@@ -76,6 +76,7 @@ class PathSearch(NamedTuple):
 
 
 CHOICE_SIGMA = 2.0  # of the Gaussian over which costs of trajectories are compared, in nodes
+FINE_SHARE = 2.0  # by which the cost of a search without coarse levels is divided
 # Set on objects of seeds that are not scored, and on the first half of slider_depth.
 PATH_SEARCHES = (PathSearch(2, 4, 1.0), PathSearch(1, 3, 1.0))
 
@@ -360,7 +361,7 @@ def estimate_trajectories(
 
     Args:
         pyramid: Images of the target's instants.
-        s: (K,) times of the instants relative to the target, -1..1.
+        s: (K,) sorted times of the instants relative to the target, -1..1.
         plan: The stages.
         cost: Parameters of the cost, float32.
 
@@ -371,15 +372,19 @@ def estimate_trajectories(
     first = plan[0].levels[0]
     found = NodeTrajectories(np.zeros((*node_shape(h, w, first), 4), np.float32), first)
     for stage in plan:
-        chosen = np.abs(s) <= stage.horizon * 1.001
+        # Instants are sorted, so that these follow each other.
+        chosen = slice(*np.searchsorted(s, stage.horizon * np.array([-1.001, 1.001])))
         for level in stage.levels:
-            p, pixels = found.at_level(level, (h, w)).p, pyramid[level]
-            if not chosen.all():
-                pixels = np.ascontiguousarray(pixels[chosen])
-            images = PackedImages.of(pixels, s[chosen])
+            p = found.at_level(level, (h, w)).p
+            images, starts = PackedImages.of(pyramid[level][chosen], s[chosen]), [p]
+            if stage is plan[0] and level == stage.levels[-1]:
+                # A pattern finer than the pixels of the coarse levels has misled these.
+                starts.append(np.zeros_like(p))
             for _ in range(stage.steps):
-                p = gauss_newton_step(images, p, cost)
-            found = NodeTrajectories(p, level)
+                starts = [gauss_newton_step(images, p, cost) for p in starts]
+            if len(starts) > 1:
+                starts = [choose_trajectories(images, starts, cost, (1.0, FINE_SHARE))]
+            found = NodeTrajectories(starts[0], level)
     return found
 
 

@@ -1,0 +1,533 @@
+"""Motion of a target's points, and its image fused along their paths.
+
+Motion is sought from nothing at anchors, whose times depend on the recording alone, and carried
+from there to targets (`TrajectoryEstimator`). `fuse_target` makes the image of one.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from jaxevent.errors import InputError
+from jaxevent.reconstruction.compensated.event_noise import EventNoise
+from jaxevent.reconstruction.compensated.exposures import FrameExposures
+from jaxevent.reconstruction.compensated.fusion import (
+    FusedImage,
+    after_weight,
+    fuse_candidates,
+    fusion_features,
+    reference_images,
+)
+from jaxevent.reconstruction.compensated.images import (
+    BrightnessPrior,
+    FrameBrightness,
+    InstantImages,
+    gaussian_blur,
+    smooth_at_target,
+)
+from jaxevent.reconstruction.compensated.instants import (
+    TIME_CLOCK,
+    InstantSchedule,
+    TargetInstants,
+    fit_motion_clock,
+    measure_image_speed,
+)
+from jaxevent.reconstruction.compensated.normal_equations import (
+    CostParams,
+    PackedImages,
+)
+from jaxevent.reconstruction.compensated.params import Params
+from jaxevent.reconstruction.compensated.robust_mean import (
+    InstantLayout,
+    RobustMean,
+    make_layout,
+    robust_mean,
+)
+from jaxevent.reconstruction.compensated.thresholds import learn_thresholds
+from jaxevent.reconstruction.compensated.trajectories import (
+    PATH_SEARCHES,
+    ImagePyramid,
+    NodeTrajectories,
+    advect_nodes,
+    borrow_paths,
+    change_clock,
+    choose_trajectories,
+    estimate_trajectories,
+    gauss_newton_step,
+    node_shape,
+    pack_images,
+    plan_stages,
+    robust_cost,
+    select_paths,
+)
+from jaxevent.reconstruction.compensated.warp import (
+    WarpedImages,
+    interpolate_paths,
+    squared_reach,
+    warp_images,
+)
+from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import EventTiming, FrameClock, time_span
+from jaxevent.reconstruction.video import FlowSource
+from jaxevent.recording import Recording
+
+N_SPEED_PROBES = 6  # instants at which the speed of the image is measured
+PYRAMID_VARIANCE_FACTOR = 0.35  # from one resolution to half of it
+ANCHOR_STEPS = 8  # steps of the schedule between anchors
+# 1 - (trust in events)^4, up to which frames alone are not asked: images would seldom choose them.
+MIN_DOUBT = 0.1
+N_CACHED_ANCHORS = 4
+N_ANCHOR_STEPS = 2  # at half resolution, on each clock
+FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
+
+
+def make_instant_schedule(
+    recording: Recording, params: Params, images: InstantImages, use_motion_clock: bool = True
+) -> InstantSchedule:
+    """Make the schedule of a recording, by the speed of its image.
+
+    Args:
+        recording: The recording.
+        params: Parameters of `mc`.
+        images: Images at instants.
+        use_motion_clock: Whether instants are on a clock that goes as fast as the scene moves.
+
+    Returns:
+        The schedule.
+
+    Raises:
+        InputError: If images are not finite with these parameters.
+    """
+    clock = FrameClock.of(recording, EventTiming.of(params))
+    # The first whole microsecond at which a frame is the one before.
+    frames = np.ceil(clock.mid).astype(np.int64) + clock.origin
+    first, last = time_span(recording, params.clock_offset)
+    lag = int(np.median(np.diff(frames)) / 4) if len(frames) > 1 else 5000
+    inner = np.linspace(0, max(last - lag - first, 0), N_SPEED_PROBES + 2)[1:-1]
+
+    speed = measure_image_speed(images.logs, first + inner.astype(np.int64), max(lag, 400))
+    if not math.isfinite(speed):
+        raise InputError(
+            f"{recording.name}: with these parameters images at single instants are not finite; "
+            "choose some nearer the defaults"
+        )
+    motion_clock = (
+        fit_motion_clock(recording, (first, last), 4 * lag) if use_motion_clock else TIME_CLOCK
+    )
+    return InstantSchedule(frames, (first, last), speed, motion_clock)
+
+
+class NodeMotion(NamedTuple):
+    """The motion of a target's points."""
+
+    instants: TargetInstants
+    p: NDArray[np.float32]  # (rows, columns, 4), of nodes, px at s = 1
+
+    def carry(self, instants: TargetInstants) -> NDArray[np.float32]:
+        """Carry the motion to another target, on the clock of that one."""
+        there, p = self
+        now = there.with_clock(instants.clock)
+        if there.clock.event_share != instants.clock.event_share:
+            p = change_clock(p, there.s, now.s)
+        s = float(now.to_relative_times(instants.t[[instants.target]])[0])
+        return advect_nodes(p, s, instants.unit / now.unit)
+
+
+class Anchor(NamedTuple):
+    """A target whose motion was sought from nothing, and its image."""
+
+    motion: NodeMotion  # at full resolution
+    L: NDArray[np.float32]  # (h, w), ln I
+    P: NDArray[np.float32]  # (h, w), its variance
+    is_steady: bool  # no smooth part was subtracted from L
+
+
+class TrajectoryEstimate(NamedTuple):
+    """A target, the images at its instants, and the motion of its points."""
+
+    instants: TargetInstants
+    L: NDArray[np.float32]  # (K, h, w), log intensity
+    V: NDArray[np.float32]  # (K, h, w), its variance
+    clear: NDArray[np.float32]  # (K, h, w), 1 where a frame shows the pixel unclipped
+    p: NDArray[np.float32]  # (rows, columns, 4), of nodes, px at s = 1
+    # (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
+    path_index: NDArray[np.int32] | None = None
+    smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
+    noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `fusion.ReferenceImages`
+
+    @property
+    def paths(self) -> NDArray[np.float32]:
+        """Paths of all pixels, (h, w, 4), px."""
+        paths = interpolate_paths(self.p, self.L.shape[1:])
+        return paths if self.path_index is None else paths.reshape(-1, 4)[self.path_index]
+
+
+@dataclasses.dataclass(frozen=True)
+class InitialMotion:
+    """Motion that is known beforehand.
+
+    Attributes:
+        motion: The flow.
+        refine: Whether images may correct it.
+    """
+
+    motion: FlowSource
+    refine: bool = True
+
+    def __call__(self, t: int, late: int, unit: float) -> NDArray[np.float32] | None:
+        """Return the trajectories of a target.
+
+        The acceleration is that of points: the difference of flow before and after, at the places
+        to which they go.
+
+        Args:
+            t: Time of the target, us.
+            late: Time before and after it at which flow is read for the acceleration, us.
+            unit: What s = 1 stands for, s.
+
+        Returns:
+            (rows, columns, 4) trajectories of nodes, px; None where the flow is not known.
+        """
+        before, now, after = np.asarray(
+            self.motion.flow(np.array([t - late, t, t + late]), extrapolate=True), float
+        )
+        if not np.isfinite([before, now, after]).all():
+            return None
+        h, w = now.shape[:2]
+        y, x = np.mgrid[:h, :w].astype(float)
+        dt = late * 1e-6
+
+        def there(field: NDArray, sign: int) -> NDArray:
+            at = [y + sign * dt * now[..., 1], x + sign * dt * now[..., 0]]
+            parts = [map_coordinates(field[..., c], at, order=1, mode="nearest") for c in (0, 1)]
+            return np.stack(parts, -1)
+
+        change = (there(after, 1) - there(before, -1)) / (2 * dt)
+        p = np.concatenate([now * unit, change / 2 * unit**2], -1)
+        rows, columns = node_shape(h, w, 0)
+        padded = np.pad(p, [(0, 2 * rows - h), (0, 2 * columns - w), (0, 0)], mode="edge")
+        return padded.reshape(rows, 2, columns, 2, 4).mean((1, 3)).astype(np.float32)
+
+
+class TrajectoryEstimator:
+    """Estimates the motion of a recording's targets: `estimate = trajectories(t)`, t in us.
+
+    Motion is sought from nothing, improved and refined with the image that it gives at anchors
+    only, whose times depend on the recording alone. A target starts from the motion and the image
+    of the anchor next to it, and takes one more step. So the images of a video cost less than
+    single ones, and none depends on which others were requested. Where motion is known beforehand
+    each target is its own anchor.
+
+    Args:
+        recording: The recording.
+        params: Parameters of `mc`.
+        images: Images at instants.
+        start: Motion that is known beforehand, or None.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        params: Params,
+        images: InstantImages,
+        start: InitialMotion | None = None,
+    ):
+        self.params, self.images, self.start = params, images, start
+        self.schedule = make_instant_schedule(
+            recording, params, images, use_motion_clock=start is None
+        )
+        self.exposures = FrameExposures(recording, params, self.schedule.speed)
+        self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
+        self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
+        cached = functools.lru_cache(N_CACHED_ANCHORS)  # by their times
+        self._anchor, self._sought_motion = cached(self._make_anchor), cached(self._seek_motion)
+        self._frame_motion = cached(self._seek_by_frames)
+        self._caution, self._cost = float(params.caution), CostParams.of(params)
+        self._latest: tuple[NDArray[np.int64], Any] | None = None  # times, and images
+
+    def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
+        """Return L, V and clear at instants, and the smooth part that is subtracted from L.
+
+        The latest ones are remembered: motion that was sought is next refined on them.
+        """
+        if self._latest is None or not np.array_equal(self._latest[0], instants.t):
+            self._latest = None  # so that two are never held at once
+            self._latest = instants.t, self._read_images(instants)
+        return self._latest[1]
+
+    def _read_images(
+        self, instants: TargetInstants
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
+        L, V, clear = self.images(instants.t)
+        self.event_noise.inflate(instants.t, V)
+        if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
+            return L, V, clear, None
+        smooth = gaussian_blur(L)
+        return L - smooth, V, clear, smooth
+
+    def _noise(self, t: int) -> NDArray[np.float32] | float:
+        """Return the factor (h, w) on the variance of the events' images at a target (us)."""
+        interval, shape = self.event_noise.locate(np.array([t]))
+        return self.event_noise(int(interval[0])).factor if shape[0] > 0 else 1.0
+
+    def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
+        """Return the variances with which motion is estimated."""
+        cautious = V * np.float32(self._caution)
+        for k in np.flatnonzero(clear.max((1, 2)) > 0):
+            np.copyto(cautious[k], V[k], where=clear[k] > 0)
+        return cautious
+
+    def _anchor_times(self, t: int) -> list[int]:
+        """Return the times (us) of the anchors next to a time, at most two, the nearest first.
+
+        Anchors are evenly spaced between two frames, and between a frame and the end of the data.
+        """
+        frames, (first, last) = self.schedule.frames, self.schedule.span
+        after = int(np.searchsorted(frames, t, "right"))
+        begin = int(frames[after - 1]) if after > 0 else first
+        end = int(frames[after]) if after < len(frames) else last
+        count = max(round((end - begin) / (ANCHOR_STEPS * self.schedule.step)), 1)
+        place = (t - begin) * count // max(end - begin, 1)
+        place = min(max(place, 0), count - 1)
+        times = [begin + (2 * n + 1) * (end - begin) // (2 * count) for n in range(count)]
+        beside = place + (1 if t >= times[place] else -1)
+        return [times[n] for n in (place, beside) if 0 <= n < count]
+
+    def _seek_motion(self, at: int) -> NodeMotion:
+        """Seek the motion of the target at a time (us) from nothing, at half resolution."""
+        instants = self.schedule(at)
+        L, V, clear, _ = self._images(instants)
+        pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+        p = self._seek(pyramid, instants.s, instants.first_horizon)
+        doubt = 1 - self.event_noise.trust(at) ** 4
+        other = self._motion_of_frames(at) if doubt > MIN_DOUBT else None
+        if other is not None:
+            images, several = PackedImages.of(pyramid[1], instants.s), (p, other.carry(instants))
+            p = choose_trajectories(images, several, self._cost, (1.0, doubt))
+        return self._improve(pyramid[1], NodeMotion(instants, p))
+
+    def _motion_of_frames(self, t: int) -> NodeMotion | None:
+        """Return the motion halfway between two frames by frames alone, at half resolution."""
+        frames = self.schedule.frames
+        after = int(np.searchsorted(frames, t, "right"))
+        if not 0 < after < len(frames):
+            return None
+        return self._frame_motion(int(frames[after - 1] + frames[after]) // 2)
+
+    def _seek_by_frames(self, at: int) -> NodeMotion:
+        """Seek the motion of the target at a time (us) from nothing, by frames alone."""
+        instants = self.schedule(at)
+        L, V, _, _ = self._images(instants)
+        framed = np.isin(instants.t, self.schedule.frames)
+        frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
+        nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
+        return NodeMotion(instants, self._seek(frames, instants.s[framed], nearest))
+
+    def _seek(
+        self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float
+    ) -> NDArray[np.float32]:
+        """Seek trajectories of nodes at half resolution, first within a horizon."""
+        motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
+        return motion.at_level(1, self.images.image_shape).p
+
+    def _make_anchor(self, at: int) -> Anchor:
+        """Find the motion of the target at a time (us), and fuse its image."""
+        return self._refine(self._sought_motion(at))
+
+    def _refine(self, motion: NodeMotion) -> Anchor:
+        """Refine motion at half resolution with the image that it gives."""
+        instants, p = motion
+        L, V, clear, smooth = self._images(instants)
+        t, size = int(instants.t[instants.target]), self.images.image_shape
+        p = NodeTrajectories(p, 1).at_level(0, size).p
+        estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=self._noise(t))
+        fused = fuse_target(self.params, estimate)
+        image, P = np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
+        packed = self._pack(estimate, image, P)
+        p = borrow_paths(packed, gauss_newton_step(packed, p, self._cost), self._cost)
+        return Anchor(NodeMotion(instants, p), image, P, smooth is None)
+
+    def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
+        """Pack the images of a target, its own replaced by one with less noise."""
+        own, V = target.instants.target, self._cautious(target.V, target.clear)
+        pixels = pack_images(target.L, V)
+        V = FUSED_VARIANCE_FACTOR * P + self._cost.floor
+        pixels[own] = pack_images(image[None], V[None])[0]
+        return PackedImages.of(pixels, target.instants.s)
+
+    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> NodeMotion:
+        """Take a few steps at half resolution, on the clock on which frames agree better.
+
+        Images from events have the faults of their clock, so that they do not judge it.
+        """
+        instants, p = motion
+        judges = np.isin(instants.t, self.schedule.frames)
+        if judges.sum() <= 2:  # agree on any clock
+            judges[:] = True
+
+        def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
+            for _ in range(N_ANCHOR_STEPS):
+                p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
+            return p
+
+        def cost(clock: TargetInstants, p: NDArray[np.float32]) -> float:
+            return robust_cost(PackedImages.of(pixels[judges], clock.s[judges]), p, self._cost)
+
+        found = improved(instants, p)
+        if not instants.clock.event_share:
+            return NodeMotion(instants, found)
+        timed = instants.with_clock(TIME_CLOCK)
+        other = improved(timed, change_clock(p, instants.s, timed.s))
+        if cost(instants, found) < cost(timed, other):
+            return NodeMotion(instants, found)
+        return NodeMotion(timed, other)
+
+    def __call__(self, t: int) -> TrajectoryEstimate:
+        """Estimate the motion of the target at a time (us)."""
+        instants = self.schedule(t)
+        L, V, clear, smooth = self._images(instants)
+        size, noise = self.images.image_shape, self._noise(t)
+        known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
+        others: list[int] = []
+        if known is None:
+            nearest, *others = self._anchor_times(t)
+            anchor = self._anchor(nearest)
+        elif self.start is not None and self.start.refine:
+            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+            known = NodeTrajectories(known, 0).at_level(1, size).p
+            anchor = self._refine(self._improve(pyramid[1], NodeMotion(instants, known)))
+        else:
+            return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
+        if not anchor.motion.instants.clock.event_share:
+            instants = instants.with_clock(TIME_CLOCK)
+        p = anchor.motion.carry(instants)
+        target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
+        packed = self._pack(target, *self._carry_image(anchor, target))
+        for at in others:
+            p = self._choose(packed, p, self._sought_motion(at).carry(instants))
+        p = gauss_newton_step(packed, p, self._cost)
+        # Nodes of the anchor have taken paths from farther away.
+        path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
+        return target._replace(p=p, path_index=path_index)
+
+    def _choose(
+        self, images: PackedImages, p: NDArray[np.float32], other: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Choose between trajectories and others at half resolution, where images agree better."""
+        size = self.images.image_shape
+        L, V = images.pixels[..., 0], images.pixels[..., 1]
+        half = PackedImages.of(ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)[1], images.s)
+        own = NodeTrajectories(p, 0).at_level(1, size).p
+        change = choose_trajectories(half, (own, other), self._cost, (1.0, 1.0)) - own
+        return p + NodeTrajectories(change, 1).at_level(0, size).p
+
+    def _carry_image(
+        self, anchor: Anchor, target: TrajectoryEstimate
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Carry the image of an anchor to a target: log intensity and variance, each (h, w)."""
+        if anchor.is_steady != (target.smooth is None):
+            fused = fuse_target(self.params, target)
+            return np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
+        there, here = anchor.motion.instants, target.instants
+        at = here.to_relative_times(there.t[[there.target]]).astype(np.float32)
+        if not at[0]:
+            return anchor.L, anchor.P
+        L, P = anchor.L[None], anchor.P[None]
+        warped = warp_images(L, P, np.zeros_like(L), at, target.paths)
+        inside = warped.inside[0] > 0
+        own = here.target
+        return (
+            np.where(inside, warped.L[0], target.L[own]),
+            np.where(inside, warped.V[0], self._caution * target.V[own]),
+        )
+
+
+@jax.jit
+def _fuse(
+    params: Params,
+    mean: RobustMean,
+    images: tuple[Numeric, Numeric, WarpedImages, InstantLayout],
+    paths: Numeric,
+    noise: Numeric | float,
+) -> FusedImage:
+    compared = reference_images(*images, squared_reach(paths), noise=noise)
+    return fuse_candidates(params, fusion_features(mean, compared))
+
+
+def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
+    """Fuse the images at a target's instants along trajectories.
+
+    Args:
+        params: Parameters of `mc`.
+        target: The target.
+
+    Returns:
+        The image, without the smooth part that was subtracted.
+    """
+    instants, L, V, clear, *_ = target
+    paths = target.paths
+    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
+    layout = make_layout(instants, clear, len(instants))
+    mean = robust_mean(params, L, warped, layout)
+    # The images that it is compared with are few, and are all that is handed over.
+    names = ("target", "before", "after", "other")
+    rows = [int(getattr(layout, name)) for name in names]
+    places = {name: np.int32(rows.index(k)) for name, k in zip(names, rows, strict=True)}
+    warped = WarpedImages(*(part[rows] for part in warped))
+    layout = InstantLayout(*(part[rows] for part in layout[:4]), **places, rest=layout.rest)
+    return _fuse(params, mean, (L[rows], V[rows], warped, layout), paths, target.noise)
+
+
+def add_smooth_part(
+    target: TrajectoryEstimate, fused: FusedImage, brightness: BrightnessPrior
+) -> FusedImage:
+    """Add the smooth part that was subtracted from a target's images.
+
+    Args:
+        target: The target.
+        fused: Its fused image.
+        brightness: Its brightness.
+
+    Returns:
+        The image with other `L` and `P`.
+    """
+    assert target.smooth is not None
+    layout = make_layout(target.instants, target.clear, len(target.instants))
+    weight = after_weight(layout)
+    L, P = smooth_at_target(target.smooth, layout, weight, target.paths, brightness)
+    return dataclasses.replace(fused, L=fused.L + L, P=fused.P + P)
+
+
+def make_trajectory_estimator(
+    recording: Recording, params: Params, window_events: int, start: InitialMotion | None = None
+) -> TrajectoryEstimator:
+    """Make the trajectory estimator of a recording, with learned thresholds of single pixels.
+
+    Args:
+        recording: The recording.
+        params: Parameters of `mc`.
+        window_events: Events per window of the smoother.
+        start: Motion that is known beforehand, or None.
+
+    Returns:
+        The estimator.
+    """
+
+    def made(factors: NDArray | None) -> TrajectoryEstimator:
+        images = InstantImages(recording, params, window_events, factors)
+        return TrajectoryEstimator(recording, params, images, start)
+
+    trajectories = made(None)
+
+    def fused(t: int) -> tuple[NDArray, NDArray]:
+        found = fuse_target(params, trajectories(t))
+        return np.asarray(found.L), np.asarray(found.P)
+
+    factors = learn_thresholds(recording, params, trajectories.schedule.span, fused)
+    return trajectories if factors is None else made(factors)
