@@ -25,14 +25,14 @@ TANGENTIAL_SIGMA_RATIO = 0.1
 RELATIVE_LENS_ERROR = 0.01
 RELATIVE_FOCAL_ERROR = 0.05  # of a focal length that is given without a calibration
 CHANGE_OVER_LAG = 1.0  # error of estimates that lag, relative to the change over twice the lag
-MAX_DIRECTION_SIGMA_RAD = 1.0  # rad, standard deviation of a direction that the data determine
+MAX_DIRECTION_SIGMA_RAD = 0.15  # standard deviation of a direction that the data determine
 
 
 def is_observable(model: str | type[Model], covariance: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return which components of the motion the data determine.
 
     A component is not observable if it belongs to a direction whose standard deviation exceeds
-    1 rad. All other components are observable.
+    0.15 rad, 9 degrees. All other components are observable.
 
     Args:
         model: Motion model, or its name.

@@ -311,7 +311,7 @@ def known_general(source, span=(0, 250_000)):
 
 def motion_of(known: KnownMotion, valid=None) -> MotionEstimate:
     n = known.values.shape[1]
-    covariance = np.broadcast_to(0.01 * np.eye(n), (len(known.t), n, n))
+    covariance = np.broadcast_to(0.0025 * np.eye(n), (len(known.t), n, n))
     return MotionEstimate.from_arrays(known.model, known.t, known.values, covariance, valid)
 
 
@@ -327,7 +327,7 @@ def test_general_motion_is_written_too(tmp_path):
     header, table = read_table(tmp_path / "out" / "motion.csv")
     names = ["tx", "ty", "tz", "wx", "wy", "wz"]
     assert header == ["t", *names, *(f"sigma_{name}" for name in names), "lost"]
-    np.testing.assert_allclose(table[table[:, -1] == 0, 7:13], 0.1)
+    np.testing.assert_allclose(table[table[:, -1] == 0, 7:13], 0.05)
     assert np.isnan(table[table[:, -1] == 1, 1:13]).all()
     error = written.errors
     assert error is not None
