@@ -75,7 +75,7 @@ def check_blobs(scope):
 
 def check_egomotion_gyro(scope):
     np.testing.assert_allclose(scope["bias"], scope["BIAS"], atol=0.08)
-    assert np.median(scope["relative"]) < 0.08
+    assert scope["relative_error"](scope["truth"]) < 0.08
 
 
 def check_data_set(scope):

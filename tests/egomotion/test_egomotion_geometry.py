@@ -220,7 +220,7 @@ def test_gyro():
     none, Omega = from_gyro(imu, gyro_bias(imu, 0, 50_000), R)(np.array([0.01, 0.0705]))
     assert none is None
     np.testing.assert_allclose(Omega, [np.zeros(3), OMEGA * 0.205], atol=1e-12)
-    with pytest.raises(InputError, match="is none"):
+    with pytest.raises(InputError, match="is no rotation"):
         from_gyro(imu, bias, -np.eye(3))
     with pytest.raises(InputError, match="no gyro sample"):
         gyro_bias(imu, 1.0, 2.0)
