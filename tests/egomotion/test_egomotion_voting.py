@@ -449,7 +449,8 @@ def test_odd_streams(model, likelihood):
         states = motion(recording.start + np.arange(5) * 300_000, extrapolate=True)
         for value in (motion.mean, motion.covariance, motion.contrast, motion.evidence):
             assert np.isfinite(value).all()
-        assert (np.isfinite(states.mean).all(1) == states.valid).all()
+        # An undecided heading is NaN in a row whose rotation is known.
+        assert (np.isfinite(states.mean).any(1) == states.valid).all()
         if model == "general":
             np.testing.assert_allclose(np.linalg.norm(motion.mean[:, :3], axis=1), 1)
     assert not motion.valid.any() or likelihood == "literal"
