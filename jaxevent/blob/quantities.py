@@ -186,7 +186,7 @@ def _relative_noise(
 
 
 def _size_variance(covariance: Array) -> Float[Array, " times"]:
-    """Return the mean variance of both sizes, px^2, not below what would be exact."""
+    """Return the mean variance of both sizes, px^2, above 0."""
     return jnp.maximum((covariance[:, 4, 4] + covariance[:, 5, 5]) / 2, 1e-10)
 
 

@@ -64,7 +64,16 @@ def table_columns(
 
 
 def evenly_spaced_times(start: int, stop: int, rate: float) -> NDArray[np.int64]:
-    """Return times (us) at a rate (1/s), from `start` to before `stop` (us)."""
+    """Return times at a rate.
+
+    Args:
+        start: First time, us.
+        stop: End, which is not included, us.
+        rate: 1/s.
+
+    Returns:
+        (n,) times, us.
+    """
     count = math.ceil((stop - start) * rate / 1e6)
     times = start + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
     return np.unique(times[times < stop])

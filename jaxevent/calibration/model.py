@@ -36,6 +36,7 @@ DEGREES_OF_FREEDOM = 4.0  # of Student's t
 # Curvature of the likelihood by the mean, as part of the mean of weights.
 CURVATURE = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + 3)
 SHORTEST_US = 50.0  # exposure, below which it is a point in time
+_LEAST_SQUARE_S2 = (1e-6 * SHORTEST_US) ** 2
 # Of the time between frames: means of several frames are exposed for longer than that.
 MAX_EXPOSURE_INTERVALS = 2.0
 MAX_RELATIVE_NOISE = 0.15  # of a frame's I + I0, beyond which logarithms of noise are biased
@@ -292,7 +293,7 @@ class Model:
         gradient[4] += ((V[1:] @ terms.X_by_square) / (V @ terms.X)).sum() / 2
         move = np.zeros(5)
         move[moves] = np.linalg.solve(H, gradient[moves])
-        if move[4] < 0 and physics.theta[4] <= (1e-6 * SHORTEST_US) ** 2:
+        if move[4] < 0 and physics.theta[4] <= _LEAST_SQUARE_S2:
             move[4], inner = 0, moves[moves != 4]
             move[inner] = np.linalg.solve(H[moves != 4][:, moves != 4], gradient[inner])
         losses = losses_of(terms.residual, V @ terms.X)
@@ -305,7 +306,7 @@ class Model:
         new[:2] = np.clip(new[:2], theta[:2] / 2, theta[:2] * 2)
         new[3] = np.clip(new[3], 0, self.interval_s / 4)
         longest = MAX_EXPOSURE_INTERVALS * self.interval_s
-        new[4] = np.clip(new[4], (1e-6 * SHORTEST_US) ** 2, longest**2)
+        new[4] = np.clip(new[4], _LEAST_SQUARE_S2, longest**2)
         return new
 
 
@@ -335,6 +336,15 @@ def sandwich(
 
     H^-1 (K_tile + K_interval - K_both) H^-1, K the sums of squared gradients of clusters (Cameron,
     Gelbach & Miller 2011).
+
+    Args:
+        J: (n, parameters) derivatives of the predicted changes.
+        weight: (n,) weights of the changes.
+        residual: (n,) residuals, ln I.
+        changes: The changes.
+
+    Returns:
+        (parameters, parameters).
     """
     H = np.linalg.pinv((J * weight[:, None]).T @ J * CURVATURE)
     S = J * (weight * residual)[:, None]

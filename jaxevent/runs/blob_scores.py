@@ -244,7 +244,17 @@ class Targets:
 def seed_from_positions(
     known: KnownPositions, target: int, begin_us: int, size_px: float
 ) -> tuple[float, float, float, int]:
-    """Make the seed of a target from a time on, or from its first position; NaN after the last."""
+    """Make the seed of a target from a time on, or from its first position.
+
+    Args:
+        known: Known positions.
+        target: Index of the target.
+        begin_us: Time from which it is tracked, us.
+        size_px: Size that it begins with, px.
+
+    Returns:
+        Position x and y (px), NaN after the last known one, size (px) and time (us).
+    """
     seen = np.isfinite(known.xi[:, target]).all(1)
     t, xi = known.t[seen], known.xi[seen, target]
     if t[-1] < begin_us:

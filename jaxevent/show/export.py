@@ -66,9 +66,10 @@ def within(
     chosen = times[(times >= first) & (times < end)]
     if not len(chosen):
         span = f"from {times[0] / 1e6:g} to {times[-1] / 1e6:g} s" if len(times) else "none"
+        bounds = (("from --start", start), ("to --stop", stop))
+        asked = " ".join(f"{words} {float(s):g} s" for words, s in bounds if s is not None)
         raise InputError(
-            f"{name}: there is no image from --start {first / 1e6:g} s to --stop {end / 1e6:g} s; "
-            f"its times are {span}, so choose others"
+            f"{name}: there is no image {asked}; its times are {span}, so choose others"
         )
     return chosen
 

@@ -111,7 +111,17 @@ def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int
 
 
 def count_events(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np.floating]:
-    """Count ON and OFF events (2, pixels), weighted for a dead time `rho` (us)."""
+    """Count ON and OFF events, weighted for a dead time.
+
+    Args:
+        recording: The recording.
+        begin: First time, us.
+        end: End, us.
+        rho: Dead time, us.
+
+    Returns:
+        (2, pixels).
+    """
     source = recording.events
     # With enough events before the begin to know the gaps of nearly all pixels.
     rows = slice(source.index(2 * begin - end), source.index(end))
