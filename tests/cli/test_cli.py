@@ -602,8 +602,12 @@ def test_reconstruct_some_times(folder, capsys):
     capsys.readouterr()
 
     blend = ["reconstruct", folder / "small.h5", "--method", "blend", "--out", folder / "no.h5"]
-    for options in (["--start", "1"], ["--stop", "0"], ["--rate", "10", "--start", "1"]):
-        fails(capsys, [*blend, *options], "small.h5", "--start")
+    for *options, name, value in (
+        ["--start", "1"],
+        ["--stop", "0"],
+        ["--rate", "10", "--start", "1"],
+    ):
+        fails(capsys, [*blend, *options, name, value], "small.h5", f"{name} {value} s")
     fails(capsys, [*blend, "--stop", "nan"], "--stop")
     (folder / "far.txt").write_text("0.01\n0.2\n")
     fails(capsys, [*blend, "--times", folder / "far.txt"], "small.h5", "200000")
