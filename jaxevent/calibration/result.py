@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +46,19 @@ class CalibratedValues(NamedTuple):
     found: dict[str, float]
     missing: dict[str, str]
 
+    def updated(self, found: Mapping[str, float], names: Iterable[str]) -> "CalibratedValues":
+        """Return the values of some names, those found elsewhere first.
+
+        Args:
+            found: Values that replace these.
+            names: Names in the order wanted; those without a value are left out.
+
+        Returns:
+            The values.
+        """
+        known = {**self.found, **found}
+        return CalibratedValues({n: known[n] for n in names if n in known}, self.missing)
+
     def __str__(self) -> str:
         return ", ".join(format_calibrated(name, value) for name, value in self.found.items())
 
@@ -60,6 +73,8 @@ def format_calibrated(name: str, value: float) -> str:
     Returns:
         Words.
     """
+    if name == "event_delay":
+        return f"events {1e3 * abs(value):.1f} ms {'late' if value >= 0 else 'early'}"
     return f"clock {1e3 * value:+.1f} ms" if name == "clock_offset" else f"{name} {value:.3g}"
 
 

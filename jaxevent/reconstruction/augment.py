@@ -42,6 +42,14 @@ class FrameParams(Parameters):
     clock_offset: Number = Number(
         0.0, "s", "added to the frames' time stamps", gradient=False, least=-1e10, most=1e10
     )
+    event_delay: Number = Number(
+        0.0,
+        "s",
+        "time by which events lag behind the changes that they stand for; images do not lag",
+        gradient=False,
+        least=-1e10,
+        most=1e10,
+    )
     deblur: Choice = Choice((True, False), "deblur frames by the events within their exposures")
     exposure: Positive = Positive(
         0.0, "s", "exposure of frames whose own is not known", gradient=False, most=1e6
@@ -55,6 +63,15 @@ class FrameParams(Parameters):
     )
 
     calibrated = ("clock_offset", "c_on", "c_off")
+
+    @property
+    def frame_delay(self) -> Any:
+        """Time added to the frames' stamps to be beside the events that show the same, s."""
+        return self.clock_offset + self.event_delay
+
+    def beside_events(self: T) -> T:
+        """Return the parameters with the frames' clock moved by the delay, for times of events."""
+        return self.replace(clock_offset=self.frame_delay, event_delay=0.0)
 
     @classmethod
     def predictor(cls) -> Any:
@@ -106,25 +123,25 @@ def calibrated_values(
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
     I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
-    values = recall_calibration(recording, I0, sample).select(names)
-    method = params.predictor()
-    if method is None or values.missing:
+    calibration, method = recall_calibration(recording, I0, sample), params.predictor()
+    values = calibration.select(names)
+    if method is None or values.missing or not calibration.clock_offset.is_identifiable:
         return values
     if method.Params is not type(params):
         of_method = calibrated_values(
             recording, method.Params(), method.Params.calibrated, sample
         ).found
-        return CalibratedValues(
-            {name: of_method.get(name, value) for name, value in values.found.items()}, {}
-        )
+        return values.updated(of_method, names)
     start = params.replace(**values.found)
     others = [start.replace(**{n: v for n, v in params.values().items() if n in THRESHOLDS})]
 
+    moved = [name for name in names if name != "clock_offset"]
+
     def compute() -> dict[str, float]:
-        return refine(method, recording, start, names, others)
+        return refine(method, recording, start, moved, others)
 
     what = f"{type(params).__module__} {' '.join(names)} {start.values()}"
-    return CalibratedValues({**values.found, **recall_numbers(recording, what, compute)}, {})
+    return values.updated(recall_numbers(recording, what, compute), names)
 
 
 class CertaintyParams(FrameParams):
@@ -375,13 +392,13 @@ def clock_lag(params: FrameParams, frames: FrameFeatures) -> Float[Array, ""]:
     """Return the seconds by which the frames' clock differs from the prepared one; 0 in a `Video`.
 
     Args:
-        params: `clock_offset`, s.
-        frames: Features that were prepared for some clock offset.
+        params: `clock_offset` and `event_delay`, s.
+        frames: Features that were prepared for some such times.
 
     Returns:
         (), s.
     """
-    return params.clock_offset - frames.clock_offset
+    return params.frame_delay - frames.frame_delay
 
 
 def segment_excess(params: FrameParams, share: Array, on: Array, off: Array) -> Array:

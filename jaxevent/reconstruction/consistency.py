@@ -44,7 +44,7 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
 
     Args:
         recording: Events and frames.
-        params: Thresholds, `I0` and `clock_offset`, see `augment.FrameParams`.
+        params: Thresholds, `I0`, `clock_offset` and `event_delay`, see `augment.FrameParams`.
 
     Returns:
         The comparison; None without two frames, or with too few such pixels.
@@ -53,7 +53,7 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
     if frames is None or len(frames) < 2 or not len(recording.events):
         return None
     c_on, c_off, I0, offset = (
-        float(v) for v in (params.c_on, params.c_off, params.I0, params.clock_offset)
+        float(v) for v in (params.c_on, params.c_off, params.I0, params.frame_delay)
     )
     t, gain = frames.t + round(offset * 1e6), recording.gain
     response = FrameImages(recording, np.dtype(np.float32)).response()
@@ -92,7 +92,7 @@ def events_contradict_frames(recording: Recording, params: Any) -> str | None:
 
     Args:
         recording: Events and frames.
-        params: Thresholds, `I0` and `clock_offset`, see `augment.FrameParams`.
+        params: Thresholds, `I0`, `clock_offset` and `event_delay`, see `augment.FrameParams`.
 
     Returns:
         A sentence that names the parameters, without a full stop.

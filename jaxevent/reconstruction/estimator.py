@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
+import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import renamed_methods
@@ -19,7 +20,7 @@ from jaxevent.reconstruction.frames import EventTiming, time_span
 from jaxevent.reconstruction.live import LiveVideo
 from jaxevent.reconstruction.video import ImageSequence, P, Video
 from jaxevent.reconstruction.windows import prepare
-from jaxevent.recording import Recording, Times, check_times
+from jaxevent.recording import Recording, Times, check_times, microseconds
 
 
 @runtime_checkable
@@ -132,8 +133,8 @@ class ImageEstimator(Estimator[P]):
 
     def check_request(
         self, recording: Recording, times: Times, params: P | None, extrapolate: bool
-    ) -> P:
-        """Check what `prepare` is given.
+    ) -> tuple[P, NDArray[np.int64]]:
+        """Check what `prepare` is given, and find the events' times of images.
 
         Args:
             recording: Events and frames.
@@ -142,7 +143,8 @@ class ImageEstimator(Estimator[P]):
             extrapolate: Whether times may lie outside the recording.
 
         Returns:
-            The parameters.
+            The parameters, and the times of the events that show the images, us: `event_delay`
+            later.
 
         Raises:
             InputError: The recording lacks what the method needs, or times lie outside it.
@@ -152,7 +154,8 @@ class ImageEstimator(Estimator[P]):
         self.check_clocks(recording, params)
         if not extrapolate:
             self.check_span(recording, times, params)
-        return params
+        delay_us = EventTiming.of(params).image_delay_us
+        return params, np.atleast_1d(microseconds(times)) + delay_us
 
     def check_clocks(self, recording: Recording, params: P) -> None:
         """Check that frames and events that are combined can be on one clock (`events.clocks`).
@@ -322,7 +325,7 @@ class PixelEstimator(ImageEstimator[P]):
                 outside
                 the recording.
         """
-        params = self.check_request(recording, times, params, extrapolate)
+        params, times = self.check_request(recording, times, params, extrapolate)
         return prepare(recording, times, EventTiming.of(params), filtering=self.is_event_driven)
 
     def estimate(

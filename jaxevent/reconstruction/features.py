@@ -206,7 +206,7 @@ class FrameFeatures(ShortRepr):
     blend_rate: Float[Numeric, " frames"]  # d blend / dt after each frame, 1/s
     present: Float[Numeric, ""]  # 1, or 0 if the recording has no frames
     rows: Int[Numeric, " 3"]  # number of frames; rows of the last one before, of the next's first
-    clock_offset: Float[Numeric, ""]  # s, for which the positions were prepared
+    frame_delay: Float[Numeric, ""]  # s, for which the positions were prepared
     flicker: Float[Numeric, ""]  # variance of the intensity that all pixels of a frame share
     movement: Float[Numeric, ""]  # how much of the recording moves, 0 to 1
     width: int = eqx.field(static=True)  # of the sensor, whose pixels are in rows

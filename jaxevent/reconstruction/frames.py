@@ -35,6 +35,7 @@ class EventTiming(NamedTuple):
     """
 
     clock_offset: float = 0.0  # added to the frames' time stamps
+    event_delay: float = 0.0  # by which events lag behind the changes that they stand for
     exposure: float = 0.0  # of frames whose own is not known
     rho_ref: float = 0.0  # dead time of a pixel after an event
     spread: float = 0.0
@@ -43,6 +44,19 @@ class EventTiming(NamedTuple):
     def of(cls, params: Any) -> "EventTiming":
         """Read an estimator's parameters, rounded to 10 ns: float32 has 7.5 ms as 7500 us too."""
         return cls(**{n: round(float(getattr(params, n, 0.0)), 8) for n in cls._fields})
+
+    @property
+    def frame_delay(self) -> float:
+        """Time added to the frames' stamps to be beside the events that show the same, s."""
+        return self.clock_offset + self.event_delay
+
+    @property
+    def image_delay_us(self) -> int:
+        """Time added to that of an image to be beside the events that show it, us.
+
+        At the time of a frame, its stamp and `clock_offset`, it is exactly that of the frame.
+        """
+        return round(1e6 * self.frame_delay) - round(1e6 * self.clock_offset)
 
 
 def time_span(recording: Recording, clock_offset: Any = 0.0) -> tuple[int, int]:
@@ -92,7 +106,7 @@ class FrameClock:
     @classmethod
     def of(cls, recording: Recording, timing: EventTiming) -> "FrameClock":
         """Read the times of a recording's frames."""
-        offset = round(timing.clock_offset * 1e8) / 100
+        offset = round(timing.frame_delay * 1e8) / 100
         frames, origin = recording.frames, recording.start
         if frames is None:
             none = np.empty(0)

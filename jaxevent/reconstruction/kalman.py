@@ -86,6 +86,8 @@ class Params(AugmentParams):
         },
     }
 
+    calibrated = ("clock_offset", "event_delay", "c_on", "c_off")
+
     @classmethod
     def predictor(cls) -> Filter:
         return akf

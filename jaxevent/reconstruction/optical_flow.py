@@ -175,6 +175,7 @@ class FlowVideo(ImageSequence[Params]):
         times = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.estimator.check_span(self.recording, times, self.params)
+        times = times + self._image_delay_us
         located = _locate(self._clock, times)
         shape = (len(times), self.recording.height, self.recording.width, 2)
         flows = np.full(shape, np.nan, self._dtype)
@@ -250,11 +251,11 @@ class Flow(ImageEstimator[Params]):
         Raises:
             InputError: As `check`, and for times outside the recording.
         """
-        params = self.check_request(recording, times, params, extrapolate)
+        params, wanted = self.check_request(recording, times, params, extrapolate)
         clock = FrameClock.of(recording, EventTiming.of(params))
         images = FrameImages(recording, np.dtype(jnp.result_type(float)))
         frames = _read_frames(images, clock, slice(0, len(clock)))
-        return frames, _locate(clock, np.atleast_1d(microseconds(times)))
+        return frames, _locate(clock, wanted)
 
     def run(
         self, params: Params, features: FrameSeries, state: None = None

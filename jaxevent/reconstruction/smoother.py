@@ -107,7 +107,7 @@ class Params(CertaintyParams):
         (True, False), "use clipped frames as evidence that L lies beyond the clip"
     )
 
-    calibrated = ("clock_offset", "c_on", "c_off", "share", "sigma_event")
+    calibrated = ("clock_offset", "event_delay", "c_on", "c_off", "share", "sigma_event")
 
     @classmethod
     def predictor(cls) -> "Smoother | None":
@@ -613,7 +613,7 @@ def adjacent_counts(
     the window's start.
 
     Args:
-        params: `clock_offset` and `share`.
+        params: `clock_offset`, `event_delay` and `share`.
         window: The window.
         points: The images.
 
@@ -828,7 +828,7 @@ class Smoother(KernelEstimator[AnyParams]):
         """
 
         def lag(known):
-            return known[0].clock_offset - known[1]["clock_offset"]
+            return known[0].frame_delay - known[1]["frame_delay"]
 
         def counted(params, on, off, around_on, around_off, given):
             return redistribute_events(params, on, around_on, given), redistribute_events(

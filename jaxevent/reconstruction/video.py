@@ -204,11 +204,12 @@ def note_first_events(first: NDArray[np.int64], events: Events) -> None:
 class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     """Images of a reconstruction: `image, variance, valid = sequence(times)`.
 
-    A subclass reads images in `_read`. Images do not depend on which others were read. Threads may
-    share a sequence: they take turns, in calls as a whole, else image by image. A pickle or copy
-    holds the arguments of the sequence, and is made anew of these. Raises `InputError` if the
-    recording lacks what the estimator needs. The first reading warns if events contradict frames at
-    the given thresholds, see `consistency`.
+    A subclass reads images in `_read`, at times of the events that show them: those of images and
+    `event_delay`. Images do not depend on which others were read. Threads may share a sequence:
+    they take turns, in calls as a whole, else image by image. A pickle or copy holds the arguments
+    of the sequence, and is made anew of these. Raises `InputError` if the recording lacks what the
+    estimator needs. The first reading warns if events contradict frames at the given thresholds,
+    see `consistency`.
     """
 
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
@@ -230,6 +231,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         estimator.check_clocks(recording, params)
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
+        self._image_delay_us = EventTiming.of(params).image_delay_us
         self._compared, self._is_live = not estimator.fuses, False
         self._turns = TurnLock(f"images of {recording.name}")
 
@@ -375,7 +377,8 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
             warnings.warn(doubt, InputWarning, stacklevel=2)
         start, stop = time_span(self.recording, self.params.clock_offset)
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
-            for batch, images in self._turns.iterate(self._read(times)):
+            for read, images in self._turns.iterate(self._read(times + self._image_delay_us)):
+                batch = read - self._image_delay_us
                 shape = (len(batch), self.recording.height, self.recording.width)
                 image, variance, valid = (
                     np.asarray(v)[: len(batch)].reshape(shape) for v in images
@@ -384,7 +387,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
                 if not inside.all():
                     valid = valid & inside[:, None, None]
                 if self._lacks_frames:
-                    valid = valid & (self._first_events <= batch[:, None, None])
+                    valid = valid & (self._first_events <= read[:, None, None])
                 yield batch, Estimate(image, variance, valid)
                 shown.update(len(batch))
 
@@ -514,7 +517,8 @@ class Video(ImageSequence[P]):
     @property
     def settled(self) -> int | None:
         """Time (us) before which images can no longer be read; None: all can."""
-        return self._starts[0].start
+        start = self._starts[0].start
+        return None if start is None else start - self._image_delay_us
 
     def extend(self, recording: Recording) -> None:
         """Go on with the same recording after events or frames were added to its end."""

@@ -282,5 +282,8 @@ def test_refined_parameters_predict_better(recording):
     hidden = dataclasses.replace(hidden, images=hidden.images[:, 16:56])
     refined = method.Params.for_recording(given)
     physics = jaxevent.calibrate(given).params(method.Params)
+    # The clock is the sensor's; that a filter sees events late is a number of its own.
+    assert float(refined.clock_offset) == float(physics.clock_offset)
+    assert float(refined.event_delay) > 0 == float(physics.event_delay)
     assert error(method, refined) < 0.95 * error(method, physics)
     assert error(method, refined) < 0.7 * error(method, method.Params())

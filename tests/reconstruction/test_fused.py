@@ -42,7 +42,7 @@ from jaxevent.recording import ColumnSource
 pytestmark = pytest.mark.filterwarnings("ignore:random. holds no frames")
 
 # Of the same choices, so that the functions are traced once; conditions on numbers choose the way.
-DEAD = {**PARAMS, "rho_ref": 0.0008, "clock_offset": 0.0007}
+DEAD = {**PARAMS, "rho_ref": 0.0008, "clock_offset": 0.0003, "event_delay": 0.0004}
 ALL = {**OPTIONS, "clock_offset": -0.0021}
 
 
@@ -87,7 +87,7 @@ def test_expressions_of_a_filter_are_its_functions(name):
     """Evaluated by NumPy, without compiling, for points of every piece."""
     method, random = jaxevent.METHODS[name], np.random.default_rng(0)
     params = params_of(method, **{"weighting": "linear", **ALL})
-    fixed = {"clock_offset": np.asarray(0.0), "present": np.asarray(1.0)}
+    fixed = {"frame_delay": np.asarray(0.0), "present": np.asarray(1.0)}
     known = DerivativeDirections().inputs(params, fixed | {"response": np.linspace(0, 1, 256)})
     kind = filter_program.KernelKind(False, np.dtype(float), 8208)
     trace = filter_program.trace_filter(method, known, kind)

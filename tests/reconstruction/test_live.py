@@ -49,7 +49,9 @@ def test_images_are_those_of_what_was_added(frames):
     if not frames:
         recording = dataclasses.replace(recording, frames=None)
     # A live recording does not know how much of it will move.
-    params = jaxevent.akf.Params(exposure=0.003, clock_offset=0.001, rho_ref=1e-5, error_still=0.0)
+    params = jaxevent.akf.Params(
+        exposure=0.003, clock_offset=0.0008, event_delay=0.0002, rho_ref=1e-5, error_still=0.0
+    )
     live = jaxevent.akf.live((WIDTH, HEIGHT), params, frames=frames, window_events=EVENTS)
     events, given, held = recording.events, 0, 0
     for row in range(0, len(events), 50):

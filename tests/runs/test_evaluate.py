@@ -562,4 +562,5 @@ def test_real_recording(data, float32):
     (row,) = evaluate(recording[1.2:1.6], ["mc"], calibrate=False)
     assert 100 * row["mse"] <= 0.02
     (row,) = evaluate(recording, ["akf"])
-    assert row["calibrated"] == ["clock_offset", "c_on", "c_off"] and 100 * row["mse"] <= 0.155
+    assert row["calibrated"] == ["clock_offset", "event_delay", "c_on", "c_off"]
+    assert 100 * row["mse"] <= 0.155

@@ -160,7 +160,8 @@ class CompensatedVideo(ImageSequence[Params]):
         progress: bool | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
-        self._start = None if motion is None else InitialMotion(motion, refine)
+        delay = self._image_delay_us
+        self._start = None if motion is None else InitialMotion(motion, delay, refine)
         self._window_events = window_events
         self._trajectories: TrajectoryEstimator | None = None
         self._latest: tuple[int, TrajectoryEstimate, FusedImage] | None = None
@@ -178,7 +179,7 @@ class CompensatedVideo(ImageSequence[Params]):
         """The estimator of the targets' motion; made when first needed."""
         if self._trajectories is None:
             self._trajectories = make_trajectory_estimator(
-                self.recording, self.params, self._window_events, self._start
+                self.recording, self.params.beside_events(), self._window_events, self._start
             )
         return self._trajectories
 
@@ -230,7 +231,7 @@ class CompensatedVideo(ImageSequence[Params]):
         if not extrapolate:
             self.estimator.check_span(self.recording, wanted, self.params)
         for t in wanted.tolist():
-            yield self._target(t)
+            yield self._target(t + self._image_delay_us)
 
     @synchronized
     def carry(
@@ -246,7 +247,8 @@ class CompensatedVideo(ImageSequence[Params]):
         Returns:
             The images (n, H, W, channels), and the visibility (n, H, W) of the points in each.
         """
-        target, fused = self._target(to)
+        target, fused = self._target(to + self._image_delay_us)
+        at = at + self._image_delay_us
         s = target.instants.to_relative_times(at).astype(np.float32)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
@@ -335,10 +337,10 @@ class MotionCompensation(ImageEstimator[Params]):
         Raises:
             InputError: If the recording has no frames, or times are missing or outside the data.
         """
-        params = self.check_request(recording, times, params, extrapolate)
-        wanted = np.atleast_1d(microseconds(times))
+        params, wanted = self.check_request(recording, times, params, extrapolate)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
+        params = params.beside_events()
         trajectories = make_trajectory_estimator(recording, params, MAX_WINDOW_EVENTS)
         chosen = [trajectories.schedule(t) for t in wanted.tolist()]
         count = pad_instant_count(max(len(one) for one in chosen))

@@ -133,7 +133,7 @@ class Params(smoother.Params):
     # Thresholds are learned (`learn`) along trajectories, from more than events between frames. But
     # they are relative to the common ones, which alone tell how far beyond white points are. The
     # exposure is needed of frames that are blurred and do not state theirs.
-    calibrated = ("clock_offset",)
+    calibrated = ("clock_offset", "event_delay")
     calibrated_if_needed = ("c_on", "c_off", "exposure")
 
     @classmethod

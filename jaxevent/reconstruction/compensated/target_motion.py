@@ -174,10 +174,12 @@ class InitialMotion:
 
     Attributes:
         motion: The flow.
+        delay_us: Time added to that of an image to be beside the events that show it.
         refine: Whether images may correct it.
     """
 
     motion: FlowSource
+    delay_us: int = 0
     refine: bool = True
 
     def __call__(self, t: int, late: int, unit: float) -> NDArray[np.float32] | None:
@@ -194,9 +196,8 @@ class InitialMotion:
         Returns:
             (rows, columns, 4) trajectories of nodes, px; None where the flow is not known.
         """
-        before, now, after = np.asarray(
-            self.motion.flow(np.array([t - late, t, t + late]), extrapolate=True), float
-        )
+        times = t - self.delay_us + np.array([-late, 0, late])
+        before, now, after = np.asarray(self.motion.flow(times, extrapolate=True), float)
         if not np.isfinite([before, now, after]).all():
             return None
         h, w = now.shape[:2]

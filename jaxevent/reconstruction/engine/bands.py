@@ -298,11 +298,11 @@ class PartitionedRecording:
         """The recording's start (us), from which kernels count."""
         return self.windows.clock.origin
 
-    def fixed_inputs(self, clock_offset: Any, has_variance: bool) -> dict[str, NDArray]:
+    def fixed_inputs(self, frame_delay: Any, has_variance: bool) -> dict[str, NDArray]:
         """Return what kernels know beside parameters.
 
         Args:
-            clock_offset: Offset of the frames' clock that windows were made for, s.
+            frame_delay: Time added to the frames' stamps that windows were made for, s.
             has_variance: Whether the method's variance rests on changes that events do not show.
 
         Returns:
@@ -312,7 +312,7 @@ class PartitionedRecording:
         known = {
             "flicker": np.asarray(unseen.flicker, self.dtype),
             "movement": np.asarray(unseen.movement, self.dtype),
-            "clock_offset": np.asarray(clock_offset, self.dtype),
+            "frame_delay": np.asarray(frame_delay, self.dtype),
             "present": np.asarray(len(self.windows.clock) > 0, self.dtype),
             "response": self._response,
         }

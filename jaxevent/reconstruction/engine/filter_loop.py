@@ -436,7 +436,7 @@ class FilterPasses:
         recording: The recording, divided among bands.
         method: The filter.
         params: Its parameters.
-        clock_offset: Offset of the frames' clock that the recording was divided for, s.
+        frame_delay: Time added to the frames' stamps that the recording was divided for, s.
         directions: Numbers by which derivatives are taken.
 
     Raises:
@@ -448,14 +448,14 @@ class FilterPasses:
         recording: PartitionedRecording,
         method: FilterMethod,
         params: Any,
-        clock_offset: Any,
+        frame_delay: Any,
         directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
         self.recording, self._method = recording, method
         self.kind = KernelKind(
             recording.windows.clock.exposed, recording.dtype, recording.layout.stride, directions
         )
-        self._fixed = recording.fixed_inputs(clock_offset, method.has_covariance)
+        self._fixed = recording.fixed_inputs(frame_delay, method.has_covariance)
         self.kernel: CompiledProgram | None = None
         self.use_params(params)
 

@@ -113,7 +113,7 @@ class FilterVideo(ImageSequence[P]):
             recording, EventTiming.of(params), estimator.is_event_driven, window_events
         )
         # Divided for the parameters' own clock: the lag is exactly 0.
-        self._passes = FilterPasses(self._partitioned, estimator, params, params.clock_offset)
+        self._passes = FilterPasses(self._partitioned, estimator, params, params.frame_delay)
         self._buffers = BufferPool(self._partitioned.windows.pixels, self.dtype)
         self._begins = [WindowStart(None, self._partitioned.windows.initial(), None)]
         self._open: BandedWindow | None = None
@@ -227,7 +227,7 @@ class SmootherVideo(ImageSequence[P]):
         partitioned = PartitionedRecording(
             recording, EventTiming.of(params), False, window_events, factors
         )
-        self._passes = SmootherPasses(partitioned, estimator, params, params.clock_offset)
+        self._passes = SmootherPasses(partitioned, estimator, params, params.frame_delay)
         self._segments = _make_segments(self._passes.clock, recording, window_events)
         most = max(segment.end - segment.begin for segment in self._segments)
         self._memory = self._passes.memory(self._passes.layout.bands, most)
@@ -383,7 +383,7 @@ class ImageKernel(abc.ABC):
         )
         self.method, self.dtype = method, self.recording.dtype
         self.pixels = recording.width * recording.height
-        self.clock_offset = np.asarray(params.clock_offset)
+        self.frame_delay = np.asarray(params.frame_delay)
         self._times = times - self.recording.origin
         self._arguments = method, recording, times, params
         self._turns = TurnLock(f"images of {recording.name}")
@@ -427,7 +427,7 @@ class ImageKernel(abc.ABC):
         """
         if directions not in self._passes:
             self._passes[directions] = self.passes_class(
-                self.recording, self.method, params, self.clock_offset, directions
+                self.recording, self.method, params, self.frame_delay, directions
             )
         self._passes[directions].use_params(params)
         return self._passes[directions]
@@ -490,7 +490,7 @@ class FilterImages(ImageKernel):
 
     def check(self, params: Any, directions: DerivativeDirections) -> None:
         kind = self.passes_with_derivatives(params).kind._replace(directions=directions)
-        fixed = self.recording.fixed_inputs(self.clock_offset, self.method.has_covariance)
+        fixed = self.recording.fixed_inputs(self.frame_delay, self.method.has_covariance)
         check_filter_kernel(self.method, params, fixed, kind)
 
     def make(
@@ -515,7 +515,7 @@ class SmootherImages(ImageKernel):
         self._bands, _ = passes.partition(self._whole, self.recording.windows.initial())
 
     def check(self, params: Any, directions: DerivativeDirections) -> None:
-        SmootherPasses(self.recording, self.method, params, self.clock_offset, directions)
+        SmootherPasses(self.recording, self.method, params, self.frame_delay, directions)
 
     def make(
         self, times_us: NDArray[np.int64], params: Any, directions: DerivativeDirections
@@ -628,10 +628,10 @@ def make_kernel_images(
     if backend == "xla" or not IS_SYNCHRONOUS or "rho_ref" in params.followed:
         return None
     times = sorted_times(times)
-    method.check_request(recording, times, params, extrapolate)
+    _, event_times = method.check_request(recording, times, params, extrapolate)
 
     def make() -> KernelImages:
-        return KernelImages.of(kind(method, recording, times, params), len(times))
+        return KernelImages.of(kind(method, recording, event_times, params), len(times))
 
     return make_kernel(method.name, compiler, serves, make)
 

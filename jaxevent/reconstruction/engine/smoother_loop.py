@@ -439,7 +439,7 @@ class SmootherPasses:
         recording: The recording, divided among bands.
         method: The smoother.
         params: Its parameters.
-        clock_offset: Offset of the frames' clock that the recording was divided for, s.
+        frame_delay: Time added to the frames' stamps that the recording was divided for, s.
         directions: Numbers by which derivatives are taken.
 
     Raises:
@@ -451,14 +451,14 @@ class SmootherPasses:
         recording: PartitionedRecording,
         method: SmoothingMethod,
         params: Any,
-        clock_offset: Any,
+        frame_delay: Any,
         directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
         self.recording, self.dtype, self._method = recording, recording.dtype, method
         self.clock, self.layout = recording.windows.clock, recording.layout
         stride = self.layout.stride
         self.kind = KernelKind(self.clock.exposed, self.dtype, stride, directions)
-        fixed = recording.fixed_inputs(clock_offset, method.has_unseen_errors)
+        fixed = recording.fixed_inputs(frame_delay, method.has_unseen_errors)
         self._fixed = {name: value for name, value in fixed.items() if name != "present"}
         self._program: SmootherProgram | None = None
         self.spare: queue.SimpleQueue[NDArray] = queue.SimpleQueue()  # memory for bands

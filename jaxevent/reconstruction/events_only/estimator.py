@@ -30,7 +30,7 @@ from jaxevent.reconstruction.events_only.video import (
 )
 from jaxevent.reconstruction.events_only.windows import SolvedWindow, WindowSolver
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times
 
 HELD_OUT_STEP = 5  # one of so many events is predicted by the others
 
@@ -135,8 +135,7 @@ class EventsOnly(ImageEstimator[Params]):
         params: Params | None,
         extrapolate: bool = False,
     ) -> tuple[WindowSolver, NDArray[np.int64], Params]:
-        params = self.check_request(recording, times, params, extrapolate)
-        wanted = np.atleast_1d(microseconds(times))
+        params, wanted = self.check_request(recording, times, params, extrapolate)
         if not len(wanted):
             raise InputError(f"{recording.name}: no times to prepare images for; give some")
         return WindowSolver(recording, params), wanted, params

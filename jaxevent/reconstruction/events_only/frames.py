@@ -58,16 +58,16 @@ class FrameMeasurements:
         windows: Source of paths and equations.
         recording: Events and at least one frame.
         I0: Offset inside the logarithm.
-        clock_offset: Added to the frames' time stamps, s.
+        frame_delay: Time added to the frames' stamps, s.
         causal: Whether later frames are left out.
     """
 
     def __init__(
-        self, windows: Windows, recording: Recording, I0: float, clock_offset: float, causal: bool
+        self, windows: Windows, recording: Recording, I0: float, frame_delay: float, causal: bool
     ):
         assert recording.frames is not None
         self.windows, self.frames, self.causal = windows, recording.frames, causal
-        self.I0, self.offset = I0, round(clock_offset * 1e6)
+        self.I0, self.offset = I0, round(frame_delay * 1e6)
         self._span = recording.start, recording.stop
         self._factors: dict[int, tuple[float, int] | None] = {}
 

@@ -124,4 +124,4 @@ class EventsOnlyVideo(ImageSequence[Params]):
         wanted = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.estimator.check_span(self.recording, wanted, self.params)
-        return self._windows.flow.flow(wanted, extrapolate=True)
+        return self._windows.flow.flow(wanted + self._image_delay_us, extrapolate=True)

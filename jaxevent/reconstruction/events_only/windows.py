@@ -70,7 +70,7 @@ class WindowSolver:
 
         self.frames: FrameMeasurements | None = None
         if params.use_frames and recording.frames is not None:
-            numbers = (float(params.I0), float(params.clock_offset))
+            numbers = (float(params.I0), float(params.frame_delay))
             self.frames = FrameMeasurements(self, recording, *numbers, causal)
 
     def rows_around(self, t: int) -> Rows:
