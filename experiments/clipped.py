@@ -53,7 +53,7 @@ def integrate(given: Recording, t: NDArray[np.int64]) -> NDArray[np.floating]:
     """Add events to the last unclipped value of each pixel, ln(I + 1)."""
     params, frames = jaxevent.akf.Params.for_recording(given), given.frames
     assert frames is not None
-    late = round(1e6 * float(params.clock_offset))
+    late = round(1e6 * float(params.frame_delay))
     events, pixels = given.events[:], given.width * given.height
     step = np.where(events.p, float(params.c_on), -float(params.c_off))
     place = events.y.astype(np.int64) * given.width + events.x
