@@ -216,7 +216,10 @@ def reconstruct(method, recording, p, times, likelihood=False):
     t = [int(v) - start for v in e.t]
     near = neighbour_times(t, e.x, e.y, 0)
     f = recording.frames
-    mid = [] if f is None else [int(v) - start + p["clock_offset"] * 1e6 for v in f.t]
+    # Late events are as early ones beside later frames, of which later images are read.
+    late = p["event_delay"] * 1e6
+    mid = [] if f is None else [int(v) - start + p["clock_offset"] * 1e6 + late for v in f.t]
+    times = [int(time) - start + round(late) for time in times]
     exposure = [] if f is None else [int(v) or p["exposure"] * 1e6 for v in f.exposure]
     images = np.empty((2, len(times), recording.height, recording.width))
     rows, pixels = {}, {}
@@ -233,18 +236,18 @@ def reconstruct(method, recording, p, times, likelihood=False):
             ]
             sources = [(1 - part * len(near_by), pixel), *((part, other) for other in near_by)]
             unseen = movement(recording)
-            seen, one = smooth(pixel, sources, [int(time) - start for time in times], p, unseen)
+            seen, one = smooth(pixel, sources, times, p, unseen)
             images[:, :, y, x], total = seen.reshape(2, -1), total + float(one)
             continue
         trace = run(method, pixel, [near[i] for i in rows[x, y]], p)
         for j, time in enumerate(times):
-            images[:, j, y, x] = read(method, pixel, trace, int(time) - start, p)
+            images[:, j, y, x] = read(method, pixel, trace, time, p)
             if method == "akf" and pixel.frames:
                 near_by = [
                     other for (i, k), other in pixels.items() if max(abs(i - x), abs(k - y)) == 1
                 ]
                 unseen = movement(recording)
-                images[1, j, y, x] += lasting(pixel, near_by, int(time) - start, p, unseen)
+                images[1, j, y, x] += lasting(pixel, near_by, time, p, unseen)
     return (images, total) if likelihood else images
 
 

@@ -755,6 +755,21 @@ def test_a_later_clock_changes_nothing():
     np.testing.assert_array_equal(one.mean, other.mean)
 
 
+@pytest.mark.slow
+def test_late_events_show_earlier_times():
+    """Of events and frames that fit as they are, but are both 3 ms late."""
+    delayed = params().replace(clock_offset=-0.003, event_delay=0.003)
+    late, t = mc.estimate(slide(), delayed, progress=False), np.array([206_000])
+    for one, other in zip(late(t - 3_000), video()(t), strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(late.flow(t - 3_000), video().flow(t))
+    pair = np.random.default_rng(0).random((2, 40, 48, 1))
+    places = np.array([190_000, 230_000])
+    carried = late.carry(pair, places - 3_000, int(t[0]) - 3_000)
+    for one, other in zip(carried, video().carry(pair, places, int(t[0])), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 @functools.cache
 def prepared():
     """Prepared images, and what is made of them: a function of raw parameters and targets."""
