@@ -9,7 +9,9 @@ and varying motion. A window of 300 ms at the middle is fitted from nothing. Err
 heading (degrees) and of Omega (vector, %) at its centre; "flipped" counts headings off by more than
 90 degrees, "both" the share with heading within 5 degrees and Omega within 8 %, "per sigma"
 medians of errors by what the covariance tells, "squared" means of squared errors of each component
-by their variance. What general.csv holds already is not computed again.
+by their variance. A second table has for several bounds of a heading's sigma how many of the right
+headings, within 5 degrees, and of the wrong ones are told. What general.csv holds already is not
+computed again.
 
 With `--uneven` the sensor has thresholds of 0.16 and 0.26, differing by 15 % between pixels, and
 times that are off by 0.5 ms; `--mismatch` and `--jitter` say how much. With `--seconds` recordings
@@ -33,6 +35,9 @@ from jaxevent.simulate import SENSORS, Sensor, motion_scene
 
 CENTRE = 250_000  # us
 COMPONENTS = [f"{name} per sigma, squared" for name in ("tx", "ty", "tz", "wx", "wy", "wz")]
+
+RIGHT_DEG = 5.0  # error of a heading that is right
+BOUNDS_RAD = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.6)  # of a heading's sigma
 
 # Thresholds that differ, between pixels too, and times that are off.
 UNEVEN = dataclasses.replace(SENSORS["ideal"], c_on=0.16, c_off=0.26, mismatch=0.15, jitter=5e-4)
@@ -91,6 +96,24 @@ def whole(scene: str, seed: int, params: Params, seconds: float) -> dict[str, An
     }
 
 
+def bound_table(table: pd.DataFrame) -> str:
+    """Return how many right and wrong headings bounds of their sigma leave."""
+    right, lines = table["heading"] <= RIGHT_DEG, []
+    for bound in BOUNDS_RAD:
+        told = table["heading sigma"] <= np.degrees(bound)
+        worst = table["heading"][told].max()
+        lines.append(
+            (
+                f"{bound:g}",
+                f"{(told & right).sum()} of {right.sum()}",
+                f"{(told & ~right).sum()} of {(~right).sum()}",
+                f"{worst:.1f}",
+            )
+        )
+    header = "bound, rad", "right headings told", "wrong ones told", "worst told, deg"
+    return markdown_table(header, lines)
+
+
 def main() -> None:
     parser = command_line(__doc__, out=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(196, 206)))
@@ -146,7 +169,7 @@ def main() -> None:
         lines.append(
             (name, len(part), *three, f"{100 * both:.0f} %", flipped, sigmas, squares, cpu, times)
         )
-    text = f"{markdown_table(header, lines)}\n\n{machine()}\n"
+    text = f"{markdown_table(header, lines)}\n\n{bound_table(table)}\n\n{machine()}\n"
     write_text(arguments.out / "general.md", text)
     print(text)
 

@@ -39,6 +39,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import batch, contrast, geometry, voting
 from jaxevent.egomotion.bundle.windows import stamp_offset
 from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.motion import is_observable
 
 Rows = list[dict[str, Any]]
 AXIS = np.array([1.0, 0.0088, 0.0]) / np.hypot(1.0, 0.0088)  # of the slider
@@ -230,6 +231,7 @@ def slider_rows(data: Path, frames: bool = True) -> Rows:
                 "estimates": len(mean),
                 "frames late by ms": late,
                 "lost": int((motion.t[~motion.valid] // 1e6 == first).sum()),
+                "undecided": int((~is_observable("general", covariance)[:, 0]).sum()),
                 "heading deg, median": np.median(heading),
                 "worst": heading.max(),
                 "|Omega| deg/s, median": np.degrees(np.median(turn)),

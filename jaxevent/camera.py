@@ -15,6 +15,7 @@ All places are (n, 2), before focal lengths and centre are applied.
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.core
@@ -25,13 +26,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
 
+_LARGEST_SENSOR = (1 << 16, 1 << 16)  # px: coordinates of events are uint16
+_MAX_TAN_ANGLE = 20.0  # tan of the widest angle from the axis that is supported, 87 degrees
+
 
 @dataclasses.dataclass(frozen=True)
 class PinholeCamera:
     """A camera of one centre of projection, with the distortion of its lens.
 
     Attributes:
-        fx: Horizontal focal length in px.
+        fx: Horizontal focal length in px, a float, int or traced number, as those that follow.
         fy: Vertical focal length in px.
         cx: Column of the centre in px.
         cy: Row of the centre in px.
@@ -41,13 +45,15 @@ class PinholeCamera:
             k3, k4).
 
     Raises:
-        InputError: The model is another, or there are more coefficients than it has.
+        InputError: The model is another, or there are more coefficients than it has; a number is
+            not finite, a focal length is not positive, or no sensor sees anything within 87 degrees
+            of the axis. Traced values are not checked.
     """
 
-    fx: float | int
-    fy: float | int
-    cx: float | int
-    cy: float | int
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
     distortion: tuple = ()
     model: str = "radtan"
 
@@ -66,6 +72,49 @@ class PinholeCamera:
             )
         object.__setattr__(self, "distortion", (*given, *(0.0,) * (len(names) - len(given))))
         object.__setattr__(self, "model", model)
+        self._check_numbers(names)
+        self.check_sensor(*_LARGEST_SENSOR)
+
+    def _check_numbers(self, coefficients: Sequence[str]) -> None:
+        """Raise `InputError` for what is not finite, and focal lengths that are not positive."""
+        given = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
+        given |= dict(zip(coefficients, self.distortion, strict=True))
+        for name, value in given.items():
+            if isinstance(value, jax.core.Tracer):
+                continue
+            if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
+                raise InputError(f"{name} of a camera is {value!r}; give one number")
+            if not np.isfinite(value):
+                raise InputError(
+                    f"{name} of a camera is {value}; give the calibration's finite numbers"
+                )
+        focal = [f for f in (self.fx, self.fy) if not isinstance(f, jax.core.Tracer)]
+        if not all(f > 0 for f in focal):
+            raise InputError(
+                f"a camera of focal lengths {self.fx} and {self.fy} px is not possible; give the "
+                "calibration's positive fx and fy in px"
+            )
+
+    def check_sensor(self, width: int, height: int, source: str = "") -> None:
+        """Check that a sensor reaches to within 87 degrees of the axis.
+
+        Args:
+            width: Columns of the sensor.
+            height: Its rows.
+            source: Name of the recording for messages.
+
+        Raises:
+            InputError: The centre is farther beside the sensor.
+        """
+        for f, c, side, name in ((self.fx, self.cx, width, "cx"), (self.fy, self.cy, height, "cy")):
+            if isinstance(f, jax.core.Tracer) or isinstance(c, jax.core.Tracer):
+                continue
+            if max(-c, c - (side - 1)) > _MAX_TAN_ANGLE * f:
+                raise InputError(
+                    f"{source}{': ' * bool(source)}a camera with {name} = {c} px, more than 87 "
+                    f"degrees beside the sensor at a focal length of {f} px, is not possible; give "
+                    "the calibration's centre in px, usually near (width - 1) / 2, (height - 1) / 2"
+                )
 
     @property
     def is_distorted(self) -> bool:
@@ -97,16 +146,8 @@ class PinholeCamera:
         Returns:
             (n, 2) coordinates X / Z, Y / Z. NaN where the distortion has no inverse, which is far
             from the centre, and more than 87 degrees from the axis.
-
-        Raises:
-            InputError: A focal length is not positive.
         """
         x, y = np.asarray(x), np.asarray(y)
-        if not (0 < self.fx < np.inf and 0 < self.fy < np.inf):
-            raise InputError(
-                f"a camera of focal lengths {self.fx} and {self.fy} px is not possible; give the "
-                "calibration's positive fx and fy in px"
-            )
         places, which = np.unique(np.stack([x, y], -1).astype(float), axis=0, return_inverse=True)
         seen = (places - (self.cx, self.cy)) / (self.fx, self.fy)
         straight = LENS_MODELS[self.model].undistort(seen, self.distortion)
@@ -438,7 +479,6 @@ def merge_exposures(
 
 Places = NDArray[np.float64]
 Coefficients = Sequence[float]
-_MAX_TAN_ANGLE = 20.0  # tan of the widest angle from the axis that is supported, 87 degrees
 _NEWTON_STEPS = 20  # of Newton's method
 
 

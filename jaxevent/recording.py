@@ -715,6 +715,8 @@ class Recording(HtmlRepr):
                 raise InputError(f"{self.name}: {field} is a {type(part).__name__}; give {remedy}")
         if self.frames is not None:
             self.frames.check_shape(self.width, self.height, self.name)
+        if self.camera is not None:
+            self.camera.check_sensor(*size, self.name)
 
     @classmethod
     def from_arrays(

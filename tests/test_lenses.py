@@ -3,6 +3,8 @@
 import dataclasses
 
 import h5py
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -83,6 +85,42 @@ def test_models_go_by_the_names_of_other_programs():
         PinholeCamera(1, 1, 0, 0, model="fov")
     with pytest.raises(InputError, match="has 5 coefficients; give at most 4, k1, k2, k3, k4"):
         PinholeCamera(1, 1, 0, 0, (0.0,) * 5, "equidistant")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ((-200, 200, 9, 7), "focal lengths -200 and 200 px is not possible; give"),
+        ((200, 0.0, 9, 7), "focal lengths 200 and 0.0 px is not possible; give"),
+        ((np.inf, 200, 9, 7), "fx of a camera is inf; give"),
+        ((200, 200, 9, np.nan), "cy of a camera is nan; give"),
+        ((200, 200, -4001, 7), "cx = -4001 px, more than 87 degrees beside the sensor .*; give"),
+        ((200, 200, 9, 1e6), "cy = 1000000.0 px, more than 87 degrees beside the sensor .*; give"),
+        ((200, 200, 9, 7, (0.1, np.nan)), "k2 of a camera is nan; give"),
+    ],
+)
+def test_a_camera_that_is_not_possible_is_refused_when_it_is_made(numbers, told):
+    with pytest.raises(InputError, match=told):
+        PinholeCamera(*numbers)
+
+
+def test_a_recording_refuses_a_camera_that_looks_past_its_sensor():
+    PinholeCamera(10, 10, 5000, 24)  # of a larger sensor
+    recording = Recording("a", *SIZE, EVENTS, camera=PinholeCamera(10, 10, 262, 24))
+    with pytest.raises(InputError, match="a: a camera with cx = 264 px, more than 87 degrees"):
+        dataclasses.replace(recording, camera=PinholeCamera(10, 10, 264, 24))
+
+
+def test_cameras_take_traced_numbers():
+    def project(f, x):
+        camera = PinholeCamera(f, 2 * f, -f, 5.0, (0.1 * f, 0.0))
+        return camera.fx * x + camera.cx * camera.distortion[0]
+
+    f, x = jnp.array([-2.0, 3.0]), 0.5  # the first is no camera, which a trace cannot see
+    want = f * x - 0.1 * f**2
+    np.testing.assert_allclose(jax.jit(project)(f[0], x), want[0], rtol=1e-6)
+    np.testing.assert_allclose(jax.vmap(project, (0, None))(f, x), want, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(project)(f[1], x), x - 0.2 * f[1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["radtan", "rational", "equidistant"])

@@ -115,8 +115,10 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
     group.add_argument(
         "--camera",
         metavar="FILE",
+        type=lens,
         help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
-        "camera_info of ROS or OpenCV; FILE:NAME takes one of several",
+        "camera_info of ROS or OpenCV, FILE:NAME of several; or numbers, fx,fy,cx,cy in px, with "
+        "distortion fx,fy,cx,cy,k1,k2,p1,p2,k3 or fx,fy,cx,cy,k1,k2,k3,k4,fisheye",
     )
     group.add_argument(
         "--time-unit",
@@ -160,9 +162,11 @@ def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
 
     if reading["size"] is None:
         raise InputError("standard input: does not state the sensor's size; give --size W,H")
-    lens = read_camera(reading["camera"], reading["size"]) if reading["camera"] else None
+    camera = reading["camera"]
+    if isinstance(camera, str):
+        camera = read_camera(camera, reading["size"])
     width, height = reading["size"]
-    recording = Recording("standard input", width, height, Events.empty(), camera=lens)
+    recording = Recording("standard input", width, height, Events.empty(), camera=camera)
     return recording, live.read_lines(sys.stdin.buffer)
 
 
@@ -264,7 +268,8 @@ def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str,
             for one in (value if isinstance(value, list) else [value])
             if isinstance(one, Path)
         ]
-        if camera := taken.get("reading", {}).get("camera"):
+        camera = taken.get("reading", {}).get("camera")
+        if isinstance(camera, str):
             inputs.append(split_name(camera)[0])
         check_outputs(named, inputs, force=force)
         read = [file for path in inputs for file in (path, *companions(path))]
@@ -280,6 +285,35 @@ def size(text: str) -> tuple[int, int]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not W,H, for example 240,180") from None
     return width, height
+
+
+def lens(text: str) -> Any:
+    """Return the camera of numbers with commas between, or else the text, a file's name."""
+    values = text.split(",")
+    model = values.pop().strip() if len(values) > 4 and not _is_number(values[-1]) else ""
+    if len(values) < 2 or not _is_number(values[0]) or Path(text).exists():
+        return text
+    if len(values) < 4 or not all(map(_is_number, values)):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither a file nor FX,FY,CX,CY, for example 200,200,119.5,89.5"
+        )
+    from jaxevent.camera import LENS_MODELS, PinholeCamera
+
+    fx, fy, cx, cy, *k = map(float, values)
+    if not model and len(k) > len(LENS_MODELS["radtan"].coefficients):
+        model = "rational"
+    try:
+        return PinholeCamera(fx, fy, cx, cy, tuple(k), model)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def number_or_path(text: str) -> float | Path:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -347,8 +348,8 @@ def _need_camera(recording: Any, kind: Any) -> None:
         others = [name for name, one in MODELS.items() if not one.needs_camera]
         raise InputError(
             f"{recording.name}: has no calibration, which {kind.title} needs"
-            f"{recording.describe_left_out('camera')}; give --focal or choose --model "
-            f"{' or '.join(others)}"
+            f"{recording.describe_left_out('camera')}; give --camera or --focal, or choose "
+            f"--model {' or '.join(others)}"
         )
 
 
@@ -403,11 +404,16 @@ def estimated(
 
 def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any) -> Any:
     """The motion by a method; `gyro` tells whether the IMU helps, its bias and its axes."""
+    from jaxevent.egomotion.estimator import LostMotionWarning
+
     more = {"cloud": N_PLOTTED_PARTICLES} if "cloud" in estimator.options else {}
     helps, bias, turned = gyro
-    if helps:
-        more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
-    return estimator.estimate(recording, values, **settings, **more)
+    with warnings.catch_warnings():
+        # The summary of the command tells it.
+        warnings.simplefilter("ignore", LostMotionWarning)
+        if helps:
+            more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
+        return estimator.estimate(recording, values, **settings, **more)
 
 
 def _gyro(

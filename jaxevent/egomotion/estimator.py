@@ -1,6 +1,7 @@
 """Estimators of the camera's motion under the common contract (`jaxevent.estimator`)."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -17,7 +18,7 @@ from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed, describe_windows, measure_image_speed
 from jaxevent.egomotion.truth import KnownMotion
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.estimator import Estimate, Estimator
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Recording, Times, check_times, microseconds
@@ -27,6 +28,10 @@ P = TypeVar("P", bound=Parameters)
 COMMON_OPTIONS = frozenset({"model", "camera", "seed"})  # of every method
 SCORE_RATE_HZ = 200.0  # of the times at which estimates are compared with known motion
 N_TRUTH_SAMPLES = 256  # of the known motion of a training segment
+
+
+class LostMotionWarning(InputWarning):
+    """A method found no motion of the camera at any time."""
 
 
 def score_times(start: int, stop: int) -> NDArray[np.int64]:
@@ -185,6 +190,21 @@ class MotionEstimator(Estimator[P]):
             camera = recording.require_camera(camera, found.title)
         self.check(recording)
         return found, camera
+
+    def warn_if_lost(self, motion: MotionEstimate) -> None:
+        """Warn with a `LostMotionWarning` if all estimates of a motion are lost."""
+        if motion.valid.any():
+            return
+        others = motion.model.best_method, motion.model.fallback_method
+        other = next((f"egomotion.{one}, " for one in others if one not in (None, self.name)), "")
+        count = len(motion)
+        warnings.warn(
+            f"{motion.recording}: {self.name} found no motion, "
+            f"{f'all {count} estimates are lost' if count else 'as there are no events'}; try "
+            f"{other}another model, or params of other windows",
+            LostMotionWarning,
+            stacklevel=3,
+        )
 
     def initial_params(self, model: type[Model]) -> P:
         """Return the parameters for a model, before they are adapted to a recording."""
@@ -346,7 +366,7 @@ class HostEstimator(MotionEstimator[P]):
     ) -> TrainingRuns:
         model, means = type(common[-1]), []
         for seed in seeds:
-            motion = self.estimate(recording, params, model=model, seed=seed, progress=False)
+            motion = self._solve(recording, params, model=model, seed=seed, progress=False)
             mean, _, valid = motion(times, extrapolate=True)
             means.append(np.where(valid[:, None], mean, 0.0))  # at rest where the motion is lost
         return FixedEstimates(*common, np.stack(means))
@@ -370,12 +390,18 @@ class HostEstimator(MotionEstimator[P]):
             options: Options of the method, see `MotionEstimator`.
 
         Returns:
-            The motion.
+            The motion. An `InputWarning` tells that none was found.
 
         Raises:
             InputError: The model is unknown or not supported, it needs a camera and there is none,
                 or the recording lacks what the method needs.
         """
+        motion = self._solve(recording, params, **options)
+        self.warn_if_lost(motion)
+        return motion
+
+    def _solve(self, recording: Recording, params: P | None, **options: Any) -> MotionEstimate:
+        """Estimate the motion, and say nothing if it is lost."""
         inputs, _ = self.prepare(recording, np.zeros(0, np.int64), params, **options)
         if params is None:
             start = self.initial_params(inputs.model)

@@ -307,8 +307,7 @@ def undistort(
         Coordinates (n, 2) in px, as the functions of this module take them, and f (px).
 
     Raises:
-        InputError: A focal length is not positive, or the distortion has no inverse at a pixel
-            within 87 degrees of the axis.
+        InputError: The distortion has no inverse at a pixel within 87 degrees of the axis.
     """
     straight = camera.normalise(x, y)
     if np.isnan(straight).any():

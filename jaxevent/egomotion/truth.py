@@ -11,6 +11,7 @@ own axes.
 """
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from jaxevent.deprecated import renamed_methods, renamed_names
 from jaxevent.egomotion.models import Model, find_model, in_words, unit_vectors
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.tables import read_table
 from jaxevent.recording import Imu, Poses, Recording, Times, check_recording, microseconds
 
@@ -148,7 +149,8 @@ def from_gyro(
             the identity.
 
     Returns:
-        The twists.
+        The twists. An `InputWarning` tells of a bias that is more than 0.2 rad/s from 0 and from
+        all of the rates, as one in deg/s.
 
     Raises:
         InputError: There is no sample, one is not finite, or the matrix is no rotation.
@@ -173,6 +175,15 @@ def from_gyro(
         )
     t, which, count = np.unique(imu.t, return_inverse=True, return_counts=True)
     gyro = np.stack([np.bincount(which, column) / count for column in imu.gyro.T], 1)
+    beyond = np.abs(bias - np.clip(bias, gyro.min(0), gyro.max(0)))
+    if (np.minimum(np.abs(bias), beyond) > MAX_GYRO_BIAS_RAD_S).any():
+        warnings.warn(
+            f"the gyro's bias {bias.tolist()} rad/s is beyond every rate that it measured, from "
+            f"{gyro.min(0).round(3).tolist()} to {gyro.max(0).round(3).tolist()} rad/s; give it in "
+            "rad/s: numpy.radians converts deg/s",
+            InputWarning,
+            stacklevel=2,
+        )
     return Twists(t, (gyro - bias) @ R.T, None, int(t[0]), int(t[-1]))
 
 

@@ -241,7 +241,7 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
         The camera.
 
     Raises:
-        InputError: The number of values is another, one is not finite, or the model is unknown.
+        InputError: The number of values is another, the model is unknown, or they are not possible.
     """
     found = find_model(model)
     if found is None:
@@ -254,7 +254,10 @@ def make_camera(values: NDArray, source: str, model: str = "radtan") -> PinholeC
             f"{' '.join(names)}"
         )
     fx, fy, cx, cy, *distortion = (float(value) for value in values)
-    return PinholeCamera(fx, fy, cx, cy, tuple(distortion), found)
+    try:
+        return PinholeCamera(fx, fy, cx, cy, tuple(distortion), found)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 def _unsupported_lens(model: str) -> str:
@@ -293,6 +296,10 @@ def make_supported_camera(
             f"{model[:40]!r}, of which {count} are supported"
         }
     k = np.concatenate([k[:count], np.zeros(max(0, count - len(k)))])
+    fx, fy = np.ravel(intrinsics)[:2]
+    if fx <= 0 or fy <= 0:
+        why = f"{source}: holds no calibration, but the focal lengths {fx:g} and {fy:g} px"
+        return None, {"camera": why}
     return make_camera(np.concatenate([np.ravel(intrinsics), k]), source, found), {}
 
 

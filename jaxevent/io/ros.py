@@ -391,8 +391,6 @@ def _read_camera(bag: Bag, topic: str | None) -> tuple[PinholeCamera | None, dic
     for _, message in bag.decoded(topic):
         matrix, k = (message.K, message.D) if bag.is_ros1 else (message.k, message.d)
         fx, _, cx, _, fy, cy = (float(value) for value in matrix[:6])
-        if fx <= 0:
-            return None, {"camera": f"{topic} holds no calibration, but a focal length of {fx:g}"}
         source = f"{bag.path}: {topic}"
         return make_supported_camera(
             np.array([fx, fy, cx, cy]), message.distortion_model, k, source

@@ -6,7 +6,6 @@ places of the event camera to places of the other one, [u, v, w] = H [x, y, 1].
 """
 
 import dataclasses
-import math
 from pathlib import Path
 
 import numpy as np
@@ -137,15 +136,6 @@ def apply_homography(H: NDArray[np.float64], points_px: NDArray[np.float64]) -> 
     seen = points_px @ H[:, :2].T + H[:, 2]
     w = seen[:, 2:] * np.sign(H[2, 2] if H[2, 2] else 1)
     return seen[:, :2] / np.where(w > 1e-9, seen[:, 2:], np.nan)
-
-
-def check_camera(camera: PinholeCamera) -> None:
-    """Raise `InputError` for focal lengths that are not positive."""
-    if not (0 < camera.fx < math.inf and 0 < camera.fy < math.inf):
-        raise InputError(
-            f"a camera of focal lengths {camera.fx} and {camera.fy} px is not possible; give the "
-            "calibration's positive fx and fy in px"
-        )
 
 
 def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from jaxevent.errors import InputError
 from jaxevent.io import calibration
 from jaxevent.io.checks import make_camera
 from jaxevent.parameters import read_toml
-from jaxevent.register.geometry import Grid, check_camera, mask_outside, pixel_rays, project
+from jaxevent.register.geometry import Grid, mask_outside, pixel_rays, project
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Rig:
         translation: (3,) m.
 
     Raises:
-        InputError: The matrix is no rotation, or a focal length is not positive.
+        InputError: The matrix is no rotation.
     """
 
     events: PinholeCamera
@@ -55,8 +55,6 @@ class Rig:
                 f"the translation {translation.tolist()} between the cameras cannot be used; give "
                 "three finite numbers in m"
             )
-        for camera in (self.events, self.frames):
-            check_camera(camera)
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
 

@@ -16,7 +16,7 @@ from jaxevent.egomotion.baselines import contrast as maximisation
 from jaxevent.egomotion.baselines import fits, points
 from jaxevent.egomotion.baselines import planes as plane_fits
 from jaxevent.egomotion.baselines.points import fit_general
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Frames
 from jaxevent.simulate import motion_scene
 
@@ -219,7 +219,10 @@ def test_a_rotation_is_found_through_a_fisheye():
 
 def test_planes_of_one_direction_are_lost():
     recording = swept(np.array([[1.0, 0.0]]), np.array([200.0]))
-    motion = planes.estimate(recording, planes.Params.of(dict(window=0.1)))
+    with pytest.warns(
+        InputWarning, match="planes found no motion, all .* are lost; try egomotion.voting, "
+    ):
+        motion = planes.estimate(recording, planes.Params.of(dict(window=0.1)))
     assert not motion.valid.any() and np.isfinite(motion.mean).all()
     assert np.isfinite(motion.covariance).all()
 
@@ -253,7 +256,8 @@ def test_frames_find_a_rotation():
 
 def test_frames_that_show_nothing_are_lost():
     pytest.importorskip("cv2", reason="needs the extra 'vision'")
-    motion = frames.estimate(filmed([np.full((HEIGHT, WIDTH), 0.5)] * 3))
+    with pytest.warns(InputWarning, match="frames found no motion, all 2 estimates are lost"):
+        motion = frames.estimate(filmed([np.full((HEIGHT, WIDTH), 0.5)] * 3))
     assert not motion.valid.any() and np.isfinite(motion.mean).all()
 
 
@@ -474,6 +478,7 @@ def test_silence_and_noise_are_lost_and_the_motion_found_again(straight, optimis
 
 
 @pytest.mark.parametrize("number", [0, 1, 50])
+@pytest.mark.filterwarnings("ignore:made. .* found no motion:jaxevent.errors.InputWarning")
 @pytest.mark.parametrize("method", [planes, contrast])
 def test_few_events_are_lost(method, number):
     few = recorded([5] * number, range(number), [3] * number, [1] * number, *SIZE)

@@ -33,7 +33,7 @@ from jaxevent.egomotion.bundle.windows import (
     stamp_offset,
 )
 from jaxevent.egomotion.truth import Twists
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Frames, Recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # it computes long
@@ -515,14 +515,16 @@ def test_a_recording_from_end_to_end(monkeypatch):
     assert valid[0] and covariance.shape == (1, 6, 6)
     assert np.linalg.norm(mean[0, :3]) == pytest.approx(1)
     assert np.degrees(np.arccos(mean[0, :3] @ T / np.linalg.norm(T))) < 15
-    few = sequence.batch.estimate(seen()[0.0:0.01], PARAMS)
+    with pytest.warns(InputWarning, match="batch found no motion, all .* are lost; try another"):
+        few = sequence.batch.estimate(seen()[0.0:0.01], PARAMS)
     assert not few.valid.any() and np.isfinite(few.mean).all()
     at_once = seen().events[:3000]
     at_once = dataclasses.replace(at_once, t=np.full(3000, 150_000))
     instant = sequence.batch.estimate(dataclasses.replace(seen(), events=at_once), PARAMS)
     assert all(np.isfinite(part).all() for part in (instant.mean, instant.covariance))
     empty = dataclasses.replace(seen(), events=seen().events[:0])
-    assert len(sequence.batch.estimate(empty, PARAMS)) == 0
+    with pytest.warns(InputWarning, match="batch found no motion, as there are no events"):
+        assert len(sequence.batch.estimate(empty, PARAMS)) == 0
 
 
 def a_fit(path, cost, ambiguity=0.0):

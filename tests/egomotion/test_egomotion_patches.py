@@ -325,6 +325,17 @@ def test_a_gyro_in_other_axes_and_with_a_bias():
             truth.imu_rotation(wrong)
 
 
+def test_a_bias_in_degrees_is_told():
+    t = np.arange(50) * 10_000
+    rates = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) + [0.0, 0.0, 3.0]
+    imu = Imu(t, rates, np.zeros_like(rates))
+    for bias in ([0.0, 0.0, 0.0], [0.19, -0.05, 0.1], [0.4, 0.0, 3.1]):
+        np.testing.assert_allclose(truth.from_gyro(imu, bias).Omega, rates - bias)
+    for degrees in ([60.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 6.0]):
+        with pytest.warns(InputWarning, match="give it in rad/s: numpy.radians converts deg/s"):
+            truth.from_gyro(imu, degrees)
+
+
 @pytest.mark.parametrize("name", ["camera", "y-up", "turned"])
 def test_comparisons_tell_of_a_gyro_in_other_axes(name):
     t = np.linspace(0, 1_000_000, 50).astype(np.int64)

@@ -1,6 +1,7 @@
 """Candidates against a slow search; the filter against NumPy, finite differences, known motions."""
 
 import dataclasses
+import warnings
 
 import equinox as eqx
 import jax
@@ -12,6 +13,7 @@ from points import HEIGHT, WIDTH, moved, recorded, scattered, search_candidates,
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import candidates, voting
 from jaxevent.egomotion.candidates import CandidateSampler
+from jaxevent.egomotion.estimator import LostMotionWarning
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
@@ -444,7 +446,10 @@ def test_odd_streams(model, likelihood):
     one_pixel = recorded(even, 0 * x + 5, 0 * y, p, camera=CAMERA)
     one = recorded(even[:1], x[:1], y[:1], p[:1], camera=CAMERA)
     for recording in (one, few, silent, at_once, one_pixel):
-        motion = voting.estimate(recording, params, model=model, smooth=True)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", LostMotionWarning)
+            motion = voting.estimate(recording, params, model=model, smooth=True)
+        assert [w.category for w in told] == [LostMotionWarning] * (not motion.valid.any())
         assert len(motion) > 0
         states = motion(recording.start + np.arange(5) * 300_000, extrapolate=True)
         for value in (motion.mean, motion.covariance, motion.contrast, motion.evidence):
@@ -455,7 +460,8 @@ def test_odd_streams(model, likelihood):
             np.testing.assert_allclose(np.linalg.norm(motion.mean[:, :3], axis=1), 1)
     assert not motion.valid.any() or likelihood == "literal"
     nothing = dataclasses.replace(few, events=Events.empty())
-    states = voting.estimate(nothing, params, model=model)(0.5)
+    with pytest.warns(LostMotionWarning, match="found no motion, as there are no events; try"):
+        states = voting.estimate(nothing, params, model=model)(0.5)
     assert not states.valid.any() and np.isnan(states.mean).all()
 
 

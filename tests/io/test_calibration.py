@@ -12,6 +12,7 @@ from rigs import turned
 import jaxevent
 from jaxevent import cli
 from jaxevent.camera import PinholeCamera
+from jaxevent.cli import arguments
 from jaxevent.errors import InputError, MissingExtra
 from jaxevent.recording import Events, Recording
 from jaxevent.register import Rig
@@ -111,6 +112,48 @@ def test_a_recording_takes_the_camera_of_its_size(stored, capsys):
         ["info", path, "--size", "18,12", "--camera", stored / "three.yaml"],
         "three.yaml:cam1",
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "lens"),
+    [
+        ("60,61,7.5,5", PinholeCamera(60, 61, 7.5, 5)),
+        ("60, 61, 7, 5, -0.1,2e-2", PinholeCamera(60, 61, 7, 5, (-0.1, 0.02))),
+        (
+            "60,61,7,5,0.1,0,0,0,0,0.2,0,0",
+            PinholeCamera(60, 61, 7, 5, (0.1, 0, 0, 0, 0, 0.2, 0, 0), "rational"),
+        ),
+        ("60,61,7,5,0.1,0.01,fisheye", PinholeCamera(60, 61, 7, 5, (0.1, 0.01), "equidistant")),
+    ],
+)
+def test_the_command_line_takes_a_camera_of_numbers(stored, text, lens):
+    out = stored / "out.h5"
+    words = ["convert", stored / "a.h5", out, "--camera", text]
+    assert cli.main([str(word) for word in words]) == 0
+    assert jaxevent.load(out).camera == lens
+    assert described(out)["inputs"].keys() == {str(stored / "a.h5")}
+    live, _ = arguments.open_live("-", {"size": (14, 10), "camera": arguments.lens(text)})
+    assert live.camera == lens
+
+
+def test_numbers_that_are_no_camera_are_refused(stored, capsys):
+    for text, *named in (
+        ("60,61,7", "neither a file nor FX,FY,CX,CY", "200,200"),
+        ("60,61,7,five,0", "neither a file nor FX,FY,CX,CY"),
+        ("-60,61,7,5", "focal lengths -60.0 and 61.0 px", "give"),
+        ("60,61,7,5,1,2,3,4,5,fisheye", "has 5 coefficients", "at most 4"),
+        ("60,61,7,5,1,fov", "'fov'", "give one of"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            cli.main(["info", str(stored / "a.h5"), f"--camera={text}"])
+        said = capsys.readouterr().err
+        assert end.value.code == 2 and all(part in said for part in (*named, "--camera")), said
+    fails(
+        capsys, ["info", stored / "a.h5", "--camera", "60,61,2e3,5"], "a: a camera with cx = 2000.0"
+    )
+    # A file may have such a name.
+    (stored / "60,61,7,5").write_text(CHAIN)
+    assert arguments.lens(str(stored / "60,61,7,5")) == str(stored / "60,61,7,5")
 
 
 OF_OPENCV = """%YAML:1.0

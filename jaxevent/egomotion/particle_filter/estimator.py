@@ -219,7 +219,7 @@ class VotingEstimator(MotionEstimator[Params]):
                 scored events on, if there is a kernel: for all but the literal likelihood.
 
         Returns:
-            The motion.
+            The motion. An `InputWarning` tells that none was found.
 
         Raises:
             InputError: The model is unknown, it needs a camera and there is none, or the compiler
@@ -246,8 +246,11 @@ class VotingEstimator(MotionEstimator[Params]):
                 shown.update(runner.row - shown.n)
         if causal:
             motion = runner.causal_motion(parts).with_recording(recording)
-            return motion._with_gaps(float(params.tau_max))
-        return runner.motion(parts, smooth=smooth is not False)
+            motion = motion._with_gaps(float(params.tau_max))
+        else:
+            motion = runner.motion(parts, smooth=smooth is not False)
+        self.warn_if_lost(motion)
+        return motion
 
     def make_runner(
         self,
