@@ -67,8 +67,12 @@ def test_two_that_cross_keep_their_identities(crossed):
     params = tracker.Params(**found.settings())
     tracks = tracker.estimate(recording, params, found=found, progress=False)
     times = np.arange(20_000, 390_000, 5000)
+    forward = tracks.filtered
     states, true = tracks(times), truth(times)
     assert len(tracks) == 2 and states.valid.all()
+    # Sizes that the backward pass reads are those of a pass of their own.
+    for one, other in zip(tracks._usual_sizes, forward._usual_sizes, strict=True):
+        np.testing.assert_array_equal(one, other)
     apart = np.linalg.norm(states.mean[:, :, None, :2] - true[:, None, :, :2], axis=-1)
     straight = apart[:, [0, 1], [0, 1]], apart[:, [0, 1], [1, 0]]
     assert min(np.sqrt((d**2).mean()) for d in straight) < 0.7
