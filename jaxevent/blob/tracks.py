@@ -167,6 +167,8 @@ class Tracks(HtmlRepr):
         self._checkpoints: list[tuple[PackingCursor, int, Any]] = []
         # The result of the backward pass in the last segments, up to `MAX_CACHED_VALUES`.
         self._kept_infos: dict[PackingCursor, Any] = {}
+        # Times (us) and the filtered sizes at these, (times, tracks, 2) px, by segments.
+        self._sizes_read: list[tuple[NDArray[np.int64], NDArray]] = []
         self._assign_ids(self._run_all())
 
     def __len__(self) -> int:
@@ -175,7 +177,7 @@ class Tracks(HtmlRepr):
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but what is computed again on request."""
         state = {k: v for k, v in vars(self).items() if k != "_segment_infos"}
-        return {**state, "_kept_infos": {}}
+        return {**state, "_kept_infos": {}, "_sizes_read": []}
 
     @property
     def filtered(self) -> "Tracks":
@@ -307,15 +309,12 @@ class Tracks(HtmlRepr):
         if not len(self) and end > first:
             yield times[first:end], self._invalid_states(times[first:end], chosen)
             first = end
-        at_once = max(MAX_STATES_PER_READOUT // max(len(chosen), 1), 1)
         for segment, record, infos in self._replay(times[first:end]):
             upto = end
             if segment.next is not None:
                 upto = int(np.searchsorted(times[:end], segment.next.start))
-            while first < upto:
-                batch = times[first : min(first + at_once, upto)]
-                yield batch, self._readout_segment(segment, record, infos, batch, chosen)
-                first += len(batch)
+            yield from self._readout_segment(segment, record, infos, times[first:upto], chosen)
+            first = upto
         if first < len(times):
             yield times[first:], self._invalid_states(times[first:], chosen)
 
@@ -360,16 +359,31 @@ class Tracks(HtmlRepr):
     @functools.cached_property
     def _usual_sizes(self) -> list[UsualSizes | None]:
         """Usual sizes of the tracks of found targets, from filtered states; None where unknown."""
-        if self._packer.found_ends is None or not len(self):
+        times = self._shape_times
+        if not len(times):
             return [None] * len(self)
-        times = np.linspace(self.start, self.stop - 1, N_SHAPE_TIMES).astype(np.int64)
-        pieces = list(self.filtered._read_by_segment(np.unique(times), None, False))
-        t = np.concatenate([now for now, _ in pieces])
-        states = _concatenate_states([states for _, states in pieces])
+        if self.smooth:
+            with self._turns:
+                _ = self._segment_infos  # also fills `_sizes_read`
+            read = sorted(self._sizes_read, key=lambda one: int(one[0][0]))
+        else:
+            read = [
+                (now, states.mean[..., 4:6])
+                for now, states in self._read_by_segment(times, None, False)
+            ]
+        t, sizes = (np.concatenate(column) for column in zip(*read, strict=True))
+        alive = (self.birth <= t[:, None]) & (t[:, None] < self.death)
         return [
-            fit_usual_sizes(t[alive] * 1e-6, states.mean[alive, k, 4:6])
-            for k, alive in enumerate(states.valid.T)
+            fit_usual_sizes(t[alive[:, k]] * 1e-6, sizes[alive[:, k], k]) for k in range(len(self))
         ]
+
+    @property
+    def _shape_times(self) -> NDArray[np.int64]:
+        """Times (us) at which sizes of found targets are read; none without such targets."""
+        if self._packer.found_ends is None or not len(self):
+            return np.zeros(0, np.int64)
+        times = np.linspace(self.start, self.stop - 1, N_SHAPE_TIMES).astype(np.int64)
+        return np.unique(times)
 
     def _indices_of(self, ids: Sequence[int] | NDArray[np.integer] | None) -> NDArray[np.int64]:
         """Return the indices of tracks in the arrays."""
@@ -400,19 +414,25 @@ class Tracks(HtmlRepr):
         infos: Any,
         times: NDArray[np.int64],
         chosen: NDArray[np.int64],
-    ) -> TrackStates:
-        """Read out some tracks at times of a segment, from its record and backward pass."""
-        states = self._invalid_states(times, chosen)
-        alive = (self.birth[chosen] <= times[:, None]) & (times[:, None] < self.death[chosen])
-        some = np.flatnonzero(alive.any(0))
-        if len(some):
-            serial, requested = self._serial[chosen[some]], alive[:, some]
-            values = self._runner.readout(segment, record, infos, times, serial, requested)
-            outs = states.mean, states.covariance, states.idle
-            for out, value in zip(outs, values, strict=True):
-                out[:, some] = value
-        states.valid[:] = alive
-        return states
+    ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
+        """Read out some tracks at times of a segment, in batches, by its record and backward pass.
+
+        Without the result of the backward pass, `infos`, states are filtered.
+        """
+        at_once = max(MAX_STATES_PER_READOUT // max(len(chosen), 1), 1)
+        for first in range(0, len(times), at_once):
+            now = times[first : first + at_once]
+            states = self._invalid_states(now, chosen)
+            alive = (self.birth[chosen] <= now[:, None]) & (now[:, None] < self.death[chosen])
+            some = np.flatnonzero(alive.any(0))
+            if len(some):
+                serial, requested = self._serial[chosen[some]], alive[:, some]
+                values = self._runner.readout(segment, record, infos, now, serial, requested)
+                outs = states.mean, states.covariance, states.idle
+                for out, value in zip(outs, values, strict=True):
+                    out[:, some] = value
+            states.valid[:] = alive
+            yield now, states
 
     def _replay(self, times: NDArray[np.int64]) -> Iterator[tuple[Segment, Any, Any]]:
         """Run the segments with some of the sorted times again: their records.
@@ -475,9 +495,13 @@ class Tracks(HtmlRepr):
 
     @functools.cached_property
     def _segment_infos(self) -> dict[PackingCursor, Any]:
-        """Backward information at the starts of all segments, from the last one on."""
+        """Backward information at the starts of all segments, from the last one on.
+
+        On the way the sizes are read that tell the tracks' usual ones.
+        """
         found: dict[PackingCursor, Any] = {}
-        left = MAX_CACHED_VALUES
+        left, times, every = MAX_CACHED_VALUES, self._shape_times, np.arange(len(self))
+        self._sizes_read.clear()
         with self._bar("smooth") as progress:
             for cursor, state, packed in self._segments_backwards():
                 segment = self._packer.pack(cursor) if packed is None else packed
@@ -486,6 +510,9 @@ class Tracks(HtmlRepr):
                 left -= count_numbers(infos)
                 if left >= 0:
                     self._kept_infos[cursor] = infos
+                times, own = np.split(times, [np.searchsorted(times, cursor.start)])
+                for now, states in self._readout_segment(segment, record, None, own, every):
+                    self._sizes_read.append((now, states.mean[..., 4:6].copy()))
                 progress.update(int(np.count_nonzero(segment.features.valid)))
         return found
 
