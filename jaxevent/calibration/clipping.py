@@ -15,6 +15,9 @@ NEIGHBOUR_LEVELS = 16  # below a pile-up, with which it is compared
 MIN_PILE_UP_RATIO = 4.0
 MIN_PILE_UP_PIXELS = 50  # so that it is no chance
 MAX_STRAY_SHARE = 1e-3  # of the pixels, beyond a pile-up
+# Pixels beyond the fullest level of a pile-up for one on it. Nothing is brighter than white; noise
+# of a bright surface goes both ways: of a quarter of a level, 2 % is more than half a level off.
+MAX_BEYOND_RATIO = 0.02
 # Of the pixels. A few that are white are taken as they are: what they hide is no loss in frames
 # that clip as well, and a guess of it is carried into the pixels beside them.
 MIN_CLIPPED_SHARE = 0.05
@@ -52,8 +55,9 @@ def find_clipping(recording: Recording) -> ClippedEnds:
     """Find the grey values at which a recording's frames clip, from the frames alone.
 
     Clipped pixels pile up at the last grey value that occurs. Three levels there are compared with
-    the fullest three of the 16 levels inside of them. White may be any level. Saturation whose own
-    noise is above about one level is not told from a bright wall and not found.
+    the fullest three of the 16 levels inside of them, and nothing may lie beyond the fullest one.
+    White may be any level. Saturation below the last level that the file can hold, with noise of
+    its own above a quarter of a level, is not told from a bright wall and not found.
     """
     frames = recording.frames
     if frames is None or not len(frames):
@@ -89,7 +93,12 @@ def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     ratio = float(windows[end] / below) if below else float("inf")
     first = max(end - WINDOW_LEVELS - NEIGHBOUR_LEVELS, 0)
     share = float(beyond[first])
+    pile = counts[max(end - WINDOW_LEVELS - NEIGHBOUR_LEVELS, 0) :]
+    fullest = int(pile[:WINDOW_LEVELS].argmax())
+    outside = int(pile[fullest + 1 : fullest + 1 + WINDOW_LEVELS].sum())
+    has_edge = outside <= MAX_BEYOND_RATIO * pile[fullest]
     piled = ratio >= MIN_PILE_UP_RATIO and windows[end] >= MIN_PILE_UP_PIXELS
+    piled &= has_edge or share > MAX_CLIPPED_SHARE  # frames of hardly more than one value
     found = piled and MIN_CLIPPED_SHARE < share <= MAX_CLIPPED_SHARE
     return ClippedEnd(first - 0.5 if found else None, share if piled else 0.0, ratio)
 

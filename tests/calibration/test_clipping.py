@@ -42,6 +42,19 @@ def test_white_is_recognised_at_any_level(scale, kind):
     assert whole.ratio < 1.5
 
 
+@pytest.mark.parametrize("noise", [0.3, 0.6, 1.2])
+def test_a_bright_surface_is_not_white(noise):
+    """Noise of a flat surface goes both ways, that of white ends at the last grey value."""
+    rng = np.random.default_rng(4)
+    grey = 230 * rng.beta(2, 3, (4, SIZE, SIZE))
+    grey[:, :16] = 238
+    noisy = np.rint(grey + rng.normal(0, noise, grey.shape))
+    assert find_clipping(make_recording(noisy.astype(np.uint8))).white.level is None
+    for last in (238, 255):
+        cut = np.minimum(noisy + (last - 238), last).astype(np.uint8)
+        assert find_clipping(make_recording(cut)).white.level is not None
+
+
 def test_black_is_recognised():
     light = smooth_greys(np.random.default_rng(2), 0.9) - 0.2
     images = (np.maximum(light, 0) * 255).astype(np.uint8)
