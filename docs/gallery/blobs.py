@@ -60,9 +60,9 @@ axes[1].legend()
 # %% [markdown]
 # A blob that grows comes nearer. `blob.quantities.growth` gives the inverse of its time to contact,
 # which is defined at rest, and its variance. `inverse_ttc` compares two blobs at one depth, and
-# `size_range` gives the range of one of known size. This blob comes from 17 m at 8 m/s. Errors of
-# sizes last, those of smoothed tracks longer, so take filtered ones. Given `Q_lambda`, `growth`
-# undoes the filter's lag and knows how long its errors last.
+# `size_range` gives the range of one of known size. This blob comes from 17 m at 8 m/s. Given
+# `Q_lambda`, `growth` undoes the lag of filtered sizes and knows how long their errors last; for a
+# smoothed track give `smoothed=True`, too.
 
 # %%
 scene, _ = jaxevent.simulate.blob_scene("growing", seed=100, rate=20_000)

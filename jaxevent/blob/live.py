@@ -123,7 +123,7 @@ class LiveTracks:
         Args:
             x: Column, px.
             y: Row, px.
-            size: About twice the standard deviation of its events, px.
+            size: Standard deviation of its events, px.
             time: Begin of its track, int us or float s; None: the last event, or the first one if
                 there is none yet.
 

@@ -11,6 +11,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
@@ -76,17 +77,16 @@ def log_size(
     return jnp.sum(jnp.log(mean[..., 4:6]), -1) / 2, variance
 
 
-@functools.partial(jax.jit, static_argnames="smooth")
-@full_precision
 def growth(
-    times: Float[Array, " times"],
-    mean: Float[Array, "times 8"],
-    covariance: Float[Array, "times 8 8"],
+    times: Float[Array | np.ndarray, " times"],
+    mean: Float[Array | np.ndarray, "times 8"],
+    covariance: Float[Array | np.ndarray, "times 8 8"],
     valid: Bool[Array, " times"] | None = None,
     *,
     Q: Number = 0.01,
     Q_lambda: Number | None = None,
     smooth: bool = True,
+    smoothed: bool = False,
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
     """Compute 1 / TTC from the growth of one blob.
 
@@ -103,15 +103,31 @@ def growth(
             all.
         Q: Spectral density of the speed's changes relative to the depth, 1/s^3. 0 is constant
             speed: the least squares line.
-        Q_lambda: The filter's own `Q_lambda`, px^2/s, of a filtered track. Its errors at close
-            times are correlated, and its sizes lag; given it, they weigh as much as the events
-            behind them, and their lag is undone. None: independent errors without a lag.
+        Q_lambda: The filter's own `Q_lambda`, px^2/s, see `Tracks.track_params`. Errors of a track
+            at close times are correlated, and sizes of a filtered one lag; given it, they weigh as
+            much as the events behind them, and their lag is undone. None: independent errors
+            without a lag.
         smooth: Whether all times are used for each (Rauch-Tung-Striebel), or those up to it.
+        smoothed: Whether the track is smoothed (`Tracks.smooth`): sizes do not lag, and their
+            errors last twice as long as a filter's.
 
     Returns:
         Inverse time to contact (times,), 1/s, and its variance, 1/s^2.
     """
+    # Differences, while times are double: seconds since 1970 in single precision are 128 s apart.
     valid = jnp.ones(times.shape, bool) if valid is None else valid
+    return _growth(
+        times - times[:1], mean, covariance, valid, Q, Q_lambda, smooth=smooth, smoothed=smoothed
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("smooth", "smoothed"))
+@full_precision
+def _growth(
+    times: Array, mean: Array, covariance: Array, valid: Array, Q: Number,
+    Q_lambda: Number | None, *, smooth: bool, smoothed: bool,
+) -> tuple[Float[Array, " times"], Float[Array, " times"]]:  # fmt: skip
+    """Compute `growth` of times from 0 on."""
     mean = jnp.where(valid[:, None], mean, 1.0)
     covariance = jnp.where(valid[:, None, None], covariance, jnp.eye(8, dtype=mean.dtype))
     logarithm, relative = log_size(mean, covariance)
@@ -119,8 +135,8 @@ def growth(
     reference = jnp.sum(jnp.where(valid, logarithm, 0)) / jnp.maximum(jnp.sum(valid), 1)
     w = jnp.exp(reference - logarithm)
     dt = jnp.diff(times, prepend=times[:1])
-    R = w**2 * _relative_noise(times, relative, covariance, valid, Q_lambda)
-    lag = _lag(times, covariance, valid, Q_lambda)
+    R = w**2 * _relative_noise(times, relative, covariance, valid, Q_lambda, smoothed)
+    lag = _lag(times, covariance, valid, None if smoothed else Q_lambda)
 
     def product(a, b):
         return jnp.sum(a[:, :, None] * b[None], 1)  # faster to compile and run than a dot
@@ -166,8 +182,9 @@ def growth(
 
 
 def _relative_noise(
-    times: Array, relative: Array, covariance: Array, valid: Array, Q_lambda: Number | None
-) -> Float[Array, " times"]:
+    times: Array, relative: Array, covariance: Array, valid: Array, Q_lambda: Number | None,
+    smoothed: bool,
+) -> Float[Array, " times"]:  # fmt: skip
     """Return the variances of log sizes for independent errors; see `growth`."""
     # Sizes known exactly would make the covariances singular.
     R = jnp.maximum(relative, 1e-10)
@@ -177,8 +194,10 @@ def _relative_noise(
     # Of P one half is noise that it passes on, the other its lag behind a walk, which steady growth
     # is not. The mean of many samples whose errors have the correlation r^k, r = exp(-dt / tau),
     # has the variance of independent ones times (1 + r) / (1 - r) = coth(dt / (2 tau)). So samples
-    # at dt << tau make P^2 / Q, the density of events' noise.
-    P_lambda = _size_variance(covariance)
+    # at dt << tau make P^2 / Q, the density of events' noise. Smoothed, P is half of the filter's,
+    # half of that is noise, of the correlation (1 + k dt / tau) r^k, and the factor at dt << tau
+    # is 4 tau / dt, so that the density is the same.
+    P_lambda = _size_variance(covariance) * (4 if smoothed else 1)
     last = jnp.max(jnp.where(valid, times, times[0]))
     span = last - jnp.min(jnp.where(valid, times, times[-1]))
     every = jnp.maximum(span, 0) / jnp.maximum(jnp.sum(valid) - 1, 1)

@@ -221,9 +221,9 @@ class Tracker(Estimator[P]):
         Args:
             recording: Events; frames are not needed.
             params: See `Params`; None: those of the found targets, or the defaults.
-            seeds: Targets as (x, y, size) or (x, y, size, t): pixel, about twice the standard
-                deviation of the events in px, and begin of the track (int us or float s on the
-                recording's clock; by default `start`). They are confirmed at once.
+            seeds: Targets as (x, y, size) or (x, y, size, t): pixel, standard deviation
+                of the events in px, and begin of the track (int us or float s on the recording's
+                clock; by default `start`). They are confirmed at once.
             start: Begin of tracking, by default the first event.
             stop: End of tracking, by default after the last event.
             detect: Whether tracks are born of unassociated events; by default only with parameters

@@ -15,7 +15,7 @@ from jaxevent.blob.lifecycle import END_REASONS, LifecycleLog
 from jaxevent.blob.prepare import ChunkPacker, PackingCursor, Segment
 from jaxevent.blob.run import count_numbers
 from jaxevent.blob.shape import N_SHAPE_TIMES, UsualSizes, fit_usual_sizes, shape_covariance
-from jaxevent.blob.track import TrackStates
+from jaxevent.blob.track import TrackStates, track_params
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
@@ -178,6 +178,15 @@ class Tracks(HtmlRepr):
         """Return everything but what is computed again on request."""
         state = {k: v for k, v in vars(self).items() if k != "_segment_infos"}
         return {**state, "_kept_infos": {}, "_sizes_read": []}
+
+    def track_params(self, id: int) -> Any:
+        """Return the parameters of a track; those of targets that were found differ.
+
+        Args:
+            id: Number of the track.
+        """
+        own = {name: values[id] for name, values in self._packer.overrides.items()}
+        return track_params(self.params, own)
 
     @property
     def filtered(self) -> "Tracks":

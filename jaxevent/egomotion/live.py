@@ -21,7 +21,7 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.live import Tail
-from jaxevent.recording import Events, Recording, Times
+from jaxevent.recording import Events, Recording, Times, microseconds
 from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
 HELD_ESTIMATES = 4096  # the latest ones, which are read
@@ -127,8 +127,17 @@ class LiveMotion:
 
     @synchronized
     def __call__(self, times: Times) -> Estimate:
-        """Return the motion at some times, as `MotionEstimate` does; later ones are predicted."""
-        return self._motion(times, extrapolate=True)
+        """Return the motion at some times, as `MotionEstimate` does.
+
+        Later ones are predicted, for as long as candidates live (`tau_max`). After that nothing is
+        known, as in a pause of events.
+        """
+        us, motion = np.atleast_1d(microseconds(times)), self._motion
+        mean, covariance, valid = motion(us, extrapolate=True)
+        if self._runner is not None and len(motion):
+            known = us <= motion.t[-1] + 1e6 * float(self._runner.params.tau_max)
+            mean, valid = np.where(known[:, None], mean, np.nan), valid & known
+        return Estimate(mean, covariance, valid)
 
     def _run(self, until_end: bool) -> MotionEstimate:
         """Run the chunks that no event to come can change."""

@@ -6,6 +6,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from jaxevent.arrays import MAX_TIME_US
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
 
@@ -93,8 +94,8 @@ class Tail:
 def read_lines(file: BinaryIO | BufferedIOBase, name: str = "standard input") -> Iterator[Events]:
     """Read events from lines `t x y p`, a chunk as soon as it has come.
 
-    The first line tells the unit of all times: seconds where its t has a decimal point, else
-    microseconds.
+    The first line tells the unit of all times: seconds where its t has a decimal point or an
+    exponent, else microseconds.
 
     Args:
         file: A binary file or pipe.
@@ -124,20 +125,24 @@ def read_lines(file: BinaryIO | BufferedIOBase, name: str = "standard input") ->
 
 def _time_scale(text: bytes) -> float:
     """Return the factor of times in microseconds."""
-    return 1e6 if b"." in text.split(maxsplit=1)[0] else 1.0
+    first = text.split(maxsplit=1)[0].lower()
+    return 1e6 if b"." in first or b"e" in first else 1.0
 
 
 def _parse(text: bytes, scale: float, place: str) -> Events:
     """Make events of lines."""
+    lines = [row for row in map(bytes.split, text.splitlines()) if row]
     try:
-        values = np.array(text.split(), np.float64)
-    except ValueError:
-        values = np.full(1, np.nan)
-    columns = values.reshape(-1, 4) if len(values) % 4 == 0 else np.full((1, 4), np.nan)
-    t, x, y, p = columns.T
-    is_number = np.isfinite(columns).all() and (columns[:, 1:3] >= 0).all()
-    if not is_number or (columns[:, 1:3] > np.iinfo(np.uint16).max).any():
+        columns = np.array(lines, np.float64)
+    except ValueError:  # words, or lines of different lengths
+        columns = np.full((1, 1), np.nan)
+    is_number = columns.shape[1] == 4 and np.isfinite(columns).all()
+    if not is_number or np.abs(columns[:, 0]).max() * scale >= MAX_TIME_US:
         raise InputError(f"{place}: is not of the form t x y p; give four numbers in each line")
+    t, x, y, p = columns.T
+    xy = columns[:, 1:3]
+    if (xy != np.rint(xy)).any() or not 0 <= xy.min() <= xy.max() < 1 << 16:
+        raise InputError(f"{place}: x and y are not pixels; give whole numbers from 0")
     times = np.rint(t * scale).astype(np.int64)
     return Events(times, x.astype(np.uint16), y.astype(np.uint16), p > 0)
 

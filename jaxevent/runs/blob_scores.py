@@ -325,7 +325,7 @@ class TrackProtocol(Protocol):
         begin = options.get("begin", "positions")
         clock = time.perf_counter()
         metrics = find_metrics(options.get("metrics", ()), MEASURE_NAMES)
-        noise = None
+        noise: dict[str, Any] = {}
         if isinstance(method, MethodFunction):
             mean, covariance = _of_function(recording, method, known.t)
         else:
@@ -335,7 +335,7 @@ class TrackProtocol(Protocol):
                 options=options, progress=progress,
             )  # fmt: skip
             mean, covariance = _states(tracks, known.t)
-            noise = float(tracks.params.Q_lambda)
+            noise = {"Q_lambda": float(tracks.params.Q_lambda), "smoothed": tracks.smooth}
         seconds = time.perf_counter() - clock
         told = score_tracks(known.xi, mean[..., :2], options.get("reach", MATCH_DISTANCE_PX))
         own = told.match
@@ -447,13 +447,13 @@ def _errors(
     covariance: NDArray[np.float64],
     options: Mapping[str, Any],
     *,
-    noise: float | None,
+    noise: Mapping[str, Any],
     recording: str,
 ) -> dict[str, float | None]:
     """Errors of what is known beside positions.
 
-    `mean` (times, targets, 8) is that of targets' tracks; `noise` is Q_lambda, None where the
-    method has none.
+    `mean` (times, targets, 8) is that of targets' tracks; `noise` are the settings of `growth`
+    that tell the errors of sizes, empty where the method does not.
     """
     more, out = known.more, {}
     if {"vx", "vy"} <= more.keys():
@@ -485,7 +485,7 @@ def _closing(
     covariance: NDArray[np.float64],
     options: Mapping[str, Any],
     *,
-    noise: float | None,
+    noise: Mapping[str, Any],
     recording: str,
 ) -> NDArray[np.float64]:
     """Errors of 1 / TTC, of pairs and of the other targets' growth."""
@@ -504,9 +504,9 @@ def _closing(
         errors.append(np.where(seen, np.asarray(value), np.nan) - truth[:, [a, b]].mean(1))
         paired |= {a, b}
     since = jnp.asarray((known.t - known.t[0]) * 1e-6)
-    for k in set(range(len(ids))) - paired if noise is not None else ():
+    for k in set(range(len(ids))) - paired if noise else ():
         seen = np.isfinite(mean[:, k, 0])
         if seen.any():
-            value, _ = growth(since, x[:, k], P[:, k], jnp.asarray(seen), Q_lambda=noise)
+            value, _ = growth(since, x[:, k], P[:, k], jnp.asarray(seen), **noise)
             errors.append(np.where(seen, np.asarray(value), np.nan) - truth[:, k])
     return np.concatenate([np.zeros(0), *errors])

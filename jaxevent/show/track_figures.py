@@ -4,6 +4,7 @@ Arrays are those of `jaxevent.show.tracks`.
 """
 
 import colorsys
+import functools
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -188,7 +189,8 @@ def write_track_plot(
     focal: float | int | None = None,
     size_factor: float | int = SIZE_FACTORS["ring"],
     Q: float | int = 0.01,
-    Q_lambda: float | int | None = None,
+    Q_lambda: Sequence[float] | None = None,
+    smoothed: bool = False,
     total: int | None = None,
 ) -> None:
     """Draw the paths of tracks and, over time, their sizes, with bands of two standard deviations.
@@ -212,7 +214,8 @@ def write_track_plot(
         focal: Focal length, px, for their range.
         size_factor: Size of a blob over that of its object's image.
         Q: Process noise of the growth.
-        Q_lambda: Process noise of the sizes; None for that of `growth`.
+        Q_lambda: (N,) process noises of the sizes; None for that of `growth`.
+        smoothed: Whether the tracks are smoothed.
         total: Number of all tracks, of which these are a part.
 
     Raises:
@@ -234,7 +237,8 @@ def write_track_plot(
     filled = np.where(valid[..., None], mean, 1.0)
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
     m, P = jnp.asarray(filled), jnp.asarray(filled_P)
-    grown, spread, grows = _growths(t, m, P, valid, Q, Q_lambda)
+    noise = None if Q_lambda is None else np.asarray(Q_lambda, m.dtype)[shown]
+    grown, spread, grows = _growths(t, m, P, valid, Q, noise, smoothed=smoothed)
     sizes = filled[..., 4:6], np.diagonal(filled_P, axis1=2, axis2=3)[..., 4:6]
     grows &= _changes_scale(*sizes, valid)
 
@@ -327,13 +331,18 @@ def _growths(
     P: Array,
     valid: NDArray[np.bool_],
     Q: float | int,
-    Q_lambda: float | int | None,
+    Q_lambda: NDArray | None,
+    *,
+    smoothed: bool,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return 1 / TTC of each growth (T, N), its variance, and the tracks (N,) where it is not 0."""
     since = jnp.asarray((t - t[0]) * 1e-6, m.dtype)
+    one = functools.partial(growth, since, Q=Q, smoothed=smoothed)
     grown, spread = jax.vmap(
-        lambda m, P, seen: growth(since, m, P, seen, Q=Q, Q_lambda=Q_lambda), in_axes=1, out_axes=1
-    )(m, P, jnp.asarray(valid))
+        lambda m, P, seen, noise: one(m, P, seen, Q_lambda=noise),
+        in_axes=(1, 1, 1, None if Q_lambda is None else 0),
+        out_axes=1,
+    )(m, P, jnp.asarray(valid), Q_lambda)
     grown, spread = np.asarray(grown, np.float64), np.asarray(spread, np.float64)
     clear = valid & (np.abs(grown) > _GROWTH_SIGMAS * np.sqrt(np.maximum(spread, 0)))
     return grown, spread, clear.sum(0) > _GROWTH_SHARE * np.maximum(valid.sum(0), 1)

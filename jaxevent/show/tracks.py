@@ -241,7 +241,8 @@ class Output:
             path, tracks.recording, rows.t, tracks.id[chosen], mean, covariance,
             valid=valid, pairs=self.pairs, extent=self.extent, focal=self.focal,
             size_factor=self._factor(), total=len(tracks),
-            Q_lambda=float(tracks.params.Q_lambda),
+            Q_lambda=[float(tracks.track_params(one).Q_lambda) for one in tracks.id[chosen]],
+            smoothed=tracks.smooth,
         )  # fmt: skip
 
     def _factor(self) -> float | int:
@@ -275,7 +276,6 @@ class Output:
         """Write time to contact and range at coarse times as CSV."""
         tables = []
         since = jnp.asarray((rows.t - rows.t[0]) * 1e-6, jnp.result_type(float))
-        Q_lambda = float(tracks.params.Q_lambda)
 
         def add(one: int, other: int | None, seen: NDArray, *values: Any) -> None:
             names = ("inverse_ttc", "sigma_inverse_ttc", "range", "sigma_range")
@@ -288,7 +288,10 @@ class Output:
         nothing = np.full(len(rows.t), np.nan)
         for place, one in enumerate(tracks.id.tolist()):
             mean, covariance, valid = (part[:, 0] for part in rows.dense([place]))
-            value = growth(since, mean, covariance, jnp.asarray(valid), Q_lambda=Q_lambda)
+            value = growth(
+                since, mean, covariance, jnp.asarray(valid),
+                Q_lambda=float(tracks.track_params(one).Q_lambda), smoothed=tracks.smooth,
+            )  # fmt: skip
             span = nothing, nothing
             if self.extent is not None and self.focal is not None:
                 span = _ranges(mean, covariance, self.extent, self.focal, self._factor())

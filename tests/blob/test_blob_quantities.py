@@ -213,21 +213,23 @@ def test_growth_allows_for_errors_that_last():
         measured = 10 + np.sqrt(noise) * rng.normal(size=(tracks, 2))
         size[:, k] = size[:, k - 1] + gain * (measured - size[:, k - 1])
     times = dt * np.arange(steps)
-    mean = np.zeros((tracks, steps, 8))
-    mean[..., 4:6] = size[:, 200:]
-    P = jnp.zeros((steps, 8, 8)).at[:, [4, 5], [4, 5]].set(spread)
 
-    @jax.jit
-    def run(mean, Q_lambda):
-        return jax.vmap(lambda m: grow(times, m, P, Q_lambda=Q_lambda))(mean)
-
-    def nees(Q_lambda):
-        value, variance = run(jnp.array(mean), Q_lambda)
+    def nees(size, spread, Q_lambda, smoothed):
+        mean = jnp.zeros((tracks, steps, 8)).at[..., 4:6].set(size)
+        P = jnp.zeros((steps, 8, 8)).at[:, [4, 5], [4, 5]].set(spread)
+        run = jax.vmap(lambda m: grow(times, m, P, Q_lambda=Q_lambda, smoothed=smoothed))
+        value, variance = run(mean)
         return float(np.mean(np.asarray(value) ** 2 / np.asarray(variance)))
 
     # The mean of 300 squares is known to 8 %.
-    assert 0.75 < nees(Q_lambda) < 1.25
-    assert nees(100 * Q_lambda) > 5
+    assert 0.75 < nees(size[:, 200:], spread, Q_lambda, False) < 1.25
+    assert nees(size[:, 200:], spread, 100 * Q_lambda, False) > 5
+    back = spread / prediction
+    for k in range(steps + 198, -1, -1):
+        size[:, k] += back * (size[:, k + 1] - size[:, k])
+    spread = (spread - back**2 * prediction) / (1 - back**2)
+    assert 0.75 < nees(size[:, 100:-100], spread, Q_lambda, True) < 1.25
+    assert nees(size[:, 100:-100], spread, Q_lambda, False) > 2
 
 
 @pytest.mark.slow
@@ -269,6 +271,14 @@ def test_growth_in_single_precision(float32):
     value, variance = quantities.growth(*args)
     assert value.dtype == jnp.float32 and np.isfinite(variance).all()
     np.testing.assert_allclose(value, truth, rtol=0.02)
+
+
+def test_growth_of_times_since_1970(float32):
+    times = np.linspace(0, 1.5, 50)
+    mean, _ = approach(times)
+    args = (jnp.asarray(mean, jnp.float32), jnp.asarray(sized(times, 0.01), jnp.float32))
+    late, early = (quantities.growth(t, *args)[0] for t in (1.7e9 + times, times))
+    np.testing.assert_allclose(late, early, rtol=1e-3)
 
 
 def test_range_from_size():

@@ -66,6 +66,13 @@ def test_lines_tell_their_unit_and_are_checked():
     seconds = list(read_lines(Pipe(b"0.5 3 4 1\n0.500002 5 6 -1")))
     assert np.concatenate([e.t for e in seconds]).tolist() == [500_000, 500_002]
     assert np.concatenate([e.p for e in seconds]).tolist() == [True, False]
-    for text in (b"1 2 3\n", b"1 2 3 four\n", b"1 -2 3 1\n", b"1 70000 3 1\n"):
+    (scientific,) = read_lines(Pipe(b"5e-1 3 4 1\n\n6e-1 5 6 -1\n"))
+    assert scientific.t.tolist() == [500_000, 600_000]
+    assert not list(read_lines(Pipe(b"\n")))
+    wrong = (
+        b"1 2 3\n", b"1 2 3 four\n", b"1 -2 3 1\n", b"1 70000 3 1\n", b"1 2.5 3 1\n",
+        b"1 2 3\n4 5 6 1 0\n", b"1e30 2 3 1\n",
+    )  # fmt: skip
+    for text in wrong:
         with pytest.raises(InputError, match="line 1"):
             list(read_lines(io.BytesIO(text)))

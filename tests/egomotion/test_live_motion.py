@@ -38,5 +38,7 @@ def test_live_motion_equals_the_causal_filter():
         np.testing.assert_array_equal(joined, getattr(whole, name))
     assert len(live.motion) == len(whole)
     np.testing.assert_array_equal(live(live.stop).mean, whole(live.stop).mean)
+    silent = live(live.stop + round(1e6 * float(PARAMS.tau_max)) * np.array([0, 2]))
+    assert silent.valid.tolist() == [True, False] and np.isnan(silent.mean[1]).all()
     with pytest.raises(InputError, match="finished"):
         live.add(recording.events[:1])
