@@ -728,6 +728,23 @@ def test_colours_move_with_their_points():
     assert error(video()) < 0.15 * in_place
 
 
+@pytest.mark.parametrize(("before", "after"), [(-0.02, 0.06), (0.06, -0.02), (-0.01, -0.02)])
+def test_the_clock_of_a_target_is_that_of_the_evidence(before, after):
+    """The nearest anchor decides; halfway both do, whichever is called the nearest."""
+    found, step = {10_000: before, 50_000: after}, 6_000
+    estimator = object.__new__(target_motion.TrajectoryEstimator)
+    estimator._sought_motion = lambda at: target_motion.SoughtMotion(None, None, found[at])
+    estimator.schedule = instants.InstantSchedule(np.array([0, 60_000]), (0, 60_000), 100.0)
+    assert estimator.schedule.step == step
+    for t in (9_000, 10_000, 26_900, 29_999, 30_000, 30_001, 33_100, 50_000, 60_000):
+        anchors = sorted(found, key=lambda at: abs(at - t))
+        timed = [found[anchors[0]] < 0, before + after < 0][abs(t - 30_000) < 1_000]
+        assert estimator._prefers_time(t, anchors) == timed
+        if t == 30_000:
+            assert estimator._prefers_time(t, anchors[::-1]) == timed
+        assert estimator._prefers_time(t, anchors[:1]) == (found[anchors[0]] < 0)
+
+
 @pytest.mark.slow
 def test_images_do_not_depend_on_others():
     times = np.array([210_000, 105_000, 206_000])

@@ -83,6 +83,7 @@ ANCHOR_STEPS = 8  # steps of the schedule between anchors
 # 1 - (trust in events)^4, up to which frames alone are not asked: images would seldom choose them.
 MIN_DOUBT = 0.1
 N_CACHED_ANCHORS = 4
+MIN_CLOCK_COST = 1e-12  # so that its logarithm exists
 N_ANCHOR_STEPS = 2  # at half resolution, on each clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
@@ -137,6 +138,18 @@ class NodeMotion(NamedTuple):
             p = change_clock(p, there.s, now.s)
         s = float(now.to_relative_times(instants.t[[instants.target]])[0])
         return advect_nodes(p, s, instants.unit / now.unit)
+
+
+class SoughtMotion(NamedTuple):
+    """The motion of a target's points on two clocks, and on which of them frames agree better."""
+
+    on_clock: NodeMotion  # of the schedule
+    on_time: NodeMotion
+    evidence: float  # for the schedule's clock: log of the cost on time over the cost on that clock
+
+    def on(self, timed: bool) -> NodeMotion:
+        """Return the motion on the clock of time, or on the schedule's."""
+        return self.on_time if timed else self.on_clock
 
 
 class Anchor(NamedTuple):
@@ -300,7 +313,7 @@ class TrajectoryEstimator:
         beside = place + (1 if t >= times[place] else -1)
         return [times[n] for n in (place, beside) if 0 <= n < count]
 
-    def _seek_motion(self, at: int) -> NodeMotion:
+    def _seek_motion(self, at: int) -> SoughtMotion:
         """Seek the motion of the target at a time (us) from nothing, at half resolution."""
         instants = self.schedule(at)
         L, V, clear, _ = self._images(instants)
@@ -337,9 +350,9 @@ class TrajectoryEstimator:
         motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
         return motion.at_level(1, self.images.image_shape).p
 
-    def _make_anchor(self, at: int) -> Anchor:
-        """Find the motion of the target at a time (us), and fuse its image."""
-        return self._refine(self._sought_motion(at))
+    def _make_anchor(self, at: int, timed: bool) -> Anchor:
+        """Find the motion of the target at a time (us) on one of its clocks, and fuse its image."""
+        return self._refine(self._sought_motion(at).on(timed))
 
     def _refine(self, motion: NodeMotion) -> Anchor:
         """Refine motion at half resolution with the image that it gives."""
@@ -362,8 +375,8 @@ class TrajectoryEstimator:
         pixels[own] = pack_images(image[None], V[None])[0]
         return PackedImages.of(pixels, target.instants.s)
 
-    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> NodeMotion:
-        """Take a few steps at half resolution, on the clock on which frames agree better.
+    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> SoughtMotion:
+        """Take a few steps at half resolution on both clocks, and compare how frames agree.
 
         Images from events have the faults of their clock, so that they do not judge it.
         """
@@ -372,22 +385,35 @@ class TrajectoryEstimator:
         if judges.sum() <= 2:  # agree on any clock
             judges[:] = True
 
-        def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NDArray[np.float32]:
+        def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NodeMotion:
             for _ in range(N_ANCHOR_STEPS):
                 p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
-            return p
+            return NodeMotion(clock, p)
 
-        def cost(clock: TargetInstants, p: NDArray[np.float32]) -> float:
-            return robust_cost(PackedImages.of(pixels[judges], clock.s[judges]), p, self._cost)
+        def cost(found: NodeMotion) -> float:
+            images = PackedImages.of(pixels[judges], found.instants.s[judges])
+            return robust_cost(images, found.p, self._cost)
 
         found = improved(instants, p)
         if not instants.clock.event_share:
-            return NodeMotion(instants, found)
+            return SoughtMotion(found, found, 0.0)
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
-        if cost(instants, found) < cost(timed, other):
-            return NodeMotion(instants, found)
-        return NodeMotion(timed, other)
+        evidence = math.log(max(cost(other), MIN_CLOCK_COST) / max(cost(found), MIN_CLOCK_COST))
+        return SoughtMotion(found, other, evidence)
+
+    def _prefers_time(self, t: int, anchors: list[int]) -> bool:
+        """Return whether a target at a time (us) is put on the clock of time.
+
+        The nearest anchor (us) decides, and halfway between two both do: a step of the schedule
+        away from there the weight of the farther one is 0.
+        """
+        evidence = [self._sought_motion(at).evidence for at in anchors]
+        if len(anchors) == 1:
+            return evidence[0] <= 0
+        nearest, other = (abs(at - t) for at in anchors)
+        weight = min((1 + (other - nearest) / self.schedule.step) / 2, 1.0)
+        return weight * evidence[0] + (1 - weight) * evidence[1] <= 0
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
@@ -397,21 +423,24 @@ class TrajectoryEstimator:
         known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
         others: list[int] = []
         if known is None:
-            nearest, *others = self._anchor_times(t)
-            anchor = self._anchor(nearest)
+            nearest, *others = anchors = self._anchor_times(t)
+            timed = self._prefers_time(t, anchors)
+            anchor = self._anchor(nearest, timed)
         elif self.start is not None and self.start.refine:
             pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
             known = NodeTrajectories(known, 0).at_level(1, size).p
-            anchor = self._refine(self._improve(pyramid[1], NodeMotion(instants, known)))
+            found = self._improve(pyramid[1], NodeMotion(instants, known))
+            timed = found.evidence <= 0
+            anchor = self._refine(found.on(timed))
         else:
             return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
-        if not anchor.motion.instants.clock.event_share:
+        if timed:
             instants = instants.with_clock(TIME_CLOCK)
         p = anchor.motion.carry(instants)
         target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         packed = self._pack(target, *self._carry_image(anchor, target))
         for at in others:
-            p = self._choose(packed, p, self._sought_motion(at).carry(instants))
+            p = self._choose(packed, p, self._sought_motion(at).on(timed).carry(instants))
         p = gauss_newton_step(packed, p, self._cost)
         # Nodes of the anchor have taken paths from farther away.
         path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
