@@ -156,6 +156,7 @@ def test_shared_tracks():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:made. .* found no motion:jaxevent.errors.InputWarning")
 @pytest.mark.parametrize("name", ["planes", "voting"])
 def test_motion_shared_and_of_ones_own(name):
     recording = points.moved(points.turning([0.3, 0.2, 0.1]), 0.15, 300, 0)
