@@ -39,6 +39,7 @@ RIVAL_RATIO = 0.2  # of the motion, least distance of the rivals beside it
 RIVAL_SIGMAS = 3.0  # of the estimate, least distance likewise
 MIN_REST_Z = 2.5  # against no motion
 MIN_RIVAL_Z = -0.5  # against the best rival
+MIN_CURVATURE_Z = 2.5  # against the motions on both sides along any axis
 MAX_OFFSET_RATIO = 0.15  # of the motion
 MIN_BLOCKS = 4.0  # effective number that support a motion of the camera
 # A motion that was told remains so until the evidence is clearly against it.
@@ -62,14 +63,19 @@ class Evidence(NamedTuple):
     offset: NDArray[np.float64]  # (d,) of the window's best motion beside the estimate
     offset_ratio: float  # its flow relative to the motion's
     offset_sigmas: float  # its length in standard deviations of the estimate
+    curvature: float  # least z of the motion against those on both of its sides, over axes
     blocks: float  # effective number of blocks of the image that support the motion
     length: float  # s, of the window
 
     @property
     def is_supported(self) -> bool:
-        """Return whether the votes support the motion against rest and against its rivals."""
+        """Return whether the votes support the motion against rest and against its rivals.
+
+        Along straight parallel edges all motions have the same votes, and none is supported.
+        """
         near = self.offset_ratio < MAX_OFFSET_RATIO or self.offset_sigmas < RIVAL_SIGMAS
-        return self.rest > MIN_REST_Z and self.rival > MIN_RIVAL_Z and near
+        is_maximum = self.rival > MIN_RIVAL_Z and self.curvature > MIN_CURVATURE_Z
+        return self.rest > MIN_REST_Z and is_maximum and near
 
 
 class EvidenceTest:
@@ -152,14 +158,16 @@ class EvidenceTest:
         slope = total[2 : 2 + d] - total[2 + d : 2 + 2 * d]
         steps = np.where(bend > 0, slope / np.maximum(2 * bend, 1e-12), np.sign(slope)).clip(-3, 3)
         offset = axes @ (steps * reach)
+        D_sides = 2 * votes[0] - votes[2 : 2 + d] - votes[2 + d : 2 + 2 * d]
+        curvature = bend / np.sqrt(np.maximum((D_sides**2).sum(1), 1e-12))
         # Where sigma is larger than the grid of rivals, so is their distance.
         sigmas = np.sqrt(((steps * reach) ** 2 / np.maximum(variance, 1e-12)).sum() / d)
         of_block = np.bincount(self._block, D[0], N_BLOCKS**2)
         blocks = max(of_block.sum(), 0.0) ** 2 / max(float((of_block**2).sum()), 1e-12)
         ratio = float(np.linalg.norm(offset)) / size
         return Evidence(
-            float(z[0]), float(z[1:].min()), offset * self._unit, ratio, float(sigmas), blocks,
-            length,
+            float(z[0]), float(z[1:].min()), offset * self._unit, ratio, float(sigmas),
+            float(curvature.min()), blocks, length,
         )  # fmt: skip
 
 

@@ -39,6 +39,20 @@ def test_true_motions_are_supported_and_others_are_not():
     assert test.measure(recording.events, 100, omega, np.eye(3), 6.5, 0.1) is None  # few events
 
 
+def test_motions_along_parallel_edges_are_not_supported():
+    """Columns of events that go to the right at 100 px/s; other motions up or down explain them."""
+    rng, test = np.random.default_rng(6), EvidenceTest(Planar(), XI)
+    t = np.sort(rng.integers(0, 100_000, 6000))
+    column = rng.integers(-1, 8, 6000)
+    x = np.rint(16 * column + 100e-6 * t).astype(int)
+    inside = (x >= 0) & (x < WIDTH)
+    y, p = rng.integers(0, HEIGHT, 6000), column % 2 == 0
+    events = Events(*(v[inside] for v in (t, x.clip(0), y, p)))
+    for up in np.linspace(-100.0, 100.0, 9):
+        found = test.measure(events, 100_000, np.array([100.0, up]), np.eye(2), 6.5, 0.1)
+        assert found is not None and found.rest > 3 and not found.is_supported
+
+
 def test_votes_equal_a_loop():
     """Sums over pairs of early and late events of overlaps of their bilinear kernels."""
     rng, n = np.random.default_rng(0), 150
@@ -80,7 +94,7 @@ class Script(EvidenceTest):
 
     def measure(self, *_):
         rest, rival, blocks = next(self.rows)
-        return Evidence(rest, rival, np.zeros(2), 0.0, 0.0, blocks, 0.01)
+        return Evidence(rest, rival, np.zeros(2), 0.0, 0.0, 9.0, blocks, 0.01)
 
 
 def told_by(rows, drift=0.0, moves=False):
