@@ -387,8 +387,9 @@ def _dispersion(
 ) -> NDArray[np.float64]:
     """Compute the dispersion of counts (windows, rows, columns) of windows in given slices."""
     calm, activity = background.calm[slices], background.activity[slices]
-    squares, expected, fullest, windows = sums = np.zeros((4, *N.shape[1:]))
+    sums = np.zeros((6, *N.shape[1:]))
     _sum_calm_counts(N, calm, activity, background.bright, sums)
+    _, squares, expected, fullest, windows, _ = sums
     full = expected >= CONFIG.min_dispersion_events
     own = np.where(full, squares / np.maximum(expected, CONFIG.min_dispersion_events), 1.0)
     usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
@@ -401,22 +402,28 @@ def _dispersion(
 def _sum_calm_counts(N: Any, calm: Any, activity: Any, bright: Any, sums: Any) -> None:
     """Fill in sums over the calm windows of each cell.
 
-    The sums are: squares of counts about what is expected, expected events, nats of the fullest
-    window of a bright cell, and the number of windows.
+    The sums are: mean count, squares about it, expected events, nats of the fullest window of a
+    bright cell, number of windows, and their activity.
     """
     windows, rows, columns = N.shape
+    mean, squares, expected = sums[0], sums[1], sums[2]
+    fullest, seen, active = sums[3], sums[4], sums[5]
+    for k in range(windows):
+        for i in range(rows):
+            for j in range(columns):
+                if calm[k, i, j]:
+                    mean[i, j] += N[k, i, j]
+                    active[i, j] += activity[k]
+                    seen[i, j] += 1
     for i in range(rows):
         for j in range(columns):
-            total = active = 0.0
-            for k in range(windows):
+            mean[i, j] /= max(active[i, j], 1.0)
+    for k in range(windows):
+        for i in range(rows):
+            for j in range(columns):
                 if calm[k, i, j]:
-                    total += N[k, i, j]
-                    active += activity[k]
-                    sums[3, i, j] += 1
-            for k in range(windows):
-                if calm[k, i, j]:
-                    mu = total / max(active, 1.0) * activity[k]
-                    sums[0, i, j] += (N[k, i, j] - mu) ** 2
-                    sums[1, i, j] += mu
-                    if bright[i, j]:
-                        sums[2, i, j] = max(sums[2, i, j], poisson_nats(N[k, i, j], mu))
+                    mu = mean[i, j] * activity[k]
+                    squares[i, j] += (N[k, i, j] - mu) ** 2
+                    expected[i, j] += mu
+                    if bright[i, j] and N[k, i, j] > mu:
+                        fullest[i, j] = max(fullest[i, j], poisson_nats(N[k, i, j], mu))

@@ -86,10 +86,12 @@ def _mains_coherence(
     table, piece = tabulate_paths(paths), CONFIG.lamp_piece_us
     begin = table.begins.min()
     pieces = (table.ends.max() - begin) // piece + 1
+    faintest = min(float(np.median(path.n)) / path.window for path in paths)
+    every = max(1, int(faintest * piece / CONFIG.min_recording_events / 10))
     n = np.zeros((len(paths), pieces))
     z = np.zeros((len(MAINS_HZ), len(paths) * pieces), complex)
     gate = CONFIG.gate_sigmas
-    for _, part, near in batches_near_paths(recording.events, table, gate):
+    for _, part, near in batches_near_paths(recording.events, table, gate, every=every):
         owner = near[:, 0]
         seen = (owner != NO_OWNER_INDEX) & ~hot[part.y, part.x]
         t = part.t[seen] - begin
