@@ -492,9 +492,12 @@ def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]
     good = on | off | negative
     if not good.all():
         row = int(np.argmin(good))
+        remedy = "p > 0 if these are ON, or p == 2 of 1 and 2"
+        if p[row] == 255 and on.any():
+            remedy = "p == 1, if 255 is -1 without its sign"
         raise InputError(
             f"{_place(source)}event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 "
-            "for ON and 0 or -1 for OFF; give p > 0 if these are ON, or p == 2 of 1 and 2"
+            f"for ON and 0 or -1 for OFF; give {remedy}"
         )
     if off.any() and negative.any():
         raise InputError(

@@ -140,6 +140,7 @@ def test_messages_name_the_argument_and_the_remedy():
     for changes, message in (
         ({"t": v["t"] / 1e6}, "t is float64, which states no unit; give time_unit='s'"),
         ({"p": v["p"] * 255}, "polarity 255; it must be 1 for ON .* p > 0"),
+        ({"p": (2 * v["p"] - 1).astype(np.uint8)}, "polarity 255; .* p == 1, if 255 is -1"),
         ({"x": v["x"] - 1}, r"x = -1; on the 64x48 sensor x is a whole number from 0 to 63"),
         ({"x": v["x"][:-5]}, "300, 295, 300 and 300 values; they must be equally long"),
         ({"y": np.ma.array(v["y"], mask=v["y"] == 3)}, "y has masked values; remove"),

@@ -56,7 +56,11 @@ DEAD_TIME_ERROR_S = 1.5e-4
 EXPOSURE_ERROR = 0.1  # relative
 BLUR_OF_GAPS, BLUR_ERROR = 0.4, 0.35  # of the squared time between events, in squared exposure
 DARK_OFFSET_ERROR = 0.8  # of its logarithm
-LATENESS_S = (-0.015, 0.005)  # interval about the best offset for whole events
+# An event shows the change since the one before at its pixel, so whole events are late by about
+# half the time between these; a part of it, as those that are dense tell most.
+LATENESS_OF_GAPS = 0.3  # of the harmonic mean of times between events of one sign
+LATENESS_ERROR_S = 0.01  # half width of the clock's interval by whole events
+MIN_GAP_US = 100  # as those of bursts
 COARSE_FACTOR = 1.6  # half width of the interval of thresholds by them
 NOISE_ERROR = 0.15  # of noises, relative
 N_PROFILE_STEPS = 4
@@ -203,7 +207,8 @@ def _by_whole_events(
 ) -> Calibration:
     """Return coarse values where few pixels move while frames are taken.
 
-    Whole events are late, and of small changes they miss a part, so that intervals are wide.
+    Whole events are late, and of small changes they miss a part, so that intervals are wide. The
+    clock is that of the sensor: the offset at which whole events fit best, less their lateness.
     """
     why = "too few pixels change brightness while frames are taken"
     rest = _without_fit(sample, ratio, dead, why, clock)
@@ -220,12 +225,25 @@ def _by_whole_events(
         return rest
     note = "from counts of whole events"
     c_on, c_off = (sums[0] / sums[1]).tolist()
+    offset = late - LATENESS_OF_GAPS * _time_between_events(sample)
+    ends = offset - LATENESS_ERROR_S, offset + LATENESS_ERROR_S
     return dataclasses.replace(
         rest,
-        clock_offset=CalibrationValue(late, late + LATENESS_S[0], late + LATENESS_S[1], "s", note),
+        clock_offset=CalibrationValue(offset, *ends, "s", note),
         c_on=CalibrationValue(c_on, c_on / COARSE_FACTOR, c_on * COARSE_FACTOR, "ln I", note),
         c_off=CalibrationValue(c_off, c_off / COARSE_FACTOR, c_off * COARSE_FACTOR, "ln I", note),
     )
+
+
+def _time_between_events(sample: Sample) -> float:
+    """Return the harmonic mean of times (s) between events of one sign at a pixel; 0 without."""
+    rates, number = 0.0, 0
+    for stretch in sample.stretches:
+        order = np.lexsort((stretch.t, stretch.pixel))
+        t, p, pixel = stretch.t[order], stretch.p[order], stretch.pixel[order]
+        gap = np.diff(t)[(np.diff(pixel) == 0) & (p[1:] == p[:-1])]
+        rates, number = rates + (1 / np.maximum(gap, MIN_GAP_US)).sum(), number + len(gap)
+    return 1e-6 * number / rates if number else 0.0
 
 
 def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibration:

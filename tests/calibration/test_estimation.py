@@ -80,6 +80,14 @@ def test_a_grating_that_repeats_itself_has_the_clock_of_its_stamps():
     assert found.exposure.low == 0  # frames are instantaneous, though a mean fits them better
 
 
+def test_the_clock_by_whole_events_is_the_sensors(recording, monkeypatch):
+    monkeypatch.setattr("jaxevent.calibration.estimation._first_fit", lambda *_: None)
+    clock = jaxevent.calibrate(recording, SENSOR.dark_offset).clock_offset
+    assert clock.note == "from counts of whole events"
+    assert clock.low < SENSOR.clock_offset < clock.high
+    assert clock.value == pytest.approx(SENSOR.clock_offset, abs=2e-3)
+
+
 @pytest.mark.slow
 def test_simulated_truth(found):
     truth = {
