@@ -72,13 +72,14 @@ class PinholeCamera:
             )
         object.__setattr__(self, "distortion", (*given, *(0.0,) * (len(names) - len(given))))
         object.__setattr__(self, "model", model)
-        self._check_numbers(names)
+        self._check_numbers()
         self.check_sensor(*_LARGEST_SENSOR)
 
-    def _check_numbers(self, coefficients: Sequence[str]) -> None:
+    def _check_numbers(self) -> None:
         """Raise `InputError` for what is not finite, and focal lengths that are not positive."""
         given = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
-        given |= dict(zip(coefficients, self.distortion, strict=True))
+        names = LENS_MODELS[self.model].coefficients
+        given |= dict(zip(names, self.distortion, strict=True))
         for name, value in given.items():
             if isinstance(value, jax.core.Tracer):
                 continue

@@ -81,7 +81,7 @@ def growth(
     times: Float[Array | np.ndarray, " times"],
     mean: Float[Array | np.ndarray, "times 8"],
     covariance: Float[Array | np.ndarray, "times 8 8"],
-    valid: Bool[Array, " times"] | None = None,
+    valid: Bool[Array | np.ndarray, " times"] | None = None,
     *,
     Q: Number = 0.01,
     Q_lambda: Number | None = None,

@@ -179,13 +179,16 @@ class Tracks(HtmlRepr):
         state = {k: v for k, v in vars(self).items() if k != "_segment_infos"}
         return {**state, "_kept_infos": {}, "_sizes_read": []}
 
-    def track_params(self, id: int) -> Any:
+    def track_params(self, id: int | np.integer) -> Any:
         """Return the parameters of a track; those of targets that were found differ.
 
         Args:
             id: Number of the track.
+
+        Returns:
+            The parameters.
         """
-        own = {name: values[id] for name, values in self._packer.overrides.items()}
+        own = {name: jnp.asarray(values[id]) for name, values in self._packer.overrides.items()}
         return track_params(self.params, own)
 
     @property

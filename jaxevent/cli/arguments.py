@@ -117,8 +117,8 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
         metavar="FILE",
         type=lens,
         help="calibration of the camera instead of the recording's: camchain.yaml of Kalibr or "
-        "camera_info of ROS or OpenCV, FILE:NAME of several; or numbers, fx,fy,cx,cy in px, with "
-        "distortion fx,fy,cx,cy,k1,k2,p1,p2,k3 or fx,fy,cx,cy,k1,k2,k3,k4,fisheye",
+        "camera_info of ROS or OpenCV, FILE:NAME of several; or fx,fy,cx,cy in px, followed by "
+        "k1,k2,p1,p2,k3 or k1,k2,k3,k4,fisheye",
     )
     group.add_argument(
         "--time-unit",

@@ -462,7 +462,7 @@ def test_info(tmp_path, capsys, monkeypatch):
         imu_t=np.r_[0, 1_000],
         gyro=np.zeros((2, 3)),
         acc=np.zeros((2, 3)),
-        calib=np.arange(9.0),
+        calib=1 + np.arange(9.0),
         threshold=np.r_[0.1, 0.2],
     )
     assert cli.main(["convert", str(path), str(tmp_path / "known.h5")]) == 0
@@ -490,7 +490,7 @@ def test_info(tmp_path, capsys, monkeypatch):
         "frames": "2 of 24 x 20, float64, 24.7 per s",
         "exposure": "3.000 to 4.000 ms",
         "grey levels": "37.5 % dark (< 0.02), 12.5 % saturated (> 0.98)",
-        "calibration": "fx 0.00, fy 1.00, cx 2.00, cy 3.00; distortion 4, 5, 6, 7, 8",
+        "calibration": "fx 1.00, fy 2.00, cx 3.00, cy 4.00; distortion 5, 6, 7, 8, 9",
         "IMU": "2, 1000.0 per s",
         "ground truth": "none",
         "extra threshold": "float64 of shape (2,)",
