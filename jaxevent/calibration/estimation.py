@@ -39,6 +39,7 @@ from jaxevent.recording import Recording, check_recording
 
 OFFSET_STEP_US = 4000
 MIN_CORRELATION = 0.1
+MIN_CORRELATION_SIGMAS = 5.0  # of chance, as many offsets are tried
 MIN_PEAK_RATIO = 2.0  # of the highest correlation to those far from it
 MIN_NEAR_SHARE = 0.95  # of the correlation within an interval of the stamps to the highest
 MIN_POLARITY_SHARE = 0.05  # of the rarer polarity
@@ -91,7 +92,7 @@ def find_offset(sample: Sample, I0: float) -> Clock:
     """
     count = SEARCH_US // OFFSET_STEP_US
     tried = np.arange(-count, count + 1) * OFFSET_STEP_US
-    found = correlate(sample, tried, I0)
+    found, number = correlate(sample, tried, I0)
     known = np.isfinite(found)
     if not known.any():
         return Clock(tried * 1e-6, found, math.nan, "no events between frames")
@@ -100,7 +101,7 @@ def find_offset(sample: Sample, I0: float) -> Clock:
     far = found[known & (np.abs(tried - tried[top]) > 2 * max(interval, OFFSET_STEP_US))]
     others = float(np.quantile(np.abs(far), 0.9)) if len(far) else 0.0
     why = ""
-    if found[top] < MIN_CORRELATION:
+    if found[top] < max(MIN_CORRELATION, MIN_CORRELATION_SIGMAS / math.sqrt(number[top])):
         why = f"events and frames agree at no offset (correlation {found[top]:.2f})"
     elif found[top] < MIN_PEAK_RATIO * others:
         # What moves periodically agrees after every period. Stamps are rarely off by more than an

@@ -292,7 +292,7 @@ def _add_moments(t, pixel, sign, change, used, edges, count, out):
 
 def correlate(
     sample: Sample, offsets_us: NDArray[np.int64], I0: float = 1.0
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Correlate the events' counts with the frames' changes at offsets of the clock.
 
     Pearson's r of ON minus OFF events with the change of ln(I + I0), over all pixels that no frame
@@ -305,7 +305,8 @@ def correlate(
         I0: Offset inside the logarithm.
 
     Returns:
-        (offsets,) correlations; NaN where fewer than half of the intervals have events.
+        (offsets,) correlations, NaN where fewer than half of the intervals have events, and
+        numbers of the changes in them.
     """
     sums = np.zeros((len(offsets_us), 6))  # S^2, S d, S, n, d^2, d
     intervals = np.zeros(len(offsets_us))
@@ -335,4 +336,5 @@ def correlate(
     n = np.maximum(n, 1)
     spread = (S2 - S * S / n) * (d2 - d * d / n)
     enough = (spread > 1e-12) & (intervals >= math.ceil(total / 2))
-    return np.where(enough, (Sd - S * d / n) / np.sqrt(np.where(enough, spread, 1)), np.nan)
+    r = np.where(enough, (Sd - S * d / n) / np.sqrt(np.where(enough, spread, 1)), np.nan)
+    return r, n.astype(np.int64)

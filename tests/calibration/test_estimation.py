@@ -7,8 +7,9 @@ import pytest
 
 import jaxevent
 from jaxevent.calibration.brightness import interpolate, read_positions, sort_by_pixel
+from jaxevent.calibration.estimation import find_offset
 from jaxevent.calibration.sampling import SampledSegment, choose_pixels, correlate, take_sample
-from jaxevent.recording import Frames, Recording
+from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.protocols import held_out
 from jaxevent.simulate import MovingObjects, Sensor, simulate
 from jaxevent.simulate.faults import blur_frames
@@ -147,7 +148,7 @@ def test_polarity_swapped(recording):
     assert not found.c_on.is_identifiable and not found.clock_offset.is_identifiable
     assert "opposite" in found.clock_offset.note
     offsets = np.arange(-20, 21) * 5000
-    one, two = (correlate(take_sample(r), offsets, 0.02) for r in (recording, swapped))
+    one, two = (correlate(take_sample(r), offsets, 0.02)[0] for r in (recording, swapped))
     np.testing.assert_allclose(one, -two, atol=1e-12)
 
 
@@ -163,7 +164,23 @@ def test_correlation_is_pearsons(recording):
         np.add.at(net[k], stretch.pixel[part], np.where(stretch.p[part], 1, -1))
     inside = stretch.frame_t[:-1] + offset >= stretch.t[0]
     r = np.corrcoef(change[inside][used[inside]], net[inside][used[inside]])[0, 1]
-    assert correlate(sample, np.array([offset]), 0.02)[0] == pytest.approx(r, abs=1e-5)
+    found, number = correlate(sample, np.array([offset]), 0.02)
+    assert found[0] == pytest.approx(r, abs=1e-5) and number[0] == used[inside].sum()
+
+
+def test_no_clock_comes_from_noise():
+    """Of three small frames of noise one in twelve correlates by more than a tenth with events."""
+    width, height, n = 24, 20, 400
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        t = np.sort(rng.integers(0, 50_000, n))
+        x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (width, height))
+        images = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
+        stamps = np.array([0, 21_000, 41_000])
+        frames = Frames(stamps, images, np.zeros_like(stamps))
+        events = Events(t, x, y, rng.random(n) < 0.5)
+        noise = Recording("noise", width, height, events, frames)
+        assert np.isnan(find_offset(take_sample(noise), 1.0).best), seed
 
 
 @pytest.mark.parametrize("rho", [0.0, 2e-3])
