@@ -47,6 +47,7 @@ EARLIER_STARTS_S = (0.0, 3e-3, 8e-3)  # counts of whole events are late
 MAX_FIRST_PIXELS = 10_000  # of the fits that choose among starts
 FIRST_VARIANCES = (1e-5, 0.05, 0.01)
 FIRST_EXPOSURE = 0.3  # of the time between frames
+FIRST_DARK_OFFSET = 0.03  # of intensity
 GREY_NOISE = 1.5 / 255  # by which pixels are chosen
 # Errors of the model itself, found on simulated scenes. Paths between events are not parabolas, so
 # that errors grow with the time between these.
@@ -131,20 +132,39 @@ def _interval(value: float, error: float, unit: str, note: str = "") -> Calibrat
     return CalibrationValue(value, value / wide, value * wide, unit, note)
 
 
-def _first_fit(model: Model, clock: Clock, is_unknown: bool) -> Fit | None:
-    """Fit from several offsets, and return the best fit."""
-    best, quick = None, model.thinned(MAX_FIRST_PIXELS)
+def _first_fit(model: Model, clock: Clock) -> Fit | None:
+    """Fit thresholds and clock from several offsets, and return the best fit."""
+    best = None
     for early in EARLIER_STARTS_S:
         theta = [0.2, 0.2, clock.best - early, 0.0, (FIRST_EXPOSURE * model.interval_s) ** 2]
         start = Physics(np.array(theta), np.array(FIRST_VARIANCES))
-        fit = quick.fit(start, (True, True, True, False, False), 5)
+        fit = model.fit(start, (True, True, True, False, False), 5)
         if fit is not None and (best is None or fit.losses.mean() < best.losses.mean()):
             best = fit
-    if best is None:
-        theta = [0.2, 0.2, clock.best, 0.0, (FIRST_EXPOSURE * model.interval_s) ** 2]
-        start = Physics(np.array(theta), np.array(FIRST_VARIANCES))
-        return model.fit(start, (True, True, True, False, False))
-    return model.fit(best.physics, (True, True, True, True, is_unknown)) or best
+    return best
+
+
+def _fit_sensor(
+    sample: Sample, slope: NDArray[np.float64], clock: Clock, is_unknown: bool
+) -> tuple[Model, Fit] | None:
+    """Fit what does not depend on the logarithm that a method works in.
+
+    Where thresholds are not the same at all intensities, changes lie off the model by more than
+    noise, and the clock follows them: the fit is at the dark offset that the frames prefer.
+
+    Returns:
+        The likelihood at that offset, and its fit; None where too few changes count.
+    """
+    model = Model(sample, FIRST_DARK_OFFSET, GREY_NOISE, slope)
+    quick = model.thinned(MAX_FIRST_PIXELS)
+    first = _first_fit(quick, clock) or _first_fit(model, clock)
+    if first is None:
+        return None
+    offsets = _DarkOffsets.of(quick, first)
+    model = model.with_offset(offsets.likeliest())
+    start = Physics(offsets.fits[offsets.place].physics.theta, np.array(FIRST_VARIANCES))
+    fit = model.fit(start, (True, True, True, True, is_unknown))
+    return None if fit is None else (model, fit)
 
 
 def calibrate(recording: Recording, I0: float = 1.0, sample: Sample | None = None) -> Calibration:
@@ -173,12 +193,14 @@ def calibrate(recording: Recording, I0: float = 1.0, sample: Sample | None = Non
     grey = np.linspace(0, 1, 1025)
     table = np.asarray(recording.response.intensity(grey), np.float64)
     slope = np.stack([grey, np.maximum(np.gradient(table, grey), 1e-6)])
-    model = Model(sample, I0, GREY_NOISE, slope)
     is_unknown = any((s.exposure == 0).any() for s in sample.stretches)
-    fit = _first_fit(model, clock, is_unknown)
-    if fit is None:
+    found = _fit_sensor(sample, slope, clock, is_unknown)
+    if found is None:
         return _by_whole_events(sample, I0, ratio, dead, clock)
-    return _with_fit(sample, fit, model, clock)
+    model, fit = found
+    c_free = (True, True, False, False, False)
+    thresholds = model.with_offset(I0).fit(fit.physics, c_free, N_PROFILE_STEPS)
+    return _with_fit(sample, model, fit, thresholds or fit, clock)
 
 
 def _without_fit(
@@ -247,34 +269,30 @@ def _time_between_events(sample: Sample) -> float:
     return 1e-6 * number / rates if number else 0.0
 
 
-def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibration:
-    """Return the values of a fit with their intervals."""
-    theta = fit.physics.theta
-    clock_error = max(CLOCK_ERROR * _gap(fit, 2, 1), MIN_CLOCK_ERROR_S)
-    more = [*(THRESHOLD_ERROR * theta[:2]), clock_error, DEAD_TIME_ERROR_S, 0.0]
-    covariance = fit.covariance + np.diag(np.square(more))
-    error = np.sqrt(np.diag(covariance))
-    c_on, c_off = (_interval(float(theta[k]), float(error[k]), "ln I") for k in (0, 1))
-    ratio = float(theta[0] / theta[1])
-    by = np.array([1 / theta[0], -1 / theta[1]])
-    ratio_error = math.hypot(math.sqrt(float(by @ fit.covariance[:2, :2] @ by)), THRESHOLD_ERROR)
-    late = float(theta[2])
-    reach = CONFIDENCE_Z * float(error[2])
+def _with_fit(
+    sample: Sample, model: Model, sensor: Fit, thresholds: Fit, clock: Clock
+) -> Calibration:
+    """Return the values of the sensor's fit and of that of thresholds with their intervals."""
+    theta = sensor.physics.theta
+    clock_error = max(CLOCK_ERROR * _gap(sensor, 2, 1), MIN_CLOCK_ERROR_S)
+    error = np.sqrt(np.diag(sensor.covariance)[2:4] + np.square([clock_error, DEAD_TIME_ERROR_S]))
+    late, reach = float(theta[2]), CONFIDENCE_Z * float(error[0])
     offset = CalibrationValue(late, late - reach, late + reach, "s")
-    rho, reach = float(theta[3]), CONFIDENCE_Z * float(error[3])
+    rho, reach = float(theta[3]), CONFIDENCE_Z * float(error[1])
     if rho - reach > 0:
         dead = CalibrationValue(rho, rho - reach, rho + reach, "s")
     else:
         dead = not_identifiable("s", f"at most {rho + reach:.2g} s")
-    exposure = _exposure(sample, fit, model)
-    noise, event_noise = _noises(fit)
+    exposure = _exposure(sample, sensor, model)
+    noise, event_noise = _noises(sensor)
+    c_on, c_off, ratio = _thresholds(thresholds)
     return Calibration(
         clock_offset=offset,
-        clock_drift=_drift(sample, fit),
+        clock_drift=_drift(sample, sensor),
         c_on=c_on,
         c_off=c_off,
-        threshold_ratio=_interval(ratio, ratio * ratio_error, "1"),
-        dark_offset=_dark_offset(model, fit),
+        threshold_ratio=ratio,
+        dark_offset=_dark_offset(model, sensor),
         event_noise=event_noise,
         frame_noise=noise,
         exposure=exposure,
@@ -283,8 +301,19 @@ def _with_fit(sample: Sample, fit: Fit, model: Model, clock: Clock) -> Calibrati
         hot_pixels=sample.hot,
         offsets=clock.offsets,
         correlations=clock.correlations,
-        threshold_factors=_factors(sample, fit),
+        threshold_factors=_factors(sample, thresholds),
     )
+
+
+def _thresholds(fit: Fit) -> tuple[CalibrationValue, CalibrationValue, CalibrationValue]:
+    """Return the thresholds and their ratio."""
+    c, covariance = fit.physics.theta[:2], fit.covariance[:2, :2]
+    error = np.sqrt(np.diag(covariance) + (THRESHOLD_ERROR * c) ** 2)
+    c_on, c_off = (_interval(float(c[k]), float(error[k]), "ln I") for k in (0, 1))
+    by = np.array([1 / c[0], -1 / c[1]])
+    spread = math.hypot(math.sqrt(float(by @ covariance @ by)), THRESHOLD_ERROR)
+    ratio = float(c[0] / c[1])
+    return c_on, c_off, _interval(ratio, ratio * spread, "1")
 
 
 def _gap(fit: Fit, column: int, power: int) -> float:
@@ -382,32 +411,61 @@ def _drift(sample: Sample, fit: Fit) -> CalibrationValue:
     return CalibrationValue(float(slope), float(slope - reach), float(slope + reach), "s/s")
 
 
+class _DarkOffsets(NamedTuple):
+    """Fits of thresholds at each of `DARK_OFFSETS`."""
+
+    fits: list[Fit]
+    losses: NDArray[np.float64]  # (offsets, n), of densities of grey values
+
+    @classmethod
+    def of(cls, model: Model, fit: Fit) -> "_DarkOffsets":
+        """Fit thresholds at each offset, all else as it is."""
+        fits, physics = [], fit.physics
+        for I0 in DARK_OFFSETS[::-1].tolist():
+            for _ in range(N_PROFILE_STEPS):
+                found, move = model.step(physics, fit.changes, np.arange(2), I0)
+                theta = physics.theta + move
+                theta[:2] = np.maximum(theta[:2], physics.theta[:2] / 2)
+                physics = Physics(theta, found.physics.V)
+            fits.insert(0, found)
+        # Densities of grey values rather than of their logarithms, which depend on I0.
+        return cls(fits, np.stack([one.losses + one.terms.log_slope for one in fits]))
+
+    @property
+    def place(self) -> int:
+        """Row of the likeliest offset."""
+        return int(np.argmin(self.losses.mean(1)))
+
+    @property
+    def is_inside(self) -> bool:
+        """True where offsets on both sides are less likely."""
+        return 0 < self.place < len(self.fits) - 1
+
+    def likeliest(self) -> float:
+        """Return the vertex of the parabola through the least loss and both neighbours."""
+        k, ratio = self.place, DARK_OFFSETS[1] / DARK_OFFSETS[0]
+        if not self.is_inside:
+            return float(DARK_OFFSETS[k])
+        left, here, right = self.losses[k - 1 : k + 2].mean(1)
+        part = (left - right) / (2 * (left - 2 * here + right))  # of a step
+        return float(DARK_OFFSETS[k] * ratio**part)
+
+
 def _dark_offset(model: Model, fit: Fit) -> CalibrationValue:
     """Return the offset in the logarithm under which frames are likeliest."""
-    fits, physics = [], fit.physics
-    thresholds = np.arange(2)
-    for I0 in DARK_OFFSETS[::-1].tolist():
-        for _ in range(N_PROFILE_STEPS):
-            found, move = model.step(physics, fit.changes, thresholds, I0)
-            theta = physics.theta + move
-            theta[:2] = np.maximum(theta[:2], physics.theta[:2] / 2)
-            physics = Physics(theta, found.physics.V)
-        # Densities of grey values rather than of their logarithms, which depend on I0.
-        fits.insert(0, found.losses + found.terms.log_slope)
-    loss = np.array([one.mean() for one in fits])
-    k = int(np.argmin(loss))
-    if k in (0, len(loss) - 1):
+    offsets = _DarkOffsets.of(model, fit)
+    k, step = offsets.place, math.log(DARK_OFFSETS[1] / DARK_OFFSETS[0])
+    if not offsets.is_inside:
         end = f"{'at most' if k == 0 else 'at least'} {DARK_OFFSETS[k]:.2g}"
         return not_identifiable("intensity", f"dark pixels tell no more than {end}")
-    step = math.log(DARK_OFFSETS[1] / DARK_OFFSETS[0])
-    left, here, right = fits[k - 1 : k + 2]
+    left, here, right = offsets.losses[k - 1 : k + 2]
     bend = float((left - 2 * here + right).sum()) / step**2
     slope = (right - left)[:, None] / (2 * step)
     meat = max(float(cluster_sums(slope, fit.changes, by)[0, 0]) for by in ("tile", "interval"))
     error = math.hypot(math.sqrt(meat) / bend, DARK_OFFSET_ERROR)
-    value = float(DARK_OFFSETS[k] * math.exp(-slope.sum() / bend))
     if not 0 < error < 1.5:
         return not_identifiable("intensity", "pixels differ too little in brightness")
+    value = offsets.likeliest()
     return _interval(value, value * error, "intensity")
 
 

@@ -145,12 +145,24 @@ class Model:
         self.sample, self.I0, self.grey_noise, self.slope = sample, I0, grey_noise, slope
         self._rho: float | None = None
         self._paths: list[Interpolation] = []
-        self._events = []
-        for stretch in sample.stretches:
-            level = np.maximum(stretch.intensity, 0) + I0
-            noise = grey_noise * np.interp(stretch.grey, *slope)
-            clear = stretch.clear & (noise < MAX_RELATIVE_NOISE * level)
-            self._events.append(sort_by_pixel(stretch, clear))
+        self._events = [sort_by_pixel(stretch, stretch.clear) for stretch in sample.stretches]
+        self._choose_clear()
+
+    def _choose_clear(self) -> None:
+        """Choose the pixels at whose brightness noise changes the logarithm little."""
+        for row, stretch in enumerate(self.sample.stretches):
+            active = self._events[row].active
+            level = np.maximum(stretch.intensity[:, active], 0) + self.I0
+            noise = self.grey_noise * np.interp(stretch.grey[:, active], *self.slope)
+            clear = stretch.clear[:, active] & (noise < MAX_RELATIVE_NOISE * level)
+            self._events[row] = self._events[row]._replace(clear=np.ascontiguousarray(clear.T))
+
+    def with_offset(self, I0: float) -> "Model":
+        """Return the likelihood with another offset inside the logarithm."""
+        other = copy.copy(self)
+        other.I0, other._events = I0, list(self._events)
+        other._choose_clear()
+        return other
 
     def thinned(self, most: int) -> "Model":
         """Return the likelihood of at most about `most` pixels of each stretch, evenly chosen."""
@@ -253,7 +265,8 @@ class Model:
         """
         physics, moves = start, np.flatnonzero(free)
         for step in range(steps + 1):
-            changes = self.changes(physics.theta)
+            if step == 0 or moves[-1] > 1:  # thresholds alone move no event
+                changes = self.changes(physics.theta)
             if len(changes.loose) < MIN_CHANGES:
                 return None
             fit, move = self.step(physics, changes, moves)
