@@ -65,7 +65,7 @@ def run(
 ) -> None:
     from jaxevent.event_flow import FlowParams, flow_from_events
     from jaxevent.io.images import read_times
-    from jaxevent.show.export import evenly_spaced_times, within
+    from jaxevent.show.export import image_times, within
     from jaxevent.show.flow import flow_writer
 
     write = flow_writer(out)
@@ -75,7 +75,7 @@ def run(
     if times is not None:
         wanted = read_times(times, (recording.start, recording.stop))
     else:
-        wanted = evenly_spaced_times(recording, rate, start)
+        wanted = image_times(recording, rate, start)
     chosen = within(wanted, start, stop, str(path))
     clock = time.perf_counter()
     write(flow_from_events(recording, values, causal=causal), chosen, out, show_progress())

@@ -126,7 +126,7 @@ def _default_times(
     """The times of images where no file gives them, us."""
     from jaxevent.events.clocks import check_clocks, compare_clocks
     from jaxevent.runs.protocols import frame_times
-    from jaxevent.show.export import evenly_spaced_times
+    from jaxevent.show.export import image_times
 
     if rate is None and recording.frames is not None:
         if not estimator.needs_frames:
@@ -137,7 +137,7 @@ def _default_times(
         check_clocks(recording, values.clock_offset)
     elif compare_clocks(recording, values.clock_offset) is not None:
         spanned = dataclasses.replace(recording, frames=None)
-    return evenly_spaced_times(spanned, 100.0 if rate is None else rate, start)
+    return image_times(spanned, 100.0 if rate is None else rate, start)
 
 
 def _warn_of_faults(recording: Any, sample: Any) -> None:

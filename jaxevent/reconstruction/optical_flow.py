@@ -20,7 +20,7 @@ from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.frames import EventTiming, FrameClock, FrameImages
 from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times
 from jaxevent.threads import synchronized
 
 MIN_SIDE_PX = 12  # pixels that OpenCV's search needs in width or height
@@ -172,10 +172,7 @@ class FlowVideo(ImageSequence[Params]):
         Raises:
             InputError: A time is not finite, or outside the recording.
         """
-        times = np.atleast_1d(microseconds(times))
-        if not extrapolate:
-            self.estimator.check_span(self.recording, times, self.params)
-        times = times + self._image_delay_us
+        times = self._among_events(times, extrapolate)
         located = _locate(self._clock, times)
         shape = (len(times), self.recording.height, self.recording.width, 2)
         flows = np.full(shape, np.nan, self._dtype)

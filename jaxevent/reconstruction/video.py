@@ -244,6 +244,13 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     def dtype(self) -> np.dtype:
         """Type of images and variances."""
 
+    def _among_events(self, times: Times, extrapolate: bool) -> NDArray[np.int64]:
+        """Return when events show images at times, us; raise `InputError` for impossible ones."""
+        wanted = np.atleast_1d(microseconds(times))
+        if not extrapolate:
+            self.estimator.check_span(self.recording, wanted, self.params)
+        return wanted + self._image_delay_us
+
     @abc.abstractmethod
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         """Read a few images after another at sorted times (us): the times and their `Estimate`.
@@ -369,15 +376,14 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
-        if not extrapolate:
-            self.estimator.check_span(self.recording, times, self.params)
+        among_events = self._among_events(times, extrapolate)
         with self._turns:
             compared, self._compared = self._compared, True
         if not compared and (doubt := self._doubt()) is not None:
             warnings.warn(doubt, InputWarning, stacklevel=2)
         start, stop = time_span(self.recording, self.params.clock_offset)
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:
-            for read, images in self._turns.iterate(self._read(times + self._image_delay_us)):
+            for read, images in self._turns.iterate(self._read(among_events)):
                 batch = read - self._image_delay_us
                 shape = (len(batch), self.recording.height, self.recording.width)
                 image, variance, valid = (

@@ -22,7 +22,7 @@ from jaxevent.runs.protocols import held_out
 from jaxevent.runs.results import check_folder, open_results, write_rows
 from jaxevent.runs.scores import Sample, ScoringOptions, score_and_sample
 from jaxevent.runs.tasks import ComputeResources, Task, run
-from jaxevent.show.export import display_images, evenly_spaced_times
+from jaxevent.show.export import display_images, image_times
 from jaxevent.show.images import (
     Kind,
     comparison_figure,
@@ -212,8 +212,6 @@ def _video(recording: Recording, path: Path) -> float:
     video = find("akf").estimate(recording, progress=False)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
-        for _, image in display_images(
-            video, evenly_spaced_times(recording, rate)[:longest], "display"
-        ):
+        for _, image in display_images(video, image_times(recording, rate)[:longest], "display"):
             write(np.kron(image, np.ones((zoom, zoom), np.uint8)))
     return rate / fps

@@ -19,10 +19,10 @@ from jaxevent.recording import Recording, microseconds
 from jaxevent.show.images import display_limits, tone_map, video_writer, write_png
 
 
-def evenly_spaced_times(
+def image_times(
     recording: Recording, rate: float | int, start: float | int | None = None
 ) -> NDArray[np.int64]:
-    """Return evenly spaced times of a recording.
+    """Return the times of evenly spaced images of a recording.
 
     Args:
         recording: The recording.

@@ -18,7 +18,7 @@ from jaxevent.io.output import complete
 from jaxevent.io.tables import read_table
 from jaxevent.reconstruction.video import ImageSequence
 from jaxevent.recording import Recording, microseconds
-from jaxevent.show.export import default_tone, display_images, evenly_spaced_times
+from jaxevent.show.export import default_tone, display_images, image_times
 from jaxevent.show.images import tone_map
 from jaxevent.show.track_tables import STATE_COLUMNS
 
@@ -240,7 +240,7 @@ def _layer_of_table(path: Path) -> _Layer:
 def _send_video(video: ImageSequence, recording: Recording, send: _Sender, name: str) -> None:
     """Send a reconstruction at the frames' times, or at even times where there are no frames."""
     if recording.frames is None:
-        times = evenly_spaced_times(recording, VIDEO_RATE_HZ)
+        times = image_times(recording, VIDEO_RATE_HZ)
         tone = default_tone(video.estimator.has_covariance, recording)
         send.toned_images(f"image/{name}", display_images(video, times, tone))
         return

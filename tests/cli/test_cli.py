@@ -721,7 +721,7 @@ def test_without_frames_images_have_a_tone_of_their_own(folder, capsys, method, 
     argv = f"reconstruct {folder}/bare.h5 --method {method} --rate 300 --out {folder}/{tone}"
     assert cli.main(argv.split()) == 0
     assert "frames," not in capsys.readouterr().out.partition("\n")[2]
-    times = export.evenly_spaced_times(recording, 300)
+    times = export.image_times(recording, 300)
     images, variance, _ = jaxevent.METHODS[method].estimate(recording)(times)
     shown = [np.asarray(Image.open(p)) for p in sorted((folder / tone).glob("*.png"))]
     limits = display_limits(images, tone, variance)

@@ -80,7 +80,7 @@ from jaxevent.reconstruction.features import Features, Numeric, ReadOut
 from jaxevent.reconstruction.frames import EventTiming, FrameImages
 from jaxevent.reconstruction.video import FlowSource, ImageSequence
 from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times
 from jaxevent.threads import synchronized
 
 
@@ -227,11 +227,8 @@ class CompensatedVideo(ImageSequence[Params]):
     def _targets(
         self, times: Times, extrapolate: bool
     ) -> Iterator[tuple[TrajectoryEstimate, FusedImage]]:
-        wanted = np.atleast_1d(microseconds(times))
-        if not extrapolate:
-            self.estimator.check_span(self.recording, wanted, self.params)
-        for t in wanted.tolist():
-            yield self._target(t + self._image_delay_us)
+        for t in self._among_events(times, extrapolate).tolist():
+            yield self._target(t)
 
     @synchronized
     def carry(

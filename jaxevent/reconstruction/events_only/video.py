@@ -14,7 +14,7 @@ from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.windows import SolvedWindow, WindowSolver
 from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.video import FlowSource, ImageSequence
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times
 from jaxevent.threads import synchronized
 
 GREY = 0.5  # intensity where the log image is at its mean: events alone tell it up to a factor
@@ -121,7 +121,4 @@ class EventsOnlyVideo(ImageSequence[Params]):
         Raises:
             InputError: A time is not finite, or outside the recording.
         """
-        wanted = np.atleast_1d(microseconds(times))
-        if not extrapolate:
-            self.estimator.check_span(self.recording, wanted, self.params)
-        return self._windows.flow.flow(wanted + self._image_delay_us, extrapolate=True)
+        return self._windows.flow.flow(self._among_events(times, extrapolate), extrapolate=True)
