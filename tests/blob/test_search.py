@@ -23,8 +23,8 @@ from jaxevent.blob.search.paths import (
     NO_OWNER_INDEX,
     TRIED_VELOCITY_NOISES,
     TargetPath,
-    _log_likelihood,
     fit_velocity_noise,
+    log_likelihood,
     owner_candidates,
     tabulate_paths,
 )
@@ -515,27 +515,22 @@ def test_agility_is_the_most_likely():
     found = fit_velocity_noise(t, m, np.full(400, R), 1e6)
     assert q / 2.5 < found < 2.5 * q and np.isclose(TRIED_VELOCITY_NOISES * 1e6, found).any()
 
-    # The density of 12 means, given the first two, written out.
-    n = 12
-    F = np.array([[1, dt], [0, 1]])
-    P = np.array([[R, R / dt], [R / dt, 2 * R / dt**2 + q * dt]])
-    S = np.zeros((n - 2, n - 2))
-    blocks = []
-    for _ in range(n - 2):
-        P = F @ P @ F.T + Q
-        blocks.append(P)
-    for i in range(n - 2):
-        for j in range(n - 2):
-            low, high = min(i, j), max(i, j)
-            S[i, j] = (np.linalg.matrix_power(F, high - low) @ blocks[low])[0, 0] + R * (i == j)
-    total = 0.0
-    for axis in range(2):
-        v = (m[1, axis] - m[0, axis]) / dt
-        mean = m[1, axis] + v * dt * np.arange(1, n - 1)
-        total += stats.multivariate_normal(mean, S).logpdf(m[2:n, axis])
-    constant = (n - 2) * np.log(2 * np.pi)
-    ours = _log_likelihood(t[:n], m[:n], np.full(n, R), q)
-    assert ours == pytest.approx(total + constant, rel=1e-9)
+
+def test_the_likelihood_of_places_is_the_density_of_all_of_them():
+    """Given the first place: its error, the first velocity and the integrated noise add up."""
+    rng = np.random.default_rng(4)
+    t, c, q = np.cumsum(rng.uniform(0.5, 1.5, 9)), 2.0, rng.uniform(0.1, 3, 8)
+    R, z = rng.uniform(0.5, 1, 9), rng.normal(0, 1, (9, 2))
+    S = R[0] + c * np.outer(t - t[0], t - t[0])
+    for k in range(8):  # acceleration between t[k] and t[k + 1], integrated twice by Simpson's rule
+        u = np.linspace(t[k], t[k + 1], 3)
+        reach = np.maximum(t[:, None] - u, 0)
+        weight = np.array([1, 4, 1]) * (t[k + 1] - t[k]) / 6
+        S += q[k] * (reach * weight) @ reach.T
+    S = (S + np.diag(R))[1:, 1:]
+    total = sum(stats.multivariate_normal(np.full(8, x[0]), S).logpdf(x[1:]) for x in z.T)
+    ours = log_likelihood(t, z, R, c, q)
+    assert ours == pytest.approx(total + 8 * np.log(2 * np.pi), rel=1e-9)
 
 
 @pytest.mark.slow

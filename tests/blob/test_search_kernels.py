@@ -229,7 +229,7 @@ def test_events_are_shared_out_among_gates_and_blobs():
         share = share / (labels == blob).sum()
         if share.sum() < CONFIG.claimed_share:
             continue
-        own = np.flatnonzero((share >= min(CONFIG.owner_share, share.max())) & (share > 0))
+        own = np.flatnonzero((share >= min(1 - CONFIG.nearly_all, share.max())) & (share > 0))
         kept = (owner >= 0) & confirmed[owner]
         for i in np.flatnonzero((labels == blob) & ~np.isin(owner, own) & ~kept):
             expected[i] = own[distance[own, i].argmin()]

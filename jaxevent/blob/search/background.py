@@ -22,10 +22,8 @@ from jaxevent.events.filters import busiest_neighbour
 N_TIME_SLICES = 64  # equal parts of the recording's time
 CELL_PX, FINE_CELL_PX = 16, 4  # px, sides of cells; fine ones where the background is bright
 GOLDEN_RATIO_CONJUGATE = 0.5 * (5**0.5 - 1)
-REST_AFFINE_MAP = np.eye(2, 3)  # the map of a scene that does not move
-REFERENCE_POINTS_PX = np.array(
-    [[60.0, 60], [180, 60], [60, 180], [180, 180]]
-)  # points that show motion
+# Points that show motion.
+REFERENCE_POINTS_PX = np.array([[60.0, 60], [180, 60], [60, 180], [180, 180]])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +75,7 @@ class SceneMotion:
 
     def still_times(self, begin: float | int, end: float | int) -> NDArray[np.float64]:
         """Divide a span (s) so that the scene hardly moves between the times returned."""
-        number = 1 + int(self.speed * (end - begin) / CONFIG.max_step_px)
+        number = 1 + int(self.speed * (end - begin) / CONFIG.resolution_px)
         return np.linspace(begin, end, number + 1)
 
 
@@ -164,7 +162,7 @@ class Background:
 
     def _map_at(self, t: float | int) -> NDArray[np.float64]:
         """Return the map (2, 3) from pixels at a time (s) to px from `corner`."""
-        return REST_AFFINE_MAP if self.scene is None else _map_to_scene(self.scene, self.corner, t)
+        return np.eye(2, 3) if self.scene is None else _map_to_scene(self.scene, self.corner, t)
 
     @functools.cached_property
     def min_rate(self) -> float:
@@ -210,9 +208,7 @@ def spans_at_rest(
 ) -> CountedSpans:
     """Divide spans (n, 2) s so that the scene is at rest in each part, counted in its span."""
     if scene is None:
-        return CountedSpans(
-            spans, np.tile(REST_AFFINE_MAP, (len(spans), 1, 1)), np.arange(len(spans))
-        )
+        return CountedSpans(spans, np.tile(np.eye(2, 3), (len(spans), 1, 1)), np.arange(len(spans)))
     times = [scene.still_times(*span) for span in spans]
     parts = np.concatenate([np.stack([t[:-1], t[1:]], 1) for t in times])
     maps = np.stack([_map_to_scene(scene, corner, t) for t in parts.mean(1)])
@@ -312,11 +308,11 @@ def _background_of_counts(cells: NDArray[np.int32], duration: float) -> Backgrou
     counted, expected = (N * low).sum((1, 2)), (m * low).sum((1, 2))
     activity = np.ones(N_TIME_SLICES)
     typical = float(np.median(counted / expected))
-    if typical > 0 and counted.mean() >= CONFIG.min_calm_events:
+    if typical > 0 and counted.mean() >= CONFIG.min_recording_events:
         activity = np.maximum(1, counted / expected / typical)
     middle = np.median(N, 0)
     calm = N <= np.maximum(middle, 1)
-    steady = np.quantile(N, 0.05, axis=0) >= CONFIG.steady_ratio * middle
+    steady = np.quantile(N, 0.05, axis=0) >= CONFIG.majority * middle
     steady &= middle >= CONFIG.min_fine_events
     full = bright = steady & (m > CONFIG.bright_ratio * np.median(m))
     density, cell = m / CELL_PX**2, CELL_PX
@@ -327,7 +323,7 @@ def _background_of_counts(cells: NDArray[np.int32], duration: float) -> Backgrou
         if full.any():
             quarter, m = _calm_mean(pool(cells, cell // FINE_CELL_PX).astype(float))
             density = np.where(full, np.maximum(m / cell**2, least), density)
-    filled = np.maximum(np.quantile(N, CONFIG.filled_quantile, axis=0), 1)
+    filled = np.maximum(np.quantile(N, CONFIG.nearly_all, axis=0), 1)
     level = np.median(N / filled, axis=(1, 2))
     rate = density / (duration / N_TIME_SLICES)
     return Background(rate, calm, bright, activity, duration, level=level)

@@ -12,7 +12,6 @@ from jaxevent.blob.search.background import (
     CELL_PX,
     Background,
     CellField,
-    look_up,
     poisson_nats,
     value_at,
 )
@@ -22,7 +21,6 @@ from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _cells = ZeroedScratch(np.int32)
 N_SPLIT_STEPS = 6  # expectation and maximisation, for two targets in a blob
-MAX_EXHAUSTIVE_EVENTS = 1000  # so many events are compared with the clutter wherever they are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,15 +39,6 @@ class Scale:
     cell: int
     dispersion: NDArray[np.float64]
     compact: bool = False
-
-    def dispersion_at(self, x: Any, y: Any) -> Any:
-        """Return the dispersion of counts in 3x3 cells, in which flicker adds up, at pixels."""
-        excess = look_up(self.dispersion, CELL_PX, x, y) - self.min_dispersion
-        return self.min_dispersion + excess * self.dispersion_gain
-
-    def with_window(self, window: float) -> "Scale":
-        """Return the scale with windows of another length, s."""
-        return dataclasses.replace(self, window=window)
 
     @functools.cached_property
     def min_dispersion(self) -> float:
@@ -127,9 +116,12 @@ def clutter_model(
     )  # fmt: skip
 
 
-@njit_noalloc_inlined
+@njit_noalloc
 def clutter_at(clutter: Any, x: Any, y: Any) -> Any:
-    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel."""
+    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel.
+
+    In 3x3 cells the dispersion of cells adds up.
+    """
     excess = value_at(clutter.dispersion, x, y) - clutter.min_dispersion
     dispersion = clutter.min_dispersion + excess * clutter.dispersion_gain
     return value_at(clutter.rates, x, y), dispersion
@@ -154,7 +146,7 @@ def detect(
     """
     scratch = DetectionScratch.empty(len(events))
     cells = zeroed_cells(shape, 1 << clutter.cell_bits)
-    number = _find_blobs(events.x, events.y, _weights(events), clutter, cells, scratch)
+    number = find_blobs(events.x, events.y, _weights(events), clutter, cells, scratch)
     return scratch.labels, number
 
 
@@ -174,12 +166,6 @@ def _weights(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
 
 
 @njit_noalloc
-def _find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
-    """Call `find_blobs` from Python."""
-    return find_blobs(x, y, n, clutter, cells, scratch)
-
-
-@njit_noalloc_inlined
 def find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
     """Label pixels with n events each in `scratch.labels`, and return the number of blobs.
 
@@ -212,19 +198,17 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
     wide, g, hit = clutter.row_cells, 1 << clutter.cell_bits, scratch.hit
     # Fewer events are no evidence even where the clutter is least.
     few, least = 1, clutter.log_threshold * clutter.min_dispersion
-    while few < MAX_EXHAUSTIVE_EVENTS and poisson_nats(few, clutter.min_events) <= least:
+    while poisson_nats(few, clutter.min_events) <= least:
         few += 1
-    some = count = 0
+    count = 0
     for i in range(filled):
-        if _sum_around(cells, scratch.filled[i], wide) >= few:
-            hit[some] = scratch.filled[i]
-            some += 1
-    for i in range(some):
-        cell = hit[i]
+        cell = scratch.filled[i]
+        total = _sum_around(cells, cell, wide)
+        if total < few:
+            continue
         x, y = (cell % wide - 1) * g + g // 2, (cell // wide - 1) * g + g // 2
         rate, F = clutter_at(clutter, x, y)
-        nats = poisson_nats(_sum_around(cells, cell, wide), rate * clutter.exposure)
-        if nats > clutter.log_threshold * F:
+        if poisson_nats(total, rate * clutter.exposure) > clutter.log_threshold * F:
             hit[count] = cell
             count += 1
     return count
@@ -280,17 +264,11 @@ def measure_blobs(
         number: Number of blobs.
     """
     blobs = Blobs.empty(number)
-    _measure_blobs(events.x, events.y, _weights(events), labels, blobs)
+    sum_blobs(events.x, events.y, _weights(events), labels, number, blobs)
     return blobs
 
 
 @njit_noalloc
-def _measure_blobs(x: Any, y: Any, weights: Any, labels: Any, blobs: Any) -> None:
-    """Call `sum_blobs` from Python."""
-    sum_blobs(x, y, weights, labels, len(blobs.n), blobs)
-
-
-@njit_noalloc_inlined
 def sum_blobs(x: Any, y: Any, weights: Any, labels: Any, number: int, blobs: Any) -> None:
     """Fill in the first `number` of `blobs`, of pixels with so many events each."""
     _clear_blobs(blobs, number)
@@ -348,7 +326,7 @@ def split_blob(events: Any, owner: Any, k: int, two: Any) -> float:
             add_moments(two, 0, 1.0, float(x[i]), float(y[i]))
     finish_moments(two, 1)
     number, most = n[0], larger_variance_of(C[0])
-    if number < 2 * CONFIG.min_split_events:
+    if number < 2 * CONFIG.min_blob_events:
         return -np.inf
     turn = 0.5 * np.arctan2(2 * C[0, 0, 1], C[0, 0, 0] - C[0, 1, 1])
     ux, uy = np.cos(turn), np.sin(turn)
@@ -366,7 +344,7 @@ def split_blob(events: Any, owner: Any, k: int, two: Any) -> float:
                 a += part * s
                 b += (1 - part) * s
                 squares += part * (s - low) ** 2 + (1 - part) * (s - high) ** 2
-        if min(weight, number - weight) < CONFIG.min_split_events:
+        if min(weight, number - weight) < CONFIG.min_blob_events:
             return -np.inf
         share, square = weight / number, squares / number + 1 / 12
         low, high = a / weight, b / (number - weight)
@@ -389,7 +367,7 @@ def split_blob(events: Any, owner: Any, k: int, two: Any) -> float:
             add_moments(two, first if s < middle else 1 - first, 1.0, float(x[i]), float(y[i]))
     finish_moments(two, 2)
     ratio = expected_between / max(expected, 1e-9)
-    if ratio >= 1 or min(n[0], n[1]) < CONFIG.min_split_events:
+    if ratio >= 1 or min(n[0], n[1]) < CONFIG.min_blob_events:
         return -np.inf
     return between * np.log(2 * ratio / (1 + ratio)) + about * np.log(2 / (1 + ratio))
 

@@ -13,7 +13,7 @@ and if what is bright in that map is connected: birds that circle alike turn as 
 
 import copy
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from scipy import ndimage
 
 from jaxevent.blob.search.background import (
     FINE_CELL_PX,
+    N_TIME_SLICES,
     Background,
     SceneMotion,
     clutter_evidence,
@@ -28,13 +29,11 @@ from jaxevent.blob.search.background import (
 )
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import larger_variance
-from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise
-from jaxevent.blob.search.scene import map_gain, measure_moving_background
+from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise, log_likelihood
+from jaxevent.blob.search.scene import BLUR_SIGMAS_BINS, map_gain, measure_moving_background
 from jaxevent.blob.search.stream import Stream
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 
-N_ANGLE_BINS, RING_WIDTH_PX = 256, FINE_CELL_PX  # bins of a turn, and px of a ring
-ANGLE_BLUR_BINS = 1.5
+N_ANGLE_BINS = 256  # bins of a turn
 
 
 def merge_parts(paths: list[TargetPath]) -> list[TargetPath]:
@@ -53,7 +52,7 @@ def merge_parts(paths: list[TargetPath]) -> list[TargetPath]:
 
 def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
     """Return whether two paths are those of parts of one object."""
-    share = CONFIG.common_share
+    share = CONFIG.nearly_all
     begin, end = max(one.begin, other.begin), min(one.end, other.end)
     if end - begin < share * min(one.end - one.begin, other.end - other.begin):
         return False
@@ -64,9 +63,9 @@ def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
     sizes = np.stack([np.interp(t, path.t, path.size[:, 0]) for path in (one, other)])
     edge = _is_edge(one, other) or _is_edge(other, one)
     small, large = np.sort(np.median(sizes, 1))
-    contact = CONFIG.edge_contact if edge else CONFIG.contact_distance
+    contact = 1.5 * CONFIG.contact_distance if edge else CONFIG.contact_distance
     if np.quantile(apart / sizes.sum(0), share) >= contact:
-        return _turn_together(p, q, CONFIG.turning_contact * float(np.median(sizes.sum(0))))
+        return _turn_together(p, q, 2 * CONFIG.contact_distance * float(np.median(sizes.sum(0))))
     both = [_interpolate(path, t) for path in (one, other)]
     if not edge and _separate_nats(both) > CONFIG.log_bayes_factor:
         return False
@@ -77,64 +76,27 @@ def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
     return bool(far > CONFIG.common_way_sizes * small and changed < most)
 
 
-@njit_noalloc
-def _rigid_nats(rows: Any) -> float:
-    """Compute nats for one rigid object against two that go their own ways.
-
-    The difference of its parts stays, or their distance where it turns, which is less likely
-    beforehand; they slide along edges by a share of the way. The velocity of two objects relative
-    to each other is as large as their own velocities, and changes as much.
-
-    Args:
-        rows: (n, 10) time, variance of the difference, both places, and both velocities.
-    """
-    slide = CONFIG.slide_share
-    moves = _log_ratio(rows, 0, slide) + _log_ratio(rows, 1, slide)
-    return max(moves, _log_ratio(rows, 2, slide / 3) - CONFIG.log_bayes_factor)
-
-
-@njit_noalloc_inlined
-def _log_ratio(rows: Any, axis: int, slide: float) -> float:
-    """Compute nats for a difference of places that stays: in x, y or the distance."""
-    return _log_likelihood(rows, axis, slide) - _log_likelihood(rows, axis, 1.0)
-
-
-@njit_noalloc_inlined
-def _difference(rows: Any, k: int, axis: int) -> float:
-    """Return the difference of both places in x or y, or their distance."""
-    x, y = rows[k, 4] - rows[k, 2], rows[k, 5] - rows[k, 3]
-    return x if axis == 0 else (y if axis == 1 else np.sqrt(x * x + y * y))
-
-
-@njit_noalloc_inlined
-def _log_likelihood(rows: Any, axis: int, share: float) -> float:
-    """Compute the log likelihood of a difference whose velocity is a share of both velocities."""
-    c = 0.0
-    for i in range(6, 10):
-        c += (share * rows[0, i]) ** 2 / 2
-    mean, rate, a, b, total = _difference(rows, 0, axis), 0.0, rows[0, 1], 0.0, 0.0
-    for k in range(1, len(rows)):
-        dt, R, change = rows[k, 0] - rows[k - 1, 0], rows[k, 1], 0.0
-        for i in range(6, 10):
-            change += (share * (rows[k, i] - rows[k - 1, i])) ** 2 / 2
-        mean += rate * dt
-        a, b = a + 2 * b * dt + c * dt * dt, b + c * dt
-        S = a + R
-        e = _difference(rows, k, axis) - mean
-        total -= 0.5 * (min(e * e / S, CONFIG.max_squared_innovation) + np.log(S))
-        mean, rate = mean + a / S * e, rate + b / S * e
-        c += change - b * b / S
-        a, b = a * R / S, b * R / S
-    return total
-
-
 def _separate_nats(rows: list[TargetPath]) -> float:
-    """Compute nats for two objects against a rigid one, of paths at the same times."""
-    rows = [path.take(slice(None, None, -(-len(path.t) // CONFIG.max_pair_rows))) for path in rows]
-    error = CONFIG.part_error_sizes**2
-    variance = sum(larger_variance(path.C) * (1 / np.maximum(path.n, 2) + error) for path in rows)
-    columns = [column for name in "pv" for path in rows for column in getattr(path, name).T]
-    return -_rigid_nats(np.stack([rows[0].t * 1e-6, variance, *columns], 1))
+    """Compute nats for two objects against a rigid one, of paths at the same times.
+
+    The difference of a rigid object's parts stays, or their distance where it turns, which is less
+    likely beforehand; they slide along edges by a share of the way. The velocity of two objects
+    relative to each other is as large as their own velocities, and changes as much.
+    """
+    rows = [path.take(slice(None, None, -(-len(path.t) // N_TIME_SLICES))) for path in rows]
+    slide = CONFIG.slide_share
+    R = sum(larger_variance(path.C) * (1 / np.maximum(path.n, 2) + slide**2) for path in rows)
+    t, d = rows[0].t * 1e-6, rows[1].p - rows[0].p
+    v = np.concatenate([path.v for path in rows], 1)
+    velocity, noise = (v[0] ** 2).sum() / 2, (np.diff(v, axis=0) ** 2).sum(1) / 2 / np.diff(t)
+
+    def rigid_nats(z: NDArray, slide: float) -> float:
+        squares = slide**2, 1.0
+        one, two = (log_likelihood(t, z, R, s * velocity, s * noise) for s in squares)
+        return one - two
+
+    turn = rigid_nats(np.hypot(*d.T)[:, None], slide / 3) - CONFIG.log_bayes_factor
+    return -max(rigid_nats(d, slide), turn)
 
 
 def _is_edge(one: TargetPath, other: TargetPath) -> bool:
@@ -145,20 +107,20 @@ def _is_edge(one: TargetPath, other: TargetPath) -> bool:
     size = np.median(one.size[:, 0])
     way = one.p[-1] - one.p[0]
     along = way @ np.median(one.C, 0) @ way / max(float(way @ way), 1e-9)
-    across = along < CONFIG.edge_along_share * size**2
-    across |= np.median(other.n) < CONFIG.edge_event_share * np.median(one.n)
+    across = along < (1 - CONFIG.considerable) * size**2
+    across |= np.median(other.n) < CONFIG.considerable * np.median(one.n)
     return bool(np.median(one.size[:, 0] / one.size[:, 1]) > CONFIG.edge_aspect and across)
 
 
 def _turn_together(p: NDArray, q: NDArray, reach: float | int) -> bool:
     """Return whether two ways (rows, 2) px turn about each other by a whole turn, rigidly."""
     apart = np.hypot(*(p - q).T)
-    share = CONFIG.common_share
+    share = CONFIG.nearly_all
     low, middle, high = np.quantile(apart, (1 - share, 0.5, share))
-    if high > reach or high - low > CONFIG.turning_change * middle:
+    if high > reach or high - low > CONFIG.slide_share * middle:
         return False
     turned = np.unwrap(np.arctan2(*(p - q).T))
-    return bool(abs(turned[-1] - turned[0]) > CONFIG.turning_angle)
+    return bool(abs(turned[-1] - turned[0]) > 2 * np.pi)
 
 
 def merge_paths(one: TargetPath, other: TargetPath) -> TargetPath:
@@ -222,7 +184,7 @@ def _continuation_evidence(
     pause = int(other.t[0] - one.t[-1])
     if one.window != other.window or pause <= 0:
         return -np.inf
-    rows, gap = CONFIG.velocity_windows, pause / one.window
+    rows, gap = CONFIG.min_windows, pause / one.window
     square = float(np.mean([np.median(larger_variance(path.C)) for path in (one, other)]))
     few = min(float(np.median(path.n)) for path in (one, other))
     whole = [_whole_rows(path) for path in (one, other)]
@@ -248,9 +210,7 @@ def _continuation_evidence(
     inside = min(
         _inside_share(one.p[-1], one.C[-1], size), _inside_share(other.p[0], other.C[0], size)
     )
-    nats += np.log(CONFIG.stop_probability)
-    nats += gap * np.log((1 - CONFIG.start_probability) * (1 - CONFIG.end_probability))
-    nats += (gap - 1) * np.log(max(inside, 1e-9))
+    nats += gap * np.log(1 - CONFIG.resume_probability) + (gap - 1) * np.log(max(inside, 1e-9))
     return float(nats + np.log(size[0] * size[1] * windows * CONFIG.new_target_volume))
 
 
@@ -262,7 +222,7 @@ def _inside_share(p: NDArray, C: NDArray, size: tuple[int, int]) -> float:
 
 def _whole_rows(path: TargetPath) -> NDArray[np.int64]:
     """Return rows with most of the usual size and events; all, where none has both."""
-    size, share = path.size[:, 0], CONFIG.whole_share
+    size, share = path.size[:, 0], CONFIG.nearly_all
     whole = (path.n >= share * np.median(path.n)) & (size >= share * np.median(size))
     return np.flatnonzero(whole) if whole.any() else np.arange(len(size))
 
@@ -295,11 +255,11 @@ def merge_turning(
         pieces = [
             path
             for path in out
-            if look_up(there, FINE_CELL_PX, *path.p.T).mean() >= CONFIG.inside_share
+            if look_up(there, FINE_CELL_PX, *path.p.T).mean() >= CONFIG.nearly_all
         ]
         # An object is seen whole, not at many sides of the sensor.
         sides = sum(bool(s.any()) for s in (there[0], there[-1], there[:, 0], there[:, -1]))
-        if not pieces or sides >= CONFIG.min_sides or len(pieces) < 2:
+        if not pieces or sides > CONFIG.majority * 4 or len(pieces) < 2:
             continue
         whole = _turning_path(pieces, _events_within(stream, there), background)
         if whole is not None:
@@ -320,17 +280,15 @@ def _turning_path(
 ) -> TargetPath | None:
     """Return the path of the object of some pieces; None if it is not one that turns."""
     centre = _centre_of_turn(own)
-    turn = Turn(_rate_of_pieces(pieces, centre), centre)
     window = max(pieces, key=lambda path: path.n.sum()).window
-    scene = _measure_turn(own, turn, window * 1e-6)
+    scene = _measure_turn(own, Turn(_rate_of_pieces(pieces, centre), centre), window * 1e-6)
     moving = measure_moving_background(own, scene)
-    if not _is_connected(moving, turn.centre):
-        return None
-    if map_gain(own, moving, window * 1e-6) < CONFIG.texture_gain:
+    if not _is_connected(moving, centre) or map_gain(own, moving, window * 1e-6) < CONFIG.min_gain:
         return None
     angles = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
     rate = float((angles[-1] - angles[0]) / (scene.t[-1] - scene.t[0]))
-    return _path_of_all(own, Turn(rate, centre), window, background)
+    path = _path_of_all(own, centre, window, background.min_rate)
+    return None if path is None else dataclasses.replace(path, turn_rate=rate)
 
 
 def _centre_of_turn(own: Stream) -> NDArray[np.float64]:
@@ -361,13 +319,14 @@ def _rate_of_pieces(pieces: list[TargetPath], centre: NDArray[np.float64]) -> fl
 def _measure_turn(own: Stream, turn: Turn, window: float) -> SceneMotion:
     """Measure the turn window by window (s), where events correlate most with those before.
 
-    Angles are sought about those of `turn`.
+    Each angle is sought about the one that `turn` leads to, as far as the turn of a window: the
+    rate of pieces is up to twice too small.
     """
     number = int(own.duration / window)
     polar = _PolarImages(own, turn, window)
     order = 1j * np.arange(N_ANGLE_BINS // 2 + 1)
     step = turn.rate * window
-    reach = max(2, int(CONFIG.turn_search * abs(step) / (2 * np.pi) * N_ANGLE_BINS))
+    reach = max(2, int(abs(step) / (2 * np.pi) * N_ANGLE_BINS))
     reach = min(reach, N_ANGLE_BINS // 2 - 1)
     near = np.arange(-reach, reach + 1)
     angles, seen = [0.0], polar.spectrum(0)
@@ -398,7 +357,7 @@ class _PolarImages:
         self.own, self.turn, self.window = own, turn, window
         whole = own.pixel_counts(0, own.duration)
         far = np.sort(np.hypot(whole.x - turn.centre[0], whole.y - turn.centre[1]))
-        self.rings = int(far[int(CONFIG.rim_share * (len(far) - 1))] / RING_WIDTH_PX) + 1
+        self.rings = int(far[int(CONFIG.nearly_all * (len(far) - 1))] / FINE_CELL_PX) + 1
 
     def spectrum(self, k: int) -> NDArray[np.complex128]:
         """Transform window k to (rings, frequencies), its events carried to its middle."""
@@ -406,11 +365,13 @@ class _PolarImages:
         dx, dy = part.x - self.turn.centre[0], part.y - self.turn.centre[1]
         late = part.t - (k + 0.5) * self.window
         angle = (np.arctan2(dy, dx) - self.turn.rate * late) / (2 * np.pi) % 1
-        ring = (np.hypot(dx, dy) / RING_WIDTH_PX).astype(np.int64)
+        ring = (np.hypot(dx, dy) / FINE_CELL_PX).astype(np.int64)
         place = ring * N_ANGLE_BINS + (angle * N_ANGLE_BINS).astype(np.int64) % N_ANGLE_BINS
         size = self.rings * N_ANGLE_BINS
         counts = np.bincount(place[place < size], minlength=size).reshape(-1, N_ANGLE_BINS)
-        image = ndimage.gaussian_filter1d(np.sqrt(counts), ANGLE_BLUR_BINS, axis=1, mode="wrap")
+        image = ndimage.gaussian_filter1d(
+            np.sqrt(counts), BLUR_SIGMAS_BINS[-1], axis=1, mode="wrap"
+        )
         return np.fft.rfft(image - image.mean(1, keepdims=True))
 
 
@@ -432,25 +393,26 @@ def _is_connected(moving: Background, centre: NDArray[np.float64]) -> bool:
     return bool(away @ np.linalg.solve(C, away) < 1)
 
 
-def _path_of_all(own: Stream, turn: Turn, window: int, background: Background) -> TargetPath | None:
-    """Return the path of all events of a place that turns.
+def _path_of_all(
+    own: Stream, centre: NDArray[np.float64], window: int, min_rate: float
+) -> TargetPath | None:
+    """Return the path of all events of an object that stays about a place.
 
-    It has the windows (us) with more events than the darkest background gives; None if none has.
+    It has the windows (us) with more events than a background of `min_rate` (1/(px s)) gives; None
+    if none has.
     """
     w, rows = window * 1e-6, []
     area = own.width * own.height - int(own.hot.sum())
     for k in range(int(own.duration / w)):
         part = own.window(k * w, (k + 1) * w)
-        nats = clutter_evidence(len(part), background.min_rate * area * w, 1)
-        if nats > -np.log(CONFIG.false_alarm_known):
-            e = np.stack([part.x, part.y], 1) - turn.centre
+        if clutter_evidence(len(part), min_rate * area * w, 1) > -np.log(CONFIG.false_alarm_known):
+            e = np.stack([part.x, part.y], 1) - centre
             rows.append(((k + 0.5) * w, e.mean(0), e.T @ e / len(e) + np.eye(2) / 12, len(e)))
     if not rows:
         return None
-    t, m, C, n = (np.array(values) for values in zip(*rows, strict=True))
+    t, m, C, n = (np.array(values, float) for values in zip(*rows, strict=True))
     R = larger_variance(C) / 2 / n
     us = own.start + np.rint(t * 1e6).astype(np.int64)
     noise = fit_velocity_noise(t, m, R, float(np.median(larger_variance(C))) / w**3)
-    p = np.tile(turn.centre, (len(t), 1))
-    n = n.astype(float)
-    return TargetPath(us, p, np.zeros_like(p), C, n, window, noise, turn_rate=turn.rate)
+    p = np.tile(centre, (len(t), 1))
+    return TargetPath(us, p, np.zeros_like(p), C, n, window, noise)

@@ -226,33 +226,39 @@ def fit_velocity_noise(t: NDArray, m: NDArray, R: NDArray, unit: float | int) ->
 
     Returns:
         The noise density of the largest likelihood, px^2/s^3; 0.01 units for fewer windows than
-        `SearchConfig.min_noise_windows`.
+        `SearchConfig.min_confirm_windows`.
     """
-    if len(t) < CONFIG.min_noise_windows:
+    if len(t) < CONFIG.min_confirm_windows:
         return 0.01 * unit
-    scores = np.array([_log_likelihood(t, m, R, float(q)) for q in TRIED_VELOCITY_NOISES * unit])
+    velocity, noise = 1e6 * (R[0] + R[1]) / (t[1] - t[0]) ** 2, np.ones(len(t) - 1)
+    scores = [log_likelihood(t, m, R, velocity, q * noise) for q in TRIED_VELOCITY_NOISES * unit]
     return float(TRIED_VELOCITY_NOISES[np.argmax(scores)] * unit)
 
 
 @njit_noalloc
-def _log_likelihood(t: Any, m: Any, R: Any, q: float | int) -> float:
-    """Compute the log likelihood of means after the first two, for velocity noise q."""
+def log_likelihood(t: Any, z: Any, R: Any, velocity: float, noise: Any) -> float:
+    """Compute the log likelihood of measured places, of a velocity that noise drives.
+
+    Args:
+        t: (n,) s.
+        z: (n, axes) px, places of which the first is given.
+        R: (n,) px^2, their variances.
+        velocity: px^2/s^2, variance of the first velocity along each axis.
+        noise: (n - 1,) px^2/s^3, densities of the noise between them.
+    """
     total = 0.0
-    for axis in range(2):
-        dt = t[1] - t[0]
-        p, v = m[1, axis], (m[1, axis] - m[0, axis]) / dt
-        a, b, c = R[1], R[1] / dt, (R[0] + R[1]) / dt**2 + q * dt
-        for k in range(2, len(t)):
-            dt = t[k] - t[k - 1]
+    for axis in range(z.shape[1]):
+        p, v, a, b, c = z[0, axis], 0.0, R[0], 0.0, velocity
+        for k in range(1, len(t)):
+            dt, q = t[k] - t[k - 1], noise[k - 1]
             p += v * dt
             a += 2 * b * dt + c * dt**2 + q * dt**3 / 3
             b += c * dt + q * dt**2 / 2
             c += q * dt
             S = a + R[k]
-            z = m[k, axis] - p
-            total -= 0.5 * (min(z * z / S, CONFIG.max_squared_innovation) + np.log(S))
-            gain, turn = a / S, b / S
-            p, v = p + gain * z, v + turn * z
-            c -= turn * b
-            a, b = a - gain * a, b - gain * b
+            e = z[k, axis] - p
+            total -= 0.5 * (min(e * e / S, CONFIG.max_squared_innovation) + np.log(S))
+            p, v = p + a / S * e, v + b / S * e
+            c -= b * b / S
+            a, b = a * R[k] / S, b * R[k] / S
     return total

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.search.config import CONFIG
+from jaxevent.blob.search.detection import Blobs, add_moments
 from jaxevent.blob.search.paths import (
     NO_OWNER_INDEX,
     TargetPath,
@@ -49,7 +50,7 @@ def drop_lamps(
     """
     some = []
     for k, path in enumerate(paths):
-        quarters = np.array_split(np.arange(len(path.t)), CONFIG.lamp_quarters)
+        quarters = np.array_split(np.arange(len(path.t)), round(1 / CONFIG.considerable))
         if any(_stays(path, rows) for rows in quarters):
             some.append(k)
     if not some:
@@ -72,7 +73,7 @@ def _stays(path: TargetPath, rows: NDArray[np.int64]) -> bool:
         return False
     p = path.p[rows]
     away = np.hypot(*(p - np.median(p, 0)).T)
-    return bool(np.median(away) <= CONFIG.lamp_sizes * np.median(path.size[rows, 0]))
+    return bool(np.median(away) <= CONFIG.gate_sigmas * np.median(path.size[rows, 0]))
 
 
 def _mains_coherence(
@@ -86,7 +87,7 @@ def _mains_coherence(
     begin = table.begins.min()
     pieces = (table.ends.max() - begin) // piece + 1
     faintest = min(float(np.median(path.n)) / path.window for path in paths)
-    every = max(1, int(faintest * piece / CONFIG.lamp_piece_events))
+    every = max(1, int(faintest * piece / CONFIG.min_recording_events / 10))
     n = np.zeros((len(paths), pieces))
     z = np.zeros((len(MAINS_HZ), len(paths) * pieces), complex)
     gate = CONFIG.gate_sigmas
@@ -125,35 +126,41 @@ def prefer_sharper(
     first, gate = table.first, CONFIG.gate_sigmas
     # Few of the events of bright targets suffice to find that no polarity lags.
     least = min(float(np.median(path.n)) for path in paths)
-    some = max(1, int(least / CONFIG.lag_test_events))
+    some = max(1, int(least / CONFIG.min_recording_events))
     sharper = paths
     for every in dict.fromkeys((some, 1)):
-        sums = np.zeros((len(table.t), 2, 6))
+        sums = Blobs(*(np.zeros((2 * len(table.t), *size)) for size in ((), (2,), (2, 2))))
         for _, part, owner in batches_near_paths(recording.events, table, gate, every=every):
             events = part.t, part.x, part.y, part.p
             _add_residuals(events, owner, table, hot, first[:-1].copy(), sums)
         rows = zip(paths, first[:-1], first[1:], strict=True)
-        sharper = [_sharper_path(path, sums[a:b]) for path, a, b in rows]
+        sharper = [
+            _sharper_path(path, Blobs(*(value[2 * a : 2 * b] for value in sums)))
+            for path, a, b in rows
+        ]
         if all(one is path for one, path in zip(sharper, paths, strict=True)):
             break
     return sharper
 
 
-def _sharper_path(path: TargetPath, sums: NDArray[np.float64]) -> TargetPath:
-    """Return the path of its sharper events, or the path itself, by sums of its residuals."""
-    n, S = sums[..., 0], sums[..., 1:]
-    mean = S[..., :2] / np.maximum(n, 1)[..., None]
-    spread = np.empty((2, 2, 2))
-    for i, (a, b) in enumerate([(0, 0), (0, 1), (1, 1)]):
-        within = (S[..., 2 + i] - n * mean[..., a] * mean[..., b]) * (n > 1)
-        spread[:, a, b] = spread[:, b, a] = within.sum(0) / np.maximum((n - (n > 0)).sum(0), 1)
+def _sharper_path(path: TargetPath, sums: Blobs) -> TargetPath:
+    """Return the path of its sharper events, or the path itself.
+
+    `sums` are those of its residuals, of OFF and of ON events by turns.
+    """
+    n, p, S = (value.reshape(-1, 2, *value.shape[1:]) for value in sums)
+    mean = p / np.maximum(n, 1)[..., None]
+    within = S - n[..., None, None] * mean[..., :, None] * mean[..., None, :]
+    within[..., 1, 0] = within[..., 0, 1]
+    spread = (within * (n > 1)[..., None, None]).sum(0)
+    spread /= np.maximum((n - (n > 0)).sum(0), 1)[:, None, None]
     spread += np.eye(2) / 12
     size = np.sqrt(np.linalg.eigvalsh(spread)[:, 1])
     sharp = int(size[1] <= size[0])
-    seen = n[:, sharp] >= CONFIG.min_sharp_events
-    enough = seen.sum() >= CONFIG.min_sharp_windows
-    enough &= n[:, sharp].sum() >= CONFIG.min_sharp_share * n.sum()
-    enough &= (n[:, 1 - sharp] > 1).sum() >= CONFIG.min_sharp_windows
+    seen = n[:, sharp] > 1
+    enough = seen.sum() >= CONFIG.min_confirm_windows
+    enough &= n[:, sharp].sum() >= CONFIG.considerable * n.sum()
+    enough &= (n[:, 1 - sharp] > 1).sum() >= CONFIG.min_confirm_windows
     if not enough or size[1 - sharp] < CONFIG.lag_ratio * size[sharp]:
         return path
     t = path.t * 1e-6
@@ -169,7 +176,7 @@ def _sharper_path(path: TargetPath, sums: NDArray[np.float64]) -> TargetPath:
 
 @njit_noalloc
 def _add_residuals(events: Any, owner: Any, table: Any, hot: Any, rows: Any, sums: Any) -> None:
-    """Add events' residuals to the sums of their paths' windows, by polarity.
+    """Add events' residuals to the sums of their paths' windows, OFF and ON by turns.
 
     Events (t, x, y, p) that may belong to two paths are left out. `rows` are those of the paths
     where the search for a window begins.
@@ -190,10 +197,4 @@ def _add_residuals(events: Any, owner: Any, table: Any, hot: Any, rows: Any, sum
         late = (t[i] - table.t[row]) / span
         ex = x[i] - table.p[row, 0] - late * (table.p[after, 0] - table.p[before, 0])
         ey = y[i] - table.p[row, 1] - late * (table.p[after, 1] - table.p[before, 1])
-        sign = np.int64(p[i])
-        sums[row, sign, 0] += 1
-        sums[row, sign, 1] += ex
-        sums[row, sign, 2] += ey
-        sums[row, sign, 3] += ex * ex
-        sums[row, sign, 4] += ex * ey
-        sums[row, sign, 5] += ey * ey
+        add_moments(sums, 2 * row + np.int64(p[i]), 1.0, ex, ey)

@@ -1,12 +1,13 @@
 """Density of a window's events, predicted from the two windows before by blobs at some scale."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.background import Background
+from jaxevent.blob.search.background import CELL_PX, Background
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import (
     Blobs,
@@ -22,16 +23,13 @@ from jaxevent.blob.search.stream import PixelCounts, Stream
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _bins = ZeroedScratch(np.int32)
-KERNEL_RADII_PX, KERNEL_BINS_PX = (
-    (3.0, 8.0, 20.0),
-    (2, 4, 8),
-)  # of the kernels, and of bins of events
-N_KERNELS = len(KERNEL_RADII_PX)
+KERNEL_RADII_PX = (3.0, 8.0, 20.0)
+KERNEL_BINS_PX = (2, 4, 8)  # of events about each kernel
 N_EM_STEPS = 15  # expectation and maximisation, for the shares of ellipses and kernels
-SORTED_STRIP_PX = 16  # px, rows of pixels that are sorted together
 MAX_SQUARED_SIGMAS = 80.0  # squared standard deviations beyond which a Gaussian is 0
 
 
+@functools.cache
 def _kernel_weights(r: float, g: int) -> NDArray[np.float64]:
     """Tabulate the kernel 3 / (pi r^2) (1 - d^2 / r^2)^2, 1/px^2.
 
@@ -43,9 +41,6 @@ def _kernel_weights(r: float, g: int) -> NDArray[np.float64]:
     apart = (np.arange(-reach, reach + 1) + 0.5) * g - np.arange(g)[:, None]
     squared = apart[:, None, :, None] ** 2 + apart[None, :, None, :] ** 2
     return 3 / (np.pi * r**2) * np.maximum(1 - squared / r**2, 0) ** 2
-
-
-_TABLES = tuple(_kernel_weights(r, g) for r, g in zip(KERNEL_RADII_PX, KERNEL_BINS_PX, strict=True))
 
 
 class ScoredEvents(NamedTuple):
@@ -95,16 +90,14 @@ class _PredictionScratch(NamedTuple):
     @classmethod
     def empty(cls, pixels: int, scored: int, shape: tuple[int, int]) -> "_PredictionScratch":
         """Allocate scratch memory for so many pixels of windows and of scored events."""
-        bins = tuple(
-            _bins(*(n // g + table.shape[-1] for n in shape))
-            for table, g in zip(_TABLES, KERNEL_BINS_PX, strict=True)
-        )
-        strips = shape[0] // SORTED_STRIP_PX + 2
+        tables = tuple(map(_kernel_weights, KERNEL_RADII_PX, KERNEL_BINS_PX))
+        bins = tuple(_bins(*(n // len(one) + one.shape[-1] for n in shape)) for one in tables)
+        strips = shape[0] // CELL_PX + 2
         return cls(
             DetectionScratch.empty(pixels), Blobs.empty(pixels), Blobs.empty(pixels),
             np.empty((pixels, 2)), np.empty((pixels, 2, 2)), np.empty((2, pixels)),
             np.empty(pixels, np.int32), np.empty(pixels), np.empty(pixels, bool),
-            np.empty(scored, np.int64), np.empty((2, strips), np.int64), bins, _TABLES,
+            np.empty(scored, np.int64), np.empty((2, strips), np.int64), bins, tables,
         )  # fmt: skip
 
 
@@ -138,7 +131,7 @@ def predict(
     out = []
     for clutter in clutters:
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
-        density, sums = np.zeros((number, 1 + N_KERNELS)), np.zeros(3)
+        density, sums = np.zeros((number, 1 + len(KERNEL_RADII_PX))), np.zeros(3)
         _predict(before, scored.pixels, clutter, cells, scratch, (density, sums))
         out.append(ScalePrediction(density, scored, *sums.tolist()))
     return out
@@ -160,7 +153,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
         for name in ("expected", "large", "split")
     )
     gains, near = np.zeros(len(predictions)), np.empty(len(b), np.int64)
-    shares = np.full((2, 1 + N_KERNELS), 1 / (1 + N_KERNELS))
+    shares = np.full((2, 1 + len(KERNEL_RADII_PX)), 1 / (1 + len(KERNEL_RADII_PX)))
     _sum_gains(density, b, weight, ends, (near, shares), gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
@@ -175,27 +168,27 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
     near, (share, new), number = scratch[0], scratch[1], 0
     for i in range(len(b)):
         total = 0.0
-        for j in range(1 + N_KERNELS):
+        for j in range(1 + len(KERNEL_RADII_PX)):
             total += density[i, j]
         if total > 0:  # a blob may reach the pixel
             near[number] = i
             number += 1
     for _ in range(N_EM_STEPS):
-        for j in range(1 + N_KERNELS):
+        for j in range(1 + len(KERNEL_RADII_PX)):
             new[j] = 0.0
         for k in range(number):
             i = near[k]
             total = b[i]
-            for j in range(1 + N_KERNELS):
+            for j in range(1 + len(KERNEL_RADII_PX)):
                 total += density[i, j] * share[j]
             part = weight[i] / total
-            for j in range(1 + N_KERNELS):
+            for j in range(1 + len(KERNEL_RADII_PX)):
                 new[j] += part * density[i, j]
         total = 0.0
-        for j in range(1 + N_KERNELS):
+        for j in range(1 + len(KERNEL_RADII_PX)):
             share[j] = share[j] * new[j] + 1e-12
             total += share[j]
-        for j in range(1 + N_KERNELS):
+        for j in range(1 + len(KERNEL_RADII_PX)):
             share[j] /= total
     window = 0
     for k in range(number):
@@ -203,7 +196,7 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
         while i >= ends[window + 1]:
             window += 1
         total = 0.0
-        for j in range(1 + N_KERNELS):
+        for j in range(1 + len(KERNEL_RADII_PX)):
             total += density[i, j] * share[j]
         gains[window] += weight[i] * np.log(total / b[i] + 1)
 
@@ -225,11 +218,11 @@ def _predict(before: Any, scored: Any, clutter: Any, cells: Any, scratch: Any, o
     pixels = _move_pixels(second, scratch)
     for j in range(near):
         order[j] = j
-    for k in range(N_KERNELS - 1, -1, -1):
+    for k in range(len(KERNEL_RADII_PX) - 1, -1, -1):
         added = density[:, k + 1]
         _add_kernels(added, scored, order[:near], pixels, k, scratch)
         # What the widest one does not reach the others do not.
-        if k == N_KERNELS - 1:
+        if k == len(KERNEL_RADII_PX) - 1:
             near = 0
             for j in range(len(scored.x)):
                 if added[j] > 0:
@@ -266,7 +259,7 @@ def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
 def _add_ellipses(density: Any, x: Any, y: Any, number: int, scratch: Any) -> None:
     """Add the densities of Gaussian blobs at pixels to the first column.
 
-    Pixels are sorted into strips of rows; a blob visits the strips that it reaches.
+    Pixels are sorted into strips of `CELL_PX` rows; a blob visits the strips that it reaches.
     """
     n, p, S, order = scratch.last.n, scratch.p, scratch.S, scratch.order
     first, following = scratch.strips[0], scratch.strips[1]
@@ -274,12 +267,12 @@ def _add_ellipses(density: Any, x: Any, y: Any, number: int, scratch: Any) -> No
     for j in range(strips + 1):
         first[j] = 0
     for j in range(len(x)):
-        first[y[j] // SORTED_STRIP_PX + 1] += 1
+        first[y[j] // CELL_PX + 1] += 1
     for j in range(strips):
         first[j + 1] += first[j]
         following[j] = first[j]
     for j in range(len(x)):
-        strip = y[j] // SORTED_STRIP_PX
+        strip = y[j] // CELL_PX
         order[following[strip]] = j
         following[strip] += 1
     for k in range(number):
@@ -287,8 +280,8 @@ def _add_ellipses(density: Any, x: Any, y: Any, number: int, scratch: Any) -> No
         determinant = a * c - b * b
         peak = n[k] / (2 * np.pi * np.sqrt(determinant))
         wide, high = np.sqrt(MAX_SQUARED_SIGMAS * a), np.sqrt(MAX_SQUARED_SIGMAS * c)
-        low = min(max(int((p[k, 1] - high) / SORTED_STRIP_PX), 0), strips - 1)
-        top = min(max(int((p[k, 1] + high) / SORTED_STRIP_PX), 0), strips - 1)
+        low = min(max(int((p[k, 1] - high) / CELL_PX), 0), strips - 1)
+        top = min(max(int((p[k, 1] + high) / CELL_PX), 0), strips - 1)
         for i in range(first[low], first[top + 1]):
             j = order[i]
             ex, ey = x[j] - p[k, 0], y[j] - p[k, 1]
@@ -345,7 +338,7 @@ def _count_split(number: int, scratch: Any) -> tuple[float, float]:
     Pieces along an outline are in contact with each other, both of its sides are not.
     """
     (n, p, C), reach, touches = scratch.last, scratch.reach, scratch.touches
-    least, large, split = CONFIG.min_split_events, 0.0, 0.0
+    least, large, split = CONFIG.min_blob_events, 0.0, 0.0
     for k in range(number):
         reach[k], touches[k] = np.sqrt(larger_variance_of(C[k])), False
     for k in range(number):

@@ -56,7 +56,7 @@ def select_scale(
     windows = np.asarray(TRIED_WINDOWS_US[TRIED_WINDOWS_US * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
         return None
-    number = CONFIG.scale_trials if min_gain is None else CONFIG.later_scale_trials
+    number = CONFIG.scale_trials // (1 if min_gain is None else 2)
     trial = _ScaleTrial(stream, background, windows, number)
     first = np.arange(CONFIG.first_trial_step // 2, number, CONFIG.first_trial_step)
     trial.evaluate(first)

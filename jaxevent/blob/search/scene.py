@@ -20,14 +20,19 @@ from jaxevent.blob.search.background import (
     CELL_PX,
     FINE_CELL_PX,
     N_TIME_SLICES,
-    REST_AFFINE_MAP,
     Background,
     SceneMotion,
     count_in_slices,
     pool,
 )
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import clutter_model, detect
+from jaxevent.blob.search.detection import (
+    Blobs,
+    clutter_model,
+    detect,
+    larger_variance,
+    sum_blobs,
+)
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.scale import TRIED_WINDOWS_US, ScaleSelection
 from jaxevent.blob.search.stream import Stream, WindowEvents
@@ -41,7 +46,6 @@ MAX_GAUSS_NEWTON_STEPS, MIN_STEP_BINS = (
 N_TILES_PER_SIDE = 4  # along each side of the sensor
 # Windows in those of blobs: of a shaking scene any of them may be suitable.
 TRIED_WINDOW_RATIOS = (1, 1 / 4, 1 / 16, 4)
-VELOCITY_DIFFERENCE_S = 0.01  # s before and after, between which the scene's velocity is measured
 
 
 def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
@@ -53,10 +57,10 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
         stream: Events.
         window: Length of the windows, s.
     """
-    steps = int(min(CONFIG.max_scene_steps, stream.duration / window))
+    steps = int(min(2 * N_TIME_SLICES, stream.duration / window))
     begins = np.linspace(0, stream.duration - window, steps)
     bins = -(-max(stream.width, stream.height) // CONFIG.max_image_bins)
-    maps, motion, reference = [REST_AFFINE_MAP], None, None
+    maps, motion, reference = [np.eye(2, 3)], None, None
     for number, begin in enumerate(begins):
         image = _event_image(stream.window(begin, begin + window), stream, bins)
         if reference is None:
@@ -189,18 +193,18 @@ def _interpolate(image: Any, y: float, x: float) -> float:
 
 def is_dense(background: Background) -> bool:
     """Return whether most of the sensor has events in a full slice."""
-    return float(np.quantile(background.level, CONFIG.filled_quantile)) > CONFIG.dense_level
+    return float(np.quantile(background.level, CONFIG.nearly_all)) > CONFIG.considerable
 
 
 def split_at_pauses(background: Background) -> list[tuple[float, float]]:
     """Split the recording into spans (s) in which most of a scene is quiet, and those between.
 
-    Shorter spans than `SearchConfig.min_pause_slices` join those about them. Without pauses the
+    Shorter spans than `SearchConfig.min_windows` join those about them. Without pauses the
     whole is one span.
     """
-    full = float(np.quantile(background.level, CONFIG.filled_quantile))
-    long = np.ones(CONFIG.min_pause_slices)
-    quiet = ndimage.binary_opening(background.level < CONFIG.pause_level * full, long)
+    full = float(np.quantile(background.level, CONFIG.nearly_all))
+    long = np.ones(CONFIG.min_windows)
+    quiet = ndimage.binary_opening(background.level < CONFIG.considerable * full, long)
     moves = ndimage.binary_opening(~quiet, long)
     first = np.flatnonzero(np.diff(moves)) + 1 if is_dense(background) else []
     edges = np.array([0, *first, N_TIME_SLICES]) / N_TIME_SLICES * background.duration
@@ -220,7 +224,8 @@ def find_moving_background(
     Returns:
         The moving background; None if the camera does not seem to move.
     """
-    if _count_filled_tiles(stream, background, selection) < CONFIG.filled_tiles:
+    tiles = _count_filled_tiles(stream, background, selection)
+    if tiles <= CONFIG.majority * N_TILES_PER_SIDE**2:
         return None
     for ratio in TRIED_WINDOW_RATIOS:
         window = ratio * selection.scale.window
@@ -245,25 +250,25 @@ def _required_gain(moving: Background) -> float | None:
     visible = moving.visible
     events = moving.mean_rate * FINE_CELL_PX**2 * moving.duration
     edges = _edge_share(np.where(visible, moving.rate, 0), moving.mean_rate)
-    few = events < CONFIG.few_scene_events
+    few = events < CONFIG.min_blob_events
     if edges >= (CONFIG.scene_edge_share_few if few else CONFIG.scene_edge_share):
         return 0.0
     bright = float((moving.rate[visible] > CONFIG.edge_rate * moving.mean_rate).mean())
-    texture = events >= CONFIG.min_texture_events and bright > CONFIG.texture_share
-    return CONFIG.texture_gain if texture else None
+    texture = events >= CONFIG.min_fine_events and bright > CONFIG.scene_edge_share
+    return CONFIG.min_gain if texture else None
 
 
 def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
     """Compute the nats per event that a map gains by moving, in most windows of w s."""
     scene = moving.scene
     assert scene is not None
-    rest = dataclasses.replace(scene, maps=np.broadcast_to(REST_AFFINE_MAP, scene.maps.shape))
+    rest = dataclasses.replace(scene, maps=np.broadcast_to(np.eye(2, 3), scene.maps.shape))
     still, gains = measure_moving_background(stream, rest), []
     for t in np.maximum(stream.quantile_times(CONFIG.scale_trials), w):
         part = stream.window(t - w, t)
         one, other = (b.rate_at(part.x, part.y, part.t) for b in (moving, still))
         gains.append(float(np.log(one / other).mean()) if len(part) else 0.0)
-    return float(np.quantile(gains, CONFIG.gain_quantile))
+    return float(np.quantile(gains, 1 - CONFIG.nearly_all))
 
 
 def _count_filled_tiles(stream: Stream, background: Background, selection: ScaleSelection) -> float:
@@ -274,9 +279,9 @@ def _count_filled_tiles(stream: Stream, background: Background, selection: Scale
     hardly leaves its place, and most of it is in the background.
     """
     w, (rows, columns) = selection.scale.window, stream.shape
-    dark = np.full_like(background.rate, np.quantile(background.rate, CONFIG.dark_quantile))
+    dark = np.full_like(background.rate, np.quantile(background.rate, 1 - CONFIG.nearly_all))
     background = dataclasses.replace(background, rate=dark)
-    tiles, sides, few, width = [], [], CONFIG.tile_events, CONFIG.side_width
+    tiles, sides, few, width = [], [], CONFIG.min_blob_events, CONFIG.side_width
     for t in np.maximum(stream.quantile_times(CONFIG.scale_trials), w):
         part = stream.window(t - w, t)
         clutter = clutter_model(background, selection.scale, stream.shape, t)
@@ -287,7 +292,7 @@ def _count_filled_tiles(stream: Stream, background: Background, selection: Scale
         strips = [width * v < n for v, n in ((x, columns), (y, rows))]
         strips += [width * (n - 1 - v) < n for v, n in ((x, columns), (y, rows))]
         sides.append(sum(strip.sum() >= few for strip in strips))
-    wide = np.mean(np.array(sides) >= CONFIG.min_sides) >= CONFIG.min_side_share
+    wide = np.mean(np.array(sides) > CONFIG.majority * 4) >= CONFIG.considerable
     return float(np.median(tiles)) if wide else 0.0
 
 
@@ -298,20 +303,14 @@ def _edge_share(rate: NDArray[np.float64], mean: float) -> float:
     ndimage.label(excess > 0, np.ones((3, 3)), labels)
     number = int(labels.max())
     y, x = np.nonzero(excess)
-    part, n = labels[y, x] - 1, excess[y, x]
-
-    def average(values: NDArray) -> NDArray:
-        return np.bincount(part, n * values, number) / mass
-
-    mass = np.bincount(part, n, number)
-    mx, my = average(x), average(y)
-    xx, yy, xy = average(x * x) - mx**2, average(y * y) - my**2, average(x * y) - mx * my
-    half, cross = (xx + yy) / 2 + 1 / 12, np.hypot((xx - yy) / 2, xy)
-    size = np.sqrt(half + cross)
-    long = size > CONFIG.edge_length * np.sqrt(half - cross)
-    long &= size > CONFIG.edge_min_size_cells
-    large = size > CONFIG.large_share * min(rate.shape)
-    return float(mass[long | large].sum() / max(mass.sum(), 1e-300))
+    parts = Blobs.empty(number)
+    sum_blobs(x, y, excess[y, x], labels[y, x], number, parts)
+    square = larger_variance(parts.C)
+    rest = np.maximum(np.trace(parts.C, axis1=1, axis2=2) - square, 0)
+    long = square > CONFIG.edge_aspect**2 * rest
+    long &= square > CONFIG.edge_min_size_cells**2
+    large = square > ((1 - CONFIG.nearly_all) * min(rate.shape)) ** 2
+    return float(parts.n[long | large].sum() / max(parts.n.sum(), 1e-300))
 
 
 def has_own_motion(path: TargetPath, scene: SceneMotion, start: int) -> bool:
@@ -339,16 +338,15 @@ def has_own_motion(path: TargetPath, scene: SceneMotion, start: int) -> bool:
     own = moved - np.maximum(with_scene, 0)[:, None] * along[1:]
     way = np.cov(np.concatenate([[[0, 0]], np.cumsum(own, 0)]).T)
     ratio = np.linalg.solve(np.median(path.C, 0) + FINE_CELL_PX**2 * np.eye(2), way)
-    return bool(np.linalg.eigvals(ratio).real.max() > CONFIG.own_way_sizes**2)
+    return bool(np.linalg.eigvals(ratio).real.max() > CONFIG.common_way_sizes**2)
 
 
 def _scene_flow(
     path: TargetPath, scene: SceneMotion, t: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Compute velocities (rows, 2) px/s of the scene at a path's places."""
-    now = np.clip(
-        t[:, None] + [-VELOCITY_DIFFERENCE_S, VELOCITY_DIFFERENCE_S], scene.t[0], scene.t[-1]
-    )
+    step = path.window * 1e-6
+    now = np.clip(t[:, None] + [-step, step], scene.t[0], scene.t[-1])
     x, y = scene.to_scene(path.p[:, 0], path.p[:, 1], t)
     x, y = scene.to_sensor(x[:, None], y[:, None], now)
     flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
@@ -379,7 +377,7 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
     cells = count_in_slices(stream, (rows * by, columns * by), scene, corner)
 
     N = np.where(seen, pool(cells, by), np.inf)
-    rank = np.ceil(CONFIG.calm_share * seen.sum(0)).astype(int) - 1
+    rank = np.ceil((1 - CONFIG.considerable) * seen.sum(0)).astype(int) - 1
     most = np.take_along_axis(np.sort(N, 0), np.maximum(rank, 0)[None], 0)[0]
     calm = seen & (N <= most)
     activity = _slice_activity(N, calm, seen)

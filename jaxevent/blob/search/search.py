@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.search.background import Background, clutter_evidence, measure_background
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import Scale, contact_distance, larger_variance
+from jaxevent.blob.search.detection import (
+    Scale,
+    clutter_at,
+    clutter_model,
+    contact_distance,
+    larger_variance,
+)
 from jaxevent.blob.search.merge import merge_parts, merge_turning, stitch_paths
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
@@ -35,11 +41,7 @@ from jaxevent.errors import InputError
 from jaxevent.progress import stage
 from jaxevent.recording import Recording, check_recording
 
-# Coefficients of x^3, x^2 and x in 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)), see
-# `max_events_per_step`.
-VARIANCE_GROWTH_COEFFICIENTS = (1 / (3 * 2**0.5), 1.0, 2**0.5)
-N_START_SIZE_WINDOWS = 4  # windows that give a target's size at its start
-UNLIMITED_COAST_S, UNLIMITED_SIGMA_PX = 1e3, 1e9  # the search decides when targets end
+UNLIMITED = 1e9  # s, px or ratio: the search decides when targets end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +94,7 @@ class TargetSearchResult:
     @property
     def compact(self) -> bool:
         """True if no ellipse of twice a target's sizes covers a quarter of the sensor."""
-        quarter = CONFIG.max_compact_share * self.recording.width * self.recording.height
+        quarter = CONFIG.considerable * self.recording.width * self.recording.height
         areas = [4 * np.pi * float(np.median(path.size.prod(1))) for path in self.paths]
         return max(areas, default=0.0) < quarter
 
@@ -135,7 +137,7 @@ class TargetSearchResult:
             x, y = path.p[0]
             at = int(np.clip(path.begin, start, stop - 1))
             x, y = np.clip(x, -0.5, width - 0.5), np.clip(y, -0.5, height - 0.5)
-            size = np.median(path.size[:N_START_SIZE_WINDOWS].mean(1))
+            size = np.median(path.size[: CONFIG.min_confirm_windows].mean(1))
             out.append((float(x), float(y), float(size), at))
         return out
 
@@ -167,10 +169,7 @@ class TargetSearchResult:
             "events_per_step": events,
             "lambda_min": min(0.5, smallest / 3),
             "lambda_max": 6 * largest,
-            "t_coast": UNLIMITED_COAST_S,
-            "t_merge": UNLIMITED_COAST_S,
-            "aspect_max": 1e3,
-            "sigma_max": UNLIMITED_SIGMA_PX,
+            **dict.fromkeys(("t_coast", "t_merge", "aspect_max", "sigma_max"), UNLIMITED),
             "cycle": W,
         }
 
@@ -264,7 +263,7 @@ def max_events_per_step(
     Returns:
         (targets,) events per step.
     """
-    roots = np.roots([*VARIANCE_GROWTH_COEFFICIENTS, 1 - (1 + accuracy) ** 2])
+    roots = np.roots([1 / (3 * 2**0.5), 1, 2**0.5, 1 - (1 + accuracy) ** 2])
     x = float(roots[abs(roots.imag) < 1e-9].real.max())
     return x * rate * (size**2 / rate / noise) ** 0.25
 
@@ -366,7 +365,7 @@ def _search_section(
     found: list[TargetPath] = []
     passes: list[SearchPass] = []
     size, gate = (stream.width, stream.height), CONFIG.gate_sigmas
-    min_gain = CONFIG.min_gain if background.scene is None else CONFIG.min_moving_gain
+    min_gain = CONFIG.min_gain * (1 if background.scene is None else 2)
     for number in range(CONFIG.max_passes):
         name = f"find, pass {number + 1}"
         if number:
@@ -404,12 +403,12 @@ def _is_persistent(path: TargetPath, duration: float | int) -> bool:
     window, seen = path.window * 1e-6, len(path.t)
     size = np.median(np.trace(path.C, axis1=1, axis2=2))
     leaves = path.velocity_noise * window**3 / 3
-    short = seen < min(CONFIG.short_windows, CONFIG.persistent_share * duration / window)
+    short = seen < min(2 * CONFIG.min_windows, CONFIG.majority * duration / window)
     if short and leaves > (CONFIG.erratic_sizes * np.median(path.size[:, 0])) ** 2:
         return False
     windows = (path.t[-1] - path.t[0]) / path.window + 1
-    enough = seen >= CONFIG.persistent_share * windows
-    return bool(size > 2 * CONFIG.min_size_px**2 and enough)
+    enough = seen >= CONFIG.majority * windows
+    return bool(size > 2 * CONFIG.resolution_px**2 and enough)
 
 
 def _extend_backwards(
@@ -426,7 +425,7 @@ def _extend_backwards(
         background: Background of the stream.
         scale: Windows and cells.
     """
-    first = min(8, len(path.t))
+    first = min(CONFIG.min_windows, len(path.t))
     if first < 3:
         return path
     w, times = scale.window, (path.t[:first] - rest.start) * 1e-6
@@ -434,7 +433,7 @@ def _extend_backwards(
     C, usual = path.C[:first].mean(0), float(np.median(path.n[:first]))
     spread = C + np.eye(2) * (0.1 + np.trace(C) / 2 / max(usual, 1))
     gate, threshold = CONFIG.gate_sigmas, -np.log(CONFIG.false_alarm_known)
-    farthest = (gate * CONFIG.max_turn_sizes) ** 2 * larger_variance(C[None])[0]
+    farthest = gate**2 * larger_variance(C[None])[0]
     t, misses, rows = float(times[0]), 0, []
     while misses < CONFIG.max_coast_windows and t - 1.5 * w > 0:
         t, p = t - w, p - v * w
@@ -446,10 +445,9 @@ def _extend_backwards(
         near = np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e) < gate**2
         n = int(near.sum())
         area = np.pi * gate**2 * np.sqrt(np.linalg.det(S))
-        mu = max(float(background.rate_at(p[0], p[1], t, 3 * scale.cell)) * w * area, 1e-3)
-        F = scale.dispersion_at(*background.to_scene(p[0], p[1], t))
+        rate, F = clutter_at(clutter_model(background, scale, rest.shape, t), p[0], p[1])
         enough = n >= 2 and n >= CONFIG.min_event_share * usual
-        if not enough or clutter_evidence(n, mu, F) < threshold:
+        if not enough or clutter_evidence(n, max(rate * w * area, 1e-3), F) < threshold:
             misses += 1
             continue
         z = e[near].mean(0)
@@ -474,6 +472,6 @@ def _is_duplicate(path: TargetPath, found: list[TargetPath]) -> bool:
         row = np.clip(np.searchsorted(other.t, path.t), 0, len(other.t) - 1)
         apart = contact_distance(path.p, path.C, other.at(path.t), other.C[row])
         near = inside & (apart < 1.5 * CONFIG.contact_distance)
-        if near.mean() >= CONFIG.duplicate_share:
+        if near.mean() >= CONFIG.majority:
             return True
     return False

@@ -176,7 +176,8 @@ class WindowTracker:
             if self.scale.compact:
                 self._split_tracks(events, gates, assignments)
             self._remove(self._find_ended())
-        new = (assignments.free >= 3) & (assignments.free >= CONFIG.free_share * assignments.counts)
+        free, least = assignments.free, 1 - CONFIG.claimed_share
+        new = (free >= CONFIG.min_blob_events) & (free >= least * assignments.counts)
         if new.any():
             free = assignments.owner < 0
             rest = WindowEvents(events.t[free], events.x[free], events.y[free])
@@ -191,7 +192,7 @@ class WindowTracker:
         if not tracks.confirmed.all():
             age = np.rint((gates.t - tracks.born) / self.scale.window) + 1
             enough = tracks.hits >= CONFIG.min_confirm_windows
-            enough &= tracks.hits >= CONFIG.min_confirm_share * age
+            enough &= tracks.hits >= CONFIG.majority * age
             enough &= tracks.nats > self.log_threshold
             tracks.confirmed[now & enough] = True
         t, m = np.full(len(now), gates.t), gates.p + measured.z
@@ -228,9 +229,9 @@ class WindowTracker:
         outside = (x <= -1) | (x >= columns) | (y <= -1) | (y >= rows)
         longest = CONFIG.max_coast_windows
         if self.background.scene is not None:
-            longest = CONFIG.max_moving_coast_windows
+            longest = CONFIG.min_confirm_windows
         coast = np.minimum(longest, 2 * tracks.hits)
-        coast = np.where(tracks.confirmed, coast, CONFIG.max_new_coast_windows)
+        coast = np.where(tracks.confirmed, coast, CONFIG.still_windows)
         return outside | (tracks.misses > coast)
 
     def _remove(self, ended: NDArray) -> None:
@@ -302,13 +303,12 @@ def predict_gates(
 @njit_noalloc
 def _predict_gates(tracks: Any, gates: Any) -> None:
     """Fill in the predictions and gates of all tracks."""
-    turn = CONFIG.max_turn_sizes
     for k in range(len(tracks.n)):
         C, known = tracks.C[k], tracks.confirmed[k]
         _predict_track(tracks, k, gates)
         variance = gates.P[k, 0]
         if known:
-            variance = min(variance, turn * turn * larger_variance_of(C))
+            variance = min(variance, larger_variance_of(C))
         more = 1 + 2 / tracks.n[k]
         a, b, c = C[0, 0] * more + variance + 0.1, C[0, 1] * more, C[1, 1] * more + variance + 0.1
         determinant = a * c - b * b
@@ -403,7 +403,7 @@ def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
             most = max(most, table[k, j])
         if claimed >= CONFIG.claimed_share * counts[k]:
             for j in range(tracks):
-                enough = min(CONFIG.owner_share * counts[k], most)
+                enough = min((1 - CONFIG.nearly_all) * counts[k], most)
                 owns[k, j] = table[k, j] >= enough and table[k, j] > 0
                 owned[k] |= owns[k, j]
     for i in range(len(labels)):
@@ -521,9 +521,8 @@ def _passes_gate(tracks: Any, k: int, n: float, z: Any, variance: float) -> bool
     A known target is not where few events are that its motion does not lead to, except for parts of
     it that are seen by turns. Most of its events may follow a turn, but no farther than it allows.
     """
-    turn, offset = CONFIG.max_turn_sizes, CONFIG.part_offset_sizes
-    square = (turn * turn) * larger_variance_of(tracks.C[k])
-    if n >= CONFIG.turn_event_share * tracks.n[k]:
+    offset, square = CONFIG.part_offset_sizes, larger_variance_of(tracks.C[k])
+    if n >= CONFIG.majority * tracks.n[k]:
         variance = max(variance, square)
     gate = CONFIG.gate_sigmas
     most = gate * gate * min(variance + offset * offset * square, 2 * square)
