@@ -89,6 +89,15 @@ def test_frames_are_steady_unless_they_change_without_events():
     assert frame_brightness(still(moving, range(WIDTH // 2))).is_steady(0, 200_000)
 
 
+def test_a_fading_light_is_not_steady_over_several_frames():
+    # Of an interval it is below the limit, of all four above.
+    wall = 110 + 40 * np.sin(np.arange(WIDTH)) * np.ones((5, HEIGHT, 1))
+    level = np.log(wall / 255 + 0.3) - 0.02 * np.arange(5)[:, None, None]
+    brightness = frame_brightness(still((255 * (np.exp(level) - 0.3)).astype(np.uint8), [3]))
+    assert brightness.is_steady(0, 100_000)
+    assert not brightness.is_steady(0, 200_000)
+
+
 def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
     wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
     assert frame_brightness(still(wall, [3])).variance(75_000) == 0

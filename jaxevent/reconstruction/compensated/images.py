@@ -206,10 +206,14 @@ class FrameBrightness:
         self._changes: dict[int, float] = {}
 
     def is_steady(self, first_us: int, last_us: int) -> bool:
-        """Return whether all frames between two times (us), included, are equally bright."""
+        """Return whether all frames between two times (us), included, are equally bright.
+
+        Changes of a light that fades are small, and add up over the frames.
+        """
         low = int(np.searchsorted(self._mid, first_us, "left"))
         high = int(np.searchsorted(self._mid, last_us, "right"))
-        return all(abs(self._change(k)) < MIN_UNSTEADY_CHANGE for k in range(low, high - 1))
+        level = np.cumsum([0.0, *(self._change(k) for k in range(low, high - 1))])
+        return float(np.ptp(level)) < MIN_UNSTEADY_CHANGE
 
     def prior(self, t_us: int) -> BrightnessPrior:
         """Return the prior of the brightness at a time (us)."""
