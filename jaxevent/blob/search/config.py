@@ -72,8 +72,8 @@ class SearchConfig(NamedTuple):
     # Passes over the recording, and their paths
     max_passes: int = 4
     min_recording_events: int = 100  # events of a recording, or of a window that shows a lag
-    min_gain: float = 0.05  # nats per event from which a pass is made, or a texture moves; twice
-    # before a moving scene, whose map is less exact
+    min_gain: float = 0.05  # nats per event from which a texture moves; twice for a pass before a
+    # moving scene, whose map is inexact everywhere
     erratic_sizes: float = 0.4  # sizes by which a path that is seen in few windows leaves its way
     # in a window at most
 

@@ -68,6 +68,7 @@ class PredictionScore(NamedTuple):
     penalised: float  # less a share for blobs in contact
     ellipses: float  # penalised, by ellipses alone
     parts: NDArray[np.float64]  # (windows,) contributions to `raw`
+    number: int  # of all events of the windows
 
 
 class _PredictionScratch(NamedTuple):
@@ -143,7 +144,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
     number = sum(one.number for one in scored)
     ends = np.cumsum([0, *(len(one.pixels) for one in scored)])
     if not ends[-1]:
-        return PredictionScore(0.0, 0.0, 0.0, np.zeros(len(predictions)))
+        return PredictionScore(0.0, 0.0, 0.0, np.zeros(len(predictions)), number)
     density = np.concatenate([one.density for one in predictions])
     b = np.concatenate([one.background for one in scored])
     most = CONFIG.max_scored_events
@@ -159,7 +160,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
     raw = float(parts.sum())
     ellipses = float(weight @ np.log1p(density[:, 0] / b) - expected.sum()) / number
     lost = CONFIG.split_loss * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
-    return PredictionScore(raw, raw - lost, ellipses - lost, parts)
+    return PredictionScore(raw, raw - lost, ellipses - lost, parts, number)
 
 
 @njit_noalloc

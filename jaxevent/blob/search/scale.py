@@ -32,22 +32,38 @@ TRIED_CELLS_PX = (2, 4, 8, 16)
 
 @dataclasses.dataclass(frozen=True)
 class ScaleSelection:
-    """A scale, and the gain of its predictions over the background in nats per event."""
+    """A scale, and the gain of its predictions over the background."""
 
     scale: Scale
-    score: float
+    score: float  # nats per event
+    nats: float  # of a window in which it was tried, in the mean
+
+    def is_worth_a_pass(self, background: Background) -> bool:
+        """Return whether blobs at this scale are evident."""
+        return _are_evident(self.score, self.nats, background)
+
+
+def _are_evident(score: float, nats: float, background: Background) -> bool:
+    """Return whether blobs are, that gain so much per event and in a window.
+
+    The Bayes factor of a window decides, whatever share of the events they send. The map of a
+    moving scene is inexact everywhere: there they must gain per event of all.
+    """
+    if background.scene is None:
+        return nats >= CONFIG.log_bayes_factor
+    return score >= 2 * CONFIG.min_gain
 
 
 def select_scale(
-    stream: Stream, background: Background, min_gain: float | None = None
+    stream: Stream, background: Background, later: bool = False
 ) -> ScaleSelection | None:
     """Select the scale that predicts best.
 
     Args:
         stream: Events.
         background: Their background.
-        min_gain: Gain (nats per event) that a scale must come to in some trials; None for a first
-            pass, which compares the scales in more trials.
+        later: True for what a pass has left: scales are compared in half of the trials, and blobs
+            must be evident in some of them.
 
     Returns:
         The scale; None if the recording is too short or nothing is gained.
@@ -56,12 +72,12 @@ def select_scale(
     windows = np.asarray(TRIED_WINDOWS_US[TRIED_WINDOWS_US * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
         return None
-    number = CONFIG.scale_trials // (1 if min_gain is None else 2)
+    number = CONFIG.scale_trials // (2 if later else 1)
     trial = _ScaleTrial(stream, background, windows, number)
     first = np.arange(CONFIG.first_trial_step // 2, number, CONFIG.first_trial_step)
     trial.evaluate(first)
-    most = trial.drop_worse()
-    if min_gain is not None and most < min_gain:
+    evident = trial.drop_worse()
+    if later and not evident:
         return None
     trial.evaluate(np.setdiff1d(np.arange(number), first))
     raw, scores, ellipses = trial.scores()
@@ -79,7 +95,9 @@ def select_scale(
     column = np.where(good[:, j], scores[:, j], -np.inf)
     i = int(np.flatnonzero(column >= column.max() - CONFIG.equal_window_loss * best).max())
     scale = dataclasses.replace(trial.scales[i][j], compact=compact)
-    return ScaleSelection(scale, float(scores[i, j]))
+    predictions, best = trial.predictions[i][j], float(scores[i, j])
+    number = sum(one.scored.number for one in predictions)
+    return ScaleSelection(scale, best, best * number / len(predictions))
 
 
 class _ScaleTrial:
@@ -116,21 +134,22 @@ class _ScaleTrial:
                 for j, one in zip(cells, predictions, strict=True):
                     self.predictions[i][j].append(one)
 
-    def drop_worse(self) -> float:
+    def drop_worse(self) -> bool:
         """Drop the scales that are clearly worse than the best one of equal cells.
 
         Returns:
-            The most that one of the scales may gain, nats per event.
+            True if blobs may be evident at one of the scales.
         """
-        most = -np.inf
+        evident = False
         for j in range(len(TRIED_CELLS_PX)):
             scores = [score(one[j]) for one in self.predictions]
             best = max(scores, key=lambda one: one.raw)
             for i, one in enumerate(scores):
-                most = max(most, _upper_bound(one.parts))
+                most, number = _upper_bound(one.parts), one.number / len(one.parts)
+                evident |= _are_evident(most, most * number, self.background)
                 excess = _upper_bound(one.parts - CONFIG.dropped_score * best.parts)
                 self.tried[i, j] = one is best or excess >= 0
-        return most
+        return evident
 
     def scores(self) -> NDArray[np.float64]:
         """Score the scales (windows, cells): raw, with penalty, by ellipses; -inf if dropped."""

@@ -365,13 +365,12 @@ def _search_section(
     found: list[TargetPath] = []
     passes: list[SearchPass] = []
     size, gate = (stream.width, stream.height), CONFIG.gate_sigmas
-    min_gain = CONFIG.min_gain * (1 if background.scene is None else 2)
     for number in range(CONFIG.max_passes):
         name = f"find, pass {number + 1}"
         if number:
             with stage(f"{name}: scale", progress):
-                selection = select_scale(stream, background, min_gain)
-        if selection is None or selection.score < min_gain:
+                selection = select_scale(stream, background, later=True)
+        if selection is None or not selection.is_worth_a_pass(background):
             break
         confirmed = WindowTracker(stream, background, selection.scale).run(name, progress)
         if not confirmed:
