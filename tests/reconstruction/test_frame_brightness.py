@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from jaxevent.camera import UnknownResponse
 from jaxevent.methods import find
 from jaxevent.reconstruction.compensated import images, target_motion
+from jaxevent.reconstruction.compensated.images import is_equally_bright
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
@@ -98,6 +99,18 @@ def test_a_fading_light_is_not_steady_over_several_frames():
     assert not brightness.is_steady(0, 200_000)
 
 
+def test_light_that_all_events_show_is_told_from_motion():
+    """Motion brightens some places and darkens others; light changes all of them alike."""
+    rng = np.random.default_rng(0)
+    texture = gaussian_filter(rng.standard_normal((192, 400)), 3, mode="wrap")
+    moving = np.stack([texture[:, 7 * k : 7 * k + 256] for k in range(15)]) / texture.std()
+    fading = -0.06 * np.arange(15)[:, None, None]
+    assert is_equally_bright(moving)
+    assert not is_equally_bright(moving + fading)
+    assert is_equally_bright(moving + fading / 30)
+    assert not is_equally_bright(0 * moving + fading)
+
+
 def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
     wall = np.full((5, HEIGHT, WIDTH), 100, np.uint8)
     assert frame_brightness(still(wall, [3])).variance(75_000) == 0
@@ -173,6 +186,7 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
     low, high = (recording.frames.intensity[k].mean() for k in (BRIGHT + 1, BRIGHT))
     assert low + 0.1 * (high - low) < image.mean() < high - 0.1 * (high - low)
     monkeypatch.setattr(target_motion.FrameBrightness, "is_steady", lambda *_: True)
+    monkeypatch.setattr(target_motion, "is_equally_bright", lambda *_: True)
     unaware = mc.estimate(recording, params, progress=False)(t).mean
     assert error(image) < 0.5 * error(unaware)
 

@@ -29,6 +29,7 @@ from jaxevent.reconstruction.compensated.images import (
     FrameBrightness,
     InstantImages,
     gaussian_blur,
+    is_equally_bright,
     smooth_at_target,
 )
 from jaxevent.reconstruction.compensated.instants import (
@@ -280,7 +281,8 @@ class TrajectoryEstimator:
     ) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
         L, V, clear = self.images(instants.t)
         self.event_noise.inflate(instants.t, V)
-        if self.brightness.is_steady(int(instants.t[0]), int(instants.t[-1])):
+        first, last = int(instants.t[0]), int(instants.t[-1])
+        if self.brightness.is_steady(first, last) and is_equally_bright(L):
             return L, V, clear, None
         smooth = gaussian_blur(L)
         return L - smooth, V, clear, smooth
