@@ -13,6 +13,8 @@ from scipy.ndimage import gaussian_filter
 import jaxevent
 from jaxevent.calibration.correspondence import TRANSFORMS
 from jaxevent.calibration.hot import find_hot_pixels
+from jaxevent.calibration.light import common_change
+from jaxevent.calibration.sampling import count_between, take_sample
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show.describe import describe
 from jaxevent.simulate import faults
@@ -185,6 +187,27 @@ def test_offset_is_found_beyond_a_quarter_of_the_interval(late_us):
         assert [fault.name for fault in found] == ["clock offset"]
         assert found[0].statistic == pytest.approx(14e-3, abs=3e-3)
         assert ("earlier" if late_us > 0 else "later") in found[0].text
+
+
+@pytest.mark.parametrize("most", [20_000, 100_000])
+def test_events_that_a_sample_leaves_out_are_known(sound, most, monkeypatch):
+    """Of dense recordings a stretch ends before its last frame."""
+    monkeypatch.setattr("jaxevent.calibration.sampling.MAX_EVENTS", most)
+    events, covered = sound.events, []
+    for stretch in take_sample(sound).stretches:
+        counted = count_between(stretch).sum((1, 2))
+        edges = np.searchsorted(events.t, stretch.frame_t)
+        np.testing.assert_array_equal(counted == np.diff(edges), stretch.is_covered())
+        covered.append(stretch.is_covered())
+    assert np.concatenate(covered).all() == (most == 100_000)
+
+
+def test_changes_in_common_are_beyond_the_scatter():
+    changes = np.random.default_rng(0).normal(size=(3, 400))
+    changes[1:] += [[0.5], [-0.5]]
+    found = common_change(changes)
+    assert found[0] == 0
+    np.testing.assert_array_equal(found[1:], np.median(changes[1:], axis=1))
 
 
 def test_gain_of_frames_is_no_flicker(sound):

@@ -240,6 +240,7 @@ def _by_whole_events(
     for stretch in sample.stretches:
         counts = count_between(stretch, round(1e6 * late)).astype(np.float64)
         change, used = log_changes(stretch, I0)
+        used = used & stretch.is_covered(round(1e6 * late))[:, None]
         for row, sign in ((0, 1), (1, -1)):
             net = sign * (counts[:, 0] - counts[:, 1])
             rising = used & (net > 0) & (sign * change > 0)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration.clipping import MAX_CLIPPED_SHARE, MIN_CLIPPED_SHARE, find_clipping
 from jaxevent.calibration.correspondence import (
     I0,
+    MIN_PIXELS,
     MIN_SIGNIFICANCE,
     TRANSFORMS,
     Correspondence,
@@ -20,6 +21,7 @@ from jaxevent.calibration.correspondence import (
     turn_events,
 )
 from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
+from jaxevent.calibration.light import common_change
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
@@ -290,15 +292,17 @@ def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iter
     steps, net, total, repeated, intervals = [], 0, 0, 0, 0
     for stretch in sample.stretches:
         changes, clear = log_changes(stretch, I0)
-        counts = count_between(stretch, 0 if np.isnan(offset) else int(offset))
-        for d, used, (on, off) in zip(changes, clear, counts, strict=True):
+        offset_us = 0 if np.isnan(offset) else int(offset)
+        counts, covered = count_between(stretch, offset_us), stretch.is_covered(offset_us)
+        known = (part[covered] for part in (changes, clear, counts))
+        for d, used, (on, off) in zip(*known, strict=True):
             quiet = used & (on + off == 0)
             repeated += not d.any() and (np.abs(on - off) >= MIN_NET_EVENTS).sum() >= MIN_CHANGING
             intervals += 1
             net += int(np.abs(on - off).sum())
             total += int((on + off).sum())
-            if quiet.any():
-                steps.append(float(np.median(d[quiet])))
+            if quiet.sum() >= MIN_PIXELS:
+                steps.append(float(common_change(d[quiet])))
     share = repeated / max(intervals, 1)
     yield Fault(
         "repeated frames", share, MAX_REPEATED_SHARE,

@@ -46,6 +46,11 @@ class SampledSegment(NamedTuple):
         clear = self.clear & ~pixels
         return self._replace(t=self.t[keep], pixel=self.pixel[keep], p=self.p[keep], clear=clear)
 
+    def is_covered(self, offset_us: int = 0) -> NDArray[np.bool_]:
+        """Return between which consecutive frames (frames - 1,) the stretch has all events."""
+        times = self.frame_t + offset_us
+        return (times[:-1] >= self.span[0]) & (times[1:] <= self.span[1])
+
 
 class Sample(NamedTuple):
     """Stretches of a recording, without its hot pixels."""
@@ -118,8 +123,8 @@ def _read_stretch(
         interval = int(np.median(np.diff(frames.t[rows]))) if frames and len(rows) > 1 else 0
         if len(rows) and reach > max(interval, 1000):
             reach //= 2
-        elif len(rows) > 3:
-            rows = rows[: (len(rows) + 3) // 2]
+        elif len(rows) > 2:
+            rows = rows[: (len(rows) + 2) // 2]
         else:
             return rows, (span[0], int(source[first + most :][:1].t[0])), first, first + most
 

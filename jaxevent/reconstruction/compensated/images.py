@@ -18,7 +18,6 @@ leaving out each of the frames around and predicting it from its neighbours.
 import collections
 import dataclasses
 import functools
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -27,6 +26,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from jaxevent.calibration.light import common_change
 from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
@@ -41,8 +41,6 @@ from jaxevent.recording import Recording
 N_CACHED_IMAGES = 96  # of instants, in a video
 SMOOTH_PART_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
 MIN_UNSTEADY_CHANGE = 0.05  # ln I, between frames that are not steady
-MIN_LIGHT_SIGMAS = 4.0  # of a change that all blocks have in common
-MEDIAN_ERROR = 1.86  # standard error of a median of n, in median deviations / sqrt(n)
 MEDIAN_BLOCK_PX = 16  # over which the change of pixels without events is a median
 MIN_BLOCK_PIXELS, MIN_BLOCKS = 8, 4  # without events
 MAX_BRIGHTNESS_FRAMES = 8  # on either side, from which the variance of brightness is estimated
@@ -211,11 +209,8 @@ def is_equally_bright(L: NDArray[np.floating]) -> bool:
         return True
     cut = L[:, : h * MEDIAN_BLOCK_PX, : w * MEDIAN_BLOCK_PX]
     means = cut.reshape(len(L), h, MEDIAN_BLOCK_PX, w, MEDIAN_BLOCK_PX).mean((2, 4))
-    change = (means - means[len(L) // 2]).reshape(len(L), -1)
-    level = np.median(change, axis=1)
-    scatter = np.median(np.abs(change - level[:, None]), axis=1)
-    error = MEDIAN_ERROR * scatter / math.sqrt(h * w)
-    return bool((np.abs(level) < np.maximum(MIN_UNSTEADY_CHANGE, MIN_LIGHT_SIGMAS * error)).all())
+    level = common_change((means - means[len(L) // 2]).reshape(len(L), -1))
+    return bool((np.abs(level) < MIN_UNSTEADY_CHANGE).all())
 
 
 class FrameBrightness:
