@@ -89,8 +89,8 @@ MUTATIONS = (
     Mutation(
         "threads read one video at the same time",
         "jaxevent/reconstruction/video.py",
-        "self._turns.iterate(self._read(times + self._image_delay_us))",
-        "self._read(times + self._image_delay_us)",
+        "self._turns.iterate(self._read(among_events))",
+        "self._read(among_events)",
         "tests/test_threads.py -k shared_video",
     ),
     Mutation(
