@@ -12,6 +12,7 @@ from jaxevent.calibration.events_alone import (
     CONFIDENCE_Z,
     estimate_dead_time,
     estimate_ratio,
+    gaps_of_pixels,
 )
 from jaxevent.calibration.model import (
     CURVATURE,
@@ -261,13 +262,8 @@ def _by_whole_events(
 
 def _time_between_events(sample: Sample) -> float:
     """Return the harmonic mean of times (s) between events of one sign at a pixel; 0 without."""
-    rates, number = 0.0, 0
-    for stretch in sample.stretches:
-        order = np.lexsort((stretch.t, stretch.pixel))
-        t, p, pixel = stretch.t[order], stretch.p[order], stretch.pixel[order]
-        gap = np.diff(t)[(np.diff(pixel) == 0) & (p[1:] == p[:-1])]
-        rates, number = rates + (1 / np.maximum(gap, MIN_GAP_US)).sum(), number + len(gap)
-    return 1e-6 * number / rates if number else 0.0
+    gaps = np.maximum(gaps_of_pixels(sample, of_one_sign=True), MIN_GAP_US)
+    return 1e-6 * len(gaps) / float((1 / gaps).sum()) if len(gaps) else 0.0
 
 
 def _with_fit(

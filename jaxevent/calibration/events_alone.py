@@ -13,13 +13,24 @@ MIN_EVENTS = 200
 CONFIDENCE_Z = 1.96
 
 
-def gaps_of_pixels(sample: Sample) -> NDArray[np.int64]:
-    """Return the times (us) between consecutive events of a pixel."""
+def gaps_of_pixels(sample: Sample, of_one_sign: bool = False) -> NDArray[np.int64]:
+    """Return the times between consecutive events of a pixel.
+
+    Args:
+        sample: The sample.
+        of_one_sign: Leave out gaps between events of different polarity.
+
+    Returns:
+        (gaps,) us.
+    """
     parts = [np.empty(0, np.int64)]
     for stretch in sample.stretches:
         order = np.argsort(stretch.pixel, kind="stable")
-        t, pixel = stretch.t[order], stretch.pixel[order]
-        parts.append(np.diff(t)[pixel[1:] == pixel[:-1]])
+        t, pixel, p = stretch.t[order], stretch.pixel[order], stretch.p[order]
+        kept = pixel[1:] == pixel[:-1]
+        if of_one_sign:
+            kept &= p[1:] == p[:-1]
+        parts.append(np.diff(t)[kept])
     return np.concatenate(parts)
 
 

@@ -90,7 +90,16 @@ class _PredictionScratch(NamedTuple):
 
     @classmethod
     def empty(cls, pixels: int, scored: int, shape: tuple[int, int]) -> "_PredictionScratch":
-        """Allocate scratch memory for so many pixels of windows and of scored events."""
+        """Allocate scratch memory.
+
+        Args:
+            pixels: Number of pixels with events in a window, at most.
+            scored: Number of pixels with scored events, at most.
+            shape: Rows and columns of the sensor.
+
+        Returns:
+            The memory.
+        """
         tables = tuple(map(_kernel_weights, KERNEL_RADII_PX, KERNEL_BINS_PX))
         bins = tuple(_bins(*(n // len(one) + one.shape[-1] for n in shape)) for one in tables)
         strips = shape[0] // CELL_PX + 2
@@ -105,7 +114,17 @@ class _PredictionScratch(NamedTuple):
 def sample_scored(
     stream: Stream, background: Background, t: float | int, window: float | int
 ) -> ScoredEvents:
-    """Choose events of the window that begins at t (s) and has the given length (s)."""
+    """Choose events of a window, on which predictions are scored.
+
+    Args:
+        stream: Events.
+        background: Their background.
+        t: Begin of the window, s.
+        window: Its length, s.
+
+    Returns:
+        The events.
+    """
     pixels, number = stream.sample(t, t + window, CONFIG.max_scored_events)
     return ScoredEvents(pixels, background.rate_at(pixels.x, pixels.y, t) * window, number)
 

@@ -259,7 +259,16 @@ def _required_gain(moving: Background) -> float | None:
 
 
 def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
-    """Compute the nats per event that a map gains by moving, in most windows of w s."""
+    """Compute what a map gains by moving, in most windows.
+
+    Args:
+        stream: Events.
+        moving: The background whose map moves.
+        w: Length of the windows, s.
+
+    Returns:
+        Nats per event.
+    """
     scene = moving.scene
     assert scene is not None
     rest = dataclasses.replace(scene, maps=np.broadcast_to(np.eye(2, 3), scene.maps.shape))
