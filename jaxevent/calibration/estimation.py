@@ -154,18 +154,19 @@ def _fit_sensor(
     noise, and the clock follows them: the fit is at the dark offset that the frames prefer.
 
     Returns:
-        The likelihood at that offset, and its fit; None where too few changes count.
+        The likelihood at that offset, and its fit; the first ones where too few changes count at
+        that offset; None where too few count at any.
     """
-    model = Model(sample, FIRST_DARK_OFFSET, GREY_NOISE, slope)
-    quick = model.thinned(MAX_FIRST_PIXELS)
-    first = _first_fit(quick, clock) or _first_fit(model, clock)
+    near = Model(sample, FIRST_DARK_OFFSET, GREY_NOISE, slope)
+    quick = near.thinned(MAX_FIRST_PIXELS)
+    first = _first_fit(quick, clock) or _first_fit(near, clock)
     if first is None:
         return None
     offsets = _DarkOffsets.of(quick, first)
-    model = model.with_offset(offsets.likeliest())
+    model = near.with_offset(offsets.likeliest())
     start = Physics(offsets.fits[offsets.place].physics.theta, np.array(FIRST_VARIANCES))
     fit = model.fit(start, (True, True, True, True, is_unknown))
-    return None if fit is None else (model, fit)
+    return (near, first) if fit is None else (model, fit)
 
 
 def calibrate(recording: Recording, I0: float = 1.0, sample: Sample | None = None) -> Calibration:

@@ -8,6 +8,7 @@ import pytest
 import jaxevent
 from jaxevent.calibration.brightness import interpolate, read_positions, sort_by_pixel
 from jaxevent.calibration.estimation import find_offset
+from jaxevent.calibration.model import Model
 from jaxevent.calibration.sampling import SampledSegment, choose_pixels, correlate, take_sample
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.protocols import held_out
@@ -175,6 +176,18 @@ def test_the_clock_is_the_same_for_every_logarithm(recording, found):
     for name, one in found.values().items():
         same = repr(getattr(other, name)) == repr(one)
         assert same == (name not in thresholds), name
+
+
+def test_where_the_last_fit_has_too_few_changes_the_first_one_holds(recording, found, monkeypatch):
+    whole = Model.fit
+
+    def fit(model, start, free, *steps):
+        return None if free[3] else whole(model, start, free, *steps)
+
+    monkeypatch.setattr(Model, "fit", fit)
+    first = jaxevent.calibrate(recording, SENSOR.dark_offset)
+    assert not first.clock_offset.note and not first.c_on.note
+    assert first.clock_offset.value == pytest.approx(found.clock_offset.value, abs=1e-3)
 
 
 def test_the_clock_of_slow_motion():
