@@ -69,13 +69,15 @@ def as_array(values: Any, what: str) -> NDArray:
         The numbers as an array, not copied if it is one.
 
     Raises:
-        InputError: The values are no numbers, or some are masked.
+        InputError: The values are no numbers, or some are missing.
     """
+    missing = np.flatnonzero(_find_missing(values))
+    if len(missing):
+        raise InputError(
+            f"{what} has no value in row {missing[0]}; remove such rows from all columns, or fill "
+            "them in"
+        )
     if isinstance(values, np.ma.MaskedArray):
-        if np.ma.getmaskarray(values).any():
-            raise InputError(
-                f"{what} has masked values; remove these rows from all columns, or fill them in"
-            )
         values = values.data
     if isinstance(values, str | bytes | Mapping | set | frozenset) or (
         not hasattr(values, "__array__") and isinstance(values, Iterable) and _is_spent(values)
@@ -94,6 +96,16 @@ def as_array(values: Any, what: str) -> NDArray:
         remedy = _REMEDY_OF_KIND.get(array.dtype.kind, "convert it to numbers")
         raise InputError(f"{what} is of type {array.dtype}, not numbers; {remedy}")
     return array
+
+
+def _find_missing(values: Any) -> Any:
+    """Return a mask of the values that a masked array or a column of a table lacks."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.getmaskarray(values)
+    for name in ("isna", "is_null"):  # of pandas; of polars and Arrow
+        if callable(find := getattr(values, name, None)):
+            return np.asarray(find())
+    return np.zeros(0, bool)
 
 
 def _is_spent(values: Iterable[Any]) -> bool:

@@ -143,7 +143,7 @@ def test_messages_name_the_argument_and_the_remedy():
         ({"p": (2 * v["p"] - 1).astype(np.uint8)}, "polarity 255; .* p == 1, if 255 is -1"),
         ({"x": v["x"] - 1}, r"x = -1; on the 64x48 sensor x is a whole number from 0 to 63"),
         ({"x": v["x"][:-5]}, "300, 295, 300 and 300 values; they must be equally long"),
-        ({"y": np.ma.array(v["y"], mask=v["y"] == 3)}, "y has masked values; remove"),
+        ({"y": np.ma.array(v["y"], mask=v["y"] == 3)}, r"y has no value in row \d+; remove"),
         ({"t": v["t"][::-1]}, "earlier than the one before .* sort the events"),
         ({"frames": images + 200, "frame_times": [0, 1]}, r"outside \[0, 1\]; .* 255"),
         ({"frames": images[:, None], "frame_times": [0, 1]}, "if channels come first"),
@@ -155,6 +155,19 @@ def test_messages_name_the_argument_and_the_remedy():
         all_of = {**v, "width": WIDTH, "height": HEIGHT, **changes}
         columns = [all_of.pop(name) for name in "txyp"]
         refuses(message, Recording.from_arrays, *columns, **all_of)
+
+
+def test_a_missing_value_is_told_before_its_type():
+    """A column of a table that lacks a value is of floats, whatever the others are."""
+    pandas = pytest.importorskip("pandas")
+    v = arrays()
+    columns = [pandas.Series(v["t"], dtype="Int64"), v["x"], v["y"], v["p"]]
+    columns[0][7] = pandas.NA
+    message = "t has no value in row 7; remove such rows"
+    refuses(message, Recording.from_arrays, *columns, width=WIDTH, height=HEIGHT)
+    arrow = pytest.importorskip("pyarrow")
+    columns[0] = arrow.array([*v["t"][:7], None, *v["t"][8:]])
+    refuses(message, Recording.from_arrays, *columns, width=WIDTH, height=HEIGHT)
 
 
 def test_frames_in_another_unit_than_events_are_told():
