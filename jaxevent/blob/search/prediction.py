@@ -25,6 +25,7 @@ from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 _bins = ZeroedScratch(np.int32)
 KERNEL_RADII_PX = (3.0, 8.0, 20.0)
 KERNEL_BINS_PX = (2, 4, 8)  # of events about each kernel
+N_DENSITIES = 1 + len(KERNEL_RADII_PX)  # of ellipses and kernels
 N_EM_STEPS = 15  # expectation and maximisation, for the shares of ellipses and kernels
 MAX_SQUARED_SIGMAS = 80.0  # squared standard deviations beyond which a Gaussian is 0
 
@@ -151,7 +152,7 @@ def predict(
     out = []
     for clutter in clutters:
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
-        density, sums = np.zeros((number, 1 + len(KERNEL_RADII_PX))), np.zeros(3)
+        density, sums = np.zeros((number, N_DENSITIES)), np.zeros(3)
         _predict(before, scored.pixels, clutter, cells, scratch, (density, sums))
         out.append(ScalePrediction(density, scored, *sums.tolist()))
     return out
@@ -173,7 +174,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
         for name in ("expected", "large", "split")
     )
     gains, near = np.zeros(len(predictions)), np.empty(len(b), np.int64)
-    shares = np.full((2, 1 + len(KERNEL_RADII_PX)), 1 / (1 + len(KERNEL_RADII_PX)))
+    shares = np.full((2, N_DENSITIES), 1 / (N_DENSITIES))
     _sum_gains(density, b, weight, ends, (near, shares), gains)
     parts = (gains - expected) / number
     raw = float(parts.sum())
@@ -188,27 +189,27 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
     near, (share, new), number = scratch[0], scratch[1], 0
     for i in range(len(b)):
         total = 0.0
-        for j in range(1 + len(KERNEL_RADII_PX)):
+        for j in range(N_DENSITIES):
             total += density[i, j]
         if total > 0:  # a blob may reach the pixel
             near[number] = i
             number += 1
     for _ in range(N_EM_STEPS):
-        for j in range(1 + len(KERNEL_RADII_PX)):
+        for j in range(N_DENSITIES):
             new[j] = 0.0
         for k in range(number):
             i = near[k]
             total = b[i]
-            for j in range(1 + len(KERNEL_RADII_PX)):
+            for j in range(N_DENSITIES):
                 total += density[i, j] * share[j]
             part = weight[i] / total
-            for j in range(1 + len(KERNEL_RADII_PX)):
+            for j in range(N_DENSITIES):
                 new[j] += part * density[i, j]
         total = 0.0
-        for j in range(1 + len(KERNEL_RADII_PX)):
+        for j in range(N_DENSITIES):
             share[j] = share[j] * new[j] + 1e-12
             total += share[j]
-        for j in range(1 + len(KERNEL_RADII_PX)):
+        for j in range(N_DENSITIES):
             share[j] /= total
     window = 0
     for k in range(number):
@@ -216,7 +217,7 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
         while i >= ends[window + 1]:
             window += 1
         total = 0.0
-        for j in range(1 + len(KERNEL_RADII_PX)):
+        for j in range(N_DENSITIES):
             total += density[i, j] * share[j]
         gains[window] += weight[i] * np.log(total / b[i] + 1)
 
