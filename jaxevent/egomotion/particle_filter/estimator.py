@@ -219,7 +219,8 @@ class VotingEstimator(MotionEstimator[Params]):
                 scored events on, if there is a kernel: for all but the literal likelihood.
 
         Returns:
-            The motion. An `InputWarning` tells that none was found.
+            The motion. An `InputWarning` tells that none was found, or that the recording
+            contradicts it; of causal estimates, which know no later events, it does not.
 
         Raises:
             InputError: The model is unknown, it needs a camera and there is none, or the compiler
@@ -249,6 +250,7 @@ class VotingEstimator(MotionEstimator[Params]):
             motion = motion._with_gaps(float(params.tau_max))
         else:
             motion = runner.motion(parts, smooth=smooth is not False)
+            motion = self.check_against(recording, motion, camera)
         self.warn_if_lost(motion)
         return motion
 
