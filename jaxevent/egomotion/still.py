@@ -128,15 +128,15 @@ def _supporting_blocks(recording: Recording, motion: MotionRows) -> float | None
     if model.half_line:
         return None
     test, numbers = EvidenceTest(model, xi), []
+    longest = min(MAX_WINDOW_S, 1e-6 * (recording.stop - recording.start))
     rows = np.flatnonzero(motion.valid)
     for k in rows[np.unique(np.linspace(0, len(rows) - 1, N_TESTED_WINDOWS).round().astype(int))]:
         speed = max(float(test.speed(motion.mean[k : k + 1])[0]), 1e-9)
-        length = min(WINDOW_DISPLACEMENT_PX / speed, MAX_WINDOW_S)
-        half = 5e5 * length
+        half = 5e5 * min(WINDOW_DISPLACEMENT_PX / speed, longest)
         end = int(min(max(motion.t[k], recording.start + half) + half, recording.stop))
         found = test.measure(
             recording.events, end, motion.mean[k], motion.covariance[k], WINDOW_DISPLACEMENT_PX,
-            MAX_WINDOW_S,
+            longest,
         )  # fmt: skip
         if found is not None:
             numbers.append(found.blocks)
