@@ -157,6 +157,24 @@ def test_a_motion_whose_events_cease_is_lost_with_them():
     assert all(told(np.repeat([50, 25], [10, 4]), slower)[8:])
 
 
+def test_a_motion_is_told_again_after_a_pause_shorter_than_a_window():
+    """A window is 6.5 px at 100 px/s, 65 ms; batches of 10 ms hold 50 events, in a pause 2."""
+
+    def told(pause):
+        lock, n = Lock(Script([(4.0, 1.0, 9.0)] * 30), 6.5, 0.1, lambda m: np.ones(2)), 30
+        count = np.full(n, 50)
+        count[10 : 10 + pause] = 2
+        return [
+            lock.update(None, count[k : k + 1], np.array([10_000 * k]), np.array([[100.0, 0]]),
+                        np.eye(2)[None], np.zeros(1, bool)).item()
+            for k in range(n)
+        ]  # fmt: skip
+
+    short, long = told(2), told(7)
+    assert all(short[5:10]) and short[10:12] == [False, False] and all(short[12:])
+    assert not any(long[10:18]) and all(long[25:])
+
+
 def test_earlier_estimates_are_told_where_they_agree():
     mean = np.array([[0.0], [9.0], [1.0], [1.1], [1.0]])
     told, covariance, drift = tell_from_later(
