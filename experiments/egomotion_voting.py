@@ -13,9 +13,9 @@ mean error is 50 % or more. Start-up is until the filter first says that it has 
 
 "situations" are estimates as the command makes them by default, smoothed, and `causal` ones, where
 motion varies, at 300 deg/s or 20 px/s, with noise, uneven thresholds, a lens or a focal length that
-is wrong, a pause, and a camera at rest. A row is beyond 3 sigma if a component is. A false lock is
-a stretch of told rows that are off by more than half of the motion (by 0.5 rad/s where it is less
-than 1).
+is wrong, a pause, dropped events, and a camera at rest. A row is beyond 3 sigma if a component is.
+A false lock is a stretch of told rows that are off by more than half of the motion (by 0.5 rad/s
+where it is less than 1).
 Where the model is chosen, "doubt" counts the sequences in which another one is not excluded, a lens
 is found, nothing is seen to move, or all rows are lost; a planar motion is held against the flow in
 the middle of the image. General motion is that of one window of `batch`. Beside them stand contrast
@@ -386,6 +386,11 @@ def situation(name: str, seed: int) -> tuple[Recording, str, Callable[[NDArray],
         moved = Events(e.t + PAUSE_US * (e.t >= PAUSE_AT_US), e.x, e.y, e.p)
         noise = noise_events((0, last + PAUSE_US), 20_000, seed)
         recording = merge(dataclasses.replace(recording, events=moved), noise, False)
+    elif name == "15 of 50 ms dropped":
+        e = recording.events[:]
+        kept = e.t % 50_000 >= 15_000
+        events = Events(*(column[kept] for column in (e.t, e.x, e.y, e.p)))
+        recording = dataclasses.replace(recording, events=events)
     elif name == "lens k1 = -0.35":
         recording = dataclasses.replace(
             recording, camera=PinholeCamera(LENS_FOCAL, LENS_FOCAL, *MIDDLE)
@@ -398,7 +403,7 @@ def situation(name: str, seed: int) -> tuple[Recording, str, Callable[[NDArray],
 SITUATIONS = (
     "planar", "rotation", "general", "300 deg/s", "low texture", "30 % noise",
     "uneven thresholds", "lens k1 = -0.35", "focal 10 % wrong", "pause of 2 s", "camera at rest",
-    "slow translation", "20 px/s",
+    "slow translation", "20 px/s", "15 of 50 ms dropped",
 )  # fmt: skip
 
 

@@ -387,7 +387,8 @@ def estimated(
     told = _told(estimator, recording, suited.params, settings, gyro)
     first, usual = told.t[told.valid][:1], (estimator, told, suited.params)
     soon = len(first) and first[0] - recording.start <= (recording.stop - recording.start) / 2
-    if soon or not other or not kind.fallback_method:
+    is_refuted = not len(first) and told.warning
+    if soon or is_refuted or not other or not kind.fallback_method:
         return usual
     late = " before the recording's middle" if len(first) else ""
     print(f"{estimator.name} found no motion{late}, so {kind.fallback_method} is tried")
@@ -404,13 +405,14 @@ def estimated(
 
 def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any) -> Any:
     """The motion by a method; `gyro` tells whether the IMU helps, its bias and its axes."""
-    from jaxevent.egomotion.estimator import LostMotionWarning
+    from jaxevent.egomotion.estimator import InconsistentMotionWarning, LostMotionWarning
 
     more = {"cloud": N_PLOTTED_PARTICLES} if "cloud" in estimator.options else {}
     helps, bias, turned = gyro
     with warnings.catch_warnings():
-        # The summary of the command tells it.
+        # The summary of the command tells them.
         warnings.simplefilter("ignore", LostMotionWarning)
+        warnings.simplefilter("ignore", InconsistentMotionWarning)
         if helps:
             more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
         return estimator.estimate(recording, values, **settings, **more)

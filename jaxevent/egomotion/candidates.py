@@ -26,6 +26,12 @@ from jaxevent.recording import Recording
 
 EVENTS_PER_READ = 65536  # events read from a file at a time
 NEVER_US = np.iinfo(np.int64).min // 2  # us, before all events
+# A gap is as long as this and as this many mean intervals between events of the whole sensor.
+MIN_GAP_US = 2000
+MIN_GAP_INTERVALS = 50
+N_MEAN_INTERVALS = 256  # number over which intervals are averaged
+FIRST_INTERVAL_NS = 1_000_000
+MAX_GAP_FRACTION = 0.5  # of the range of ages, from which an event says nothing
 
 Numeric = Array | np.ndarray
 Ages = float | int | NDArray[np.floating]
@@ -54,7 +60,7 @@ class Candidates(eqx.Module):
     age: Float[Numeric, "*batches K C"]  # s
     xi: Float[Numeric, "*batches K 2"]  # px, of the event; see `pixel_coordinates`
     bounds: Float[Numeric, "*batches K 2 2"]  # px, least and largest d within the sensor, (x, y)
-    valid: Bool[Numeric, "*batches K"]  # whether an event is real rather than padding
+    valid: Bool[Numeric, "*batches K"]  # false for padding, and where candidates are missing
     scale: Float[Numeric, "*batches K"]  # number of candidates that each stands for
     rate: Float[Numeric, "*batches K"]  # 1/s, candidates per time of age
     elapsed: Float[Numeric, "*batches"]  # s, from the last event of the batch before to this one's
@@ -116,6 +122,10 @@ class CandidateSampler:
         batch: Number of scored events of a batch.
         longest: Largest duration of a batch, s; it may hold fewer events.
         silence: Gap between events after which the history starts anew, s.
+
+    Where the whole sensor is silent, as where a driver drops events, there are no candidates. An
+    event is not valid, and says nothing of the motion, if the latest such gap covers more than
+    `MAX_GAP_FRACTION` of its range of ages.
     """
 
     def __init__(
@@ -144,7 +154,8 @@ class CandidateSampler:
         )
         self._row = 0
         self._last = int(recording.events[:1].t[0]) if len(recording.events) else 0
-        self._clock = np.array([self._last, self._last])  # start of the history, last event
+        # Start of the history, last event, mean interval (ns), begin and end of the latest gap.
+        self._clock = np.array([self._last, self._last, FIRST_INTERVAL_NS, NEVER_US, NEVER_US])
 
     @property
     def is_exhausted(self) -> bool:
@@ -187,6 +198,7 @@ class CandidateSampler:
             bounds=np.zeros((*shape, 2, 2), real),
             scale=np.ones(shape, real),
             rate=np.zeros(shape, real),
+            valid=np.zeros(shape, bool),
             row=np.full(shape, -1),
             t=np.zeros(batches, np.int64),
             history=np.zeros(batches, real),
@@ -221,7 +233,7 @@ class CandidateSampler:
         elapsed = np.diff(t, prepend=self._last) * 1e-6
         self._last = int(t[-1])
         candidates = Candidates(
-            out.d, out.age, out.xi, out.bounds, out.row >= 0, out.scale, out.rate,
+            out.d, out.age, out.xi, out.bounds, out.valid, out.scale, out.rate,
             elapsed.astype(real), history.astype(real), self.radius,
         )  # fmt: skip
         return CandidateBatches(candidates, t, out.row)
@@ -239,7 +251,7 @@ class CandidateSampler:
         parts: list[CandidateBatches] = []
         while not parts or not self.is_exhausted:
             parts.append(self.sample(64, youngest, oldest))
-        used = max(1, sum(int(part.candidates.valid.any(-1).sum()) for part in parts))
+        used = max(1, sum(int((part.row >= 0).any(-1).sum()) for part in parts))
         names = {field.name for field in dataclasses.fields(Candidates)} - {"radius"}
         fields = {
             name: np.concatenate([getattr(part.candidates, name) for part in parts])[:used]
@@ -290,6 +302,7 @@ class CandidateArrays(NamedTuple):
     bounds: NDArray
     scale: NDArray
     rate: NDArray
+    valid: NDArray
     row: NDArray
     t: NDArray
     history: NDArray
@@ -302,7 +315,7 @@ def _fill_batches(stream, rules, recent, out, cursor, clock):
     t_in, x, y, p, row_in = stream
     limits, gate, margin, every, longest, span, radius, silence = rules
     position, ring, head, scratch = recent
-    d, age, xi, bounds, scale, rate, row, t, history = out
+    d, age, xi, bounds, scale, rate, valid, row, t, history = out
     batch, fill, first, until = cursor
     parts_y, parts_x = limits.shape[1:]
     gates_y, gates_x = gate.shape[1:]
@@ -310,8 +323,13 @@ def _fill_batches(stream, rules, recent, out, cursor, clock):
     height, width, kept = ring.shape[1], ring.shape[2], ring.shape[3]
     for i in range(len(t_in)):
         now, column, line, sign = t_in[i], int(x[i]), int(y[i]), int(p[i])
-        if now - clock[1] > silence:
+        interval = now - clock[1]
+        if interval > silence:
             clock[0] = now
+        if interval > MIN_GAP_US and 1000 * interval > MIN_GAP_INTERVALS * clock[2]:
+            clock[3], clock[4] = clock[1], now
+        else:
+            clock[2] += (1000 * interval - clock[2]) // N_MEAN_INTERVALS
         clock[1] = now
         if (row_in + i) % every == 0:
             if fill == size or (fill > 0 and now - first > longest):
@@ -364,6 +382,8 @@ def _fill_batches(stream, rules, recent, out, cursor, clock):
             bounds[batch, fill, 1, 0] = here_x - position[line, 0, 0]
             bounds[batch, fill, 0, 1] = here_y - position[height - 1, column, 1]
             bounds[batch, fill, 1, 1] = here_y - position[0, column, 1]
+            missing = min(clock[4], now - youngest) - max(clock[3], now - oldest)
+            valid[batch, fill] = missing <= MAX_GAP_FRACTION * (oldest - youngest)
             row[batch, fill] = row_in + i
             t[batch] = now
             history[batch] = (now - clock[0]) * 1e-6

@@ -34,6 +34,10 @@ class LostMotionWarning(InputWarning):
     """A method found no motion of the camera at any time."""
 
 
+class InconsistentMotionWarning(InputWarning):
+    """A recording contradicts a motion, or the image does not move as one."""
+
+
 def score_times(start: int, stop: int) -> NDArray[np.int64]:
     """Return times (us) at `SCORE_RATE_HZ` from `start` on, before `stop`."""
     return np.arange(start, stop, round(1e6 / SCORE_RATE_HZ))
@@ -191,9 +195,29 @@ class MotionEstimator(Estimator[P]):
         self.check(recording)
         return found, camera
 
+    def check_against(
+        self, recording: Recording, motion: MotionEstimate, camera: PinholeCamera | None
+    ) -> MotionEstimate:
+        """Return a motion with what the whole recording shows, see `with_flow_consistency`.
+
+        Args:
+            recording: The recording.
+            motion: Its motion.
+            camera: The camera; by default the recording's.
+
+        Returns:
+            The motion. An `InconsistentMotionWarning` tells what is wrong.
+        """
+        if camera is not None:
+            recording = dataclasses.replace(recording, camera=camera)
+        motion, line = motion.with_flow_consistency(recording)
+        if line:
+            warnings.warn(f"{recording.name}: {line}", InconsistentMotionWarning, stacklevel=4)
+        return motion
+
     def warn_if_lost(self, motion: MotionEstimate) -> None:
         """Warn with a `LostMotionWarning` if all estimates of a motion are lost."""
-        if motion.valid.any():
+        if motion.valid.any() or motion.warning:
             return
         others = motion.model.best_method, motion.model.fallback_method
         other = next((f"egomotion.{one}, " for one in others if one not in (None, self.name)), "")
@@ -390,13 +414,15 @@ class HostEstimator(MotionEstimator[P]):
             options: Options of the method, see `MotionEstimator`.
 
         Returns:
-            The motion. An `InputWarning` tells that none was found.
+            The motion. An `InputWarning` tells that none was found, or that the recording
+            contradicts it.
 
         Raises:
             InputError: The model is unknown or not supported, it needs a camera and there is none,
                 or the recording lacks what the method needs.
         """
         motion = self._solve(recording, params, **options)
+        motion = self.check_against(recording, motion, options.get("camera"))
         self.warn_if_lost(motion)
         return motion
 

@@ -127,7 +127,7 @@ class EvidenceTest:
             longest: Largest length of the window, s.
 
         Returns:
-            The evidence, or None if the window holds too few events.
+            The evidence, or None if the window or a third of it holds too few events.
         """
         m = np.asarray(motion, np.float64) / self._unit
         size = float(np.linalg.norm(m))
@@ -137,6 +137,8 @@ class EvidenceTest:
             return None
         tau = (part.t - time) * 1e-6 + length / 2
         kept = np.flatnonzero(np.abs(tau) > length / 6)
+        if min((tau[kept] < 0).sum(), (tau[kept] > 0).sum()) < MIN_WINDOW_EVENTS / 4:
+            return None
         kept = kept[:: -(-len(kept) // MAX_WINDOW_EVENTS) or 1]
         x, y = part.x[kept].astype(int), part.y[kept].astype(int)
         sign = np.where(part.p[kept], 1.0, -1.0)
@@ -193,11 +195,13 @@ class Lock:
         self._test, self._displacement, self._longest = test, displacement, longest
         self.diffusion, self._camera_moves = diffusion, camera_moves
         self._end: int | None = None
-        self._density = np.nan  # mean number of events in a stretch of the motion
+        self._dense = 0  # us, of the last batch that was not sparse
+        self.sparse = np.zeros(0, bool)  # (n,) of the batches of the last update
         self._restart()
 
     def _restart(self) -> None:
         self._is_settled, self._supporting = False, 0
+        self._density = np.nan  # mean number of events in a stretch of the motion
         self._blocks = np.nan  # mean effective number
         self._history: list[tuple[int, NDArray]] = []  # times and motions since it was found
 
@@ -228,37 +232,44 @@ class Lock:
             return told
         if self._end is not None and t[0] - self._end > 1e6 * self._longest:
             self._restart()
-        ends = searching | self._find_sparse(count, t, mean, searching)
+        ends = self._find_ends(count, t, mean, searching)
         self._end = int(t[-1])
         if ends.any():
             told[: ends.argmax()] = self._is_settled
             self._restart()
-        if ends[-1]:
-            return told
-        self._weigh(events, int(t[-1]), mean[-1], covariance[-1])
-        first = len(t) - int(ends[::-1].argmax()) if ends.any() else 0
-        told[first:] = self._is_settled
-        return told
+        if not ends[-1]:
+            if not self.sparse[-1]:
+                self._weigh(events, int(t[-1]), mean[-1], covariance[-1])
+            first = len(t) - int(ends[::-1].argmax()) if ends.any() else 0
+            told[first:] = self._is_settled
+        return told & ~self.sparse
 
-    def _find_sparse(
+    def _find_ends(
         self, count: NDArray, t: NDArray, mean: NDArray, searching: NDArray
     ) -> NDArray[np.bool_]:
-        """Return (n,) whether batches hold far fewer events than the motion made before.
+        """Return (n,) whether a motion ends, and find `sparse` batches.
 
-        As long as a motion lasts, each px of it makes about as many events.
+        As long as a motion lasts, each px of it makes about as many events. Where batches hold far
+        fewer, events may have been dropped. The motion ends where that lasts for longer than a
+        window: then no event before has candidates any more.
         """
-        path = 1e-6 * np.diff(t, prepend=t[0] if self._end is None else self._end)
-        path = path * self._test.speed(mean) / (DENSITY_DISPLACEMENTS * self._displacement)
-        sparse = np.zeros(len(t), bool)
+        speed, stretch = self._test.speed(mean), DENSITY_DISPLACEMENTS * self._displacement
+        path = 1e-6 * np.diff(t, prepend=t[0] if self._end is None else self._end) * speed / stretch
+        window = np.minimum(self._displacement / np.maximum(speed, 1e-9), self._longest)
+        self.sparse, ends = np.zeros(len(t), bool), searching.copy()
         for k in range(len(t)):
             least = MIN_DENSITY_RATIO * self._density * path[k]
-            sparse[k] = count[k] + 3 * np.sqrt(count[k]) < least
-            if searching[k] or sparse[k]:
+            self.sparse[k] = not searching[k] and count[k] + 3 * np.sqrt(count[k]) < least
+            if self.sparse[k]:
+                ends[k] = t[k] - self._dense > 1e6 * window[k]
+            else:
+                self._dense = int(t[k])
+            if ends[k]:
                 self._density = np.nan
-            elif path[k] > 0:
+            elif path[k] > 0 and not self.sparse[k]:
                 old = self._density if np.isfinite(self._density) else count[k] / path[k]
                 self._density = old + (count[k] - old * path[k]) / max(path[k], 1)
-        return sparse & ~searching
+        return ends
 
     def _weigh(self, events: Any, t: int, mean: NDArray, covariance: NDArray) -> None:
         """Update the decision by the window before a time."""

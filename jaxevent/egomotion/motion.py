@@ -138,6 +138,7 @@ class MotionEstimate(HtmlRepr):
         n_extended: Number of estimates that `extended_to` has added at the ends.
         causal: Whether the motion is read as it is known at a time, without later events.
         model_assumed: Whether the model is the method's first, as none was asked for.
+        warning: What `with_flow_consistency` found wrong, "" if nothing; None before it.
     """
 
     model: type[Model]
@@ -155,6 +156,7 @@ class MotionEstimate(HtmlRepr):
     n_extended: int = 0
     causal: bool = False
     model_assumed: bool = False
+    warning: str | None = None
 
     @classmethod
     def from_arrays(
@@ -255,31 +257,33 @@ class MotionEstimate(HtmlRepr):
 
         One velocity of the whole image is at most as certain as its parts are alike. Where they
         differ from a rotation, translation may have caused all of the motion. Where the camera may
-        be static while objects move (`still`), the estimate is lost.
+        be static while objects move (`still`), the estimate is lost. All methods' `estimate` does
+        this, but for causal ones. It is done once: then the estimate is returned as it is.
 
         Args:
             recording: The recording of the estimate.
 
         Returns:
-            The estimate with the larger covariance, and a warning; "" if nothing was added.
+            The estimate with the larger covariance, and its `warning`.
         """
         from jaxevent.egomotion.patches import flow_consistency
-        from jaxevent.egomotion.still import Turns, find_undecided
+        from jaxevent.egomotion.still import MotionRows, find_undecided
 
-        turns = None
-        for part in self.model.parts:
-            if part.figure == "Omega":
-                at = self.t - np.rint(1e6 * self.lag).astype(np.int64)
-                turns = Turns(at, self.mean[:, part.rows], self.covariance[:, part.rows, part.rows])
-        undecided, still = find_undecided(recording, self.valid, turns)
+        if self.warning is not None:
+            return self, self.warning
+        at = self.t - np.rint(1e6 * self.lag).astype(np.int64)
+        told = MotionRows(self.model, at, self.mean, self.covariance, self.valid)
+        undecided, still = find_undecided(recording, told)
         if undecided.any():
             unsure = self._with_full_uncertainty().covariance
             covariance = np.where(undecided[:, None, None], unsure, self.covariance)
-            told = dataclasses.replace(self, valid=self.valid & ~undecided, covariance=covariance)
-            return told, still
-        found = flow_consistency(recording, self.model)
+            valid = self.valid & ~undecided
+            return dataclasses.replace(
+                self, valid=valid, covariance=covariance, warning=still
+            ), still
+        found = flow_consistency(recording, self.model) if self.valid.any() else None
         if found is None or not found.is_inconsistent:
-            return self, ""
+            return dataclasses.replace(self, warning=""), ""
         mean = np.nan_to_num(self.mean)
         size2 = (mean**2).sum(1)[:, None, None]
         spread = found.spread if self.model.uniform else 1.0
@@ -295,7 +299,8 @@ class MotionEstimate(HtmlRepr):
             f"{found.fast:.0f} px/s, as {cause}; sigmas include that, and --model {other}{needs} "
             "may explain it"
         )
-        return dataclasses.replace(self, covariance=self.covariance + along + across), line
+        covariance = self.covariance + along + across
+        return dataclasses.replace(self, covariance=covariance, warning=line), line
 
     def _with_full_uncertainty(self) -> "MotionEstimate":
         """Add the whole motion to the covariance: it may not be the camera's at all."""

@@ -22,6 +22,7 @@ normal where both explain the events alike.
 
 import contextlib
 import dataclasses
+import functools
 import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -92,7 +93,8 @@ class ImageSpeed:
 
 
 @renamed_methods(length="duration", ways="displacements")
-class PatchSharpness(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class PatchSharpness:
     """Sharpness of the patches of a window by displacement, for two halves of the pixels.
 
     Patches with too few events are left out.
@@ -105,6 +107,11 @@ class PatchSharpness(NamedTuple):
     # (2, patches, n, n) sum of squares of the signed image per event; rows by the displacement in y
     energy: NDArray[np.float64]
     displacements: NDArray[np.float64]  # (n,) px in the window's duration, in x and in y
+
+    @functools.cached_property
+    def log_energy(self) -> NDArray[np.float64]:
+        """Natural logarithms of `energy`."""
+        return np.log(np.maximum(self.energy, 1e-6))
 
 
 def spread_times(recording: Recording, number: int) -> list[int]:
@@ -530,7 +537,7 @@ def log_sharpness(
     """
     at = np.clip(displacements + MAX_FIT_DISPLACEMENT_PX, 0, 2 * MAX_FIT_DISPLACEMENT_PX)
     patch = np.broadcast_to(np.arange(len(window.xi)), at.shape[:-1])
-    values = np.log(np.maximum(window.energy[half], 1e-6))
+    values = window.log_energy[half]
     return map_coordinates(values, [patch, at[..., 1], at[..., 0]], order=1, mode="nearest")
 
 
@@ -550,7 +557,7 @@ def _minimise(loss: Callable[[NDArray], float], starts: list[NDArray], size: flo
 def fit_planar(window: PatchSharpness) -> NDArray[np.float64]:
     """Fit one displacement (2,) in px to all patches."""
     n = len(window.displacements)
-    sums = np.log(np.maximum(window.energy[0], 1e-6)).sum(0)
+    sums = window.log_energy[0].sum(0)
     row, column = divmod(int(sums.argmax()), n)
     start = window.displacements[[column, row]]
 

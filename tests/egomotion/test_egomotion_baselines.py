@@ -16,6 +16,7 @@ from jaxevent.egomotion.baselines import contrast as maximisation
 from jaxevent.egomotion.baselines import fits, points
 from jaxevent.egomotion.baselines import planes as plane_fits
 from jaxevent.egomotion.baselines.points import fit_general
+from jaxevent.egomotion.estimator import LostMotionWarning
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Frames
 from jaxevent.simulate import motion_scene
@@ -453,6 +454,31 @@ def test_changes_that_windows_average_are_in_sigma():
         assert inner.sum() > 3
         ends[k] = np.sqrt(np.median(motion.covariance[1:-1][inner][:, 0, 0]))
     assert ends[0] < 0.05 * 150 and 0.3 * 60 < ends[1] < 1.2 * 60
+
+
+@pytest.mark.parametrize(
+    "active, filled",
+    [
+        ([(0, 100)], (True, True, True)),
+        ([(0, 60)], (True, False, False)),  # the camera stops
+        ([(40, 100)], (False, False, True)),  # it begins to move
+        ([(0, 25), (75, 100)], (True, False, True)),
+        ([(0, 45), (60, 100)], (True, True, True)),  # events were dropped
+    ],
+)
+def test_windows_across_a_stop_are_lost(active, filled):
+    """Events 20 us apart while the camera moves, 400 us apart of noise."""
+    spans = [np.arange(1000 * a, 1000 * b, 20) for a, b in active]
+    t = np.sort(np.concatenate([*spans, np.arange(0, 100_000, 400)]))
+    rng = np.random.default_rng(1)
+    x, y = rng.integers(0, WIDTH, len(t)), rng.integers(0, HEIGHT, len(t))
+    recording = recorded(t, x, y, x % 2 == 0, *SIZE)
+    params = SMALL.replace(duration=0.0996)
+    windows = maximisation.WindowSequence(recording, params)
+    assert len(windows) == 1 and tuple(windows.fills(next(iter(windows)))) == filled
+    if not filled[1]:
+        with pytest.warns(LostMotionWarning):
+            assert not contrast.estimate(recording, params).valid.any()
 
 
 @pytest.mark.slow

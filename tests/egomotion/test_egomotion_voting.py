@@ -13,7 +13,7 @@ from points import HEIGHT, WIDTH, moved, recorded, scattered, search_candidates,
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import candidates, voting
 from jaxevent.egomotion.candidates import CandidateSampler
-from jaxevent.egomotion.estimator import LostMotionWarning
+from jaxevent.egomotion.estimator import InconsistentMotionWarning, LostMotionWarning
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
@@ -131,6 +131,21 @@ def test_a_batch_ends_in_time_and_times_add_up():
     assert made.t.tolist() == [100, 5000, 30001]
     np.testing.assert_allclose(made.candidates.elapsed, [1e-4, 4.9e-3, 25.001e-3])
     np.testing.assert_allclose(made.candidates.history, [1e-4, 5e-3, 1e-6])
+
+
+def test_events_whose_candidates_were_dropped_are_not_valid():
+    """Silence of 15 ms among events 20 us apart, seen by candidates 18 to 28 ms old."""
+    t = np.r_[0:60_000:20, 75_000:150_000:20]
+    place = np.arange(len(t)) % 400
+    recording = recorded(t, place % 20, place // 20, t > 0, 20, 20)
+    sampler = CandidateSampler(recording, every=1, batch=64, longest=0.01)
+    sample = sampler.sample_all(0.018, 0.028)
+    at = recording.events.t[np.maximum(sample.row, 0)]
+    missing = np.minimum(75_000, at - 18_000) - np.maximum(60_000, at - 28_000)
+    is_real, valid = sample.row >= 0, sample.candidates.valid
+    assert is_real.sum() == len(t) and not valid[~is_real].any()
+    sure = is_real & (np.abs(missing - 5000) > 50)
+    assert (valid == (missing < 5000))[sure].all() and 700 < (~valid & is_real).sum() < 800
 
 
 def test_displacements_are_undistorted():
@@ -378,6 +393,22 @@ def test_planar_motion_is_found():
     np.testing.assert_array_equal(motion.mean, again.mean)
 
 
+def test_motion_is_found_where_events_were_dropped():
+    """15 of each 50 ms are missing; then nothing is told, as the camera may have stopped."""
+    truth = np.array([130.0, -70.0])
+    recording = moved(lambda at: truth, 0.4, 120, seed=4)
+    e = recording.events
+    kept = e.t % 50_000 >= 15_000
+    events = Events(e.t[kept], e.x[kept], e.y[kept], e.p[kept])
+    motion = voting.estimate(dataclasses.replace(recording, events=events), FAST, seed=1)
+    times = np.arange(200_000, 380_000, 1000)
+    mean, covariance, valid = motion(times)
+    silent = times % 50_000 < 15_000
+    assert not valid[silent & (times % 50_000 > 2000)].any() and valid[~silent].mean() > 0.5
+    z = (mean - truth)[valid] / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[valid])
+    assert np.abs(z).max() < 3
+
+
 def test_rotation_is_found():
     truth = np.array([0.5, 1.5, -1.2])
     recording = moved(turning(truth), 0.45, 150, seed=5, camera=CAMERA)
@@ -399,7 +430,8 @@ def test_motion_is_found_again_after_a_sudden_change():
     second = moved(lambda at: np.array(truth), 0.4, 120, seed=7).events
     parts = [np.concatenate([getattr(first, n), getattr(second, n)]) for n in "xyp"]
     recording = recorded(np.concatenate([first.t, second.t + 300_000]), *parts)
-    motion = voting.estimate(recording, FAST)
+    with pytest.warns(InconsistentMotionWarning, match="does not move as one"):
+        motion = voting.estimate(recording, FAST)
     assert not motion.valid[motion.t > 300_000].all()
     # Candidates of the new motion are as old as the baseline takes: 76 to 108 ms at 60 px/s.
     again = 0.3 + 0.1 + 0.7 * 6.5 / np.hypot(*truth)
@@ -448,8 +480,10 @@ def test_odd_streams(model, likelihood):
     for recording in (one, few, silent, at_once, one_pixel):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", LostMotionWarning)
+            warnings.simplefilter("ignore", InconsistentMotionWarning)
             motion = voting.estimate(recording, params, model=model, smooth=True)
-        assert [w.category for w in told] == [LostMotionWarning] * (not motion.valid.any())
+        is_lost = not motion.valid.any() and not motion.warning
+        assert [w.category for w in told] == [LostMotionWarning] * is_lost
         assert len(motion) > 0
         states = motion(recording.start + np.arange(5) * 300_000, extrapolate=True)
         for value in (motion.mean, motion.covariance, motion.contrast, motion.evidence):

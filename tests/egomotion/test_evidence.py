@@ -8,10 +8,12 @@ from points import HEIGHT, WIDTH, moved, recorded, turning
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import pixel_coordinates
+from jaxevent.egomotion.estimator import HostEstimator, InconsistentMotionWarning
 from jaxevent.egomotion.evidence import Evidence, EvidenceTest, Lock, tell_from_later
 from jaxevent.egomotion.models import Planar, Rotation
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.scores import errors_by_part
+from jaxevent.parameters import Parameters
 from jaxevent.recording import Events, Imu
 
 CAMERA = PinholeCamera(100.0, 100.0, 59.5, 44.5)
@@ -155,6 +157,24 @@ def test_a_motion_whose_events_cease_is_lost_with_them():
     assert all(told(np.repeat([50, 25], [10, 4]), slower)[8:])
 
 
+def test_a_motion_is_told_again_after_a_pause_shorter_than_a_window():
+    """A window is 6.5 px at 100 px/s, 65 ms; batches of 10 ms hold 50 events, in a pause 2."""
+
+    def told(pause):
+        lock, n = Lock(Script([(4.0, 1.0, 9.0)] * 30), 6.5, 0.1, lambda m: np.ones(2)), 30
+        count = np.full(n, 50)
+        count[10 : 10 + pause] = 2
+        return [
+            lock.update(None, count[k : k + 1], np.array([10_000 * k]), np.array([[100.0, 0]]),
+                        np.eye(2)[None], np.zeros(1, bool)).item()
+            for k in range(n)
+        ]  # fmt: skip
+
+    short, long = told(2), told(7)
+    assert all(short[5:10]) and short[10:12] == [False, False] and all(short[12:])
+    assert not any(long[10:18]) and all(long[25:])
+
+
 def test_earlier_estimates_are_told_where_they_agree():
     mean = np.array([[0.0], [9.0], [1.0], [1.1], [1.0]])
     told, covariance, drift = tell_from_later(
@@ -208,6 +228,17 @@ def test_events_of_a_part_of_the_image_do_not_tell_a_camera_motion():
     told, line = motion.with_flow_consistency(part)
     assert not told.valid.any() and "may stand still" in line
     assert np.isnan(told(200_000, extrapolate=True).mean).all()
+    assert told.with_flow_consistency(part) == (told, line)  # once
+    # Noise over the whole image does not support a motion of the camera either.
+    rng, n = np.random.default_rng(3), 2 * len(part.events)
+    noise = rng.integers(0, 300_000, n), rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n)
+    columns = zip(dataclasses.astuple(part.events), (*noise, rng.random(n) < 0.5), strict=True)
+    columns = [np.concatenate(pair) for pair in columns]
+    order = np.argsort(columns[0], kind="stable")
+    noisy = dataclasses.replace(part, events=Events(*(c[order] for c in columns)))
+    method = HostEstimator("own", Parameters, lambda params, inputs: motion)
+    with pytest.warns(InconsistentMotionWarning, match="may stand still"):
+        assert not method.estimate(noisy, model="planar").valid.any()
 
 
 def test_a_heading_that_is_not_observable_is_empty():

@@ -65,6 +65,7 @@ WINDOW_DISPLACEMENT_RANGE_PX = (5.0, 60.0)  # within which the default is kept
 WINDOW_DURATION_RANGE_S = (0.002, 2.0)
 COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.09)
 SYSTEMATIC_ERROR_PX = 0.25  # of the displacement in a window, from events at pixels' middles
+MIN_PART_RATIO = 0.35  # of the density of events in halves of a window, relative to the largest
 N_NEIGHBOURS = 3  # estimates, up to which halves of windows show how the motion changes
 N_HALVED_WINDOWS = 5  # of more, whose halves show changes that neighbours do not
 RELATIVE_NOISE = 0.5  # 1/sqrt(s), change of a motion that few windows do not show
@@ -461,6 +462,25 @@ class WindowSequence:
         events = self.recording.events[part.begin : part.end]
         return max(np.abs(events.t - part.middle).max(initial=0) * 1e-6, 1e-6)
 
+    def fills(self, part: EventRange) -> NDArray[np.bool_]:
+        """Return whether events fill a window's first quarter, its middle, and its last quarter.
+
+        Where the camera stops or begins to move within a window, all events are of a part of it.
+        They fill the middle if they are about as dense in the first, the central and the last half.
+
+        Args:
+            part: The range of events.
+
+        Returns:
+            (3,) booleans.
+        """
+        t = self.recording.events[part.begin : part.end].t
+        half = 1e6 * self.half_length(part)
+        count = np.histogram(t, part.middle + half * np.linspace(-1, 1, 5))[0]
+        halves = count[:-1] + count[1:]
+        least = MIN_PART_RATIO * halves.max()
+        return np.array([2 * count[0] >= least, halves.min() >= least, 2 * count[-1] >= least])
+
     def crop(self, part: EventRange, half: float | None = None) -> Window:
         """Make a window.
 
@@ -617,10 +637,10 @@ def _drop_duplicates(
 def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     """Estimate the motion in overlapping windows of time; estimates are at their middles.
 
-    `contrast` is the objective relative to that with shuffled times. Where it is too small, or
-    events are too few, the motion is lost. Then its mean is that of the window before, and all
-    motions are searched for the next window. The first and the last estimate are extended to their
-    windows' ends.
+    `contrast` is the objective relative to that with shuffled times. Where it is too small, events
+    are too few, or do not fill the window, the motion is lost. Then its mean is that of the window
+    before, and all motions are searched for the next window. The first and the last estimate are
+    extended to their windows' ends if events fill them.
 
     Args:
         params: The parameters.
@@ -637,7 +657,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     parts: list[EventRange] = []
     for part in bar(windows, desc="sharpen windows", unit="window", progress=inputs.progress):
         parts.append(part)
-        if part.end - part.begin < params.fewest:
+        if part.end - part.begin < params.fewest or not windows.fills(part)[1]:
             motion = None
             fits.append(None)
             contrasts.append(0.0)
@@ -679,7 +699,10 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         # A change d along a window is off its mean by d / sqrt(12).
         added = windows.unseen_change(parts, spans, estimate) / 12
         estimate = dataclasses.replace(estimate, covariance=estimate.covariance + added)
-    before, after = (round(1e6 * windows.half_length(parts[k])) for k in (0, -1))
+    before, after = (
+        round(1e6 * windows.half_length(part)) if windows.fills(part)[end] else 0
+        for part, end in ((parts[0], 0), (parts[-1], 2))
+    )
     return estimate.extended_to(int(t[0]) - before, int(t[-1]) + after, rate)
 
 

@@ -51,6 +51,7 @@ MAX_AGE_BASELINES = 1.2  # largest age of candidates, in baselines of the fast q
 MAX_CANDIDATE_AGE_S = 1.0
 TIME_PENALTY_RATIO = 25.0  # r_t per median image speed
 MIN_SEARCH_SPEED_RATIO = 2.5  # median image speeds, least largest speed of a search
+MIN_GAP_BATCHES = 1.2  # longest batches, time between two from which the sensor was silent
 MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 # The maximum of the votes is up to about half a per cent beside the motion.
@@ -219,7 +220,8 @@ class VotingEstimator(MotionEstimator[Params]):
                 scored events on, if there is a kernel: for all but the literal likelihood.
 
         Returns:
-            The motion. An `InputWarning` tells that none was found.
+            The motion. An `InputWarning` tells that none was found, or that the recording
+            contradicts it; of causal estimates, which know no later events, it does not.
 
         Raises:
             InputError: The model is unknown, it needs a camera and there is none, or the compiler
@@ -249,6 +251,7 @@ class VotingEstimator(MotionEstimator[Params]):
             motion = motion._with_gaps(float(params.tau_max))
         else:
             motion = runner.motion(parts, smooth=smooth is not False)
+            motion = self.check_against(recording, motion, camera)
         self.warn_if_lost(motion)
         return motion
 
@@ -447,6 +450,7 @@ class ChunkRunner:
         self._key, self._corners = jax.random.key(seed), _basis_at_corners(model, sampler)
         self._state: ParticleState | None = None
         self._number = 0
+        self._lag = 0.0  # s, of the latest observation
 
     def causal_motion(
         self, parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]]
@@ -480,6 +484,12 @@ class ChunkRunner:
                 self.lock.diffusion,
             )  # fmt: skip
             motion = dataclasses.replace(motion, valid=valid, covariance=covariance)
+        gaps = self._find_gaps(motion.t)
+        valid = motion.valid.copy()
+        for k in gaps:  # the filter coasts
+            valid[k] |= bool(valid[k - 1 : k + 2 : 2].all())
+        silent = [(int(motion.t[k - 1]), int(motion.t[k])) for k in gaps]
+        motion = dataclasses.replace(motion, valid=valid)
         drift = dataclasses.replace(motion, covariance=drift)._with_gaps(longest).covariance
         motion = motion._with_gaps(longest)
         span = 2 * motion.lag
@@ -489,7 +499,19 @@ class ChunkRunner:
                 mean = filtering.undo_averages(motion, span, self.params)
                 motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
         found = calibrate(motion, self.camera, span)
-        return dataclasses.replace(found, covariance=found.covariance + drift)
+        seen, valid = found.t - np.rint(1e6 * found.lag).astype(np.int64), found.valid.copy()
+        for begin, end in silent:
+            valid[(seen > begin) & (seen < end)] = False
+        return dataclasses.replace(found, covariance=found.covariance + drift, valid=valid)
+
+    def _find_gaps(self, t: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Return the batches before which the sensor was silent for about as long as one lasts.
+
+        In a pause so short the camera may have stopped, or events have been dropped.
+        """
+        last = len(t) - 1
+        gaps = 1 + np.flatnonzero(np.diff(t) > MIN_GAP_BATCHES * 1e6 * float(self.params.longest))
+        return gaps[gaps < last]
 
     def has_chunk(self) -> bool:
         """Return whether the next chunk is complete, whatever events are still to come."""
@@ -526,12 +548,21 @@ class ChunkRunner:
         info = jax.tree.map(lambda a: np.asarray(a)[:used], info)
         # Events of a batch precede its end, on average by half of its duration.
         duration = np.minimum(sample.candidates.elapsed[:used], float(self.params.longest))
-        info = eqx.tree_at(lambda report: report.lag, info, info.lag + duration / 2)
+        # Where candidates are missing, the motion is predicted, as it was observed before.
+        row = np.maximum.accumulate(
+            np.where(sample.candidates.valid[:used].any(1), np.arange(used), -1)
+        )
+        lag = np.where(row >= 0, (info.lag + duration / 2)[row], self._lag)
+        self._lag = float(lag[-1]) if used else self._lag
+        info = eqx.tree_at(lambda report: report.lag, info, lag)
         t, told = sample.t[:used], ~info.searching
         if self.lock is not None:
             events = self.sampler.recording.events
             count = np.diff(sample.row[:used].max(1), prepend=self.row - 1)
             told = self.lock.update(events, count, t, info.mean, info.covariance, info.searching)
+            # No motion is told backwards across a pause.
+            searching = info.searching | self.lock.sparse
+            info = eqx.tree_at(lambda report: report.searching, info, searching)
         self._number += 1
         self.row = int(sample.row.max(initial=self.row - 1)) + 1
         return t, info, told
