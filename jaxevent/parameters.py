@@ -297,7 +297,8 @@ class Parameters(_ParameterArrays):
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     calibrated: ClassVar[tuple[str, ...]] = ()  # names that calibrations of recordings determine
-    calibrated_if_needed: ClassVar[tuple[str, ...]] = ()  # where frames are clipped or blurred
+    # Where frames are clipped or blurred, or events contradict them at the defaults.
+    calibrated_if_needed: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)

@@ -22,6 +22,7 @@ from jaxevent.calibration.clipping import find_clipping
 from jaxevent.calibration.sampling import Sample
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
+from jaxevent.reconstruction.consistency import events_contradict_frames
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.refinement import refine
 from jaxevent.recording import Recording, check_recording
@@ -117,12 +118,19 @@ def calibrated_values(
     Returns:
         The values.
     """
-    further = THRESHOLDS.intersection(names).intersection(params.calibrated_if_needed)
-    if further and find_clipping(recording).white.level is None:
-        names = [name for name in names if name not in further]
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
-    I0 = float(f"{float(params.I0):.6g}") if THRESHOLDS.intersection(names) else 1.0
+    if_needed = THRESHOLDS.intersection(names).intersection(params.calibrated_if_needed)
+    if if_needed:
+        others = [name for name in names if name not in if_needed]
+        values = calibrated_values(recording, params, others, sample)
+        if not _thresholds_are_needed(recording, params.replace(**values.found)):
+            return values
+        # Those of a predictor would hold at its own I0.
+        found = recall_calibration(recording, _rounded_I0(params), sample).select(if_needed)
+        missing = {**values.missing, **found.missing}
+        return CalibratedValues(values.found, missing).updated(found.found, names)
+    I0 = _rounded_I0(params) if THRESHOLDS.intersection(names) else 1.0
     calibration, method = recall_calibration(recording, I0, sample), params.predictor()
     values = calibration.select(names)
     if method is None or values.missing or not calibration.clock_offset.is_identifiable:
@@ -142,6 +150,16 @@ def calibrated_values(
 
     what = f"{type(params).__module__} {' '.join(names)} {start.values()}"
     return values.updated(recall_numbers(recording, what, compute), names)
+
+
+def _rounded_I0(params: FrameParams) -> float:
+    return float(f"{float(params.I0):.6g}")
+
+
+def _thresholds_are_needed(recording: Recording, params: FrameParams) -> bool:
+    """Return whether frames reach their white, or contradict events at these thresholds."""
+    white = find_clipping(recording).white.level
+    return white is not None or events_contradict_frames(recording, params) is not None
 
 
 class CertaintyParams(FrameParams):

@@ -170,6 +170,17 @@ def test_explicit_values_win_one_by_one(recording):
     assert float(at_I0.c_on) == pytest.approx(made_up(recording, 0.3).c_on.value)
 
 
+def test_mc_takes_thresholds_where_events_contradict_its_own(recording):
+    """Four events for each make its own thresholds four times too large."""
+    events = recording.events[:]
+    many = Events(*(np.repeat(part, 4) for part in (events.t, events.x, events.y, events.p)))
+    sensitive = dataclasses.replace(recording, events=many)
+    given, found = mc.Params.for_recording(sensitive), made_up(sensitive, 0.3)
+    for name in ("c_on", "c_off"):  # in its own ln(I + I0), not in that of `aks`
+        assert float(getattr(given, name)) == pytest.approx(getattr(found, name).value)
+    assert float(mc.Params.for_recording(sensitive, c_on=0.1).c_on) == pytest.approx(0.1)
+
+
 def test_estimate_calibrates_what_combines_events_and_frames(recording):
     assert aks.usual_params(recording).values() == aks.Params.for_recording(recording).values()
     video = aks.estimate(recording, progress=False)

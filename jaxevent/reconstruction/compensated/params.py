@@ -131,8 +131,9 @@ class Params(smoother.Params):
         0.2, "ln I", "standard deviation from which an image is not valid", gradient=False
     )
     # Thresholds are learned (`learn`) along trajectories, from more than events between frames. But
-    # they are relative to the common ones, which alone tell how far beyond white points are. The
-    # exposure is needed of frames that are blurred and do not state theirs.
+    # they are relative to the common ones, which alone tell how far beyond white points are, and
+    # which must be near the sensor's. The exposure is needed of frames that are blurred and do not
+    # state theirs.
     calibrated = ("clock_offset", "event_delay")
     calibrated_if_needed = ("c_on", "c_off", "exposure")
 
