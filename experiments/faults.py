@@ -1,6 +1,6 @@
 """Faults that are found in faulty recordings, false alarms in sound ones, and errors of methods.
 
-JAXEVENT_DATA=FOLDER python experiments/faults.py --out faults [--only matrix clean methods]
+JAXEVENT_DATA=FOLDER python experiments/faults.py --out faults [--only matrix clean methods scenes]
 
 matrix   what `check_consistency` reports of recordings with one fault each
 clean    what it reports of all recordings of the folder, and of 40 simulated scenes without
@@ -9,6 +9,9 @@ methods  mean squared error x 1e-2 of 8 hidden frames: every second frame is giv
          at 3 Hz" all that are left. Methods calibrate themselves by what is given. The truth is
          the sound frame, of clipped ones the clipped one. --method, --recording and --fault
          choose some. "mc / best" compares mc with the best of the others.
+scenes   the same of images between frames of simulated scenes, against their true intensity: a
+         camera that shakes faster than frames follow, and a pan under a lamp of 100 Hz, each by
+         a sensor of three thresholds, of seeds that chose no number.
 """
 
 import json
@@ -20,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from common import command_line, markdown_table, write_text
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 import jaxevent
 from jaxevent.metrics import mse
@@ -48,6 +52,7 @@ FAULTY_FILES = (
     "public_cases/r03_esim.bag", "public_cases/r04_bayer.bag", "public_cases/r05_jpeg.bag",
 )  # fmt: skip
 N_SCENES, FIRST_SEED = 40, 8_000
+KINDS, THRESHOLDS, FIRST_KIND_SEED = ("shake", "lamp"), (0.05, 0.1, 0.2), 8_100
 N_IMAGES = 8
 
 
@@ -61,6 +66,55 @@ class Dimmed:
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
         return self.gain * self.source.intensity(t)
+
+
+class Panned:
+    """A texture before a camera that shakes, or that moves on under a lamp of 100 Hz."""
+
+    size, duration = (96, 72), 0.8
+
+    def __init__(self, kind: str, seed: int):
+        rng = np.random.default_rng(seed)
+        grains = [
+            gaussian_filter(rng.standard_normal((256, 256)), s, mode="wrap") for s in (1.5, 6)
+        ]
+        grain = sum(one / one.std() for one in grains)
+        self.image = 0.06 + 0.84 / (1 + np.exp(-1.2 * grain))
+        self.y, self.x = np.mgrid[: self.size[1], : self.size[0]].astype(float)
+        self.shakes, self.frequencies = kind == "shake", rng.uniform(5, 9, 2)
+        self.reach = rng.uniform(3, 8, 2) if self.shakes else rng.uniform(-90, 90, 2)
+
+    def intensity(self, t: float | int) -> NDArray[np.float64]:
+        turn = 2 * np.pi * t
+        dx, dy = self.reach * (np.sin(turn * self.frequencies) if self.shakes else t)
+        image = map_coordinates(self.image, [self.y + dy, self.x + dx], order=3, mode="grid-wrap")
+        light = 1.0 if self.shakes else (1 + 0.3 * np.sin(100 * turn)) / 1.3
+        return image.clip(0.03, 1) * light
+
+
+def scenes() -> str:
+    """Return the table of errors x 1e-2 between the frames of simulated scenes."""
+    rows = []
+    for kind in KINDS:
+        for seed, c in enumerate(THRESHOLDS, FIRST_KIND_SEED):
+            source = Panned(kind, seed)
+            sensor = Sensor(c_on=c, c_off=c, frame_rate=24.0, exposure=4e-3, truth_rate=1.0)
+            given = simulate(source, sensor, seed)
+            assert given.frames is not None
+            mid = given.frames.t[2:-2]
+            parts = np.resize([0.5, 0.25, 0.7], len(mid) - 1)
+            times = np.round(mid[:-1] + parts * np.diff(mid)).astype(np.int64)[::2]
+            truth = np.stack([source.intensity(t * 1e-6) for t in times.tolist()])
+            errors = {}
+            for method in METHODS:
+                estimator = jaxevent.METHODS[method]
+                video = estimator.estimate(given, progress=False)
+                images = np.clip(np.asarray(video(times).mean), 0, 1)
+                errors[method] = 100 * float(np.mean((images - truth) ** 2))
+            best = min(v for k, v in errors.items() if k != "mc")
+            rows.append([kind, f"{c} of seed {seed}", *errors.values(), errors["mc"] / best])
+            print(*rows[-1], flush=True)
+    return markdown_table(["scene", "threshold", *METHODS, "mc / best"], rows, 2)
 
 
 def simulated_scene(seed: int) -> Recording:
@@ -179,7 +233,9 @@ def compare(folder: Path, store: Path, chosen: dict[str, list[str]]) -> str:
 
 
 def main() -> None:
-    parser = command_line(__doc__, out=True, data=True, parts=("matrix", "clean", "methods"))
+    parser = command_line(
+        __doc__, out=True, data=True, parts=("matrix", "clean", "methods", "scenes")
+    )
     faults = ["none", *(name for name in FAULTS if name != "clocks disjoint")]
     for name, choices in (("method", METHODS), ("recording", RECORDINGS), ("fault", faults)):
         parser.add_argument(f"--{name}", nargs="+", choices=choices, default=list(choices))
@@ -189,6 +245,8 @@ def main() -> None:
     for part in arguments.only:
         if part == "methods":
             text = compare(arguments.data, arguments.out / "errors.json", chosen)
+        elif part == "scenes":
+            text = scenes()
         else:
             text = {"matrix": matrix, "clean": clean}[part](arguments.data)
         write_text(arguments.out / f"{part}.md", text + "\n")
