@@ -389,7 +389,7 @@ def situation(name: str, seed: int) -> tuple[Recording, str, Callable[[NDArray],
     elif name == "15 of 50 ms dropped":
         e = recording.events[:]
         kept = e.t % 50_000 >= 15_000
-        events = Events(*(column[kept] for column in (e.t, e.x, e.y, e.p)))
+        events = Events(e.t[kept], e.x[kept], e.y[kept], e.p[kept])
         recording = dataclasses.replace(recording, events=events)
     elif name == "lens k1 = -0.35":
         recording = dataclasses.replace(
