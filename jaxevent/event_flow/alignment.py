@@ -28,7 +28,7 @@ which have the information I_r together, are n_r in effect, and differ by D_r in
     C = min_r  I_r^-1 + beta D_r / n_r                                                          (5)
 
 The first term is the noise of events, the second what smoothness and unequal motion add. A velocity
-is uncertain by the rate of its clock, too.
+is uncertain by its clock, too: by the mean square of what smoothing takes from the clock's rates.
 """
 
 from typing import Any, NamedTuple
@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
-from jaxevent.event_flow.clock import Clock
 from jaxevent.recording import Events
 
 N_STEPS = 5  # Gauss-Newton steps at each size of cells
+CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
 CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
 CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
 MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
@@ -256,6 +256,56 @@ def _quadratic_basis(x: NDArray, y: NDArray) -> NDArray[np.float64]:
     one, zero = np.ones_like(x), np.zeros_like(x)
     along_x = [one, x, y, zero, zero, zero, x * x, x * y]
     return np.array([along_x, [zero, zero, zero, one, x, y, x * y, y * y]])
+
+
+def _smooth(values: NDArray) -> NDArray[np.float64]:
+    """Return binomial means over five values, four fewer than there are."""
+    return np.convolve(values, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
+
+
+class Clock(NamedTuple):
+    """Relative times s of a window, linear between some times."""
+
+    t: NDArray[np.float64]  # (K,) us, rising
+    s: NDArray[np.float64]  # (K,)
+
+    @classmethod
+    def of(cls, events: Events, at: int, half: int) -> "Clock":
+        """Make the clock of a window that goes as fast as time and, in equal parts, events do.
+
+        Events come as fast as a scene moves.
+
+        Args:
+            events: The events, one or more.
+            at: Time at which s = 0, us.
+            half: Number of events around it on either side.
+
+        Returns:
+            The clock.
+        """
+        parts = max(round(CLOCK_PARTS * len(events) / half), 1)
+        rows = np.linspace(0, len(events) - 1, parts + 1).astype(int)
+        t, first = np.unique(events.t[rows], return_index=True)
+        if len(t) < 2:
+            return cls(at + np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
+        s = rows[first] / half
+        s = (s + (t - t[0]) * (s[-1] / (t[-1] - t[0]))) / 2
+        return cls(t.astype(float), s - np.interp(at, t, s))
+
+    @property
+    def mean_rate(self) -> float:
+        """Mean rate of s over the window, 1/s."""
+        return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
+
+    def rate(self, t: float) -> tuple[float, float]:
+        """Return how fast s goes at a time (us), 1/s, and the variance of that, 1/s^2."""
+        order = 1 if len(self.t) < 3 else 2
+        rates = np.gradient(self.s, self.t, edge_order=order)
+        # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
+        smooth = _smooth(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
+        variance = _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))
+        rate, spread = (float(np.interp(t, self.t, one)) for one in (smooth, variance))
+        return rate * 1e6, spread * 1e12
 
 
 class WindowEvents(NamedTuple):
