@@ -71,7 +71,7 @@ def as_array(values: Any, what: str) -> NDArray:
     Raises:
         InputError: The values are no numbers, or some are missing.
     """
-    missing = np.flatnonzero(_find_missing(values))
+    missing = np.nonzero(np.atleast_1d(_find_missing(values)))[0]
     if len(missing):
         raise InputError(
             f"{what} has no value in row {missing[0]}; remove such rows from all columns, or fill "
@@ -103,7 +103,8 @@ def _find_missing(values: Any) -> Any:
     if isinstance(values, np.ma.MaskedArray):
         return np.ma.getmaskarray(values)
     for name in ("isna", "is_null"):  # of pandas; of polars and Arrow
-        if callable(find := getattr(values, name, None)):
+        find = None if isinstance(values, type) else getattr(values, name, None)
+        if callable(find):
             return np.asarray(find())
     return np.zeros(0, bool)
 

@@ -13,6 +13,7 @@ from refusals import refuses
 
 import jaxevent
 from jaxevent import Events, Frames, InputError, InputWarning, Recording
+from jaxevent.arrays import as_array
 
 SIZE = WIDTH, HEIGHT = 64, 48
 KINDS = ("i1", "u1", ">i2", "<u2", ">i4", "u4", "i8", ">u8", "f4", ">f8")
@@ -168,6 +169,10 @@ def test_a_missing_value_is_told_before_its_type():
     arrow = pytest.importorskip("pyarrow")
     columns[0] = arrow.array([*v["t"][:7], None, *v["t"][8:]])
     refuses(message, Recording.from_arrays, *columns, width=WIDTH, height=HEIGHT)
+    images = np.ma.array(np.zeros((9, HEIGHT, WIDTH)), mask=False)
+    images[5, 1, 2] = np.ma.masked
+    refuses("row 5; remove", as_array, images, "frames")
+    refuses("cannot be read|not numbers", as_array, pandas.Series, "frames")
 
 
 def test_frames_in_another_unit_than_events_are_told():

@@ -372,10 +372,18 @@ def estimated(
     gyro: Any,
     other: bool,
 ) -> tuple[Any, Any, Any]:
-    """The method, the motion by it, and its parameters, which suit the recording.
+    """Estimate the motion, by the model's other method where one finds nothing until the middle.
 
-    Where it finds nothing, or not before the middle, by the model's `other` method. `gyro` is that
-    of `_told`.
+    Args:
+        estimator: The method.
+        recording: The recording.
+        params: File of parameters, or None.
+        settings: Options of `estimate`, with the model.
+        gyro: Whether the IMU helps, its bias and its axes.
+        other: Whether another method may be tried.
+
+    Returns:
+        The method, the motion by it, and its parameters, which suit the recording.
     """
     from jaxevent.runs.egomotion import find_estimator
 

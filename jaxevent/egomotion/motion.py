@@ -252,6 +252,11 @@ class MotionEstimate(HtmlRepr):
         added = RELATIVE_FOCAL_ERROR**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, covariance=self.covariance + added)
 
+    @property
+    def observed_t(self) -> NDArray[np.int64]:
+        """(n,) us, times at which the events of the estimates show the motion: `t` less `lag`."""
+        return self.t - np.rint(1e6 * self.lag).astype(np.int64)
+
     def with_flow_consistency(self, recording: Recording) -> tuple["MotionEstimate", str]:
         """Add the spread of the motions of parts of the image to the covariance.
 
@@ -271,8 +276,7 @@ class MotionEstimate(HtmlRepr):
 
         if self.warning is not None:
             return self, self.warning
-        at = self.t - np.rint(1e6 * self.lag).astype(np.int64)
-        told = MotionRows(self.model, at, self.mean, self.covariance, self.valid)
+        told = MotionRows(self.model, self.observed_t, self.mean, self.covariance, self.valid)
         undecided, still = find_undecided(recording, told)
         if undecided.any():
             unsure = self._with_full_uncertainty().covariance

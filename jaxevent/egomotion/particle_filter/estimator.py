@@ -499,7 +499,7 @@ class ChunkRunner:
                 mean = filtering.undo_averages(motion, span, self.params)
                 motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
         found = calibrate(motion, self.camera, span)
-        seen, valid = found.t - np.rint(1e6 * found.lag).astype(np.int64), found.valid.copy()
+        seen, valid = found.observed_t, found.valid.copy()
         for begin, end in silent:
             valid[(seen > begin) & (seen < end)] = False
         return dataclasses.replace(found, covariance=found.covariance + drift, valid=valid)

@@ -446,7 +446,7 @@ def smooth(motion: MotionEstimate, params: Params | None = None) -> MotionEstima
         for part in model.parts:
             if part.direction:
                 m[k, part.rows] /= np.linalg.norm(m[k, part.rows])
-    seen = motion.t - np.rint(1e6 * motion.lag).astype(np.int64)
+    seen = motion.observed_t
     if motion.span is not None:
         seen = np.maximum(seen, motion.span[0])
     return dataclasses.replace(
