@@ -31,6 +31,7 @@ from jaxevent.reconstruction.compensated.normal_equations import (
     solve_normal_equations,
 )
 from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
+from jaxevent.reconstruction.compensated.warp import PathTimes
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
 
@@ -68,7 +69,7 @@ def test_motion_is_found_from_nothing(v, a):
     L = moved(v, a, s)
     pyramid = trajectories.ImagePyramid(L, np.full_like(L, 1e-3), 0.35)
     plan = trajectories.plan_stages(s, 0.5)
-    motion = trajectories.estimate_trajectories(pyramid, s, plan, COST)
+    motion = trajectories.estimate_trajectories(pyramid, PathTimes.of(s), plan, COST)
     assert motion.level == 1
     p = motion.at_level(0, (40, 56)).p
     inner = p[6:-6, 6:-6]
@@ -88,7 +89,7 @@ def test_motion_of_a_pattern_finer_than_coarse_pixels():
     L += np.random.default_rng(0).normal(0, 0.05, L.shape).astype(np.float32)
     pyramid = trajectories.ImagePyramid(L, np.full_like(L, 2.5e-3), 0.35)
     plan = trajectories.plan_stages(s, 0.2)
-    p = trajectories.estimate_trajectories(pyramid, s, plan, COST).p
+    p = trajectories.estimate_trajectories(pyramid, PathTimes.of(s), plan, COST).p
     np.testing.assert_allclose(2 * np.median(p, (0, 1))[:2], (12, 0), atol=0.3)
 
 
@@ -99,7 +100,7 @@ def test_motion_of_half_the_image_alone():
     L = np.where(np.arange(56) < 28, still, moving).astype(np.float32)
     pyramid = trajectories.ImagePyramid(L, np.full_like(L, 1e-3), 0.35)
     plan = trajectories.plan_stages(s, 0.5)
-    p = trajectories.estimate_trajectories(pyramid, s, plan, COST).p
+    p = trajectories.estimate_trajectories(pyramid, PathTimes.of(s), plan, COST).p
     assert np.abs(p[:, :5, :2] * 2).max() < 0.3  # of half resolution
     np.testing.assert_allclose(p[2:-2, -5:-2, 0] * 2, 3, atol=0.4)
 
@@ -108,9 +109,9 @@ def test_motion_of_a_later_target():
     p = np.zeros((8, 10, 4), np.float32)
     p[..., 0], p[..., 2] = 0.2 * 2 * np.arange(10), 0.5  # px/s at s = 0: it grows with x
     p[..., 1] = -2.0
-    later = trajectories.advect_nodes(p, 0.4, 1.5)
-    # x + (0.2 x) s + 0.5 s^2 is where a point is; x is that of the target before.
-    before = (2 * np.arange(10) - 0.5 * 0.4**2) / (1 + 0.2 * 0.4)
+    later = trajectories.advect_nodes(p, 0.4, 1.5, np.float32([0.7, -0.3]))
+    # x + (0.2 x) s + 0.5 s^2 + 0.7 is where a point is; x is that of the target before.
+    before = (2 * np.arange(10) - 0.5 * 0.4**2 - 0.7) / (1 + 0.2 * 0.4)
     expected = 1.5 * (0.2 * before + 2 * 0.5 * 0.4)
     np.testing.assert_allclose(later[3, 1:, 0], expected[1:], atol=2e-3)
     np.testing.assert_allclose(later[..., 1], -3, atol=1e-5)
@@ -160,7 +161,7 @@ def test_pixels_take_the_path_of_their_side():
     x = np.arange(56)
     still, moving = moved((0, 0), (0, 0), s), moved((6.0, -3.0), (0, 0), s)
     packed = trajectories.pack_images(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
-    images = PackedImages.of(packed, s)
+    images = PackedImages.of(packed, PathTimes.of(s))
     # Between both motions a ramp, 12 px wide, as nodes leave it.
     part = np.clip((x - 21.5) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
     paths = (part * [6.0, -3, 0, 0]).astype(np.float32)
@@ -176,7 +177,8 @@ def test_pixels_take_the_path_of_their_side():
     # What moves has left the image's other half, so that some pixels see it in few instants.
     assert wrong(before) > 0.5 and wrong(chosen) < 0.25
     # Steps from paths of others leave fewer wrong ones than steps alone; sizes may be odd.
-    odd, p = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), s), paths[::2, ::2]
+    odd = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), PathTimes.of(s))
+    p = paths[::2, ::2]
     step = trajectories.gauss_newton_step
     refined = step(odd, trajectories.borrow_paths(odd, step(odd, p, COST), COST), COST)
     plain = step(odd, step(odd, p, COST), COST)
@@ -190,7 +192,8 @@ def test_pixels_take_the_path_of_their_side():
     # What noise prefers is not chosen: here nothing but noise tells paths apart.
     rng = np.random.default_rng(4)
     noise = rng.normal(0, 0.05, still.shape).astype(np.float32)
-    images = PackedImages.of(trajectories.pack_images(noise, np.full_like(still, 0.01)), s)
+    packed = trajectories.pack_images(noise, np.full_like(still, 0.01))
+    images = PackedImages.of(packed, PathTimes.of(s))
     rough = rng.normal(0, 1, paths.shape).astype(np.float32)
     assert (trajectories.select_paths(images, rough, COST) != own).mean() < 0.05
 
@@ -202,17 +205,21 @@ def warped_case():
     V = rng.uniform(0.01, 0.1, L.shape).astype(np.float32)
     clear = (rng.random(L.shape) < 0.5).astype(np.float32)
     p = rng.uniform(-4, 4, (9, 12, 4)).astype(np.float32)
-    return L, V, clear, np.float32([-1, 0, 1]), warp.interpolate_paths(p, (18, 23))
+    times = PathTimes(np.float32([-1, 0, 1]), np.float32([[1.5, -0.7], [0, 0], [-2.1, 3.2]]))
+    return L, V, clear, times, warp.interpolate_paths(p, (18, 23))
 
 
 @pytest.mark.slow
 def test_images_along_trajectories():
-    L, V, clear, s, paths = warped_case()
-    quick = warp.warp_images(L, V, clear, s, paths)
-    pure = jax.jit(warp.warp_images_jax)(L, V, clear, s, paths)
+    L, V, clear, times, paths = warped_case()
+    quick = warp.warp_images(L, V, clear, times, paths)
+    pure = jax.jit(warp.warp_images_jax)(L, V, clear, times, paths)
     for one, other in zip(quick, pure, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
-    Y, X = (np.asarray(v) for v in warp.path_positions(jnp.asarray(paths), jnp.asarray(s)))
+    s, (common_x, common_y) = times.s[:, None, None], times.common.T[..., None, None]
+    y, x = np.mgrid[:18, :23]
+    Y = y + paths[..., 1] * s + paths[..., 3] * s**2 + common_y
+    X = x + paths[..., 0] * s + paths[..., 2] * s**2 + common_x
     for k in range(3):
         at = [Y[k], X[k]]
         expected = map_coordinates(V[k], at, order=1, mode="nearest")
@@ -229,7 +236,12 @@ def make_layout(count, own, before, after):
     framed[[before, after]] = 1
     near = (np.abs(np.arange(count) - own) <= 1).astype(np.float32)
     return robust_mean.InstantLayout(
-        s, np.ones(count, np.float32), framed, near, *map(np.int32, (own, before, after, after))
+        s,
+        np.ones(count, np.float32),
+        framed,
+        near,
+        np.zeros((count, 2), np.float32),
+        *map(np.int32, (own, before, after, after)),
     )
 
 
@@ -241,8 +253,8 @@ def still(L, V=0.01):
 
 @pytest.mark.slow
 def test_robust_mean_is_that_of_jax():
-    L, V, clear, s, paths = warped_case()
-    along = warp.warp_images(L, V, clear, s, paths)
+    L, V, clear, times, paths = warped_case()
+    along = warp.warp_images(L, V, clear, times, paths)
     L[0, 4:9, 5:12] += 1.0  # a thing in front
     # Activity is what changes between frames; where none follows, or is before, up to the target.
     purely = jax.jit(robust_mean.robust_mean_jax)
@@ -337,7 +349,10 @@ def test_a_stationary_point_is_that_of_its_smoother():
     np.testing.assert_allclose(staying[:, :6], L[2, :, :6], atol=1e-4)
     np.testing.assert_allclose(staying[10, 12], far[10, 12], rtol=1e-2)
     frames_move = np.float32([1.0, -2.0, 0.5, 0])  # to 1.5, -2 px at s = 1
-    assert warp.squared_reach(np.broadcast_to(frames_move, (2, 3, 4))).tolist() == [[6.25] * 3] * 2
+    paths, common = np.broadcast_to(frames_move, (2, 3, 4)), np.zeros((2, 2), np.float32)
+    assert warp.squared_reach(paths, common).tolist() == [[6.25] * 3] * 2
+    common[1, 0] = -1  # and all points by as much
+    assert warp.squared_reach(paths, common).tolist() == [[10.25] * 3] * 2
 
 
 @pytest.mark.slow
@@ -468,8 +483,11 @@ SHIFT = (6.0, -4.0)  # px per unit
 
 
 @functools.cache
-def exposed(half=0.5):
-    """Two frames of a texture that goes by while they are exposed, and its sharp image."""
+def exposed(half=0.5, common=0.0):
+    """Two frames of a texture that goes by while they are exposed, and its sharp image.
+
+    A part of the motion is common to all points, and not in the paths.
+    """
     level = texture(18, 23, 8)
     y, x = np.mgrid[:18, :23].astype(float)
 
@@ -480,7 +498,12 @@ def exposed(half=0.5):
         [np.mean([intensity(s + h) for h in np.linspace(-half, half, 401)], 0) for s in (-0.5, 0.4)]
     )
     adjacent = exposures.AdjacentExposures(
-        np.int32([0, 1]), np.float32([-0.5, 0.4]), np.float32([half, half]), np.ones(2, np.float32)
+        np.int32([0, 1]),
+        np.float32([-0.5, 0.4]),
+        np.float32([half, half]),
+        np.ones(2, np.float32),
+        np.outer([-0.5, 0.4], SHIFT).astype(np.float32) * np.float32(common),
+        np.outer([half, half], SHIFT).astype(np.float32) * np.float32(common),
     )
     adjacent_frames = exposures.AdjacentFrames(
         np.full((2, 18 * 23), 0.5, np.float32),
@@ -489,7 +512,7 @@ def exposed(half=0.5):
         np.ones(2, np.float32),
     )
     paths = np.zeros((18, 23, 4), np.float32)
-    paths[..., :2] = SHIFT
+    paths[..., :2] = (1 - common) * np.array(SHIFT)
     I0 = float(Params().I0)
     return np.log(intensity(0) + I0).astype(np.float32), adjacent, adjacent_frames, paths
 
@@ -509,14 +532,15 @@ def constrain(params, L, P, case, samples):
 
 
 @pytest.mark.slow
-def test_an_exposure_is_the_mean_along_trajectories():
-    L, adjacent, adjacent_frames, paths = exposed()
+@pytest.mark.parametrize("common", [0.0, 0.4])
+def test_an_exposure_is_the_mean_along_trajectories(common):
+    L, adjacent, adjacent_frames, paths = exposed(common=common)
     I0 = float(Params().I0)
     smeared = jax.jit(exposures.blur_by_motion_jax)
     D = jax.jit(exposures.exposure_displacements, static_argnums=2)(adjacent, paths, 15)
     B, shares = smeared(L, D)
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
-    Y, X = (np.asarray(v) for v in warp.path_positions(jnp.asarray(paths), jnp.asarray(adjacent.s)))
+    Y, X = (np.asarray(v) for v in warp.path_positions(jnp.asarray(paths), adjacent.path_times))
     for k in range(2):
         seen = map_coordinates(adjacent_frames.intensity[k].reshape(18, 23), [Y[k], X[k]], order=3)
         expected = np.log(seen + I0)  # exp L is I + I0, path_index mean is that of I, plus I0
@@ -881,16 +905,18 @@ def motion_problem():
     L = moved((1.0, -0.5), (0.2, 0.1), s, 9, 10) + rng.normal(0, 0.02, (3, 9, 10))
     V = rng.uniform(2e-4, 1e-3, L.shape)
     p = np.float32([1, -0.5, 0.2, 0.1]) + rng.normal(0, 0.02, (5, 5, 4))
-    images = [np.asarray(v, np.float32) for v in (L, V, s, np.ones(3))]
+    L, V, present = (np.asarray(v, np.float32) for v in (L, V, np.ones(3)))
+    times = PathTimes(s, np.float32([[0.1, -0.05], [0, 0], [-0.08, 0.12]]))
     numbers = [np.float32(v) for v in (2e-4, 10, 40, 0.04, 0.1, 0.2)]
-    values = (p.astype(np.float32), normal_equations.MotionImages(*images), CostParams(*numbers))
+    images = normal_equations.MotionImages(L, V, times, present)
+    values = (p.astype(np.float32), images, CostParams(*numbers))
     return jax.tree.map(jnp.asarray, values)
 
 
 @pytest.mark.slow
 def test_equations_are_those_of_the_steps():
-    p, (L, V, s, _), numbers = jax.tree.map(np.asarray, motion_problem())
-    images = PackedImages.of(trajectories.pack_images(L, V), s)
+    p, (L, V, times, _), numbers = jax.tree.map(np.asarray, motion_problem())
+    images = PackedImages.of(trajectories.pack_images(L, V), times)
     cost = CostParams(*map(np.float32, numbers))
     quick = normal_equations.linearise(images, p, cost)
     found = jax.jit(normal_equations.linearise_jax)(*motion_problem())
@@ -909,7 +935,8 @@ def test_equations_do_not_depend_on_the_turns_of_threads():
     s = np.linspace(-1, 1, 5).astype(np.float32)
     L = moved((1.0, -0.5), (0.2, 0.1), s, 8, 200) + rng.normal(0, 0.02, (5, 8, 200))
     V = np.full(L.shape, 5e-4, np.float32)
-    images = PackedImages.of(trajectories.pack_images(L.astype(np.float32), V), s)
+    packed = trajectories.pack_images(L.astype(np.float32), V)
+    images = PackedImages.of(packed, PathTimes.of(s))
     p = np.float32([1, -0.5, 0.2, 0.1]) + rng.normal(0, 0.02, (4, 100, 4)).astype(np.float32)
     cost = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
     first = normal_equations.linearise(images, p, cost)

@@ -156,7 +156,8 @@ def test_beyond_the_frames_brightness_is_that_of_the_nearest_along_trajectories(
     paths = np.zeros((HEIGHT, WIDTH, 4), np.float32)
     paths[..., 0] = -3
     at, zero = np.arange(2, dtype=np.float32), np.zeros((), np.float32)
-    layout = InstantLayout(at - 1, at * 0 + 1, 1 - at, at, *np.array([1, 0, 0, 0]))
+    common = np.zeros((2, 2), np.float32)
+    layout = InstantLayout(at - 1, at * 0 + 1, 1 - at, at, common, *np.array([1, 0, 0, 0]))
     brightness = images.BrightnessPrior(np.float32(0.02), np.float32(-b))
     base, P = images.smooth_at_target(np.stack([frame, own]), layout, zero, paths, brightness)
     np.testing.assert_allclose(base[:, :-3], frame[:, 3:] - b, rtol=1e-6)

@@ -68,6 +68,7 @@ from jaxevent.reconstruction.compensated.target_motion import (
     make_trajectory_estimator,
 )
 from jaxevent.reconstruction.compensated.warp import (
+    PathTimes,
     interpolate_paths_jax,
     path_positions,
     sample_bilinear,
@@ -119,9 +120,9 @@ class PreparedTargets(ShortRepr):
 
 
 @jax.jit
-def _carry(images: Array, s: Array, paths: Array) -> Array:
-    """Read images (n, h, w, channels) at s (n,) along trajectories."""
-    Y, X = path_positions(paths, s)
+def _carry(images: Array, times: PathTimes, paths: Array) -> Array:
+    """Read images (n, h, w, channels) at n times along trajectories."""
+    Y, X = path_positions(paths, times)
     return jax.vmap(lambda one: sample_bilinear(one, Y, X), -1, -1)(images)
 
 
@@ -246,15 +247,15 @@ class CompensatedVideo(ImageSequence[Params]):
         """
         target, fused = self._target(to + self._image_delay_us)
         at = at + self._image_delay_us
-        s = target.instants.to_relative_times(at).astype(np.float32)
+        there = target.instants.path_times_at(at)
         order = np.argsort(at, kind="stable")
         L, V, clear = (part[np.argsort(order)] for part in self.trajectories.images(at[order]))
         self.trajectories.event_noise.inflate(at, V)
         M = np.asarray(fused.L, np.float32)
         if target.smooth is not None:
             L, M = L - gaussian_blur(L), M - gaussian_blur(M)
-        warped = warp_images(L, V, clear, s, target.paths)
-        carried = _carry(np.asarray(images, np.float32), s, target.paths)
+        warped = warp_images(L, V, clear, there, target.paths)
+        carried = _carry(np.asarray(images, np.float32), there, target.paths)
         return np.asarray(carried), np.asarray(_visibility(self.params, M, warped))
 
     @synchronized
@@ -268,11 +269,13 @@ class CompensatedVideo(ImageSequence[Params]):
         Returns:
             (T, H, W, 2) flow along x and y, px/s.
         """
-        step = self.trajectories.schedule.step
-        found = [
-            target.paths[..., :2] * np.float32(target.instants.relative_times_per_second(step))
-            for target, _ in self._targets(times, extrapolate)
-        ]
+        step, found = self.trajectories.schedule.step, []
+        for target, _ in self._targets(times, extrapolate):
+            instants = target.instants
+            flow = target.paths[..., :2] * np.float32(instants.relative_times_per_second(step))
+            if instants.common is not None:
+                flow = flow + instants.common.velocity(int(instants.t[instants.target]), step)
+            found.append(flow)
         return np.stack(found)
 
     @synchronized
@@ -420,8 +423,9 @@ class MotionCompensation(ImageEstimator[Params]):
             if self.through_motion:
                 p = self._with_derivative(params, images, layout, p)
             paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
-            warped = warp_images_jax(*images, layout.s, paths)
-            fused = fuse(params, *images[:2], warped, layout, squared_reach(paths), noise=factor)
+            warped = warp_images_jax(*images, layout.path_times, paths)
+            reach = squared_reach(paths, layout.common)
+            fused = fuse(params, *images[:2], warped, layout, reach, noise=factor)
             weight = after_weight(layout)
             base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
             base, added = (1 - steady) * base, (1 - steady) * variance
@@ -457,7 +461,7 @@ class MotionCompensation(ImageEstimator[Params]):
         L, V, clear = images
         cost = CostParams.of(params, lambda value: jnp.asarray(value, L.dtype))
         variance = V * jnp.where(clear > 0, 1, params.caution)
-        motion_images = MotionImages(L, variance, layout.s, layout.present)
+        motion_images = MotionImages(L, variance, layout.path_times, layout.present)
         return implicit_trajectories(p, motion_images, cost)
 
     def estimate(

@@ -37,6 +37,7 @@ from jaxevent.reconstruction.compensated.robust_mean import (
     squared_gradient,
 )
 from jaxevent.reconstruction.compensated.warp import (
+    PathTimes,
     bilinear_cell,
     is_in_image,
     path_displacements,
@@ -63,6 +64,14 @@ class AdjacentExposures(NamedTuple):
     s: Float[Numeric, " n"]  # mid-exposures, relative to the target as `InstantLayout.s`
     half: Float[Numeric, " n"]  # half of the exposures, on the same clock
     present: Float[Numeric, " n"]  # 1, or 0 where there is none
+    # Along x and y, px: common displacement of all points, and its change over `half`.
+    common: Float[Numeric, "n 2"]
+    drift: Float[Numeric, "n 2"]
+
+    @property
+    def path_times(self) -> PathTimes:
+        """Mid-exposures on the clock of paths."""
+        return PathTimes(self.s, self.common)
 
 
 class AdjacentFrames(NamedTuple):
@@ -135,12 +144,14 @@ class FrameExposures:
             frame[far.argmax()], present[far.argmax()] = here, True
         frame = frame.clip(0, max(len(self.mid) - 1, 0)).astype(np.int32)
         mid, half = self.mid[frame], self._half[frame]
-        begin, end = instants.to_relative_times(mid - half), instants.to_relative_times(mid + half)
+        at, begin, end = (instants.path_times_at(t) for t in (mid, mid - half, mid + half))
         return AdjacentExposures(
             frame,
-            np.where(present, instants.to_relative_times(mid), 0).astype(np.float32),
-            ((end - begin) / 2).astype(np.float32),
+            np.where(present, at.s, np.float32(0)),
+            (end.s - begin.s) / 2,
             present.astype(np.float32),
+            at.common * present[:, None],
+            (end.common - begin.common) / 2,
         )
 
 
@@ -225,10 +236,16 @@ def blur_by_motion_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArr
 
 def exposure_displacements(exposures: AdjacentExposures, paths: Array, samples: int) -> Array:
     """Return D (n, samples, h, w, 2), px, along paths (h, w, 4)."""
-    s, half = jnp.asarray(exposures.s), jnp.asarray(exposures.half)
-    at = s[:, None] + half[:, None] * ((jnp.arange(samples) + 0.5) / samples * 2 - 1)
-    whole = path_displacements(paths, at.reshape(-1)).reshape(*at.shape, *paths.shape[:2], 2)
-    return whole - path_displacements(paths, s)[:, None]
+    s, half, common, drift = (
+        jnp.asarray(part)[:, None]
+        for part in (exposures.s, exposures.half, exposures.common, exposures.drift)
+    )
+    part = (jnp.arange(samples) + 0.5) / samples * 2 - 1
+    at = s + half * part
+    moved = common + drift * part[:, None]
+    whole = path_displacements(paths, PathTimes(at.reshape(-1), moved.reshape(-1, 2)))
+    whole = whole.reshape(*at.shape, *paths.shape[:2], 2)
+    return whole - path_displacements(paths, exposures.path_times)[:, None]
 
 
 def _motion_disagreement(D: Array) -> Array:
@@ -268,7 +285,7 @@ def clipped_part(params: Params, model: ExposureModel) -> Array | None:
     exposures, frames, paths = model
     if frames.white is None or not params.one_sided:
         return None
-    Y, X = path_positions(paths, jnp.asarray(exposures.s))
+    Y, X = path_positions(paths, exposures.path_times)
     side = jnp.maximum(clipped_side(params, frames), 0).reshape(-1, *Y.shape[1:])
     absent = 1 - jnp.asarray(exposures.present)[:, None, None]
     return jnp.maximum(sample_bilinear(side, Y, X), absent).min(0)
@@ -300,7 +317,7 @@ def _frame_evidence(
     """Return the evidence of frames; B is what they would show of the image."""
     exposures, frames, paths = model
     _, h, w = B.shape
-    Y, X = path_positions(paths, jnp.asarray(exposures.s))
+    Y, X = path_positions(paths, exposures.path_times)
     light = jnp.asarray(frames.intensity) + params.I0
     at_target = jnp.asarray(exposures.s)[:, None, None] == 0
     inside = is_in_image(Y, X, h, w) * jnp.asarray(exposures.present)[:, None, None]

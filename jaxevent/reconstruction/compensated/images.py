@@ -31,7 +31,7 @@ from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
-from jaxevent.reconstruction.compensated.warp import path_positions, sample_bilinear
+from jaxevent.reconstruction.compensated.warp import PathTimes, path_positions, sample_bilinear
 from jaxevent.reconstruction.features import FrameFeatures, Numeric
 from jaxevent.reconstruction.frames import FrameImages
 from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smoother
@@ -184,7 +184,8 @@ def smooth_at_target(
         The smooth part (h, w) and its variance (h, w), (ln I)^2.
     """
     nearest = jnp.asarray(smooth)[layout.before][None]
-    Y, X = path_positions(jnp.asarray(paths), jnp.asarray(layout.s)[layout.before][None])
+    frame = PathTimes(*(jnp.asarray(part)[layout.before][None] for part in layout.path_times))
+    Y, X = path_positions(jnp.asarray(paths), frame)
     beyond = sample_bilinear(nearest, Y, X)[0] + prior.offset
     difference = smooth[layout.after] - smooth[layout.before]
     variance = jnp.maximum(weight * (1 - weight) * difference**2, prior.variance)

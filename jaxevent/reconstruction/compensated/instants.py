@@ -15,8 +15,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
 
 from jaxevent.calibration.gaps import Gaps, find_gaps
+from jaxevent.reconstruction.compensated.warp import PathTimes
 from jaxevent.recording import Recording
 
 GRID_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # distances of instants from the target
@@ -173,6 +175,34 @@ def _count_parts(recording: Recording, begin: int, length: int) -> NDArray[np.fl
     return counts.reshape(N_PARTS**2, N_BINS).astype(float)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class CommonMotion:
+    """The displacement of all points of a scene, a function of time.
+
+    Attributes:
+        t: (K,) sorted times, us, K >= 2.
+        displacement: (K, 2) along x and y at these times, px.
+    """
+
+    t: NDArray[np.int64]
+    displacement: NDArray[np.float64]
+
+    def between(self, start: int, times: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the displacements (n, 2), px, from a time to others (n,), us."""
+        moved = self._interpolate(np.append(times, start))
+        return (moved[:-1] - moved[-1]).astype(np.float32)
+
+    def velocity(self, time: int, span: int) -> NDArray[np.float32]:
+        """Return the mean velocity (2,), px/s, over `span` us before and after a time (us)."""
+        before, after = self._interpolate(np.array([time - span, time + span]))
+        return ((after - before) / (2e-6 * span)).astype(np.float32)
+
+    def _interpolate(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        seconds = (self.t - self.t[0]) * 1e-6
+        course = Akima1DInterpolator(seconds, self.displacement)
+        return course(((times - self.t[0]) * 1e-6).clip(0, seconds[-1]))
+
+
 @dataclasses.dataclass(frozen=True)
 class TargetInstants:
     """The instants of one target, sorted, and their times on a clock."""
@@ -188,6 +218,22 @@ class TargetInstants:
     # 1 where the scene is at rest between the target and frames on one side of it alone, else 0;
     # 0 where frames are on both sides.
     rest: float = 0.0
+    common: CommonMotion | None = None  # of all points, which trajectories do not explain
+
+    @functools.cached_property
+    def path_times(self) -> PathTimes:
+        """The instants on the clock of paths."""
+        return PathTimes(self.s, self._common_displacement(self.t))
+
+    def path_times_at(self, times_us: NDArray[np.int64]) -> PathTimes:
+        """Put other times (us) on the clock of paths."""
+        s = self.to_relative_times(times_us).astype(np.float32)
+        return PathTimes(s, self._common_displacement(times_us))
+
+    def _common_displacement(self, times: NDArray[np.int64]) -> NDArray[np.float32]:
+        if self.common is None:
+            return np.zeros((len(times), 2), np.float32)
+        return self.common.between(int(self.t[self.target]), times)
 
     def to_relative_times(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
         """Convert times (us) to those of `s`."""
@@ -203,6 +249,10 @@ class TargetInstants:
         """Put the instants on another clock."""
         s, unit = _relative_times(clock, self.t, self.target)
         return dataclasses.replace(self, s=s, unit=unit, clock=clock)
+
+    def with_common_motion(self, common: CommonMotion | None) -> "TargetInstants":
+        """Put the motion that all points have in common beside their trajectories."""
+        return dataclasses.replace(self, common=common)
 
     def __len__(self) -> int:
         return len(self.t)

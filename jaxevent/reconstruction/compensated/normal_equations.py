@@ -26,6 +26,7 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, ru
 from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
+    PathTimes,
     RowScratch,
     bilinear_weights,
     gradient_at_pixel,
@@ -84,21 +85,22 @@ class PackedImages(NamedTuple):
     """Images at K instants with their gradients."""
 
     pixels: NDArray[np.float32]  # (K, h, w, 4): log intensity, its variance, gradient along x, y
-    s: NDArray[np.float32]  # (K,), times relative to the target, -1..1
+    times: PathTimes  # float32
     near: NDArray[np.float32]  # (K,), weights with which a robust mean begins
 
     @classmethod
-    def of(cls, pixels: NDArray[np.float32], s: NDArray[np.float32]) -> "PackedImages":
+    def of(cls, pixels: NDArray[np.float32], times: PathTimes) -> "PackedImages":
         """Add the weights, which fall with the distance from the target.
 
         Args:
             pixels: (K, h, w, 4) packed images; see `trajectories.pack_images`.
-            s: (K,) times relative to the target, -1..1.
+            times: Their times, with common displacements in px of these images.
 
         Returns:
             Images with weights.
         """
-        return cls(pixels, s, np.exp(-2 * (s / max_instant_distance(s)) ** 2).astype(np.float32))
+        relative = times.s / max_instant_distance(times.s)
+        return cls(pixels, times, np.exp(-2 * relative**2).astype(np.float32))
 
 
 def max_instant_distance(s: NDArray[np.float32]) -> np.float32:
@@ -207,7 +209,8 @@ def _sample_row(y, begin, inputs, scratch, points, means):
         interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
     for k in range(count):
         row = (path, at, pixel, part, inside)
-        locate_points(np.float32(y), images.s[k], (h, w), w, row)
+        instant = images.times.s[k], images.times.common[k, 0], images.times.common[k, 1]
+        locate_points(np.float32(y), instant, (h, w), w, row)
         _read_channels(images.pixels[k], pixel, part, k, points)
         fill_information(points[1, k], inside, cost.floor, info[k])
     found = (points[1], means, scratch.sums[begin])
@@ -316,7 +319,7 @@ def _linearise(begin, end, inputs, scratch, M, out):
                 gx, gy = gradient_at_pixel(M, y, x)
                 grad_M[0, x], grad_M[1, x] = gx, gy
                 sums[14, x] += np.sqrt(gx * gx + gy * gy)
-            _add_pixels(points[y % 4], M[y], inputs[0].s, grad_M, own, sums)
+            _add_pixels(points[y % 4], M[y], inputs[0].times.s, grad_M, own, sums)
         for j in range(out.shape[1]):
             left, right = 2 * j, min(2 * j + 1, w - 1)
             both = np.float32(right - left)  # 0 or 1
@@ -381,7 +384,7 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
     run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
     blurred = np.empty((*shape, 14), np.float32)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
-    horizon = max_instant_distance(images.s)
+    horizon = max_instant_distance(images.times.s)
     weights = np.zeros((2, *shape), np.float32)
     _weigh_differences(p, entries[..., 14], horizon, cost, weights)
     squared = horizon * horizon
@@ -584,7 +587,7 @@ class MotionImages(NamedTuple):
 
     L: Float[Numeric, "k h w"]  # log intensity
     V: Float[Numeric, "k h w"]  # its variance, (ln I)^2
-    s: Float[Numeric, " k"]  # times relative to the target, -1..1
+    times: PathTimes
     present: Float[Numeric, " k"]  # 1, or 0 of instants that only pad the number
 
 
@@ -622,14 +625,14 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
     Returns:
         The equations, N as matrices (4, 4).
     """
-    L, V, s, present = images
+    L, V, times, present = images
     count, h, w = L.shape
-    Y, X = (one.astype(p.dtype) for one in path_positions(interpolate_paths_jax(p, h, w), s))
+    Y, X = (one.astype(p.dtype) for one in path_positions(interpolate_paths_jax(p, h, w), times))
     inside = is_in_image(Y, X, h, w)
     gx, gy = gradient_jax(L)
     L, V, gx, gy = (sample_bilinear(image, Y, X) for image in (L, V, gx, gy))
     W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
-    s = s[:, None, None]
+    s = jnp.asarray(times.s)[:, None, None]
     R = W * jnp.exp(-2 * s**2)
     M = (R * L).sum(0) / R.sum(0)
     for _ in range(2):

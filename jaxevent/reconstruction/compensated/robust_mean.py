@@ -13,6 +13,7 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, ru
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
+    PathTimes,
     WarpedImages,
     gradient_at_pixel,
     gradient_jax,
@@ -35,6 +36,7 @@ class InstantLayout(NamedTuple):
     present: Float[Numeric, " k"]  # 1, or 0 of instants that only pad the number
     framed: Float[Numeric, " k"]  # 1 where a frame was taken
     near: Float[Numeric, " k"]  # 1 of the target and of those next to it without frame
+    common: Float[Numeric, "k 2"]  # displacements that all points share, px
     target: Numeric  # (), index of the target
     before: Numeric  # (), index of the frame before
     after: Numeric  # (), index of the frame after
@@ -42,6 +44,11 @@ class InstantLayout(NamedTuple):
     # alone the next nearest; where there is none, `before`.
     other: Numeric
     rest: Numeric = np.float32(0)  # (), `TargetInstants.rest`
+
+    @property
+    def path_times(self) -> PathTimes:
+        """The instants on the clock of paths."""
+        return PathTimes(self.s, self.common)
 
 
 def make_layout(instants: TargetInstants, clear: NDArray, count: int) -> InstantLayout:
@@ -72,7 +79,8 @@ def make_layout(instants: TargetInstants, clear: NDArray, count: int) -> Instant
         )
 
     layout = pad(instants.s, 1), pad(np.ones(len(instants))), pad(framed), pad(near)
-    return InstantLayout(*layout, *indices, rest=np.float32(instants.rest))
+    common = np.pad(instants.path_times.common, [(0, count - len(instants)), (0, 0)])
+    return InstantLayout(*layout, common, *indices, rest=np.float32(instants.rest))
 
 
 class RobustMean(NamedTuple):

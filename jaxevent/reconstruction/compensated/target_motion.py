@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from jaxevent.errors import InputError
+from jaxevent.reconstruction.compensated.common_motion import estimate_common_motion
 from jaxevent.reconstruction.compensated.event_noise import EventNoise
 from jaxevent.reconstruction.compensated.exposures import FrameExposures
 from jaxevent.reconstruction.compensated.fusion import (
@@ -60,6 +61,7 @@ from jaxevent.reconstruction.compensated.trajectories import (
     change_clock,
     choose_trajectories,
     estimate_trajectories,
+    fit_path,
     gauss_newton_step,
     node_shape,
     pack_images,
@@ -68,6 +70,7 @@ from jaxevent.reconstruction.compensated.trajectories import (
     select_paths,
 )
 from jaxevent.reconstruction.compensated.warp import (
+    PathTimes,
     WarpedImages,
     interpolate_paths,
     squared_reach,
@@ -85,6 +88,8 @@ ANCHOR_STEPS = 8  # steps of the schedule between anchors
 MIN_DOUBT = 0.1
 N_CACHED_ANCHORS = 4
 MIN_CLOCK_COST = 1e-12  # so that its logarithm exists
+# By which the frames' cost must fall, so that common motion is used.
+MAX_COMMON_COST = 0.7
 N_ANCHOR_STEPS = 2  # at half resolution, on each clock
 FUSED_VARIANCE_FACTOR = 3.0  # on the variance of the fused image that motion is refined with
 
@@ -137,8 +142,15 @@ class NodeMotion(NamedTuple):
         now = there.with_clock(instants.clock)
         if there.clock.event_share != instants.clock.event_share:
             p = change_clock(p, there.s, now.s)
-        s = float(now.to_relative_times(instants.t[[instants.target]])[0])
-        return advect_nodes(p, s, instants.unit / now.unit)
+        at = now.path_times_at(instants.t[[instants.target]])
+        p = advect_nodes(p, float(at.s[0]), instants.unit / now.unit, at.common[0])
+        if there.common is not instants.common:
+            own, other = (
+                one.path_times.common
+                for one in (instants, instants.with_common_motion(there.common))
+            )
+            p = p + fit_path(instants.s, other - own).astype(np.float32)
+        return p
 
 
 class SoughtMotion(NamedTuple):
@@ -320,13 +332,40 @@ class TrajectoryEstimator:
         instants = self.schedule(at)
         L, V, clear, _ = self._images(instants)
         pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-        p = self._seek(pyramid, instants.s, instants.first_horizon)
+        p = self._seek(pyramid, instants.path_times, instants.first_horizon)
         doubt = 1 - self.event_noise.trust(at) ** 4
         other = self._motion_of_frames(at) if doubt > MIN_DOUBT else None
         if other is not None:
-            images, several = PackedImages.of(pyramid[1], instants.s), (p, other.carry(instants))
+            images = PackedImages.of(pyramid[1], instants.path_times.at_level(1))
+            several = p, other.carry(instants)
             p = choose_trajectories(images, several, self._cost, (1.0, doubt))
-        return self._improve(pyramid[1], NodeMotion(instants, p))
+        return self._improve(
+            pyramid[1], self._allow_common_motion(pyramid, NodeMotion(instants, p))
+        )
+
+    def _allow_common_motion(self, pyramid: ImagePyramid, motion: NodeMotion) -> NodeMotion:
+        """Seek motion anew beside what all points have in common, and compare how frames agree."""
+        instants = motion.instants
+        common = estimate_common_motion(pyramid, instants.t, instants.s, self._cost)
+        if common is None:
+            return motion
+        instants = instants.with_common_motion(common)
+        p = self._seek(pyramid, instants.path_times, instants.first_horizon)
+        other = NodeMotion(instants, p)
+        costs = [self._frame_cost(pyramid[1], one) for one in (motion, other)]
+        return other if costs[1] < MAX_COMMON_COST * costs[0] else motion
+
+    def _frame_cost(self, pixels: NDArray[np.float32], motion: NodeMotion) -> float:
+        """Return the mean squared difference of frames along motion at half resolution.
+
+        Images from events have the faults of their clock and course, so that they do not judge it.
+        """
+        instants, p = motion
+        judges = np.isin(instants.t, self.schedule.frames)
+        if judges.sum() <= 2:  # agree on any clock
+            judges[:] = True
+        times = instants.path_times.take(judges).at_level(1)
+        return robust_cost(PackedImages.of(pixels[judges], times), p, self._cost)
 
     def _motion_of_frames(self, t: int) -> NodeMotion | None:
         """Return the motion halfway between two frames by frames alone, at half resolution."""
@@ -343,13 +382,12 @@ class TrajectoryEstimator:
         framed = np.isin(instants.t, self.schedule.frames)
         frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
         nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        return NodeMotion(instants, self._seek(frames, instants.s[framed], nearest))
+        return NodeMotion(instants, self._seek(frames, instants.path_times.take(framed), nearest))
 
-    def _seek(
-        self, pyramid: ImagePyramid, s: NDArray[np.float32], horizon: float
-    ) -> NDArray[np.float32]:
+    def _seek(self, pyramid: ImagePyramid, times: PathTimes, horizon: float) -> NDArray[np.float32]:
         """Seek trajectories of nodes at half resolution, first within a horizon."""
-        motion = estimate_trajectories(pyramid, s, plan_stages(s, horizon), self._cost)
+        plan = plan_stages(times.s, horizon)
+        motion = estimate_trajectories(pyramid, times, plan, self._cost)
         return motion.at_level(1, self.images.image_shape).p
 
     def _make_anchor(self, at: int, timed: bool) -> Anchor:
@@ -375,26 +413,20 @@ class TrajectoryEstimator:
         pixels = pack_images(target.L, V)
         V = FUSED_VARIANCE_FACTOR * P + self._cost.floor
         pixels[own] = pack_images(image[None], V[None])[0]
-        return PackedImages.of(pixels, target.instants.s)
+        return PackedImages.of(pixels, target.instants.path_times)
 
     def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> SoughtMotion:
-        """Take a few steps at half resolution on both clocks, and compare how frames agree.
-
-        Images from events have the faults of their clock, so that they do not judge it.
-        """
+        """Take a few steps at half resolution on both clocks, and compare how frames agree."""
         instants, p = motion
-        judges = np.isin(instants.t, self.schedule.frames)
-        if judges.sum() <= 2:  # agree on any clock
-            judges[:] = True
 
         def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NodeMotion:
+            images = PackedImages.of(pixels, clock.path_times.at_level(1))
             for _ in range(N_ANCHOR_STEPS):
-                p = gauss_newton_step(PackedImages.of(pixels, clock.s), p, self._cost)
+                p = gauss_newton_step(images, p, self._cost)
             return NodeMotion(clock, p)
 
         def cost(found: NodeMotion) -> float:
-            images = PackedImages.of(pixels[judges], found.instants.s[judges])
-            return robust_cost(images, found.p, self._cost)
+            return self._frame_cost(pixels, found)
 
         found = improved(instants, p)
         if not instants.clock.event_share:
@@ -436,6 +468,7 @@ class TrajectoryEstimator:
             anchor = self._refine(found.on(timed))
         else:
             return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
+        instants = instants.with_common_motion(anchor.motion.instants.common)
         if timed:
             instants = instants.with_clock(TIME_CLOCK)
         p = anchor.motion.carry(instants)
@@ -454,7 +487,8 @@ class TrajectoryEstimator:
         """Choose between trajectories and others at half resolution, where images agree better."""
         size = self.images.image_shape
         L, V = images.pixels[..., 0], images.pixels[..., 1]
-        half = PackedImages.of(ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)[1], images.s)
+        pyramid = ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)
+        half = PackedImages.of(pyramid[1], images.times.at_level(1))
         own = NodeTrajectories(p, 0).at_level(1, size).p
         change = choose_trajectories(half, (own, other), self._cost, (1.0, 1.0)) - own
         return p + NodeTrajectories(change, 1).at_level(0, size).p
@@ -467,8 +501,8 @@ class TrajectoryEstimator:
             fused = fuse_target(self.params, target)
             return np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
         there, here = anchor.motion.instants, target.instants
-        at = here.to_relative_times(there.t[[there.target]]).astype(np.float32)
-        if not at[0]:
+        at = here.path_times_at(there.t[[there.target]])
+        if not at.s[0]:
             return anchor.L, anchor.P
         L, P = anchor.L[None], anchor.P[None]
         warped = warp_images(L, P, np.zeros_like(L), at, target.paths)
@@ -488,7 +522,8 @@ def _fuse(
     paths: Numeric,
     noise: Numeric | float,
 ) -> FusedImage:
-    compared = reference_images(*images, squared_reach(paths), noise=noise)
+    reach = squared_reach(paths, images[3].common)
+    compared = reference_images(*images, reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, compared))
 
 
@@ -504,7 +539,7 @@ def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
     """
     instants, L, V, clear, *_ = target
     paths = target.paths
-    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.s, paths)
+    warped = warp_images(L, V, np.asarray(clear, np.float32), instants.path_times, paths)
     layout = make_layout(instants, clear, len(instants))
     mean = robust_mean(params, L, warped, layout)
     # The images that it is compared with are few, and are all that is handed over.
@@ -512,7 +547,7 @@ def fuse_target(params: Params, target: TrajectoryEstimate) -> FusedImage:
     rows = [int(getattr(layout, name)) for name in names]
     places = {name: np.int32(rows.index(k)) for name, k in zip(names, rows, strict=True)}
     warped = WarpedImages(*(part[rows] for part in warped))
-    layout = InstantLayout(*(part[rows] for part in layout[:4]), **places, rest=layout.rest)
+    layout = InstantLayout(*(part[rows] for part in layout[:5]), **places, rest=layout.rest)
     return _fuse(params, mean, (L[rows], V[rows], warped, layout), paths, target.noise)
 
 

@@ -1,8 +1,8 @@
 """Trajectories of the scene points that are visible at a target time.
 
-Point x of the target's image lies at x + u(x, s) at the instant s, u = v(x) s + a(x) s^2, s = -1..1
-over the instants. v and a are bilinear between nodes, one for every 2 x 2 pixels. They minimise,
-with the unknown image M of the target,
+Point x of the target's image lies at x + u(x, s) at the instant s, u = v(x) s + a(x) s^2 + c(s),
+s = -1..1 over the instants. c is common to all points (`common_motion`). v and a are bilinear
+between nodes, one for every 2 x 2 pixels. They minimise, with the unknown image M of the target,
 
     sum_k sum_x rho((L_k(x + u(x, s_k)) - M(x))^2 W_k(x + u)) + smoothness,
     rho(q) = nu log(1 + q / nu),   W_k = 1 / (V_k + floor)
@@ -44,6 +44,7 @@ from jaxevent.reconstruction.compensated.robust_mean import (
     gaussian_taps,
 )
 from jaxevent.reconstruction.compensated.warp import (
+    PathTimes,
     RowScratch,
     bilinear_cell,
     bilinear_weights,
@@ -214,7 +215,7 @@ def gauss_newton_step(
     out, flat, horizon = (
         np.empty_like(p),
         (rows, columns * channels),
-        max_instant_distance(images.s),
+        max_instant_distance(images.times.s),
     )
     longest = MAX_STEP_PX / np.repeat([horizon, horizon * horizon / 4], 2).astype(np.float32)
     scratch = np.empty(flat, np.float32), np.empty((3, flat[1] + 2 * channels), np.float32)
@@ -289,6 +290,21 @@ def change_clock(
     return np.einsum("ab,ijbc->ijac", change, paths).reshape(p.shape).astype(np.float32)
 
 
+def fit_path(s: NDArray[np.float32], displacement: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Fit a path to displacements, by least squares, most of all near the target.
+
+    Args:
+        s: (K,) times relative to the target, -1..1.
+        displacement: (K, 2) along x and y, px.
+
+    Returns:
+        (4,) the path, px.
+    """
+    weight = np.exp(-2 * s**2)[:, None]
+    powers = np.stack([s, s**2], 1).astype(float)
+    return np.linalg.lstsq(weight * powers, weight * displacement, rcond=None)[0].ravel()
+
+
 class RefinementStage(NamedTuple):
     """Steps at some resolutions, with the instants within a horizon."""
 
@@ -355,13 +371,13 @@ class NodeTrajectories(NamedTuple):
 
 
 def estimate_trajectories(
-    pyramid: ImagePyramid, s: NDArray[np.float32], plan: list[RefinementStage], cost: CostParams
+    pyramid: ImagePyramid, times: PathTimes, plan: list[RefinementStage], cost: CostParams
 ) -> NodeTrajectories:
     """Estimate trajectories from no motion, by all stages of a plan.
 
     Args:
         pyramid: Images of the target's instants.
-        s: (K,) sorted times of the instants relative to the target, -1..1.
+        times: Sorted times of the K instants.
         plan: The stages.
         cost: Parameters of the cost, float32.
 
@@ -373,10 +389,11 @@ def estimate_trajectories(
     found = NodeTrajectories(np.zeros((*node_shape(h, w, first), 4), np.float32), first)
     for stage in plan:
         # Instants are sorted, so that these follow each other.
-        chosen = slice(*np.searchsorted(s, stage.horizon * np.array([-1.001, 1.001])))
+        chosen = slice(*np.searchsorted(times.s, stage.horizon * np.array([-1.001, 1.001])))
         for level in stage.levels:
             p = found.at_level(level, (h, w)).p
-            images, starts = PackedImages.of(pyramid[level][chosen], s[chosen]), [p]
+            at = times.take(chosen).at_level(level)
+            images, starts = PackedImages.of(pyramid[level][chosen], at), [p]
             if stage is plan[0] and level == stage.levels[-1]:
                 # A pattern finer than the pixels of the coarse levels has misled these.
                 starts.append(np.zeros_like(p))
@@ -389,7 +406,7 @@ def estimate_trajectories(
 
 
 @njit_noalloc
-def _advect(begin, end, p, s, out):
+def _advect(begin, end, p, s, common, out):
     rows, columns, _ = p.shape
     half = np.float32(0.5)  # nodes per px
     for i in range(begin, end):
@@ -397,25 +414,28 @@ def _advect(begin, end, p, s, out):
             X, Y = np.float32(j), np.float32(i)
             for _ in range(4):
                 blend_nodes(p, bilinear_cell(X, Y, rows, columns), out[i, j])
-                X = np.float32(j) - half * (out[i, j, 0] + out[i, j, 2] * s) * s
-                Y = np.float32(i) - half * (out[i, j, 1] + out[i, j, 3] * s) * s
+                X = np.float32(j) - half * ((out[i, j, 0] + out[i, j, 2] * s) * s + common[0])
+                Y = np.float32(i) - half * ((out[i, j, 1] + out[i, j, 3] * s) * s + common[1])
             for c in range(2):
                 out[i, j, c] += np.float32(2) * out[i, j, c + 2] * s
 
 
-def advect_nodes(p: NDArray[np.float32], s: float, unit: float) -> NDArray[np.float32]:
+def advect_nodes(
+    p: NDArray[np.float32], s: float, unit: float, common: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Carry trajectories to another target: those of the points that are visible there.
 
     Args:
         p: (rows, columns, 4) trajectories of the points visible at 0, px.
         s: Time of the new target on the clock of `p`.
         unit: What 1 stands for on the new clock, in units of the old one.
+        common: (2,) displacement that all points share at s, px.
 
     Returns:
         (rows, columns, 4) trajectories of the points visible at s, on the new clock, px.
     """
     out = np.empty_like(p)
-    run_over_rows(_advect, len(p), p, np.float32(s), out)
+    run_over_rows(_advect, len(p), p, np.float32(s), common, out)
     return out * np.array([unit, unit, unit**2, unit**2], np.float32)
 
 
@@ -476,25 +496,26 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
     """
     images, nu = inputs.images, inputs.cost.robust
     h, w = images.pixels.shape[1:3]
-    s, rows, lines = images.s, scratch.rows, scratch.lines[begin]
+    times, rows, lines = images.times, scratch.rows, scratch.lines[begin]
     path, pixel, part = rows.path[begin], rows.pixel[begin], rows.part[begin]
     x, inside = rows.x[begin], rows.inside[begin]
     level, W, R = scratch.values[begin, 0], scratch.values[begin, 1], scratch.values[begin, 2]
     means, costs = lines[2, :count], lines[3]
     total, product = scratch.logs[begin, 0], scratch.logs[begin, 1]
-    for k in range(len(s)):
-        locate_points(y, s[k], (h, w), count, (path, x, pixel, part, inside))
+    for k in range(len(times.s)):
+        instant = times.s[k], times.common[k, 0], times.common[k, 1]
+        locate_points(y, instant, (h, w), count, (path, x, pixel, part, inside))
         _read_levels(images.pixels[k], pixel, part, level[k, :count], W[k])
         fill_information(W[k, :count], inside, inputs.cost.floor, W[k])
     robust_means(level, W, images.near, nu, (R, means, lines[:2]))
     for i in range(count):
         total[i], product[i] = 0.0, 1.0
-    for k in range(len(s)):
+    for k in range(len(times.s)):
         for i in range(count):
             e = level[k, i] - means[i]
             product[i] *= 1.0 + e * e * W[k, i] / nu
         # One logarithm for many takes less time; nor is this too large for it.
-        if k % 16 == 15 or k + 1 == len(s):
+        if k % 16 == 15 or k + 1 == len(times.s):
             for i in range(count):
                 total[i] += np.log(product[i])
                 product[i] = 1.0
@@ -606,7 +627,7 @@ def select_paths(
         (h, w) flat indices of the pixels whose paths are taken, row by row.
     """
     h, w, _ = paths.shape
-    min_gain = np.float32(MIN_COST_GAIN * len(images.s))
+    min_gain = np.float32(MIN_COST_GAIN * len(images.times.s))
     path_index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     for spacing, distance, sigma in searches:
         some = paths.reshape(-1, 4)[path_index[::spacing, ::spacing]]
@@ -615,7 +636,7 @@ def select_paths(
             images, some, spacing, NEIGHBOUR_OFFSETS * distance, cost, taps, min_gain
         )
         costs = np.empty((len(NEIGHBOUR_OFFSETS), *shape), np.float32)
-        scratch = _SearchScratch.allocate(shape, len(images.s), len(taps))
+        scratch = _SearchScratch.allocate(shape, len(images.times.s), len(taps))
         run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
         out = np.empty_like(path_index)
         run_over_rows(_select, shape[0], inputs, (costs, path_index), scratch, out)

@@ -1,12 +1,13 @@
 """Paths of pixels, and images read along them: in numba loops, and in JAX for derivatives.
 
 A path holds the numbers (vx, vy, ax, ay) of a point that the target's image shows at the pixel x.
-At the instant s the point lies at x + v s + a s^2, s in -1..1. Paths are given at nodes, one for
+At the instant s the point lies at x + v s + a s^2 + c, s in -1..1, where c is the displacement that
+all points have in common at the instant. Paths are given at nodes, one for
 every 2 x 2 pixels, and bilinear between them. Functions whose names end in `_jax` are
 differentiable.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,26 @@ from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, ru
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
+
+
+class PathTimes(NamedTuple):
+    """Instants on the clock of paths, and how far all points have moved beside their paths."""
+
+    s: Float[Numeric, " k"]  # relative to the target, -1..1
+    common: Float[Numeric, "k 2"]  # displacement along x and y that all points share, px
+
+    @classmethod
+    def of(cls, s: NDArray[np.float32]) -> "PathTimes":
+        """Put instants s (K,) on the clock of paths that explain all motion."""
+        return cls(s, np.zeros((len(s), 2), np.float32))
+
+    def at_level(self, level: int) -> "PathTimes":
+        """Convert to pixels of a level of resolution; 0 is full resolution."""
+        return PathTimes(self.s, self.common * np.float32(0.5**level))
+
+    def take(self, chosen: Any) -> "PathTimes":
+        """Choose some of the instants."""
+        return PathTimes(self.s[chosen], self.common[chosen])
 
 
 class WarpedImages(NamedTuple):
@@ -167,19 +188,21 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
 
 
 @njit_noalloc_inlined
-def locate_points(y, s, image_shape, n_points, scratch_row):
+def locate_points(y, instant, image_shape, n_points, scratch_row):
     """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
 
-    `scratch_row` holds the parts of a `RowScratch` for one row.
+    `instant` is s and the common displacement along x and y. `scratch_row` holds the parts of a
+    `RowScratch` for one row.
     """
     h, w = image_shape
+    s, common_x, common_y = instant
     path, x, pixel, part, inside = scratch_row
     one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     right, bottom = np.float32(w - 1), np.float32(h - 1)
     last_x, last_y = np.int32(max(w - 2, 0)), np.int32(max(h - 2, 0))
     for i in range(n_points):
-        X = x[i] + (path[0, i] + path[2, i] * s) * s
-        Y = y + (path[1, i] + path[3, i] * s) * s
+        X = x[i] + (path[0, i] + path[2, i] * s) * s + common_x
+        Y = y + (path[1, i] + path[3, i] * s) * s + common_y
         here = (X >= -half) & (X <= right + half) & (Y >= -half) & (Y <= bottom + half)
         inside[i] = one if here else zero
         # So that what is no number becomes 0, too: it must not point outside.
@@ -237,7 +260,7 @@ def _read_bicubic(image, pixel, weights, out):
 
 @njit_noalloc
 def _warp(begin, end, inputs, scratch, cubic, out):
-    L, V, clear, shown, s, paths = inputs
+    L, V, clear, shown, times, paths = inputs
     count, h, w = L.shape
     path, pixel, part = scratch.path[begin], scratch.pixel[begin], scratch.part[begin]
     at, weights = scratch.x[begin], cubic[begin]
@@ -249,7 +272,8 @@ def _warp(begin, end, inputs, scratch, cubic, out):
                 path[c, x] = paths[y, x, c]
         for k in range(count):
             row = (path, at, pixel, part, out.inside[k, y])
-            locate_points(np.float32(y), s[k], (h, w), w, row)
+            instant = times.s[k], times.common[k, 0], times.common[k, 1]
+            locate_points(np.float32(y), instant, (h, w), w, row)
             _cubic_weights(part[0], weights[:4])
             _cubic_weights(part[1], weights[4:])
             _read_bicubic(L[k], pixel, weights, out.L[k, y])
@@ -260,14 +284,16 @@ def _warp(begin, end, inputs, scratch, cubic, out):
                 out.clear[k, y] = np.float32(0)
 
 
-def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArray) -> WarpedImages:
+def warp_images(
+    L: NDArray, V: NDArray, clear: NDArray, times: PathTimes, paths: NDArray
+) -> WarpedImages:
     """Read images along the paths of pixels.
 
     Args:
         L: (K, h, w) float32, log intensity.
         V: (K, h, w) float32, its variance, (ln I)^2.
         clear: (K, h, w) float32, 1 where a frame shows the pixel unclipped.
-        s: (K,) float32, times of the images relative to the target, -1..1.
+        times: Their K times, float32.
         paths: (h, w, 4) float32, px.
 
     Returns:
@@ -275,26 +301,36 @@ def warp_images(L: NDArray, V: NDArray, clear: NDArray, s: NDArray, paths: NDArr
     """
     _, h, w = L.shape
     out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    inputs = (L, V, clear, clear.any((1, 2)), s, paths)
+    inputs = (L, V, clear, clear.any((1, 2)), times, paths)
     run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
 
 
-def path_displacements(paths: Array, s: Array) -> Array:
-    """Return the displacements (K, h, w, 2) along x and y (px) of paths (h, w, 4) at s (K,)."""
+def path_displacements(paths: Array, times: PathTimes) -> Array:
+    """Return the displacements (K, h, w, 2) along x and y (px) of paths (h, w, 4) at K times."""
+    s, common = (jnp.asarray(part) for part in times)
     s = s[:, None, None, None]
-    return (paths[..., :2] + paths[..., 2:] * s) * s
+    return (paths[..., :2] + paths[..., 2:] * s) * s + common[:, None, None]
 
 
-def squared_reach(paths: Numeric) -> Numeric:
-    """Return an upper bound (px^2) of the squared distance that points of paths (h, w, 4) go."""
-    return ((abs(paths[..., :2]) + abs(paths[..., 2:])) ** 2).sum(-1)
+def squared_reach(paths: Numeric, common: Numeric) -> Numeric:
+    """Return an upper bound of the squared distance that points go.
+
+    Args:
+        paths: (h, w, 4) their paths, px.
+        common: (K, 2) displacements that all share, px.
+
+    Returns:
+        (h, w), px^2.
+    """
+    farthest = abs(common).max(0)
+    return ((abs(paths[..., :2]) + abs(paths[..., 2:]) + farthest) ** 2).sum(-1)
 
 
-def path_positions(paths: Array, s: Array) -> tuple[Array, Array]:
-    """Return y and x, (K, h, w) each, of the points of paths (h, w, 4) at s (K,)."""
+def path_positions(paths: Array, times: PathTimes) -> tuple[Array, Array]:
+    """Return y and x, (K, h, w) each, of the points of paths (h, w, 4) at K times."""
     height, width, _ = paths.shape
-    moved = path_displacements(paths, s)
+    moved = path_displacements(paths, times)
     return jnp.arange(height)[:, None] + moved[..., 1], jnp.arange(width) + moved[..., 0]
 
 
@@ -317,17 +353,19 @@ def is_in_image(Y: Array, X: Array, height: int, width: int) -> Array:
     return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
 
 
-def warp_images_jax(L: Array, V: Array, clear: Array, s: Array, paths: Array) -> WarpedImages:
+def warp_images_jax(
+    L: Array, V: Array, clear: Array, times: PathTimes, paths: Array
+) -> WarpedImages:
     """Read images along the paths of pixels, as `warp` does; differentiable."""
     _, h, w = L.shape
-    Y, X = path_positions(paths, s)
+    Y, X = path_positions(paths, times)
     inside = is_in_image(Y, X, h, w)
     V, clear = sample_bilinear(V, Y, X), sample_bilinear(clear, Y, X)
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
     y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
     x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
     fy, fx = Y - y0, X - x0
-    k = jnp.arange(len(s))[:, None, None]
+    k = jnp.arange(len(L))[:, None, None]
     row = [jnp.clip(y0 + i, 0, h - 1) for i in range(-1, 3)]
     column = [jnp.clip(x0 + j, 0, w - 1) for j in range(-1, 3)]
 
