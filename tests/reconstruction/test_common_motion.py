@@ -86,7 +86,7 @@ def test_velocity_of_a_course():
 @pytest.mark.slow
 def test_images_of_a_shaken_camera(monkeypatch):
     recording, source = shaken(), Shaken()
-    t = np.array([110_000, 172_000, 235_000])
+    t = np.array([110_000, 172_000, 189_000])
     truth = np.stack([source.intensity(one * 1e-6) for one in t])
     params = Params(c_on=0.1, c_off=0.1)  # of ln(I + 0.3)
 
@@ -95,9 +95,9 @@ def test_images_of_a_shaken_camera(monkeypatch):
 
     video = mc.estimate(recording, params, progress=False)
     ours = error(video(t).mean)
-    # All points move with the velocity of the camera.
+    # All points move with the velocity of the camera, of up to 270 px/s.
     flow = np.median(video.flow(t), (1, 2))
-    assert np.abs(flow - source.velocity(t * 1e-6)).max() < 40  # of 230 px/s
+    assert np.abs(flow - source.velocity(t * 1e-6)).max() < 30
     # What is prepared for derivatives is the same.
     features, out = mc.prepare(recording, t, params)
     trajectory, _ = jax.jit(mc.run)(params, features)
@@ -106,6 +106,5 @@ def test_images_of_a_shaken_camera(monkeypatch):
     aks = find("aks").estimate(recording, progress=False)
     monkeypatch.setattr(target_motion, "estimate_common_motion", lambda *_: None)
     alone = error(mc.estimate(recording, params, progress=False)(t).mean)
-    print(ours, alone, error(aks(t).mean), flow, source.velocity(t * 1e-6))
     assert ours < 0.3 * alone
     assert ours < 0.7 * error(aks(t).mean)

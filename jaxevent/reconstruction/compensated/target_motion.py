@@ -339,21 +339,26 @@ class TrajectoryEstimator:
             images = PackedImages.of(pyramid[1], instants.path_times.at_level(1))
             several = p, other.carry(instants)
             p = choose_trajectories(images, several, self._cost, (1.0, doubt))
-        return self._improve(
-            pyramid[1], self._allow_common_motion(pyramid, NodeMotion(instants, p))
-        )
+        found = self._improve(pyramid[1], NodeMotion(instants, p))
+        beside = self._seek_beside_common_motion(pyramid, instants)
+        if beside is None:
+            return found
+        costs = [
+            min(self._frame_cost(pyramid[1], one.on(timed)) for timed in (False, True))
+            for one in (found, beside)
+        ]
+        return beside if costs[1] < MAX_COMMON_COST * costs[0] else found
 
-    def _allow_common_motion(self, pyramid: ImagePyramid, motion: NodeMotion) -> NodeMotion:
-        """Seek motion anew beside what all points have in common, and compare how frames agree."""
-        instants = motion.instants
+    def _seek_beside_common_motion(
+        self, pyramid: ImagePyramid, instants: TargetInstants
+    ) -> SoughtMotion | None:
+        """Seek motion beside that of all points; None where trajectories explain all of it."""
         common = estimate_common_motion(pyramid, instants.t, instants.s, self._cost)
         if common is None:
-            return motion
+            return None
         instants = instants.with_common_motion(common)
         p = self._seek(pyramid, instants.path_times, instants.first_horizon)
-        other = NodeMotion(instants, p)
-        costs = [self._frame_cost(pyramid[1], one) for one in (motion, other)]
-        return other if costs[1] < MAX_COMMON_COST * costs[0] else motion
+        return self._improve(pyramid[1], NodeMotion(instants, p))
 
     def _frame_cost(self, pixels: NDArray[np.float32], motion: NodeMotion) -> float:
         """Return the mean squared difference of frames along motion at half resolution.
