@@ -75,6 +75,8 @@ def format_calibrated(name: str, value: float) -> str:
     """
     if name == "event_delay":
         return f"events {1e3 * abs(value):.1f} ms {'late' if value >= 0 else 'early'}"
+    if name == "rho_ref":
+        return f"dead time {1e3 * value:.2g} ms"
     return f"clock {1e3 * value:+.1f} ms" if name == "clock_offset" else f"{name} {value:.3g}"
 
 
@@ -150,7 +152,7 @@ class Calibration:
     def select(self, names: Iterable[str]) -> CalibratedValues:
         """Return the values of some names, and those that the data do not determine.
 
-        An exposure that may be none is left out.
+        An exposure or a dead time that may be none is left out.
 
         Args:
             names: Names, as of `Parameters.calibrated`; those of other things are left out.
@@ -160,8 +162,9 @@ class Calibration:
         """
         values = self.values()
         chosen = {name: values[name] for name in names if name in values}
-        if "exposure" in chosen and not chosen["exposure"].low > 0:
-            del chosen["exposure"]
+        for name in ("exposure", "rho_ref"):
+            if name in chosen and not chosen[name].low > 0:
+                del chosen[name]
         return CalibratedValues(
             {name: one.value for name, one in chosen.items() if one.is_identifiable},
             {name: one.note for name, one in chosen.items() if not one.is_identifiable},
