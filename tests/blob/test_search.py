@@ -288,6 +288,17 @@ def test_two_in_contact_that_go_their_own_ways_are_two():
     assert len(merge_parts([moving[0], moving[2]])) == 1
 
 
+def test_the_two_edges_of_a_slow_disc_are_one():
+    """In windows its outline has few events; its sides, which send least, have none."""
+    motion = LinearMotion((40.0, 48.0), (20.0, 0.0), size=(9.8, 6.9))  # radius 12 px
+    recording, truth = scene([Target(motion, 2880, shape="disc")], 1.0, 6e3)
+    (path,) = blob.find(recording, progress=False).paths
+    apart = path.p - truth(path.t)[:, 0, :2]
+    assert np.hypot(*apart.mean(0)) < 1.5
+    # Of a rim with |cos| of the angle to the heading, along it and across.
+    np.testing.assert_allclose(path.size[0], [9.8, 6.9], rtol=0.3)
+
+
 @pytest.mark.slow
 def test_recordings_of_few_events_have_no_targets():
     for count in (0, 1, 99):

@@ -23,6 +23,7 @@ from jaxevent.blob.search.detection import (
     larger_variance,
 )
 from jaxevent.blob.search.merge import merge_parts, merge_turning, stitch_paths
+from jaxevent.blob.search.own_frame import OwnFrame
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
 from jaxevent.blob.search.scale import ScaleSelection, select_scale
@@ -379,7 +380,9 @@ def _search_section(
         with stage(f"{name}: beginnings", progress):
             rest = stream.without(confirmed, gate, max(path.begin for path in confirmed))
             whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
-        near = whole = merge_parts(whole)
+        at_rest = background.scene is None
+        frame = OwnFrame(stream, background, selection.scale) if at_rest else None
+        near = whole = merge_parts(whole, frame)
         if background.scene is not None:
             whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]
