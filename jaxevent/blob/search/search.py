@@ -188,9 +188,15 @@ class TargetSearchResult:
 
     def _target_values(self) -> dict[str, NDArray[np.float64]]:
         """Values of parameters for each target."""
-        L, v, _ = self._numbers()
+        L, v, rate = self._numbers()
         W = np.array([path.window * 1e-6 for path in self.paths])
+        sensor = self.recording.width * self.recording.height
+        density = self.background / sensor
+        # Within three sizes there may be more clutter than events of the target.
+        area = np.array([np.pi * path.size.prod(1).mean() for path in self.paths])
+        inside = density * np.minimum(CONFIG.gate_sigmas**2 * area, sensor)
         return {
+            "clutter": np.where(inside > rate, density / rate, 0.0),
             "Q_p": 1e-4 * L**2 / W,
             "Q_v": np.array([path.velocity_noise for path in self.paths]),
             "Q_lambda": (0.05 * L) ** 2 / W,
