@@ -276,6 +276,15 @@ def test_a_target_over_a_quarter_of_the_sensor_is_not_compact():
         assert found.compact == compact and found.score == 0
 
 
+def test_clutter_counts_where_a_gate_holds_more_of_it_than_of_the_target():
+    recording, _ = scene([Target(LinearMotion((60, 40)), 1e3)], 0.1)
+    noise = 0.5 * SMALL[0] * SMALL[1]  # a gate of three sizes has 9 pi size^2 of its pixels
+    for size, clutter in ((3.0, 0.0), (10.0, 0.5 / 1000)):
+        path = _path(np.arange(3) * 1000, 60.0, 40.0, size, 1)  # 1000 events/s
+        found = TargetSearchResult((path,), (), 0, noise, recording)
+        assert found.settings()["clutter"] == pytest.approx(clutter)
+
+
 def test_two_in_contact_that_go_their_own_ways_are_two():
     t = np.arange(0, 60_000, 1000)
     x, swing = 20 + 1.5e-3 * t, 5 * np.sin(t / 4e3)

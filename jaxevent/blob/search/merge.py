@@ -62,10 +62,9 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
                 whole = merge_paths(paths[k], paths[i])
             elif may_be_pieces and frame and differ(balances[k], balances[i]):
                 others = [path for j, path in enumerate(paths) if j not in (k, i)]
-                seen = frame.whole(paths[k], paths[i])
-                if seen is not None and others:
-                    seen = frame.without(others).whole(paths[k], paths[i])
-                whole = seen and seen[0]
+                whole = frame.whole(paths[k], paths[i])
+                if whole is not None and others:
+                    whole = frame.without(others).whole(paths[k], paths[i])
             if whole is not None:
                 # The whole may now be in contact with what none of its parts was.
                 n = [paths[j].n.sum() for j in (k, i)]
@@ -74,10 +73,7 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
                 paths[k], k = whole, -1
                 break
         k += 1
-    if frame is None or not any(differ(one, 0.0) for one in balances):
-        return paths
-    rest = frame.without(paths)
-    return [rest.completed(*one) for one in zip(paths, balances, strict=True)]
+    return paths
 
 
 def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
@@ -110,7 +106,7 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     if touch and together and (edge or _separate_nats(both) <= CONFIG.log_bayes_factor):
         return True, False
     within = np.quantile(apart / sizes.max(0), share) < contact
-    near = together and reach < CONFIG.gate_sigmas * contact and _separate_nats(both) < 0
+    near = together and reach < CONFIG.gate_sigmas * contact
     return False, bool(within or near)
 
 

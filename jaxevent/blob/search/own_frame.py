@@ -60,16 +60,15 @@ class OwnFrame:
             sums += [np.bincount(owners, weights, len(sums[0])) for weights in (signs, signs**2)]
         return (sums[0] / np.maximum(sums[1], 1))[1:].tolist()
 
-    def whole(self, one: TargetPath, other: TargetPath) -> tuple[TargetPath, float] | None:
-        """Return the path of the object of which two paths are pieces, and its balance.
+    def whole(self, one: TargetPath, other: TargetPath) -> TargetPath | None:
+        """Return the path of the object of which two paths are pieces.
 
         Args:
             one: Path of a piece.
-            other: That of another piece, or the same.
+            other: That of another piece.
 
         Returns:
-            A path with the place and shape of what connects the pieces, and the balance of its
-            polarities; None if nothing does.
+            A path with the place and shape of what connects the pieces; None if nothing does.
         """
         rows = merge_paths(one, other)
         both = [interpolate_path(path, rows.t).p for path in (one, other)]
@@ -78,15 +77,14 @@ class OwnFrame:
         width = min(CONFIG.min_windows, len(rows.t)) | 1
         way = ndimage.uniform_filter1d(way, width, axis=0, mode="nearest")
         size, shape = np.array(self.stream.shape[::-1]), self.stream.shape
-        events = self.stream.events_between(rows.begin, rows.end)
-        middle = [np.interp(events.t, rows.t, along) for along in way.T]
+        begin, end = ((at - self.stream.start) * 1e-6 for at in (rows.begin, rows.end))
+        events, t = self.stream.window(begin, end), (rows.t - self.stream.start) * 1e-6
         x, y = (
-            np.rint(xy - along + half).astype(np.int32)
-            for xy, along, half in zip((events.x, events.y), middle, size // 2, strict=True)
+            np.rint(xy - np.interp(events.t, t, along) + half).astype(np.int32)
+            for xy, along, half in zip((events.x, events.y), way.T, size // 2, strict=True)
         )
         inside = (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
-        moved = WindowEvents(1e-6 * (events.t[inside] - rows.begin), x[inside], y[inside])
-        begin, end = ((at - self.stream.start) * 1e-6 for at in (rows.begin, rows.end))
+        moved = WindowEvents(events.t[inside], x[inside], y[inside])
         # Cells no larger than the larger piece.
         large = max(float(np.median(path.size[:, 0])) for path in (one, other))
         cell = max(self.scale.cell, 2 ** int(np.log2(max(large, 1))))
@@ -101,27 +99,11 @@ class OwnFrame:
         squared = np.einsum("kbi,bij,kbj->kb", away, np.linalg.inv(C), away).max(0)
         k = int(squared.argmin())
         # What is much larger than what the pieces span is something else that goes along.
-        apart = float(np.median(np.hypot(*(both[0] - both[1]).T)))
-        most = CONFIG.gate_sigmas * large if one is other else apart / 2 + large
-        if squared[k] >= CONFIG.contact_distance**2 or larger_variance(C)[k] > most**2:
+        span = float(np.median(np.hypot(*(both[0] - both[1]).T))) / 2 + large
+        if squared[k] >= CONFIG.contact_distance**2 or larger_variance(C)[k] > span**2:
             return None
-        balance = 2 * float(events.p[inside][labels == k + 1].mean()) - 1
         C = np.broadcast_to(C[k], rows.C.shape)
-        n = rows.n if one is not other else one.n
-        return dataclasses.replace(rows, p=way + p[k] - size // 2, C=C, n=n), balance
-
-    def completed(self, path: TargetPath, balance: float) -> TargetPath:
-        """Return the path of the larger object of which a path is a piece, or the path itself.
-
-        Args:
-            path: Path of a target; the frame is without its events and those of all others.
-            balance: Balance of its polarities.
-        """
-        missing = self.whole(path, path) if differ(balance, 0.0) else None
-        if missing is None or not differ(balance, missing[1]):
-            return path
-        known, seen = (np.median(larger_variance(one.C)) for one in (path, missing[0]))
-        return path if seen < CONFIG.contact_distance * known else missing[0]
+        return dataclasses.replace(rows, p=way + p[k] - size // 2, C=C)
 
 
 def differ(balance: float, other: float) -> bool:

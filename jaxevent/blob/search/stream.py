@@ -150,17 +150,6 @@ class Stream:
         number = _select(rows, self.start, WindowEvents(t, x, y))
         return WindowEvents(t[:number], x[:number], y[:number])
 
-    def events_between(self, begin: int, end: int) -> Events:
-        """Return the events from `begin` to before `end` (us) with their polarities."""
-        first, last = (self._index(min(max(t, self.start), self.stop)) for t in (begin, end))
-        if self._held is not None:
-            return self._held[first:last]
-        events = self.recording.events[first:last]
-        kept = ~self.hot[events.y, events.x]
-        if self._kept is not None:
-            kept &= self._kept[first - self._first : last - self._first]
-        return events[kept]
-
     def pixel_counts(self, begin: float | int, end: float | int) -> PixelCounts:
         """Count the events of a span (s) in their pixels, ordered by their first events."""
         return self.sample(begin, end, len(self))[0]
