@@ -50,25 +50,26 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
         paths: Paths of targets, all seen in the same windows.
         frame: Their events, which show pieces of outlines; None: only the paths are compared.
     """
-    if not paths:
-        return paths
     paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
-    balances = frame.balances(paths) if frame else [0.0] * len(paths)
+    balances: list[float] = []  # of each path, once they are asked for
     while k < len(paths):
         for i in range(k + 1, len(paths)):
             whole = None
             are_parts, may_be_pieces = _compare(paths[k], paths[i])
             if are_parts:
                 whole = merge_paths(paths[k], paths[i])
-            elif may_be_pieces and frame and differ(balances[k], balances[i]):
-                others = [path for j, path in enumerate(paths) if j not in (k, i)]
-                whole = frame.whole(paths[k], paths[i])
-                if whole is not None and others:
-                    whole = frame.without(others).whole(paths[k], paths[i])
+            elif may_be_pieces and frame:
+                balances = balances or frame.balances(paths)
+                if differ(balances[k], balances[i]):
+                    others = [path for j, path in enumerate(paths) if j not in (k, i)]
+                    whole = frame.whole(paths[k], paths[i])
+                    if whole is not None and others:
+                        whole = frame.without(others).whole(paths[k], paths[i])
             if whole is not None:
                 # The whole may now be in contact with what none of its parts was.
-                n = [paths[j].n.sum() for j in (k, i)]
-                balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
+                if balances:
+                    n = [paths[j].n.sum() for j in (k, i)]
+                    balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
                 del paths[i]
                 paths[k], k = whole, -1
                 break
@@ -100,7 +101,7 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     # Pieces slide along an edge, but less far than they go with it.
     far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
     changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
-    far *= (end - begin) / max(t[-1] - t[0], 1)
+    far *= (end - begin) / max(t[-1] - t[0], 1)  # of all of its windows
     together = far > CONFIG.common_way_sizes * small
     together &= bool(changed < max(large, far if edge else far / 2))
     if touch and together and (edge or _separate_nats(both) <= CONFIG.log_bayes_factor):

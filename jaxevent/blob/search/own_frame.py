@@ -46,8 +46,6 @@ class OwnFrame:
 
     def without(self, paths: list[TargetPath]) -> "OwnFrame":
         """Return the frame of the events of other objects than those of some paths."""
-        if not paths:
-            return self
         return dataclasses.replace(self, stream=self.stream.without(paths, CONFIG.gate_sigmas))
 
     def balances(self, paths: list[TargetPath]) -> list[float]:
