@@ -4,7 +4,8 @@
 sensors, outlines, bars, pairs of edges, one polarity only, targets that come and go, flicker, a
 background that moves with the camera, very short and very long recordings, stars; `OBJECTS` are
 rigid bodies, flocks, hands and targets that leave. Constants were chosen on seeds below 20, and of
-`OBJECTS` on seeds from 100 on. Each is called with a seed and gives the recording and its truth.
+`OBJECTS` and `DISCS`, outlines of few events, on seeds from 100 on. Each is called with a seed and
+gives the recording and its truth.
 """
 
 import dataclasses
@@ -783,3 +784,24 @@ OBJECTS: dict[str, Scene] = {
     "flock of 12, close": _close_flock,
     "dim tails": _dim_tails,
 }
+
+
+def _slow_disc(radius: float, speed: float, density: float) -> Scene:
+    """A disc (px, px/s) with so many events per px of its outline and px of its way."""
+
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
+        frame, size = (240, 180), radius / np.sqrt(1.5)
+        motion = LinearMotion((80.0, 84.0), (speed, 0.0), size=(size, size / np.sqrt(2)))
+        target = Target(motion, 4 * density * radius * speed, "disc")
+        return simulate_blobs([target], frame, 1.0, 0.5 * frame[0] * frame[1], seed)
+
+    return scene
+
+
+DISCS: dict[str, Scene] = {
+    f"disc of {radius} px, {speed} px/s, {density} events/px": _slow_disc(radius, speed, density)
+    for radius, speed, density in (
+        (7, 12, 3), (7, 20, 3), (7, 40, 1), (7, 40, 3), (12, 12, 3), (12, 20, 1), (12, 20, 3),
+        (12, 40, 1), (12, 40, 3), (45, 60, 1),
+    )
+}  # fmt: skip

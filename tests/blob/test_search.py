@@ -276,6 +276,15 @@ def test_a_target_over_a_quarter_of_the_sensor_is_not_compact():
         assert found.compact == compact and found.score == 0
 
 
+def test_clutter_counts_where_a_gate_holds_more_of_it_than_of_the_target():
+    recording, _ = scene([Target(LinearMotion((60, 40)), 1e3)], 0.1)
+    noise = 0.5 * SMALL[0] * SMALL[1]  # a gate of three sizes has 9 pi size^2 of its pixels
+    for size, clutter in ((3.0, 0.0), (10.0, 0.5 / 1000)):
+        path = _path(np.arange(3) * 1000, 60.0, 40.0, size, 1)  # 1000 events/s
+        found = TargetSearchResult((path,), (), 0, noise, recording)
+        assert found.settings()["clutter"] == pytest.approx(clutter)
+
+
 def test_two_in_contact_that_go_their_own_ways_are_two():
     t = np.arange(0, 60_000, 1000)
     x, swing = 20 + 1.5e-3 * t, 5 * np.sin(t / 4e3)
@@ -286,6 +295,17 @@ def test_two_in_contact_that_go_their_own_ways_are_two():
     ]
     assert len(merge_parts([moving[0], moving[1]])) == 2
     assert len(merge_parts([moving[0], moving[2]])) == 1
+
+
+def test_the_two_edges_of_a_slow_disc_are_one():
+    """In windows its outline has few events; its sides, which send least, have none."""
+    motion = LinearMotion((40.0, 48.0), (20.0, 0.0), size=(9.8, 6.9))  # radius 12 px
+    recording, truth = scene([Target(motion, 2880, shape="disc")], 1.0, 6e3)
+    (path,) = blob.find(recording, progress=False).paths
+    apart = path.p - truth(path.t)[:, 0, :2]
+    assert np.hypot(*apart.mean(0)) < 1.5
+    # Of a rim with |cos| of the angle to the heading, along it and across.
+    np.testing.assert_allclose(path.size[0], [9.8, 6.9], rtol=0.3)
 
 
 @pytest.mark.slow

@@ -29,51 +29,86 @@ from jaxevent.blob.search.background import (
 )
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import larger_variance
-from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise, log_likelihood
+from jaxevent.blob.search.own_frame import OwnFrame, differ
+from jaxevent.blob.search.paths import (
+    TargetPath,
+    fit_velocity_noise,
+    interpolate_path,
+    log_likelihood,
+    merge_paths,
+)
 from jaxevent.blob.search.scene import BLUR_SIGMAS_BINS, map_gain, measure_moving_background
 from jaxevent.blob.search.stream import Stream
 
 N_ANGLE_BINS = 256  # bins of a turn
 
 
-def merge_parts(paths: list[TargetPath]) -> list[TargetPath]:
-    """Merge paths that are parts of one object; all are seen in the same windows."""
+def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[TargetPath]:
+    """Merge paths that are parts of one object.
+
+    Args:
+        paths: Paths of targets, all seen in the same windows.
+        frame: Their events, which show pieces of outlines; None: only the paths are compared.
+    """
     paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
+    balances: list[float] = []  # of each path, once they are asked for
     while k < len(paths):
-        later = range(k + 1, len(paths))
-        part = next((i for i in later if _are_one_object(paths[k], paths[i])), None)
-        if part is None:
-            k += 1
-        else:
-            # The whole may now be in contact with what none of its parts was.
-            paths[k], k = merge_paths(paths[k], paths.pop(part)), 0
+        for i in range(k + 1, len(paths)):
+            whole = None
+            are_parts, may_be_pieces = _compare(paths[k], paths[i])
+            if are_parts:
+                whole = merge_paths(paths[k], paths[i])
+            elif may_be_pieces and frame:
+                balances = balances or frame.balances(paths)
+                if differ(balances[k], balances[i]):
+                    others = [path for j, path in enumerate(paths) if j not in (k, i)]
+                    whole = frame.whole(paths[k], paths[i])
+                    if whole is not None and others:
+                        whole = frame.without(others).whole(paths[k], paths[i])
+            if whole is not None:
+                # The whole may now be in contact with what none of its parts was.
+                if balances:
+                    n = [paths[j].n.sum() for j in (k, i)]
+                    balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
+                del paths[i]
+                paths[k], k = whole, -1
+                break
+        k += 1
     return paths
 
 
-def _are_one_object(one: TargetPath, other: TargetPath) -> bool:
-    """Return whether two paths are those of parts of one object."""
-    share = CONFIG.nearly_all
+def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
+    """Return whether two paths are those of parts of one object, and whether they may be pieces.
+
+    Pieces are those of an outline that windows do not show as one.
+    """
+    share, contact = CONFIG.nearly_all, CONFIG.contact_distance
     begin, end = max(one.begin, other.begin), min(one.end, other.end)
     if end - begin < share * min(one.end - one.begin, other.end - other.begin):
-        return False
+        return False, False
     t = np.union1d(one.t, other.t)
     t = t[(t >= begin) & (t < end)]
-    p, q = one.at(t), other.at(t)
+    both = [interpolate_path(path, t) for path in (one, other)]
+    p, q = both[0].p, both[1].p
     apart = np.hypot(*(p - q).T)
-    sizes = np.stack([np.interp(t, path.t, path.size[:, 0]) for path in (one, other)])
+    sizes = np.stack([path.size[:, 0] for path in both])
     edge = _is_edge(one, other) or _is_edge(other, one)
     small, large = np.sort(np.median(sizes, 1))
-    contact = 1.5 * CONFIG.contact_distance if edge else CONFIG.contact_distance
-    if np.quantile(apart / sizes.sum(0), share) >= contact:
-        return _turn_together(p, q, 2 * CONFIG.contact_distance * float(np.median(sizes.sum(0))))
-    both = [_interpolate(path, t) for path in (one, other)]
-    if not edge and _separate_nats(both) > CONFIG.log_bayes_factor:
-        return False
+    reach = float(np.quantile(apart / sizes.sum(0), share))
+    touch = reach < (1.5 * contact if edge else contact)
+    if not touch and _turn_together(p, q, 2 * contact * float(np.median(sizes.sum(0)))):
+        return True, False
     # Pieces slide along an edge, but less far than they go with it.
     far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
     changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
-    most = max(large, far if edge else far / 2)
-    return bool(far > CONFIG.common_way_sizes * small and changed < most)
+    far *= (end - begin) / max(t[-1] - t[0], 1)  # of all of its windows
+    together = far > CONFIG.common_way_sizes * small
+    together &= bool(changed < max(large, far if edge else far / 2))
+    if touch and together and (edge or _separate_nats(both) <= CONFIG.log_bayes_factor):
+        return True, False
+    within = np.quantile(apart / sizes.max(0), share) < contact
+    near = together and reach < CONFIG.gate_sigmas * contact
+    return False, bool(within or near)
 
 
 def _separate_nats(rows: list[TargetPath]) -> float:
@@ -121,35 +156,6 @@ def _turn_together(p: NDArray, q: NDArray, reach: float | int) -> bool:
         return False
     turned = np.unwrap(np.arctan2(*(p - q).T))
     return bool(abs(turned[-1] - turned[0]) > 2 * np.pi)
-
-
-def merge_paths(one: TargetPath, other: TargetPath) -> TargetPath:
-    """Merge the paths of two parts: the moments of the events of both, of each while it is seen."""
-    t = np.union1d(one.t, other.t)
-    rows = [_interpolate(path, t) for path in (one, other)]
-    n = rows[0].n + rows[1].n
-    share = rows[1].n / n
-    d = rows[1].p - rows[0].p
-    C = (1 - share)[:, None, None] * rows[0].C + share[:, None, None] * rows[1].C
-    C += (share * (1 - share))[:, None, None] * np.einsum("ti,tj->tij", d, d)
-    p = rows[0].p + share[:, None] * d
-    v = rows[0].v + share[:, None] * (rows[1].v - rows[0].v)
-    noise = min(one.velocity_noise, other.velocity_noise)
-    return TargetPath(t, p, v, C, n, one.window, noise)
-
-
-def _interpolate(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:
-    """Interpolate a path linearly at times (us), without events before and after its life."""
-
-    def at(values: NDArray) -> NDArray[np.float64]:
-        flat = values.reshape(len(path.t), -1)
-        columns = np.stack([np.interp(t, path.t, column) for column in flat.T], 1)
-        return columns.reshape(len(t), *values.shape[1:])
-
-    alive = (t >= path.t[0]) & (t <= path.t[-1])
-    return dataclasses.replace(
-        path, t=t, p=at(path.p), v=at(path.v), C=at(path.C), n=np.where(alive, at(path.n), 0)
-    )
 
 
 def stitch_paths(

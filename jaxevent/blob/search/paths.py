@@ -80,6 +80,35 @@ class TargetPath:
         return np.polyfit(t - t[0], p, 1)[0] if len(t) > 2 else np.zeros(2)
 
 
+def merge_paths(one: TargetPath, other: TargetPath) -> TargetPath:
+    """Merge the paths of two parts: the moments of the events of both, of each while it is seen."""
+    t = np.union1d(one.t, other.t)
+    rows = [interpolate_path(path, t) for path in (one, other)]
+    n = rows[0].n + rows[1].n
+    share = rows[1].n / n
+    d = rows[1].p - rows[0].p
+    C = (1 - share)[:, None, None] * rows[0].C + share[:, None, None] * rows[1].C
+    C += (share * (1 - share))[:, None, None] * np.einsum("ti,tj->tij", d, d)
+    p = rows[0].p + share[:, None] * d
+    v = rows[0].v + share[:, None] * (rows[1].v - rows[0].v)
+    noise = min(one.velocity_noise, other.velocity_noise)
+    return TargetPath(t, p, v, C, n, one.window, noise)
+
+
+def interpolate_path(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:
+    """Interpolate a path linearly at times (us), without events before and after its life."""
+
+    def at(values: NDArray) -> NDArray[np.float64]:
+        flat = values.reshape(len(path.t), -1)
+        columns = np.stack([np.interp(t, path.t, column) for column in flat.T], 1)
+        return columns.reshape(len(t), *values.shape[1:])
+
+    alive = (t >= path.t[0]) & (t <= path.t[-1])
+    return dataclasses.replace(
+        path, t=t, p=at(path.p), v=at(path.v), C=at(path.C), n=np.where(alive, at(path.n), 0)
+    )
+
+
 class PathTable(NamedTuple):
     """Rows of several paths, one after another; path k has rows first[k] to first[k + 1]."""
 

@@ -68,7 +68,7 @@ def select_scale(
     Returns:
         The scale; None if the recording is too short or nothing is gained.
     """
-    longest = min(stream.duration / CONFIG.min_windows, background.max_window)
+    longest = min(stream.duration / (2 * CONFIG.min_motion_windows), background.max_window)
     windows = np.asarray(TRIED_WINDOWS_US[TRIED_WINDOWS_US * 1e-6 <= longest] * 1e-6, np.float64)
     if not len(windows):
         return None

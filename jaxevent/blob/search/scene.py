@@ -227,9 +227,12 @@ def find_moving_background(
     tiles = _count_filled_tiles(stream, background, selection)
     if tiles <= CONFIG.majority * N_TILES_PER_SIDE**2:
         return None
+    longest = stream.duration / CONFIG.min_windows
+    # Blobs may be seen in longer windows than a scene's motion; these are halves of each other.
+    usual = selection.scale.window / (2 if selection.scale.window > longest else 1)
     for ratio in TRIED_WINDOW_RATIOS:
-        window = ratio * selection.scale.window
-        if not TRIED_WINDOWS_US[0] * 1e-6 <= window <= stream.duration / CONFIG.min_windows:
+        window = ratio * usual
+        if not TRIED_WINDOWS_US[0] * 1e-6 <= window <= longest:
             continue
         scene = measure_scene_motion(stream, window)
         moving = measure_moving_background(stream, scene)

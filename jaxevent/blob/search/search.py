@@ -23,6 +23,7 @@ from jaxevent.blob.search.detection import (
     larger_variance,
 )
 from jaxevent.blob.search.merge import merge_parts, merge_turning, stitch_paths
+from jaxevent.blob.search.own_frame import OwnFrame
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
 from jaxevent.blob.search.scale import ScaleSelection, select_scale
@@ -187,9 +188,15 @@ class TargetSearchResult:
 
     def _target_values(self) -> dict[str, NDArray[np.float64]]:
         """Values of parameters for each target."""
-        L, v, _ = self._numbers()
+        L, v, rate = self._numbers()
         W = np.array([path.window * 1e-6 for path in self.paths])
+        sensor = self.recording.width * self.recording.height
+        density = self.background / sensor
+        # Within three sizes there may be more clutter than events of the target.
+        area = np.array([np.pi * path.size.prod(1).mean() for path in self.paths])
+        inside = density * np.minimum(CONFIG.gate_sigmas**2 * area, sensor)
         return {
+            "clutter": np.where(inside > rate, density / rate, 0.0),
             "Q_p": 1e-4 * L**2 / W,
             "Q_v": np.array([path.velocity_noise for path in self.paths]),
             "Q_lambda": (0.05 * L) ** 2 / W,
@@ -379,7 +386,9 @@ def _search_section(
         with stage(f"{name}: beginnings", progress):
             rest = stream.without(confirmed, gate, max(path.begin for path in confirmed))
             whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
-        near = whole = merge_parts(whole)
+        at_rest = background.scene is None
+        frame = OwnFrame(stream, background, selection.scale) if at_rest else None
+        near = whole = merge_parts(whole, frame)
         if background.scene is not None:
             whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]
