@@ -402,7 +402,7 @@ def test_bursts_do_not_make_the_motion_too_fast():
     x, y, p = (np.repeat(column, len(late)) for column in (e.x, e.y, e.p))
     motion = voting.estimate(recorded(t, x, y, p), FAST, seed=1)
     mean = motion.mean[motion.t > 150_000].mean(0)
-    np.testing.assert_allclose(mean, truth, atol=0.02 * np.linalg.norm(truth))
+    np.testing.assert_allclose(mean, truth, atol=3.0)
 
 
 def test_motion_is_found_where_events_were_dropped():
