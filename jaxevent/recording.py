@@ -1023,3 +1023,14 @@ class Recording(HtmlRepr):
             raise InputError(
                 f"{source or self.name}: holds no event and no frame; choose a recording with some"
             )
+
+    def refuse_one_time(self, source: str | None = None) -> None:
+        """Raise `InputError` if several events are all at one time, which shows no motion."""
+        if len(self.events) < 2:
+            return
+        first, last = self.event_span()
+        if first == last:
+            raise InputError(
+                f"{source or self.name}: all {len(self.events):,} events are at one time, "
+                f"{first} us; choose a recording with times"
+            )

@@ -94,7 +94,7 @@ def run(
     if start is not None or stop is not None:
         steps.append(("cut in time", lambda r: r[start:stop]))
     if hot_pixels:
-        steps.append(("hot pixels", events.remove_hot_pixels))
+        steps.append(("hot pixels", _remove_hot_pixels))
     if crop is not None:
         steps.append(("crop", lambda r: events.crop(r, *crop)))
     if undistort:
@@ -124,3 +124,12 @@ def run(
         share = 100 * count / max(told[0][1], 1)
         print(f"{title:12} {count:>{width},}  {share:5.1f} %")
     print_stored(recording, target)
+
+
+def _remove_hot_pixels(recording: Any) -> Any:
+    """Remove the hot pixels that `jaxevent info` and `jaxevent calibrate` report."""
+    from jaxevent.calibration.event_calibration import count_parts
+    from jaxevent.calibration.hot import find_hot_pixels
+    from jaxevent.events import remove_hot_pixels
+
+    return remove_hot_pixels(recording, find_hot_pixels(count_parts(recording).sum(1)))

@@ -72,6 +72,7 @@ def run(
     values = FlowParams() if params is None else FlowParams.load(params)
     recording = arguments.open_recording(path, reading)
     recording.refuse_empty(str(path))
+    recording.refuse_one_time(str(path))
     if times is not None:
         wanted = read_times(times, (recording.start, recording.stop))
     else:

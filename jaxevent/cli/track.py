@@ -163,6 +163,7 @@ def run(
     recording = dataclasses.replace(recording, name=str(path))  # for messages
     if not len(recording.events):
         raise InputError(f"{path}: holds no events to track; choose another recording")
+    recording.refuse_one_time(str(path))
     check_accuracy(accuracy)
     if accuracy is not None and (seeds is not None or detect):
         raise InputError("--accuracy is for targets that are found; leave out --seed and --detect")

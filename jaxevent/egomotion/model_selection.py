@@ -118,8 +118,8 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     windows = [] if speed is None else measure_windows(recording, speed, camera)
     if not windows:
         raise InputError(
-            f"{recording.name}: nothing is seen to move {describe_windows(recording)}; name the "
-            "model of its motion"
+            f"{recording.name}: nothing is seen to move {describe_windows(recording)}; this "
+            "may be noise; if something moves, name the model of its motion"
         )
     if camera is None:
         line = (

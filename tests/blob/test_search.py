@@ -597,7 +597,7 @@ def test_steps_follow_the_accuracy():
     # The time constant is that of 161 events.
     assert told == [1, 4, 16, 32]
     assert two.settings(0.02)["events_per_step"] == 8
-    for bad in (0.0, -1.0, np.nan):
+    for bad in (0.0, -1.0, 7.0, np.nan):
         with pytest.raises(InputError, match="accuracy"):
             one.settings(bad)
 

@@ -49,3 +49,17 @@ def test_what_cannot_be_filtered(stored, tmp_path, capsys):
     fails(capsys, ["filter", source, target, "--background", 0], "is 0 us")
     fails(capsys, ["filter", source, target, "--start", 90], source, "no event")
     assert not target.exists()
+
+
+def test_hot_pixels_beside_each_other_are_left_out(tmp_path):
+    """A fifth of the pixels fires 60 times, others once."""
+    rng = np.random.default_rng(7)
+    hot = rng.random((30, 40)) < 0.2
+    y, x = np.repeat(np.indices(hot.shape).reshape(2, -1), np.where(hot, 60, 1).ravel(), axis=1)
+    t, p = np.sort(rng.integers(0, 1_000_000, len(x))), rng.random(len(x)) < 0.5
+    order = rng.permutation(len(x))
+    source, target = tmp_path / "hot.npz", tmp_path / "clean.h5"
+    np.savez(source, t=t, x=x[order], y=y[order], p=p, width=40, height=30)
+    assert cli.main(["filter", str(source), str(target), "--time-unit", "us", "--hot-pixels"]) == 0
+    left = jaxevent.load(target).events
+    assert hot[left.y, left.x].mean() < 0.05

@@ -390,6 +390,20 @@ def test_contrast_finds_the_motion(straight, rotating, sharpened, model):
 
 
 @pytest.mark.slow
+def test_contrast_along_parallel_edges_is_lost():
+    """Upright bars that move by (120, 60) px/s, with the scatter of pixels' thresholds."""
+    rng = np.random.default_rng(31)
+    edges = np.cumsum(rng.integers(1, 4, 60) * 8) - 60.0
+    x, y, edge = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT), edges, indexing="ij")
+    t = (x - edge + rng.normal(0, 0.3, x.shape[:2])[..., None]) / 120
+    kept = (t > 0) & (t < 0.25)
+    on = np.broadcast_to(np.arange(len(edges)) % 2, t.shape)
+    recording = recorded(1e6 * t[kept], x[kept], y[kept], on[kept], *SIZE)
+    with pytest.warns(InputWarning, match="edges in view are parallel"):
+        motion = contrast.estimate(recording, SMALL, model="planar")
+    assert len(motion) and not motion.valid.any()
+
+
 def test_search_finds_fast_rotations():
     """About ten times as fast as could be searched in the whole window."""
     omega = np.array([14.0, 8.0, -6.0])

@@ -393,6 +393,18 @@ def test_planar_motion_is_found():
     np.testing.assert_array_equal(motion.mean, again.mean)
 
 
+def test_bursts_do_not_make_the_motion_too_fast():
+    """An edge makes 16 events at a pixel, of levels that are 0.15 px apart."""
+    truth = np.array([130.0, -70.0])
+    e = moved(lambda at: truth, 0.3, 60, seed=8).events
+    late = np.arange(16) * 0.15e6 / 148
+    t = (e.t[:, None] + late).ravel()
+    x, y, p = (np.repeat(column, len(late)) for column in (e.x, e.y, e.p))
+    motion = voting.estimate(recorded(t, x, y, p), FAST, seed=1)
+    mean = motion.mean[motion.t > 150_000].mean(0)
+    np.testing.assert_allclose(mean, truth, atol=3.0)
+
+
 def test_motion_is_found_where_events_were_dropped():
     """15 of each 50 ms are missing; then nothing is told, as the camera may have stopped."""
     truth = np.array([130.0, -70.0])

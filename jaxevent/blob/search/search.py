@@ -152,7 +152,7 @@ class TargetSearchResult:
                 by event, which sets `events_per_step`; None for about 32 steps in a window.
 
         Raises:
-            InputError: `accuracy` is not positive.
+            InputError: `accuracy` is not above 0 and at most 1.
         """
         check_accuracy(accuracy)
         if not len(self):
@@ -246,9 +246,11 @@ class TargetSearchResult:
 
 
 def check_accuracy(accuracy: float | int | None) -> None:
-    """Raise `InputError` for an accuracy that is not positive."""
-    if accuracy is not None and not 0 < accuracy < np.inf:
-        raise InputError(f"an accuracy of {accuracy:g} is not possible; give a share above 0")
+    """Raise `InputError` for an accuracy that is not a share, above 0 and at most 1."""
+    if accuracy is not None and not 0 < accuracy <= 1:
+        raise InputError(
+            f"an accuracy of {accuracy:g} is not possible; give a share above 0, at most 1"
+        )
 
 
 def max_events_per_step(

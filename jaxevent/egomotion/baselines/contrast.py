@@ -13,6 +13,12 @@ fall together. It is found from coarse to fine, with much blur at first, from th
 window before. For the first window, and when the motion was lost, all motions are searched.
 SciPy's BFGS uses one compiled gradient for all blurs.
 
+Along straight parallel edges J is as sharp for all motions, and chance decides which one is best.
+So each maximum is compared with motions up to 6 px away along the axis in which it is flattest, on
+the points that all of these keep in view: where edges leave the sensor, they would end. Cells of
+the image, drawn anew with replacement, have the maximum elsewhere (Efron, Ann. Stat. 1979). Its
+mean square is in the covariance, and if one in twenty draws has it at the ends, the motion is lost.
+
 Points that enter or leave the sensor within the window pull the motion towards 0, for a slower one
 keeps their cut tracks together as well. So J only counts where a point is in view for the whole
 window. That region is computed from the motion that an ascent starts with, and then fixed; events
@@ -59,6 +65,11 @@ GRID_RANGE_RATIO = 4.0  # between the ranges of the grids of a search
 N_REFINED_MOTIONS = 4  # motions of a grid that are refined
 INDEPENDENT_CELL_PX = 24  # of the parts of the image whose errors are independent
 CURVATURE_PROBE_PX = 0.5  # at the window's end, from the maximum, where the curvature is measured
+COMPARED_DISPLACEMENTS_PX = np.arange(
+    -6.0, 7.0, 2.0
+)  # at the window's end, along the flattest axis
+N_DRAWS = 200  # of the image's cells
+MAX_UNBOUNDED_FRACTION = 0.05  # of draws that have the maximum at the ends of these
 MIN_RELATIVE_GRADIENT = 1e-3  # 1/px, relative to the objective, at which an ascent ends
 BEST_WINDOW_DISPLACEMENT_PX = 10.0  # of the image in a window, at best
 WINDOW_DISPLACEMENT_RANGE_PX = (5.0, 60.0)  # within which the default is kept
@@ -70,6 +81,10 @@ N_NEIGHBOURS = 3  # estimates, up to which halves of windows show how the motion
 N_HALVED_WINDOWS = 5  # of more, whose halves show changes that neighbours do not
 RELATIVE_NOISE = 0.5  # 1/sqrt(s), change of a motion that few windows do not show
 INITIAL_VARIANCE_PX2 = 2.0  # px^2, inverse curvature relative to the objective, at the start
+PARALLEL_EDGES = (
+    "the edges in view are parallel: events show the motion across them alone, and any motion "
+    "along them explains the events as well; rows are empty"
+)
 
 Numeric = Array | np.ndarray
 
@@ -240,29 +255,31 @@ def _value_and_grad(params: Params, window: Window, z: Array, times: Array) -> t
 _mask_visible = eqx.filter_jit(mask_visible)
 
 
+def _cell_parts(params: Params, window: Window, z: Array) -> Float[Array, " cells"]:
+    """Return each image cell's part of the objective, without that of the mean."""
+    J = warped_image(params, window, z * jnp.asarray(window.scale)) * window.mask
+    rows, columns = (-(-n // INDEPENDENT_CELL_PX) for n in J.shape)
+    size = rows * INDEPENDENT_CELL_PX, columns * INDEPENDENT_CELL_PX
+    J = jnp.pad(J, [(0, whole - n) for whole, n in zip(size, J.shape, strict=True)])
+    cells = (J**2).reshape(rows, INDEPENDENT_CELL_PX, columns, INDEPENDENT_CELL_PX)
+    return cells.sum((1, 3)).reshape(-1) / window.total_weight
+
+
 @eqx.filter_jit
 def _cell_gradients(params: Params, window: Window, z: Array) -> Float[Array, "cells dimension"]:
-    """Return the gradient of each image cell's part of the objective, without that of the mean."""
+    """Return the gradient of each image cell's part of the objective."""
+    return jax.jacfwd(lambda z: _cell_parts(params, window, z))(z)
 
-    def parts(z: Array) -> Array:
-        J = warped_image(params, window, z * jnp.asarray(window.scale)) * window.mask
-        height, width = (-(-n // INDEPENDENT_CELL_PX) for n in J.shape)
-        J = jnp.pad(
-            J,
-            [
-                (0, height * INDEPENDENT_CELL_PX - J.shape[0]),
-                (0, width * INDEPENDENT_CELL_PX - J.shape[1]),
-            ],
-        )
-        squares = (
-            (J**2)
-            .reshape(height, INDEPENDENT_CELL_PX, width, INDEPENDENT_CELL_PX)
-            .sum((1, 3))
-            .reshape(-1)
-        )
-        return squares / window.total_weight
 
-    return jax.jacfwd(parts)(z)
+@eqx.filter_jit
+def _cell_profile(
+    params: Params, window: Window, z: Float[Array, "motions dimension"]
+) -> Float[Array, "motions cells"]:
+    """Return each image cell's part of the objective, on points that all motions keep in view."""
+    motions = z * jnp.asarray(window.scale)
+    masks = lax.map(lambda motion: mask_visible(window, motion).mask, motions[jnp.array([0, -1])])
+    window = dataclasses.replace(window, mask=masks.prod(0))
+    return lax.map(lambda z: _cell_parts(params, window, z), z)
 
 
 def _evaluate(
@@ -309,6 +326,7 @@ class WindowEstimate(NamedTuple):
     motion: NDArray[np.float64]
     contrast: float  # the objective relative to that with shuffled times
     covariance: NDArray[np.float64] | None  # see `covariance`
+    is_observable: bool  # whether the maximum is one along all axes
 
 
 def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> WindowEstimate:
@@ -329,45 +347,94 @@ def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> Wind
     z = motion / np.asarray(window.scale, np.float64)
     shuffled = dataclasses.replace(window, t=window.shuffled)
     chance, _ = _evaluate(params, shuffled, z, params.blur)
-    return WindowEstimate(motion, value / max(chance, 1e-12), covariance(params, window, motion))
+    curvature = measure_curvature(params, window, motion)
+    found = covariance(params, window, motion, curvature)
+    spread = None if found is None else maximum_spread(params, window, motion, curvature)
+    if found is not None and spread is not None:
+        found = found + spread
+    return WindowEstimate(motion, value / max(chance, 1e-12), found, spread is not None)
+
+
+class Curvature(NamedTuple):
+    """Eigenvalues of the negative curvature of the objective of motions in px, rising."""
+
+    values: NDArray[np.float64]  # (d,)
+    axes: NDArray[np.float64]  # (d, d) eigenvectors in columns
+
+
+def measure_curvature(params: Params, window: Window, motion: NDArray[np.floating]) -> Curvature:
+    """Measure the curvature of the objective at a motion (d,), from differences of gradients."""
+    z = np.asarray(motion, np.float64) / np.asarray(window.scale, np.float64)
+    H = [
+        _evaluate(params, window, z + h, params.blur)[1]
+        - _evaluate(params, window, z - h, params.blur)[1]
+        for h in CURVATURE_PROBE_PX * np.eye(len(z))
+    ]
+    H = np.array(H) / (2 * CURVATURE_PROBE_PX)
+    if not np.isfinite(H).all():
+        return Curvature(np.zeros(len(z)), np.eye(len(z)))
+    return Curvature(*np.linalg.eigh(-(H + H.T) / 2))
 
 
 def covariance(
-    params: Params, window: Window, motion: NDArray[np.floating]
+    params: Params, window: Window, motion: NDArray[np.floating], curvature: Curvature
 ) -> NDArray[np.float64] | None:
     """Return the sandwich covariance H^-1 (sum_c g_c g_c') H^-1 of a motion.
 
-    H is the objective's curvature at its maximum, from differences of gradients. g_c is the
-    gradient of the part of the objective in cell c of the image (24 px). The sum of these is 0, and
-    their scatter gives the error of the maximum, if cells are independent. Changes of the motion
-    within the window are not in it; see `CovarianceCalibration`. A direction with less than 1 % of
-    the largest curvature is assumed to have that much.
+    H is the objective's curvature at its maximum. g_c is the gradient of the part of the objective
+    in cell c of the image (24 px). The sum of these is 0, and their scatter gives the error of the
+    maximum, if cells are independent. Changes of the motion within the window are not in it; see
+    `CovarianceCalibration`. A direction with less than 1 % of the largest curvature is assumed to
+    have that much.
 
     Args:
         params: The parameters.
         window: The window.
         motion: (d,) motion at the maximum.
+        curvature: The curvature there.
 
     Returns:
         (d, d) covariance, or None if there is no maximum.
     """
     scale = np.asarray(window.scale, np.float64)
     z = np.asarray(motion, np.float64) / scale
-    probes = CURVATURE_PROBE_PX * np.eye(len(z))
-    H = [
-        _evaluate(params, window, z + h, params.blur)[1]
-        - _evaluate(params, window, z - h, params.blur)[1]
-        for h in probes
-    ]
-    H = np.array(H) / (2 * CURVATURE_PROBE_PX)
+    values, axes = curvature
     g = np.asarray(_cell_gradients(params, window, jnp.asarray(z, window.xi.dtype)), np.float64)
-    if not (np.isfinite(H).all() and np.isfinite(g).all()):
+    if not (np.isfinite(g).all() and values[-1] > 0):
         return None
-    values, vectors = np.linalg.eigh(-(H + H.T) / 2)
-    if not values[-1] > 0:
-        return None
-    inverse = vectors / np.maximum(values, 0.01 * values[-1]) @ vectors.T
+    inverse = axes / np.maximum(values, 0.01 * values[-1]) @ axes.T
     return inverse @ (g.T @ g) @ inverse * np.outer(scale, scale)
+
+
+def maximum_spread(
+    params: Params, window: Window, motion: NDArray[np.floating], curvature: Curvature
+) -> NDArray[np.float64] | None:
+    """Return the covariance of the maximum along its flattest axis, if cells are drawn anew.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        motion: (d,) motion at the maximum.
+        curvature: The curvature there.
+
+    Returns:
+        (d, d) covariance, or None if the draws do not bound the maximum: along parallel edges.
+    """
+    scale = np.asarray(window.scale, np.float64)
+    axis = curvature.axes[:, 0]
+    z = np.asarray(motion, np.float64) / scale + COMPARED_DISPLACEMENTS_PX[:, None] * axis
+    profile = _cell_profile(params, window, jnp.asarray(z, window.xi.dtype))
+    profile = np.asarray(profile, np.float64)
+    profile = profile[:, profile.any(0)]
+    cells = profile.shape[1]
+    if not cells:
+        return None
+    draws = np.random.default_rng(0).multinomial(cells, np.full(cells, 1 / cells), N_DRAWS)
+    best = (profile @ draws.T).argmax(0)
+    if np.isin(best, [0, len(z) - 1]).mean() > MAX_UNBOUNDED_FRACTION:
+        return None
+    offset = axis * scale
+    return (COMPARED_DISPLACEMENTS_PX[best] ** 2).mean() * np.outer(offset, offset)
 
 
 class EventRange(NamedTuple):
@@ -655,6 +722,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
         return MotionEstimate.empty(inputs.model)
     motion, fits, contrasts = None, [], []
     parts: list[EventRange] = []
+    unobservable = 0
     for part in bar(windows, desc="sharpen windows", unit="window", progress=inputs.progress):
         parts.append(part)
         if part.end - part.begin < params.fewest or not windows.fills(part)[1]:
@@ -666,13 +734,14 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
             motion = windows.search(part)
         found = refine(params, windows.crop(part), motion)
         is_sharp = found.contrast >= float(params.contrast)
-        is_found = is_sharp and found.covariance is not None
+        is_found = is_sharp and found.is_observable
+        unobservable += is_sharp and not is_found
         fit = None
         if is_found and found.covariance is not None:
             fit = Fit(found.motion, found.covariance).with_systematic_error(
                 SYSTEMATIC_ERROR_PX, windows.length(part), windows.pixel_scale
             )
-        motion = None if fit is None else fit.mean
+        motion = found.motion if is_sharp and found.covariance is not None else None
         fits.append(fit)
         contrasts.append(found.contrast)
     t = np.array([part.middle for part in parts])
@@ -680,6 +749,8 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     estimate = motion_of_fits(inputs.model, t, fits, np.array(contrasts))
     change = rate = None
     valid = np.flatnonzero(estimate.valid)
+    if not len(valid) and unobservable:
+        return dataclasses.replace(estimate, warning=PARALLEL_EDGES)
     if 0 < len(valid) <= N_NEIGHBOURS:
         change = np.zeros_like(estimate.mean)
         for k in valid:

@@ -23,6 +23,7 @@ class Params(Parameters):
             "radius": 2,
             "tau_max": 0.05,
             "every": 16,
+            "per_pixel": 8,
             "candidates": 96,
             "noise": 1.0,
         },
@@ -46,7 +47,12 @@ class Params(Parameters):
     radius: Count = Count(
         8, "px", "largest distance of candidates in x and y; baseline + 1.5 or more"
     )
-    per_pixel: Count = Count(8, "", "number of latest events of a pixel that are candidates")
+    per_pixel: Count = Count(
+        24,
+        "",
+        "latest events of a pixel that are candidates; the last of a longer burst are late, and "
+        "the motion too fast",
+    )
     candidates: Count = Count(
         128, "", "most candidates of an event; of more, these many in even steps"
     )
