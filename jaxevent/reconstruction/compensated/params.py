@@ -133,8 +133,8 @@ class Params(smoother.Params):
     # Thresholds are learned (`learn`) along trajectories, from more than events between frames. But
     # they are relative to the common ones, which alone tell how far beyond white points are, and
     # which must be near the sensor's. Where pixels are dead after events, fast motion loses many,
-    # and images between frames stay behind. The exposure is needed of frames that are blurred and do
-    # not state theirs.
+    # and images between frames stay behind. The exposure is needed of frames that are blurred and
+    # do not state theirs.
     calibrated = ("clock_offset", "event_delay", "rho_ref")
     calibrated_if_needed = ("c_on", "c_off", "exposure")
 
