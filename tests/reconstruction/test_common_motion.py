@@ -13,7 +13,7 @@ from jaxevent.reconstruction.compensated.common_motion import estimate_common_mo
 from jaxevent.reconstruction.compensated.instants import CommonMotion
 from jaxevent.reconstruction.compensated.normal_equations import CostParams
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.compensated.trajectories import ImagePyramid
+from jaxevent.reconstruction.compensated.trajectories import ImagePyramid, fit_path
 from jaxevent.simulate import Sensor, simulate
 
 COST = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
@@ -108,3 +108,9 @@ def test_images_of_a_shaken_camera(monkeypatch):
     alone = error(mc.estimate(recording, params, progress=False)(t).mean)
     assert ours < 0.3 * alone
     assert ours < 0.7 * error(aks(t).mean)
+
+
+def test_a_path_that_explains_a_course():
+    s = np.linspace(-0.8, 1, 7, dtype=np.float32)
+    course = np.outer(s, [3.0, -1.5]) + np.outer(s**2, [0.5, 2.0])
+    np.testing.assert_allclose(fit_path(s, course.astype(np.float32)), [3, -1.5, 0.5, 2], atol=1e-5)

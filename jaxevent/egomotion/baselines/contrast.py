@@ -65,9 +65,8 @@ GRID_RANGE_RATIO = 4.0  # between the ranges of the grids of a search
 N_REFINED_MOTIONS = 4  # motions of a grid that are refined
 INDEPENDENT_CELL_PX = 24  # of the parts of the image whose errors are independent
 CURVATURE_PROBE_PX = 0.5  # at the window's end, from the maximum, where the curvature is measured
-COMPARED_DISPLACEMENTS_PX = np.arange(
-    -6.0, 7.0, 2.0
-)  # at the window's end, along the flattest axis
+# At the window's end, along the flattest axis.
+COMPARED_DISPLACEMENTS_PX = np.arange(-6.0, 7.0, 2.0)
 N_DRAWS = 200  # of the image's cells
 MAX_UNBOUNDED_FRACTION = 0.05  # of draws that have the maximum at the ends of these
 MIN_RELATIVE_GRADIENT = 1e-3  # 1/px, relative to the objective, at which an ascent ends

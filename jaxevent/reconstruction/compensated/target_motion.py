@@ -149,7 +149,7 @@ class NodeMotion(NamedTuple):
                 one.path_times.common
                 for one in (instants, instants.with_common_motion(there.common))
             )
-            p = p + fit_path(instants.s, other - own).astype(np.float32)
+            p = p + fit_path(instants.s, other - own)
         return p
 
 

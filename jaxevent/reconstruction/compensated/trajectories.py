@@ -302,7 +302,8 @@ def fit_path(s: NDArray[np.float32], displacement: NDArray[np.float32]) -> NDArr
     """
     weight = np.exp(-2 * s**2)[:, None]
     powers = np.stack([s, s**2], 1).astype(float)
-    return np.linalg.lstsq(weight * powers, weight * displacement, rcond=None)[0].ravel()
+    path = np.linalg.lstsq(weight * powers, weight * displacement, rcond=None)[0]
+    return path.ravel().astype(np.float32)
 
 
 class RefinementStage(NamedTuple):
