@@ -120,7 +120,8 @@ def calibrated_values(
     """
     if not names or recording.frames is None or len(recording.frames) < 2:
         return CalibratedValues({}, {})
-    if_needed = THRESHOLDS.intersection(names).intersection(params.calibrated_if_needed)
+    of_events = {*THRESHOLDS, "rho_ref"}  # the dead time belongs to its thresholds
+    if_needed = of_events.intersection(names).intersection(params.calibrated_if_needed)
     if if_needed:
         others = [name for name in names if name not in if_needed]
         values = calibrated_values(recording, params, others, sample)
@@ -129,7 +130,8 @@ def calibrated_values(
         # Those of a predictor would hold at its own I0.
         found = recall_calibration(recording, _rounded_I0(params), sample).select(if_needed)
         missing = {**values.missing, **found.missing}
-        return CalibratedValues(values.found, missing).updated(found.found, names)
+        known = {} if found.missing else found.found
+        return CalibratedValues(values.found, missing).updated(known, names)
     I0 = _rounded_I0(params) if THRESHOLDS.intersection(names) else 1.0
     calibration, method = recall_calibration(recording, I0, sample), params.predictor()
     values = calibration.select(names)

@@ -135,8 +135,8 @@ class Params(smoother.Params):
     # which must be near the sensor's. Where pixels are dead after events, fast motion loses many,
     # and images between frames stay behind. The exposure is needed of frames that are blurred and
     # do not state theirs.
-    calibrated = ("clock_offset", "event_delay", "rho_ref")
-    calibrated_if_needed = ("c_on", "c_off", "exposure")
+    calibrated = ("clock_offset", "event_delay")
+    calibrated_if_needed = ("c_on", "c_off", "rho_ref", "exposure")
 
     @classmethod
     def predictor(cls) -> smoother.Smoother:
