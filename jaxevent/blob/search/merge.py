@@ -62,9 +62,7 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
                 balances = balances or frame.balances(paths)
                 if differ(balances[k], balances[i]):
                     others = [path for j, path in enumerate(paths) if j not in (k, i)]
-                    whole = frame.whole(paths[k], paths[i])
-                    if whole is not None and others:
-                        whole = frame.without(others).whole(paths[k], paths[i])
+                    whole = frame.whole(paths[k], paths[i], others)
             if whole is not None:
                 # The whole may now be in contact with what none of its parts was.
                 if balances:

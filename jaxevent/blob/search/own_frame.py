@@ -44,10 +44,6 @@ class OwnFrame:
     background: Background
     scale: Scale
 
-    def without(self, paths: list[TargetPath]) -> "OwnFrame":
-        """Return the frame of the events of other objects than those of some paths."""
-        return dataclasses.replace(self, stream=self.stream.without(paths, CONFIG.gate_sigmas))
-
     def balances(self, paths: list[TargetPath]) -> list[float]:
         """Compute the balance of polarities of each path's events: 1 if all are ON, -1 if OFF."""
         sums = np.zeros((2, len(paths) + 1))
@@ -58,16 +54,27 @@ class OwnFrame:
             sums += [np.bincount(owners, weights, len(sums[0])) for weights in (signs, signs**2)]
         return (sums[0] / np.maximum(sums[1], 1))[1:].tolist()
 
-    def whole(self, one: TargetPath, other: TargetPath) -> TargetPath | None:
+    def whole(
+        self, one: TargetPath, other: TargetPath, others: list[TargetPath]
+    ) -> TargetPath | None:
         """Return the path of the object of which two paths are pieces.
 
         Args:
             one: Path of a piece.
             other: That of another piece.
+            others: Paths of other targets, whose events connect nothing.
 
         Returns:
             A path with the place and shape of what connects the pieces; None if nothing does.
         """
+        found = self._connect(one, other)
+        if found is None or not others:  # to leave out events takes long
+            return found
+        stream = self.stream.without(others, CONFIG.gate_sigmas)
+        return dataclasses.replace(self, stream=stream)._connect(one, other)
+
+    def _connect(self, one: TargetPath, other: TargetPath) -> TargetPath | None:
+        """Return the path of what connects two pieces by all events of the stream."""
         rows = merge_paths(one, other)
         both = [interpolate_path(path, rows.t).p for path in (one, other)]
         # Means of several windows, for pieces slide along their outline.

@@ -362,7 +362,16 @@ class Curvature(NamedTuple):
 
 
 def measure_curvature(params: Params, window: Window, motion: NDArray[np.floating]) -> Curvature:
-    """Measure the curvature of the objective at a motion (d,), from differences of gradients."""
+    """Measure the curvature of the objective at a motion, from differences of gradients.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        motion: (d,) the motion.
+
+    Returns:
+        The curvature; 0 along all axes where gradients are not finite.
+    """
     z = np.asarray(motion, np.float64) / np.asarray(window.scale, np.float64)
     H = [
         _evaluate(params, window, z + h, params.blur)[1]

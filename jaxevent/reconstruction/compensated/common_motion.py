@@ -53,8 +53,8 @@ def estimate_common_motion(
     steps = [_register(pyramid, k, np.zeros(2), COARSE_LEVELS, cost) for k in pairs]
     if _deviation(_subtract_parabola(steps, s)) < MIN_DEVIATION_PX:
         return None
-    levels = pyramid[SEARCH_LEVEL][..., 0]
-    starts = [_search(levels[k], levels[k + 1]) * 2**SEARCH_LEVEL for k in pairs]
+    L = pyramid[SEARCH_LEVEL][..., 0]
+    starts = [_search(L[k], L[k + 1]) * 2**SEARCH_LEVEL for k in pairs]
     steps = [_register(pyramid, k, starts[k], FINE_LEVELS, cost) for k in pairs]
     rest = _subtract_parabola(steps, s)
     return CommonMotion(t, rest) if _deviation(rest) > MIN_DEVIATION_PX else None

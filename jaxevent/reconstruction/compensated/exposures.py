@@ -174,7 +174,16 @@ def blur_by_motion_jax(L: Array, D: Array) -> tuple[Array, Array]:
 
 
 def blur_by_motion_adjoint_jax(error: Array, shares: Array, D: Array) -> Array:
-    """Bring errors (n, h, w) of B back to the points of L that it averaged: (h, w)."""
+    """Bring errors of B back to the points of L that it averaged.
+
+    Args:
+        error: (n, h, w) errors of B.
+        shares: (n, j, h, w) shares of the samples, of `blur_by_motion_jax`.
+        D: (n, j, h, w, 2) displacements at the samples, px.
+
+    Returns:
+        (h, w).
+    """
     n, j, h, w = shares.shape
     y, x = jnp.arange(h)[:, None], jnp.arange(w)
     Y, X = (y + D[..., 1]).reshape(-1, h, w), (x + D[..., 0]).reshape(-1, h, w)
@@ -235,7 +244,16 @@ def blur_by_motion_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArr
 
 
 def exposure_displacements(exposures: AdjacentExposures, paths: Array, samples: int) -> Array:
-    """Return D (n, samples, h, w, 2), px, along paths (h, w, 4)."""
+    """Return how far points move from mid-exposure to the samples of each exposure.
+
+    Args:
+        exposures: The n exposures.
+        paths: (h, w, 4) paths of the points, px.
+        samples: Samples of each exposure.
+
+    Returns:
+        D, (n, samples, h, w, 2), along x and y, px.
+    """
     s, half, common, drift = (
         jnp.asarray(part)[:, None]
         for part in (exposures.s, exposures.half, exposures.common, exposures.drift)

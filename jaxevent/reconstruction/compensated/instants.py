@@ -197,10 +197,12 @@ class CommonMotion:
         before, after = self._interpolate(np.array([time - span, time + span]))
         return ((after - before) / (2e-6 * span)).astype(np.float32)
 
+    @functools.cached_property
+    def _course(self) -> Akima1DInterpolator:
+        return Akima1DInterpolator((self.t - self.t[0]) * 1e-6, self.displacement)
+
     def _interpolate(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
-        seconds = (self.t - self.t[0]) * 1e-6
-        course = Akima1DInterpolator(seconds, self.displacement)
-        return course(((times - self.t[0]) * 1e-6).clip(0, seconds[-1]))
+        return self._course((times.clip(self.t[0], self.t[-1]) - self.t[0]) * 1e-6)
 
 
 @dataclasses.dataclass(frozen=True)

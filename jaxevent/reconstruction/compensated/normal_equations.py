@@ -209,8 +209,7 @@ def _sample_row(y, begin, inputs, scratch, points, means):
         interpolate_path(p, at_y, np.float32(x) * half - np.float32(0.25), path[:, x])
     for k in range(count):
         row = (path, at, pixel, part, inside)
-        instant = images.times.s[k], images.times.common[k, 0], images.times.common[k, 1]
-        locate_points(np.float32(y), instant, (h, w), w, row)
+        locate_points(np.float32(y), images.times, k, (h, w), w, row)
         _read_channels(images.pixels[k], pixel, part, k, points)
         fill_information(points[1, k], inside, cost.floor, info[k])
     found = (points[1], means, scratch.sums[begin])

@@ -430,15 +430,13 @@ class TrajectoryEstimator:
                 p = gauss_newton_step(images, p, self._cost)
             return NodeMotion(clock, p)
 
-        def cost(found: NodeMotion) -> float:
-            return self._frame_cost(pixels, found)
-
         found = improved(instants, p)
         if not instants.clock.event_share:
             return SoughtMotion(found, found, 0.0)
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
-        evidence = math.log(max(cost(other), MIN_CLOCK_COST) / max(cost(found), MIN_CLOCK_COST))
+        costs = [max(self._frame_cost(pixels, one), MIN_CLOCK_COST) for one in (other, found)]
+        evidence = math.log(costs[0] / costs[1])
         return SoughtMotion(found, other, evidence)
 
     def _prefers_time(self, t: int, anchors: list[int]) -> bool:

@@ -504,8 +504,7 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
     means, costs = lines[2, :count], lines[3]
     total, product = scratch.logs[begin, 0], scratch.logs[begin, 1]
     for k in range(len(times.s)):
-        instant = times.s[k], times.common[k, 0], times.common[k, 1]
-        locate_points(y, instant, (h, w), count, (path, x, pixel, part, inside))
+        locate_points(y, times, k, (h, w), count, (path, x, pixel, part, inside))
         _read_levels(images.pixels[k], pixel, part, level[k, :count], W[k])
         fill_information(W[k, :count], inside, inputs.cost.floor, W[k])
     robust_means(level, W, images.near, nu, (R, means, lines[:2]))

@@ -188,14 +188,14 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
 
 
 @njit_noalloc_inlined
-def locate_points(y, instant, image_shape, n_points, scratch_row):
+def locate_points(y, times, k, image_shape, n_points, scratch_row):
     """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
 
-    `instant` is s and the common displacement along x and y. `scratch_row` holds the parts of a
+    `times` are `PathTimes`, and k is the instant's index. `scratch_row` holds the parts of a
     `RowScratch` for one row.
     """
     h, w = image_shape
-    s, common_x, common_y = instant
+    s, common_x, common_y = times.s[k], times.common[k, 0], times.common[k, 1]
     path, x, pixel, part, inside = scratch_row
     one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     right, bottom = np.float32(w - 1), np.float32(h - 1)
@@ -272,8 +272,7 @@ def _warp(begin, end, inputs, scratch, cubic, out):
                 path[c, x] = paths[y, x, c]
         for k in range(count):
             row = (path, at, pixel, part, out.inside[k, y])
-            instant = times.s[k], times.common[k, 0], times.common[k, 1]
-            locate_points(np.float32(y), instant, (h, w), w, row)
+            locate_points(np.float32(y), times, k, (h, w), w, row)
             _cubic_weights(part[0], weights[:4])
             _cubic_weights(part[1], weights[4:])
             _read_bicubic(L[k], pixel, weights, out.L[k, y])
