@@ -2,7 +2,9 @@
 
 A calibration needs some ten thousand changes of brightness, and not more as recordings grow. So a
 sample has at most `MAX_EVENTS` events, `MAX_INTERVALS` intervals between frames and `MAX_PIXELS`
-pixels, in stretches that are spread over the recording. Short recordings are taken whole.
+pixels, in stretches that are spread over the recording. Short recordings are taken whole. Where
+events are dense, a stretch is two frames with an interval between frames before and after, and the
+sample has fewer pixels: with a part of an interval's events it would miss the change between them.
 """
 
 import math
@@ -52,6 +54,15 @@ class SampledSegment(NamedTuple):
         return (times[:-1] >= self.span[0]) & (times[1:] <= self.span[1])
 
 
+class Stretch(NamedTuple):
+    """Place of a stretch in a recording."""
+
+    rows: NDArray[np.intp]  # (frames,)
+    span: tuple[int, int]  # us, first and last time of which all events are in it
+    first: int  # row of its first event
+    last: int  # row after that of its last event
+
+
 class Sample(NamedTuple):
     """Stretches of a recording, without its hot pixels."""
 
@@ -61,15 +72,17 @@ class Sample(NamedTuple):
     size: tuple[int, int]  # width, height
     hot: NDArray[np.bool_]  # (height, width)
     counts: NDArray[np.int64]  # (2, height, width) ON and OFF events of all pixels and stretches
-    is_whole: bool  # whether it holds every event and frame
 
 
-def choose_pixels(width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def choose_pixels(
+    width: int, height: int, share: float = 1.0
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Choose pixels in whole tiles, spread over the sensor.
 
     Args:
         width: Width of the sensor, px.
         height: Height of the sensor, px.
+        share: Largest part of the pixels, above 0.
 
     Returns:
         (pixels,) places y width + x, and numbers of their tiles.
@@ -78,7 +91,8 @@ def choose_pixels(width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np
     y, x = np.divmod(np.arange(width * height), width)
     tile = y // TILE_PX * across + x // TILE_PX
     order = np.random.default_rng(0).permutation(int(tile[-1]) + 1)
-    kept = order[: max(1, len(order) * MAX_PIXELS // max(width * height, MAX_PIXELS))]
+    share = min(share, MAX_PIXELS / (width * height), 1.0)
+    kept = order[: max(1, int(len(order) * share))]
     chosen = np.zeros(len(order), bool)
     chosen[kept] = True
     places = np.flatnonzero(chosen[tile])
@@ -104,49 +118,39 @@ def _choose_rows(recording: Recording) -> list[NDArray[np.intp]]:
     return [begins[k] + np.arange(each + 1) for k in best]
 
 
-def _read_stretch(
-    recording: Recording, span: tuple[int, int], most: int, rows: NDArray[np.intp]
-) -> tuple[NDArray[np.intp], tuple[int, int], int, int]:
+def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> Stretch:
     """Shrink a stretch until it has at most `most` events: first the search, then the frames.
 
-    Returns:
-        Rows of its frames, its span (us), and the first and last row of its events.
+    What remains is at least two frames, with at least half of an interval before and after.
     """
     source, frames = recording.events, recording.frames
+    assert frames is not None
     reach = SEARCH_US
     while True:
-        if frames is not None and len(rows):
-            span = int(frames.t[rows[0]]) - reach, int(frames.t[rows[-1]]) + reach
+        span = int(frames.t[rows[0]]) - reach, int(frames.t[rows[-1]]) + reach
         first, last = source.index(span[0]), source.index(span[1] + 1)
-        if last - first <= most:
-            return rows, span, first, last
-        interval = int(np.median(np.diff(frames.t[rows]))) if frames and len(rows) > 1 else 0
-        if len(rows) and reach > max(interval, 1000):
+        if last - first > most and reach > max(int(np.median(np.diff(frames.t[rows]))), 1000):
             reach //= 2
-        elif len(rows) > 2:
+        elif last - first > most and len(rows) > 2:
             rows = rows[: (len(rows) + 2) // 2]
         else:
-            return rows, (span[0], int(source[first + most :][:1].t[0])), first, first + most
+            return Stretch(rows, span, first, last)
 
 
-def _choose_stretches(recording: Recording) -> list[NDArray[np.intp]]:
-    """Choose the frames of each stretch, of which there may be none."""
-    frames = recording.frames
+def _choose_stretches(recording: Recording) -> list[Stretch]:
+    """Choose the stretches, of whose frames there may be none."""
+    frames, source = recording.frames, recording.events
     if frames is not None and len(frames) > 1:
-        return _choose_rows(recording)
+        chosen = _choose_rows(recording)
+        return [_bound_stretch(recording, rows, MAX_EVENTS // len(chosen)) for rows in chosen]
     rows = np.arange(len(frames) if frames is not None else 0)
-    return [rows] * (N_STRETCHES if len(recording.events) > MAX_EVENTS else 1)
-
-
-def _spread_events(
-    recording: Recording, number: int, count: int, most: int
-) -> tuple[tuple[int, int], int, int]:
-    """Return the span (us) and rows of the events of one of several stretches without frames."""
-    source = recording.events
-    first = max((len(source) - most) * number // max(count - 1, 1), 0)
-    last = min(first + most, len(source))
-    ends = source[first:last].t[[0, -1]] if last > first else (0, 0)
-    return (int(ends[0]), int(ends[1])), first, last
+    count = N_STRETCHES if len(source) > MAX_EVENTS else 1
+    most, found = MAX_EVENTS // count, []
+    for first in np.linspace(0, max(len(source) - most, 0), count).astype(int).tolist():
+        last = min(first + most, len(source))
+        ends = source[first:last].t[[0, -1]].tolist() if last > first else (0, 0)
+        found.append(Stretch(rows, (ends[0], ends[1]), first, last))
+    return found
 
 
 def _read_frames(
@@ -165,14 +169,39 @@ def _read_frames(
     return grey, intensity
 
 
-def _count_by_part(
-    t: NDArray[np.int64], place: NDArray[np.int64], parts: int, pixels: int
-) -> list[NDArray[np.int32]]:
-    """Count the events of each pixel in parts of equal length."""
-    cuts = np.empty(0, np.intp)
-    if parts > 1 and len(t):
-        cuts = np.searchsorted(t, np.linspace(t[0], t[-1] + 1, parts + 1)[1:-1])
-    return [np.bincount(part, minlength=pixels).astype(np.int32) for part in np.split(place, cuts)]
+def _read_events(
+    recording: Recording, stretch: Stretch, index: NDArray[np.int32], parts: int
+) -> tuple[list[NDArray], NDArray[np.int32]]:
+    """Read the events of a stretch.
+
+    Args:
+        recording: The recording.
+        stretch: The stretch.
+        index: (pixels of the sensor,) index among the sampled pixels, -1 outside of these.
+        parts: Number of parts of equal length in time.
+
+    Returns:
+        Times, pixels and polarity of the events at sampled pixels, and numbers (2, parts, pixels of
+        the sensor) of ON and OFF events at all.
+    """
+    source, first, last = recording.events, stretch.first, stretch.last
+    counts, kept = np.zeros((2, parts, len(index)), np.int32), []
+    t0, t1 = source[first:last].t[[0, -1]] if parts > 1 and last > first else (0, 0)
+    cuts = np.linspace(t0, t1 + 1, parts + 1)[1:-1]
+    for row in range(first, last, MAX_EVENTS):
+        events = source[row : min(row + MAX_EVENTS, last)]
+        place = events.y.astype(np.int64) * recording.width + events.x
+        begins = [0, *np.searchsorted(events.t, cuts).tolist(), len(place)]
+        for part in range(parts):
+            within = slice(begins[part], begins[part + 1])
+            for k, of in enumerate((events.p[within], ~events.p[within])):
+                counts[k, part] += np.bincount(place[within][of], minlength=len(index))
+        pixel = index[place]
+        keep = pixel >= 0
+        kept.append((events.t[keep], pixel[keep], events.p[keep]))
+    if not kept:
+        kept.append((np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0, np.bool_)))
+    return [np.concatenate(column) for column in zip(*kept, strict=True)], counts
 
 
 def take_sample(recording: Recording) -> Sample:
@@ -184,49 +213,38 @@ def take_sample(recording: Recording) -> Sample:
     Returns:
         The sample, without events of hot pixels.
     """
-    width, height = recording.width, recording.height
-    frames, source = recording.frames, recording.events
-    places, tile = choose_pixels(width, height)
+    width, height, frames = recording.width, recording.height, recording.frames
+    chosen = _choose_stretches(recording)
+    most = max(stretch.last - stretch.first for stretch in chosen) * len(chosen)
+    places, tile = choose_pixels(width, height, MAX_EVENTS / max(most, MAX_EVENTS))
     index = np.full(width * height, -1, np.int32)
     index[places] = np.arange(len(places))
-    chosen = _choose_stretches(recording)
-    most = MAX_EVENTS // len(chosen)
-    counts = np.zeros((2, width * height), np.int64)
-    by_part, found, events_read = [], [], 0
-    for number, rows in enumerate(chosen):
-        if len(rows) > 1:
-            rows, span, first, last = _read_stretch(recording, (0, 0), most, rows)
-        else:
-            span, first, last = _spread_events(recording, number, len(chosen), most)
-        events = source[first:last]
-        events_read += len(events)
-        place = events.y.astype(np.int64) * width + events.x
-        for row, of in enumerate((events.p, ~events.p)):
-            counts[row] += np.bincount(place[of], minlength=width * height)
-        parts = N_STRETCHES if len(chosen) == 1 else 1
-        by_part += _count_by_part(events.t, place, parts, width * height)
-        pixel = index[place]
-        keep = pixel >= 0
+    found, by_part = [], []
+    parts = N_STRETCHES if len(chosen) == 1 else 1
+    for stretch in chosen:
+        columns, counts = _read_events(recording, stretch, index, parts)
+        by_part.append(counts)
+        rows = stretch.rows
         grey, intensity = _read_frames(recording, rows, places)
         stamps = frames.t[rows] if frames is not None else np.empty(0, np.int64)
         exposure = frames.exposure[rows] if frames is not None else np.empty(0, np.int64)
         # Before the first and after the last event nothing is known to be missing.
         found.append(
             SampledSegment(
-                events.t[keep], pixel[keep], events.p[keep], span, rows, stamps, exposure,
-                grey, intensity, np.zeros(grey.shape, bool),
+                *columns, stretch.span, rows, stamps, exposure, grey, intensity,
+                np.zeros(grey.shape, bool),
             )
         )  # fmt: skip
+    counts = np.concatenate(by_part, 1).reshape(2, -1, height, width)
     white = max((float(s.grey.max(initial=0)) for s in found), default=0.0) * WHITE_SHARE
     dark, bright = MARGIN_LEVELS / 255, min(white, 1 - MARGIN_LEVELS / 255)
-    hot = find_hot_pixels(np.stack(by_part).reshape(-1, height, width))
+    hot = find_hot_pixels(counts.sum(0))
     is_out = hot.ravel()[places]
     stretches = tuple(
         s._replace(clear=(s.grey > dark) & (s.grey < bright)).without(is_out) for s in found
     )
     return Sample(
-        stretches, places, tile, (width, height), hot, counts.reshape(2, height, width),
-        events_read == len(source) and sum(map(len, chosen)) == (len(frames) if frames else 0),
+        stretches, places, tile, (width, height), hot, counts.sum(1, dtype=np.int64)
     )  # fmt: skip
 
 

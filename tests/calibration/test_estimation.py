@@ -256,10 +256,25 @@ def test_the_sample_of_a_long_recording_is_bounded(recording, monkeypatch):
     monkeypatch.setattr("jaxevent.calibration.sampling.MAX_INTERVALS", 8)
     monkeypatch.setattr("jaxevent.calibration.sampling.N_STRETCHES", 4)
     sample = take_sample(recording)
-    assert len(sample.stretches) == 4 and not sample.is_whole
+    assert len(sample.stretches) == 4
     assert sum(len(s.rows) - 1 for s in sample.stretches) == 8
     found = jaxevent.calibrate(recording, 0.02)
     assert found.clock_offset.value == pytest.approx(SENSOR.clock_offset, abs=3e-3)
+
+
+def test_a_sample_of_dense_events_has_fewer_pixels_but_whole_intervals(recording, monkeypatch):
+    monkeypatch.setattr("jaxevent.calibration.sampling.MAX_EVENTS", len(recording.events) // 4)
+    sample = take_sample(recording)
+    assert sum(len(s.t) for s in sample.stretches) <= len(recording.events) // 4
+    assert 0 < len(sample.places) < recording.width * recording.height
+    for stretch in sample.stretches:
+        assert stretch.is_covered().all()
+        events = recording.events
+        inside = (events.t >= stretch.span[0]) & (events.t <= stretch.span[1])
+        place = events.y.astype(int) * recording.width + events.x
+        known = inside & np.isin(place, sample.places) & ~sample.hot[events.y, events.x]
+        np.testing.assert_array_equal(stretch.t, events.t[known])
+        np.testing.assert_array_equal(sample.places[stretch.pixel], place[known])
 
 
 def odd_recordings(recording):
