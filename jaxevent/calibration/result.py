@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from jaxevent.parameters import Parameters
 
+WIDE_RATIO = 1.5  # of the ends of an interval, from which these differ much
+
 
 class CalibrationValue(NamedTuple):
     """A value that data determine, with its confidence interval.
@@ -169,6 +171,18 @@ class Calibration:
             {name: one.value for name, one in chosen.items() if one.is_identifiable},
             {name: one.note for name, one in chosen.items() if not one.is_identifiable},
         )
+
+    def threshold_candidates(self) -> list[dict[str, float]]:
+        """Return the thresholds found, and the ends of their intervals where these are wide.
+
+        Returns:
+            `c_on` and `c_off` of each candidate.
+        """
+        pair = {"c_on": self.c_on, "c_off": self.c_off}
+        which = ["value"]
+        if max(one.high / one.low for one in pair.values()) > WIDE_RATIO:
+            which += ["low", "high"]
+        return [{name: getattr(one, end) for name, one in pair.items()} for end in which]
 
     def params(self, kind: type[Parameters], **explicit: Any) -> Any:
         """Return parameters of a method with the values that were found.

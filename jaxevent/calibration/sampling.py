@@ -54,7 +54,7 @@ class SampledSegment(NamedTuple):
         return (times[:-1] >= self.span[0]) & (times[1:] <= self.span[1])
 
 
-class Stretch(NamedTuple):
+class SegmentPlace(NamedTuple):
     """Place of a stretch in a recording."""
 
     rows: NDArray[np.intp]  # (frames,)
@@ -118,7 +118,7 @@ def _choose_rows(recording: Recording) -> list[NDArray[np.intp]]:
     return [begins[k] + np.arange(each + 1) for k in best]
 
 
-def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> Stretch:
+def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> SegmentPlace:
     """Shrink a stretch until it has at most `most` events: first the search, then the frames.
 
     What remains is at least two frames, with at least half of an interval before and after.
@@ -134,10 +134,10 @@ def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> S
         elif last - first > most and len(rows) > 2:
             rows = rows[: (len(rows) + 2) // 2]
         else:
-            return Stretch(rows, span, first, last)
+            return SegmentPlace(rows, span, first, last)
 
 
-def _choose_stretches(recording: Recording) -> list[Stretch]:
+def _choose_stretches(recording: Recording) -> list[SegmentPlace]:
     """Choose the stretches, of whose frames there may be none."""
     frames, source = recording.frames, recording.events
     if frames is not None and len(frames) > 1:
@@ -149,7 +149,7 @@ def _choose_stretches(recording: Recording) -> list[Stretch]:
     for first in np.linspace(0, max(len(source) - most, 0), count).astype(int).tolist():
         last = min(first + most, len(source))
         ends = source[first:last].t[[0, -1]].tolist() if last > first else (0, 0)
-        found.append(Stretch(rows, (ends[0], ends[1]), first, last))
+        found.append(SegmentPlace(rows, (ends[0], ends[1]), first, last))
     return found
 
 
@@ -170,7 +170,7 @@ def _read_frames(
 
 
 def _read_events(
-    recording: Recording, stretch: Stretch, index: NDArray[np.int32], parts: int
+    recording: Recording, stretch: SegmentPlace, index: NDArray[np.int32], parts: int
 ) -> tuple[list[NDArray], NDArray[np.int32]]:
     """Read the events of a stretch.
 

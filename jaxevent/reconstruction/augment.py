@@ -22,9 +22,9 @@ from jaxevent.calibration.clipping import find_clipping
 from jaxevent.calibration.sampling import Sample
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
-from jaxevent.reconstruction.consistency import events_contradict_frames
+from jaxevent.reconstruction.consistency import thresholds_are_doubtful
 from jaxevent.reconstruction.features import FrameFeatures, Points
-from jaxevent.reconstruction.refinement import refine
+from jaxevent.reconstruction.refinement import choose, refine
 from jaxevent.recording import Recording, check_recording
 
 MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
@@ -83,6 +83,13 @@ class FrameParams(Parameters):
         return None
 
     @classmethod
+    def judge(cls) -> Any:
+        """Return the method whose predictions of hidden frames say whether `calibrated_if_needed`
+        numbers are better than defaults, or None, where they are taken without that.
+        """
+        return None
+
+    @classmethod
     def for_recording(cls: type[T], recording: Recording, **explicit: Any) -> T:
         """Return parameters with the clock and the thresholds that a recording shows.
 
@@ -125,13 +132,9 @@ def calibrated_values(
     if if_needed:
         others = [name for name in names if name not in if_needed]
         values = calibrated_values(recording, params, others, sample)
-        if not _thresholds_are_needed(recording, params.replace(**values.found)):
-            return values
-        # Those of a predictor would hold at its own I0.
-        found = recall_calibration(recording, _rounded_I0(params), sample).select(if_needed)
-        missing = {**values.missing, **found.missing}
-        known = {} if found.missing else found.found
-        return CalibratedValues(values.found, missing).updated(known, names)
+        known = _numbers_if_needed(recording, params.replace(**values.found), names, sample)
+        missing = {**values.missing, **known.missing}
+        return CalibratedValues(values.found, missing).updated(known.found, names)
     I0 = _rounded_I0(params) if THRESHOLDS.intersection(names) else 1.0
     calibration, method = recall_calibration(recording, I0, sample), params.predictor()
     values = calibration.select(names)
@@ -158,10 +161,49 @@ def _rounded_I0(params: FrameParams) -> float:
     return float(f"{float(params.I0):.6g}")
 
 
-def _thresholds_are_needed(recording: Recording, params: FrameParams) -> bool:
-    """Return whether frames reach their white, or contradict events at these thresholds."""
-    white = find_clipping(recording).white.level
-    return white is not None or events_contradict_frames(recording, params) is not None
+def _numbers_if_needed(
+    recording: Recording, params: FrameParams, names: Sequence[str], sample: Sample | None
+) -> CalibratedValues:
+    """Return the numbers of events that a recording calls for in place of defaults.
+
+    It does where frames reach their white, beyond which events alone tell how bright points are,
+    and where events and frames differ at the defaults. In the second case numbers are taken if they
+    predict hidden frames better.
+
+    Args:
+        recording: Events and frames.
+        params: Parameters, of which those of the clock are calibrated.
+        names: Names of the numbers that the user leaves open.
+        sample: A sample of the recording; None: it is taken where it is needed.
+
+    Returns:
+        The values, with a delay of events that goes with them; none where defaults do.
+    """
+    clipped = find_clipping(recording).white.level is not None
+    if not clipped and not thresholds_are_doubtful(recording, params):
+        return CalibratedValues({}, {})
+    # Those of a predictor would hold at its own I0.
+    calibration = recall_calibration(recording, _rounded_I0(params), sample)
+    found = calibration.select(name for name in names if name in params.calibrated_if_needed)
+    judge = params.judge()
+    if found.missing or clipped or judge is None:
+        return CalibratedValues({} if found.missing else found.found, found.missing)
+    values = found.found
+    thresholds = [
+        {name: one for name, one in pair.items() if name in values}
+        for pair in calibration.threshold_candidates()
+    ]
+    # The shortest gaps between events bound a dead time from above alone.
+    dead = [{"rho_ref": part * values["rho_ref"]} for part in (1.0, 0.5) if "rho_ref" in values]
+    # The calibrated delay makes up in part for the dead time that the predictor leaves out.
+    delays = [{"event_delay": 0.0}] if "event_delay" in names else []
+    steps = [thresholds, dead, delays]
+
+    def compute() -> dict[str, float]:
+        return choose(judge, recording, params, steps)
+
+    what = f"{type(params).__module__} {sorted(names)} {steps} {params.values()}"
+    return CalibratedValues(recall_numbers(recording, what, compute), {})
 
 
 class CertaintyParams(FrameParams):

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxevent.reconstruction.frames import FrameImages
+from jaxevent.reconstruction.stream import count_polarities
 from jaxevent.recording import Recording
 
 # Intervals between frames, evenly spread over the recording, in which both are compared.
@@ -15,6 +16,7 @@ MIN_COMPARED_PIXELS = 100  # fewer do not determine the ratio
 MIN_SIGN_AGREEMENT = 0.8  # of signs; below, events and frames differ by more than a scale
 # Factor by which the ratio may be off; real recordings at the defaults are within 0.6 to 0.8.
 MAX_RATIO_FACTOR = 2.0
+DOUBTFUL_RATIO_FACTOR = 1.5  # from which it is worth asking whether other thresholds do better
 CONTRADICTION_SIGMAS = 6.0  # of independent pixels; about 3 where neighbours err alike
 
 
@@ -44,7 +46,7 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
 
     Args:
         recording: Events and frames.
-        params: Thresholds, `I0`, `clock_offset` and `event_delay`, see `augment.FrameParams`.
+        params: Thresholds, `rho_ref`, `I0` and those of the clock, see `augment.FrameParams`.
 
     Returns:
         The comparison; None without two frames, or with too few such pixels.
@@ -61,18 +63,15 @@ def change_ratio(recording: Recording, params: Any) -> ChangeRatio | None:
     for first in np.unique(
         np.linspace(0, len(t) - 2, N_COMPARED_INTERVALS).round().astype(int)
     ).tolist():
-        begin, end = (recording.events.index(int(one)) for one in t[first : first + 2])
-        events = recording.events[begin:end]
-        place = events.y.astype(np.int64) * recording.width + events.x
-        both = np.bincount(place, minlength=recording.width * recording.height)
-        on = np.bincount(place[events.p], minlength=len(both))
-        used = np.flatnonzero(np.abs(2 * on - both) >= MIN_NET_EVENTS)
+        begin, end = t[first : first + 2].tolist()
+        on, off = count_polarities(recording, begin, end, 1e6 * float(params.rho_ref))
+        used = np.flatnonzero(np.abs(on - off) >= MIN_NET_EVENTS)
         grey = frames[first : first + 2].intensity.reshape(2, -1)[:, used]
         clear = ((grey > CLIPPING_MARGIN) & (grey < 1 - CLIPPING_MARGIN)).all(0)
         grey, used = grey[:, clear], used[clear]
         intensity = np.interp(grey, np.linspace(0, 1, 256), response)
         level = np.log(intensity / gain[first : first + 2, None] + I0)
-        parts.append((c_on * on[used] - c_off * (both - on)[used], level[1] - level[0]))
+        parts.append((c_on * on[used] - c_off * off[used], level[1] - level[0]))
     S, dL = (np.concatenate(part) for part in zip(*parts, strict=True))
     known = S != 0
     size, along = np.abs(S[known]), (np.sign(S) * dL)[known]
@@ -92,18 +91,15 @@ def events_contradict_frames(recording: Recording, params: Any) -> str | None:
 
     Args:
         recording: Events and frames.
-        params: Thresholds, `I0`, `clock_offset` and `event_delay`, see `augment.FrameParams`.
+        params: Thresholds, `rho_ref`, `I0` and those of the clock, see `augment.FrameParams`.
 
     Returns:
         A sentence that names the parameters, without a full stop.
     """
     found = change_ratio(recording, params)
-    if found is None or found.agreement < MIN_SIGN_AGREEMENT:
+    if found is None or not _is_beyond(found, MAX_RATIO_FACTOR):
         return None
-    less = found.ratio + CONTRADICTION_SIGMAS * found.sigma < 1 / MAX_RATIO_FACTOR
-    more = found.ratio - CONTRADICTION_SIGMAS * found.sigma > MAX_RATIO_FACTOR
-    if not (less or more):
-        return None
+    less = found.ratio < 1
     c_on, c_off, I0 = (f"{float(v):.3g}" for v in (params.c_on, params.c_off, params.I0))
     lower = "lower" if less else "higher"
     return (
@@ -112,3 +108,24 @@ def events_contradict_frames(recording: Recording, params: Any) -> str | None:
         f"I0 = {I0}; give the sensor's own, I0 about 0.003 for simulated log intensity, or {lower} "
         "thresholds"
     )
+
+
+def thresholds_are_doubtful(recording: Recording, params: Any) -> bool:
+    """Return whether events and frames differ enough to ask for better thresholds.
+
+    Args:
+        recording: Events and frames.
+        params: Thresholds, `rho_ref`, `I0` and those of the clock, see `augment.FrameParams`.
+
+    Returns:
+        Whether the sizes of their changes differ by more than `DOUBTFUL_RATIO_FACTOR`.
+    """
+    found = change_ratio(recording, params)
+    return found is not None and _is_beyond(found, DOUBTFUL_RATIO_FACTOR)
+
+
+def _is_beyond(found: ChangeRatio, factor: float) -> bool:
+    """Return whether changes of the same direction differ in size by more than a factor."""
+    reach = CONTRADICTION_SIGMAS * found.sigma
+    is_beyond = found.ratio + reach < 1 / factor or found.ratio - reach > factor
+    return is_beyond and found.agreement >= MIN_SIGN_AGREEMENT

@@ -9,7 +9,7 @@ Nothing but given frames is used.
 
 import contextlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from jaxevent.recording import Frames, Recording
 
 N_STRETCHES = 3
 FRAMES_PER_STRETCH = 9
+FRAMES_TO_CHOOSE = 5  # of a stretch, where methods are slow
 MAX_PIXELS = 40_000
 MAX_EVENTS = 400_000  # of all stretches
 N_STEPS = 6
@@ -66,12 +67,15 @@ def _busiest_band(recording: Recording, events: Any) -> tuple[int, int]:
     return int(np.argmax(total[height:] - total[:-height])), height
 
 
-def choose_parts(recording: Recording, clock_offset: float) -> list[HiddenFrames]:
+def choose_parts(
+    recording: Recording, clock_offset: float, each: int = FRAMES_PER_STRETCH
+) -> list[HiddenFrames]:
     """Choose parts of a recording that are spread over it.
 
     Args:
         recording: Events and frames.
         clock_offset: Calibrated clock offset, s.
+        each: Largest number of frames of a part.
 
     Returns:
         The parts; none where there are fewer than three frames.
@@ -79,7 +83,7 @@ def choose_parts(recording: Recording, clock_offset: float) -> list[HiddenFrames
     frames, source = recording.frames, recording.events
     if frames is None or len(frames) < 3:
         return []
-    each = min(FRAMES_PER_STRETCH, len(frames))
+    each = min(each, len(frames))
     number = min(N_STRETCHES, max(len(frames) // each, 1))
     found = []
     for begin in np.unique(np.linspace(0, len(frames) - each, number).astype(int)).tolist():
@@ -167,3 +171,41 @@ def refine(
             if gain < MIN_GAIN:
                 break
     return {name: float(getattr(at, name)) for name in names}
+
+
+def choose(
+    method: Any,
+    recording: Recording,
+    params: Any,
+    steps: Sequence[Sequence[Mapping[str, float]]],
+) -> dict[str, float]:
+    """Choose the values with which a method predicts hidden frames of a recording best.
+
+    Args:
+        method: The reconstruction method.
+        recording: Events and frames.
+        params: Parameters, as they are without these values.
+        steps: Values by name that each step tries beside those chosen before.
+
+    Returns:
+        The values that lower the squared error; none where the recording is too short to tell.
+    """
+    parts = choose_parts(recording, float(params.clock_offset), FRAMES_TO_CHOOSE)
+    if not parts:
+        return {}
+
+    def loss(values: Mapping[str, float]) -> float:
+        errors = [part.errors(method, params.replace(**values)) for part in parts]
+        return float((np.concatenate(errors) ** 2).mean())
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        chosen: dict[str, float] = {}
+        least = loss(chosen)
+        for offered in steps:
+            before = chosen
+            for values in offered:
+                error = loss({**before, **values})
+                if error < least:
+                    chosen, least = {**before, **values}, error
+    return chosen

@@ -130,6 +130,40 @@ def event_weights(
     return out
 
 
+def count_polarities(
+    recording: Recording, begin: int, end: int, rho_us: float
+) -> NDArray[np.float64]:
+    """Count the ON and OFF events of each pixel between two times, weighted for a dead time.
+
+    Args:
+        recording: The recording.
+        begin: First time, us.
+        end: End, us.
+        rho_us: Dead time, us.
+
+    Returns:
+        (2, pixels) ON and OFF events.
+    """
+    source, pixels = recording.events, recording.width * recording.height
+    # With enough events before the begin to know the gaps of nearly all pixels.
+    first = 2 * begin - end if rho_us > 0 else begin
+    events = source[source.index(first) : source.index(end)]
+    weight = np.ones(len(events))
+    if rho_us > 0:
+        last_us = np.full(pixels, recording.start)
+        stream = EventStream.of(events, recording.width)
+        weight = event_weights(stream, last_us, DeadTime(rho_us, False))
+    place = events.y.astype(np.int64) * recording.width + events.x
+    inside = events.t >= begin
+    return np.stack(
+        [
+            np.bincount(place[of], weight[of], minlength=pixels)
+            for of in (inside & events.p, inside & ~events.p)
+        ],
+        dtype=np.float64,
+    )
+
+
 @njit_noalloc
 def _event_weights(stream, last, dead, out):
     t, x, y = stream.t, stream.x, stream.y

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from jaxevent.reconstruction.compensated.images import InstantImages, gaussian_blur
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.compensated.thresholds import count_events
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.stream import count_polarities
 from jaxevent.recording import Recording
 
 REGION_SIGMA_PX = 8.0  # of the Gaussian of the mean around a pixel
@@ -129,7 +129,7 @@ class EventNoise:
             return IntervalNoise(np.ones(size, np.float32), np.zeros(size, np.float32), 1.0)
         params, begin, end = self._params, *self._frames[interval : interval + 2].tolist()
         L, V, clear = self._images(np.array([begin, end]))
-        counts = count_events(self._recording, begin, end, 1e6 * float(params.rho_ref))
+        counts = count_polarities(self._recording, begin, end, 1e6 * float(params.rho_ref))
         if self._images.factors is not None:
             counts = counts * self._images.factors
         on, off = _share_out(counts.reshape(2, *size), float(params.share))

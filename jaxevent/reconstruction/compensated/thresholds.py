@@ -19,13 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from jaxevent.reconstruction.compensated.params import Params
-from jaxevent.reconstruction.stream import (
-    MAX_EVENT_WEIGHT,
-    DeadTime,
-    EventStream,
-    count_before_edges,
-    event_weights,
-)
+from jaxevent.reconstruction.stream import MAX_EVENT_WEIGHT, count_polarities
 from jaxevent.recording import Recording
 
 N_IMAGE_PAIRS = 8  # between pairs of images that are evenly spaced over a recording
@@ -110,30 +104,6 @@ def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int
     return [(t, t + lag) for t in begins.tolist()]
 
 
-def count_events(recording: Recording, begin: int, end: int, rho: float) -> NDArray[np.floating]:
-    """Count ON and OFF events, weighted for a dead time.
-
-    Args:
-        recording: The recording.
-        begin: First time, us.
-        end: End, us.
-        rho: Dead time, us.
-
-    Returns:
-        (2, pixels).
-    """
-    source = recording.events
-    # With enough events before the begin to know the gaps of nearly all pixels.
-    rows = slice(source.index(2 * begin - end), source.index(end))
-    stream = EventStream.of(source[rows], recording.width)
-    pixels = recording.width * recording.height
-    weight = event_weights(stream, np.full(pixels, recording.start), DeadTime(rho, False))
-    before, after = count_before_edges(
-        stream, weight, np.array([begin, end]), np.zeros((2, pixels))
-    )
-    return after - before
-
-
 def learn_thresholds(
     recording: Recording, params: Params, span_us: tuple[int, int], images: ImageFunction
 ) -> NDArray[np.float32] | None:
@@ -158,7 +128,7 @@ def learn_thresholds(
     if n_events * MAX_EVENT_WEIGHT < MIN_EVENTS_PER_PIXEL * pixels:
         return None
     rho = 1e6 * float(params.rho_ref)  # us
-    counts = np.stack([count_events(recording, *pair, rho) for pair in times], 1)
+    counts = np.stack([count_polarities(recording, *pair, rho) for pair in times], 1)
     if counts.sum((0, 1)).mean() < MIN_EVENTS_PER_PIXEL:
         return None
     known = {t: images(t) for t in sorted({t for pair in times for t in pair})}
