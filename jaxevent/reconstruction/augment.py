@@ -22,11 +22,15 @@ from jaxevent.calibration.clipping import find_clipping
 from jaxevent.calibration.sampling import Sample
 from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
-from jaxevent.reconstruction.consistency import thresholds_are_doubtful
+from jaxevent.reconstruction.consistency import (
+    events_contradict_frames,
+    thresholds_are_doubtful,
+)
 from jaxevent.reconstruction.features import FrameFeatures, Points
 from jaxevent.reconstruction.refinement import choose, refine
 from jaxevent.recording import Recording, check_recording
 
+LONG_EXPOSURE = 0.25  # of the time between frames
 MIN_MEASURED_SHARE = 1e-6  # of frames that are clipped, so that two of them have weights
 
 T = TypeVar("T", bound="FrameParams")
@@ -132,7 +136,13 @@ def calibrated_values(
     if if_needed:
         others = [name for name in names if name not in if_needed]
         values = calibrated_values(recording, params, others, sample)
-        known = _numbers_if_needed(recording, params.replace(**values.found), names, sample)
+        known = _numbers_if_needed(
+            recording,
+            params.replace(**values.found),
+            sorted(if_needed),
+            sample,
+            "event_delay" in names,
+        )
         missing = {**values.missing, **known.missing}
         return CalibratedValues(values.found, missing).updated(known.found, names)
     I0 = _rounded_I0(params) if THRESHOLDS.intersection(names) else 1.0
@@ -162,31 +172,38 @@ def _rounded_I0(params: FrameParams) -> float:
 
 
 def _numbers_if_needed(
-    recording: Recording, params: FrameParams, names: Sequence[str], sample: Sample | None
+    recording: Recording,
+    params: FrameParams,
+    names: Sequence[str],
+    sample: Sample | None,
+    delay_is_open: bool,
 ) -> CalibratedValues:
     """Return the numbers of events that a recording calls for in place of defaults.
 
     It does where frames reach their white, beyond which events alone tell how bright points are,
     and where events and frames differ at the defaults. In the second case numbers are taken if they
-    predict hidden frames better.
+    predict hidden frames better; of long exposures, whose means images at one time do not predict,
+    if events contradict frames.
 
     Args:
         recording: Events and frames.
         params: Parameters, of which those of the clock are calibrated.
-        names: Names of the numbers that the user leaves open.
+        names: Names of the numbers.
         sample: A sample of the recording; None: it is taken where it is needed.
+        delay_is_open: Whether the delay of events may change with them.
 
     Returns:
         The values, with a delay of events that goes with them; none where defaults do.
     """
     clipped = find_clipping(recording).white.level is not None
-    if not clipped and not thresholds_are_doubtful(recording, params):
+    judge = None if clipped or _exposures_are_long(recording, params) else params.judge()
+    is_needed = thresholds_are_doubtful if judge is not None else events_contradict_frames
+    if not (clipped or is_needed(recording, params)):
         return CalibratedValues({}, {})
     # Those of a predictor would hold at its own I0.
     calibration = recall_calibration(recording, _rounded_I0(params), sample)
-    found = calibration.select(name for name in names if name in params.calibrated_if_needed)
-    judge = params.judge()
-    if found.missing or clipped or judge is None:
+    found = calibration.select(names)
+    if found.missing or judge is None:
         return CalibratedValues({} if found.missing else found.found, found.missing)
     values = found.found
     thresholds = [
@@ -196,14 +213,22 @@ def _numbers_if_needed(
     # The shortest gaps between events bound a dead time from above alone.
     dead = [{"rho_ref": part * values["rho_ref"]} for part in (1.0, 0.5) if "rho_ref" in values]
     # The calibrated delay makes up in part for the dead time that the predictor leaves out.
-    delays = [{"event_delay": 0.0}] if "event_delay" in names else []
+    delays = [{"event_delay": 0.0}] if delay_is_open else []
     steps = [thresholds, dead, delays]
 
     def compute() -> dict[str, float]:
         return choose(judge, recording, params, steps)
 
-    what = f"{type(params).__module__} {sorted(names)} {steps} {params.values()}"
+    what = f"{type(params).__module__} {steps} {params.values()}"
     return CalibratedValues(recall_numbers(recording, what, compute), {})
+
+
+def _exposures_are_long(recording: Recording, params: FrameParams) -> bool:
+    """Return whether exposures take much of the time between frames."""
+    frames = recording.frames
+    assert frames is not None
+    exposure = np.where(frames.exposure > 0, frames.exposure, 1e6 * float(params.exposure))
+    return bool(np.median(exposure) > LONG_EXPOSURE * np.median(np.diff(frames.t)))
 
 
 class CertaintyParams(FrameParams):
