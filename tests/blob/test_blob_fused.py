@@ -43,12 +43,11 @@ def crossing(rng, events=2400, seconds=0.03):
 
 
 CASES = {
-    "moment": {"events_per_step": 1},
-    "moving_moments": {"events_per_step": 6, "association": "nearest", "gate_shape": "circle"},
-    "options": {
+    "moment": {
         "events_per_step": 5, "tau_q": 0.01, "t_still": 1e-3, "clutter": 1e-3,
         "polarity_offset": True,
     },
+    "moving_moments": {"events_per_step": 6, "association": "nearest", "gate_shape": "circle"},
 }  # fmt: skip
 
 
@@ -60,7 +59,7 @@ FEW = {"n_birth": 8.0, "n_confirm": 20.0, "lambda0": 4.0, "gate_min": 4.0, "t_co
 def test_kernel_equals_run(case):
     """States, births and deaths of seeds, of targets that are born and of those that end."""
     values = CASES[case]
-    tracker = getattr(blob, case, blob.moment)
+    tracker = getattr(blob, case)
     params = tracker.Params(**FEW, **values, max_targets=3)
     seeds = [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
     rec = crossing(np.random.default_rng(7))
@@ -101,8 +100,8 @@ def test_kernel_equals_run(case):
 def test_tracks_of_both_compilers():
     """Smoothed states, with pauses in which targets stand still, and whose the events are."""
     rec, seeds = crossing(np.random.default_rng(7)), [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
-    tracker, options = blob.constant_velocity, {**FEW, **CASES["moving_moments"]}
-    params = tracker.Params(**options, t_still=1e-3, max_targets=3)
+    tracker = blob.constant_velocity
+    params = tracker.Params(**FEW, events_per_step=1, t_still=1e-3, max_targets=3)
     fused, scanned = (
         tracker.estimate(rec, params, seeds=seeds, detect=True, compiler=compiler, progress=False)
         for compiler in ("numba", "xla")

@@ -6,8 +6,8 @@ from scripts import script
 
 import jaxevent
 from jaxevent.blob import Tracks, moment
+from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.prepare import ChunkPacker
-from jaxevent.blob.run import XlaRunner, run_compiled
 from jaxevent.recording import Events, Recording
 
 
@@ -25,7 +25,7 @@ def dot(data):
 def follow(recording, params, steps, chunks):
     """`estimate` with chunks of a size that suits short slices."""
     packer = ChunkPacker(recording, params, steps=steps, chunks=chunks)
-    return Tracks(XlaRunner(moment.filter, params), packer)
+    return Tracks(KernelRunner(moment.filter, params, detect=packer.detect), packer)
 
 
 def test_reference_finds_a_known_path(real):
@@ -71,10 +71,12 @@ def test_tail_of_the_dot_begins_no_track(real, dot, float32):
     for surround in (1.0, 2.0):
         params = moment.Params(preset="fast", **real.DOT_FOUND, surround=surround)
         packer = ChunkPacker(cut, params, steps=64, chunks=128)
+        runner = KernelRunner(moment.filter, params, detect=True)
         cursor, state = packer.first, None
-        while cursor is not None:  # in the program of `follow`
+        while cursor is not None:
             segment = packer.pack(cursor)
-            state, _ = run_compiled(moment.filter, params, state, segment.features)
+            state = runner.init(segment.features) if state is None else state
+            state, _ = runner.run(state, segment.features)
             cursor = segment.next
         begun[surround] = int(state.next_id)
     assert begun[2.0] == 1 < begun[1.0]

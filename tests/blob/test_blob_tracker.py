@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
+from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.filter import EventBatch
 from jaxevent.blob.prepare import ChunkPacker
-from jaxevent.blob.run import XlaRunner
 from jaxevent.blob.track import canonical_ellipse
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError, InputWarning
@@ -67,12 +67,12 @@ def pair():
 
 
 def follow(rec, params=None, seeds=None, detect=False, steps=64, chunks=32, tracker=blob.moment):
-    """`estimate` with chunks of one size, so that few programs are compiled."""
+    """`estimate` with chunks of a size that suits short recordings."""
     params = params or Params()
     packer = ChunkPacker(
         rec, params, seeds, detect=detect or seeds is None, steps=steps, chunks=chunks
     )
-    return Tracks(XlaRunner(tracker.filter, params), packer)
+    return Tracks(KernelRunner(tracker.filter, params, detect=packer.detect), packer)
 
 
 @functools.cache

@@ -7,9 +7,9 @@ import pytest
 from test_blob_tracker import cloud, line, noise, together
 
 from jaxevent import blob
+from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.live import CHUNKS_PER_RUN, STEPS_PER_CHUNK
 from jaxevent.blob.prepare import ChunkPacker
-from jaxevent.blob.run import XlaRunner
 from jaxevent.blob.tracks import Tracks
 from jaxevent.errors import InputError
 from jaxevent.recording import Events, Recording
@@ -73,7 +73,7 @@ def test_states_are_those_of_the_whole_however_it_is_divided():
     packer = ChunkPacker(
         recording, params, seeds, detect=True, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN
     )
-    whole = Tracks(XlaRunner(tracker.filter, params), packer)
+    whole = Tracks(KernelRunner(tracker.filter, params, detect=packer.detect), packer)
     assert len(whole) > 2 and (whole.ended[2] == "idle")
     known = by_confirmation(whole, 2)
     for seed in range(2):
@@ -99,7 +99,7 @@ def test_steps_of_several_events_are_those_of_what_was_added():
         packer = ChunkPacker(
             so_far(recording, row), params, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN
         )
-        part = Tracks(XlaRunner(tracker.filter, params), packer)
+        part = Tracks(KernelRunner(tracker.filter, params, detect=packer.detect), packer)
         compare(live(live.stop), part, live.stop, by_confirmation(part, 0))
 
 
@@ -112,7 +112,7 @@ def test_targets_are_added_while_events_come():
     begins = start + 1000 * np.array([0, 10, 30, 60, 95])
     given = [(*place, int(begin)) for place, begin in zip(places, begins, strict=True)]
     packer = ChunkPacker(recording, params, given, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN)
-    whole = Tracks(XlaRunner(tracker.filter, params), packer)
+    whole = Tracks(KernelRunner(tracker.filter, params, detect=packer.detect), packer)
     live = tracker.live(SIZE, params, seeds=given[:1])
     order = [0, 2, 1]
     assert [live.add_target(*given[k]) for k in order[1:]] == [1, 2]
@@ -154,7 +154,9 @@ def test_after_the_last_event_states_are_predicted():
     live = blob.constant_velocity.live(SIZE, params, seeds=seeds)
     live.add(recording.events[:600])
     packer = ChunkPacker(recording, params, seeds, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN)
-    whole = Tracks(XlaRunner(blob.constant_velocity.filter, params), packer)
+    whole = Tracks(
+        KernelRunner(blob.constant_velocity.filter, params, detect=packer.detect), packer
+    )
     compare(live(live.stop), whole, live.stop, np.arange(1))
     times = live.stop + np.array([0, 5_000, 30_000])
     states = live(times)

@@ -12,9 +12,9 @@ from test_cli_track import HEIGHT, METHOD, WIDTH, two
 import jaxevent
 from jaxevent import cli
 from jaxevent.blob import constant_velocity
+from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.live import CHUNKS_PER_RUN, STEPS_PER_CHUNK
 from jaxevent.blob.prepare import ChunkPacker
-from jaxevent.blob.run import XlaRunner
 from jaxevent.blob.tracks import Tracks, evenly_spaced_times
 
 SETTINGS = "Q_v = 1e4\nP0_v = 1e4\nn_birth = 8.0\nn_confirm = 20.0\nlambda0 = 5.0\n"
@@ -42,7 +42,7 @@ def test_live_rows_are_those_of_the_causal_tracks(tmp_path, capsys, monkeypatch)
     packer = ChunkPacker(
         recording, own, [(30, 30, 6)], detect=True, steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN
     )
-    whole = Tracks(XlaRunner(constant_velocity.filter, own), packer)
+    whole = Tracks(KernelRunner(constant_velocity.filter, own, detect=packer.detect), packer)
     times = evenly_spaced_times(whole.start, whole.stop, 1900.0)
     states = whole(times)
     shown = states.valid & (whole.confirmed <= times[:, None])

@@ -126,6 +126,8 @@ def test_equations_are_solved():
     full = np.einsum("yxki,yxkj->yxij", J, J)
     N = np.stack([full[..., i, j] for i in range(4) for j in range(i, 4)], -1).astype(np.float32)
     b, p = rng.normal(size=(2, rows, columns, 4)).astype(np.float32)
+    sums = np.concatenate([N, b], -1)  # in one array, as `linearise` makes them
+    N, b = sums[..., :10], sums[..., 10:]
     weights = rng.uniform(0.2, 1, (2, rows, columns)).astype(np.float32)
     across, down = weights[0], weights[1]
     smooth = np.array([2, 2, 3, 3], np.float32)
@@ -178,7 +180,7 @@ def test_pixels_take_the_path_of_their_side():
     assert wrong(before) > 0.5 and wrong(chosen) < 0.25
     # Steps from paths of others leave fewer wrong ones than steps alone; sizes may be odd.
     odd = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), PathTimes.of(s))
-    p = paths[::2, ::2]
+    p = np.ascontiguousarray(paths[::2, ::2])
     step = trajectories.gauss_newton_step
     refined = step(odd, trajectories.borrow_paths(odd, step(odd, p, COST), COST), COST)
     plain = step(odd, step(odd, p, COST), COST)
