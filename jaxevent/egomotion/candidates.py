@@ -211,7 +211,7 @@ class CandidateSampler:
         if expected is None:
             gate, margin = np.array([0, 0, np.inf])[:, None, None], 0.0
         else:
-            gate = np.concatenate([expected.U, expected.slack[None]]).astype(np.float64)
+            gate = np.concatenate([expected.U, expected.slack[None]]).astype(np.float64, order="C")
             margin = expected.margin
         span = -NEVER_US if span == np.inf else round(1e6 * span)
         rules = BatchRules(

@@ -243,7 +243,8 @@ def make_layout(count, own, before, after):
         framed,
         near,
         np.zeros((count, 2), np.float32),
-        *map(np.int32, (own, before, after, after)),
+        *map(np.int32, (own, before, after)),
+        np.array(after, np.int32),
     )
 
 
@@ -917,7 +918,7 @@ def motion_problem():
 
 @pytest.mark.slow
 def test_equations_are_those_of_the_steps():
-    p, (L, V, times, _), numbers = jax.tree.map(np.asarray, motion_problem())
+    p, (L, V, times, _), numbers = jax.tree.map(np.array, motion_problem())
     images = PackedImages.of(trajectories.pack_images(L, V), times)
     cost = CostParams(*map(np.float32, numbers))
     quick = normal_equations.linearise(images, p, cost)

@@ -171,6 +171,7 @@ def test_the_likelihood_refuses_ratios_of_thresholds_far_from_the_true_one():
     held = events_only.prepare_likelihood(translated(), [0.1, 0.2], PLAIN)
     ratios = np.array([0.75, 1.0, 1.5, 2.25, 3.0])
 
+    @jax.jit
     def likelihood(ratio):
         c = PLAIN.replace(c_on=0.2 / jnp.sqrt(ratio), c_off=0.2 * jnp.sqrt(ratio))
         return events_only.log_likelihood(c, held)

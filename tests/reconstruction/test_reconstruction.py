@@ -12,7 +12,6 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
-from noise import small
 
 import jaxevent
 from jaxevent.methods import names
@@ -681,7 +680,7 @@ def test_presets():
 @pytest.mark.slow
 def test_a_video_becomes_an_xarray_dataset():
     xarray = pytest.importorskip("xarray", reason="needs the extra xarray")
-    recording = small()
+    recording = random_recording(6, 90, 4)
     video = jaxevent.akf.estimate(recording, params_of(jaxevent.akf, **PARAMS))
     times = [recording.start + 5_000, recording.start + 1_000]
     dataset = video.to_xarray(times)
