@@ -205,16 +205,16 @@ def _numbers_if_needed(
     found = calibration.select(names)
     if found.missing or judge is None:
         return CalibratedValues({} if found.missing else found.found, found.missing)
-    values = found.found
-    thresholds = [
-        {name: one for name, one in pair.items() if name in values}
-        for pair in calibration.threshold_candidates()
-    ]
     # The shortest gaps between events bound a dead time from above alone.
-    dead = [{"rho_ref": part * values["rho_ref"]} for part in (1.0, 0.5) if "rho_ref" in values]
+    dead = [{}] + [{"rho_ref": part * found.found.get("rho_ref", 0.0)} for part in (1.0, 0.5)]
+    thresholds = [
+        {name: one for name, one in {**pair, **lost}.items() if name in found.found}
+        for pair in calibration.threshold_candidates()
+        for lost in (dead if "rho_ref" in found.found else dead[:1])
+    ]
     # The calibrated delay makes up in part for the dead time that the predictor leaves out.
     delays = [{"event_delay": 0.0}] if delay_is_open else []
-    steps = [thresholds, dead, delays]
+    steps = [thresholds, delays]
 
     def compute() -> dict[str, float]:
         return choose(judge, recording, params, steps)
