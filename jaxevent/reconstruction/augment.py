@@ -68,6 +68,9 @@ class FrameParams(Parameters):
     )
 
     calibrated = ("clock_offset", "c_on", "c_off")
+    # The method whose predictions of hidden frames say whether `calibrated_if_needed` numbers are
+    # better than defaults; its module sets it. None: they are taken without that.
+    validator: ClassVar[Any] = None
 
     @property
     def frame_delay(self) -> Any:
@@ -83,13 +86,6 @@ class FrameParams(Parameters):
         """Return the method whose predictions of hidden frames refine a calibration, or None.
 
         Parameters of another class take over what it finds.
-        """
-        return None
-
-    @classmethod
-    def judge(cls) -> Any:
-        """Return the method whose predictions of hidden frames say whether `calibrated_if_needed`
-        numbers are better than defaults, or None, where they are taken without that.
         """
         return None
 
@@ -196,14 +192,14 @@ def _numbers_if_needed(
         The values, with a delay of events that goes with them; none where defaults do.
     """
     clipped = find_clipping(recording).white.level is not None
-    judge = None if clipped or _exposures_are_long(recording, params) else params.judge()
-    is_needed = thresholds_are_doubtful if judge is not None else events_contradict_frames
+    validator = None if clipped or _exposures_are_long(recording, params) else params.validator
+    is_needed = thresholds_are_doubtful if validator is not None else events_contradict_frames
     if not (clipped or is_needed(recording, params)):
         return CalibratedValues({}, {})
     # Those of a predictor would hold at its own I0.
     calibration = recall_calibration(recording, _rounded_I0(params), sample)
     found = calibration.select(names)
-    if found.missing or judge is None:
+    if found.missing or validator is None:
         return CalibratedValues({} if found.missing else found.found, found.missing)
     # The shortest gaps between events bound a dead time from above alone.
     dead = [{}] + [{"rho_ref": part * found.found.get("rho_ref", 0.0)} for part in (1.0, 0.5)]
@@ -217,7 +213,7 @@ def _numbers_if_needed(
     steps = [thresholds, delays]
 
     def compute() -> dict[str, float]:
-        return choose(judge, recording, params, steps)
+        return choose(validator, recording, params, steps)
 
     what = f"{type(params).__module__} {steps} {params.values()}"
     return CalibratedValues(recall_numbers(recording, what, compute), {})

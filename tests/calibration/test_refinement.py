@@ -68,7 +68,7 @@ def test_thresholds_that_contradict_frames_are_taken_if_they_predict_better(reco
     for prefers_low in (True, False):
         sign = 1 if prefers_low else -1
         method = method_with_loss(recording, lambda p, sign=sign: 0.1 + 0.02 * sign * float(p.c_on))
-        monkeypatch.setattr(Params, "judge", classmethod(lambda cls, method=method: method))
+        monkeypatch.setattr(Params, "validator", method)
         monkeypatch.setattr(augment, "recall_numbers", lambda recording, what, compute: compute())
         values = augment.calibrated_values(recording, wrong, ("c_on", "c_off", "rho_ref")).found
         assert ("c_on" in values) == prefers_low, values

@@ -494,5 +494,6 @@ mc = MotionCompensation(
     "from frames and events together, and fuses both along their paths. Where that fails it falls "
     "back on the smoother of each pixel and on the frames.",
 )
+Params.validator = mc
 
 __getattr__ = renamed_names(__name__)

@@ -1,7 +1,5 @@
 """Parameters of the motion-compensated reconstruction."""
 
-from typing import Any
-
 from jaxevent.parameters import Choice, Number, Positive, UnitInterval
 from jaxevent.reconstruction import smoother
 
@@ -143,12 +141,6 @@ class Params(smoother.Params):
     @classmethod
     def predictor(cls) -> smoother.Smoother:
         return smoother.aks  # the images at single instants are a smoother's
-
-    @classmethod
-    def judge(cls) -> Any:
-        from jaxevent.reconstruction.compensated.estimator import mc
-
-        return mc
 
     presets = {
         "hdr": {
