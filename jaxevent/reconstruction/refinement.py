@@ -22,6 +22,7 @@ from jaxevent.recording import Frames, Recording
 
 N_STRETCHES = 3
 FRAMES_PER_STRETCH = 9
+MIN_CHOICE_GAIN = 0.1  # the same of each choice, of a few frames
 FRAMES_TO_CHOOSE = 5  # of a stretch, where methods are slow
 MAX_PIXELS = 40_000
 MAX_EVENTS = 400_000  # of all stretches
@@ -188,7 +189,7 @@ def choose(
         steps: Values by name that each step tries beside those chosen before.
 
     Returns:
-        The values that lower the squared error; none where the recording is too short to tell.
+        The values that lower the squared error by a tenth; none where the recording is too short to tell.
     """
     parts = choose_parts(recording, float(params.clock_offset), FRAMES_TO_CHOOSE)
     if not parts:
@@ -206,6 +207,6 @@ def choose(
             before = chosen
             for values in offered:
                 error = loss({**before, **values})
-                if error < least:
+                if error < (1 - MIN_CHOICE_GAIN) * least:
                     chosen, least = {**before, **values}, error
     return chosen
