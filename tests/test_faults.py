@@ -191,15 +191,21 @@ def test_offset_is_found_beyond_a_quarter_of_the_interval(late_us):
 
 @pytest.mark.parametrize("most", [20_000, 100_000])
 def test_events_that_a_sample_leaves_out_are_known(sound, most, monkeypatch):
-    """Of dense recordings a stretch ends before its last frame."""
+    """Dense recordings are sampled at fewer pixels, and not far from the frames."""
     monkeypatch.setattr("jaxevent.calibration.sampling.MAX_EVENTS", most)
-    events, covered = sound.events, []
-    for stretch in take_sample(sound).stretches:
-        counted = count_between(stretch).sum((1, 2))
-        edges = np.searchsorted(events.t, stretch.frame_t)
-        np.testing.assert_array_equal(counted == np.diff(edges), stretch.is_covered())
-        covered.append(stretch.is_covered())
-    assert np.concatenate(covered).all() == (most == 100_000)
+    events, sample = sound.events, take_sample(sound)
+    place = events.y.astype(int) * sound.width + events.x
+    sampled = np.concatenate([[0], np.cumsum(np.isin(place, sample.places))])
+    assert 0 < len(sample.places) < sound.width * sound.height
+    for stretch in sample.stretches:
+        first, last = stretch.span
+        offsets = (0, first - int(stretch.frame_t[0]), last + 1 - int(stretch.frame_t[-1]))
+        for offset, covered in zip(offsets, (True, True, False), strict=True):
+            known = stretch.is_covered(offset)
+            assert known[:-1].all() and known[-1] == covered
+            counted = count_between(stretch, offset).sum((1, 2))
+            edges = np.searchsorted(events.t, stretch.frame_t + offset)
+            np.testing.assert_array_equal(counted[known], np.diff(sampled[edges])[known])
 
 
 def test_changes_in_common_are_beyond_the_scatter():
