@@ -79,6 +79,8 @@ def format_calibrated(name: str, value: float) -> str:
         return f"events {1e3 * abs(value):.1f} ms {'late' if value >= 0 else 'early'}"
     if name == "rho_ref":
         return f"dead time {1e3 * value:.2g} ms"
+    if name == "exposure":
+        return f"exposure {1e3 * value:.3g} ms"
     return f"clock {1e3 * value:+.1f} ms" if name == "clock_offset" else f"{name} {value:.3g}"
 
 
