@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration.hot import find_hot_pixels
 from jaxevent.codegen import njit_noalloc
-from jaxevent.recording import Recording
+from jaxevent.recording import EventSource, Recording
 
 MAX_EVENTS = 3_000_000
+MAX_READ_EVENTS = 24_000_000  # of all pixels, where events are dense
 MAX_INTERVALS = 48
 MAX_PIXELS = 100_000
 N_STRETCHES = 8
@@ -137,12 +138,26 @@ def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> S
             return SegmentPlace(rows, span, first, last)
 
 
+def _cut_stretch(source: EventSource, stretch: SegmentPlace) -> SegmentPlace:
+    """End a stretch after `MAX_READ_EVENTS`, as where minutes pass between two frames."""
+    last = stretch.first + MAX_READ_EVENTS
+    if last >= stretch.last:
+        return stretch
+    end = int(source[last : last + 1].t[0])
+    return stretch._replace(span=(stretch.span[0], end - 1), last=source.index(end))
+
+
 def _choose_stretches(recording: Recording) -> list[SegmentPlace]:
     """Choose the stretches, of whose frames there may be none."""
     frames, source = recording.frames, recording.events
     if frames is not None and len(frames) > 1:
         chosen = _choose_rows(recording)
-        return [_bound_stretch(recording, rows, MAX_EVENTS // len(chosen)) for rows in chosen]
+        found = [_bound_stretch(recording, rows, MAX_EVENTS // len(chosen)) for rows in chosen]
+        number = MAX_READ_EVENTS // max(1, *(one.last - one.first for one in found))
+        if number < len(found):
+            some = np.linspace(0, len(found) - 1, max(number, 1)).round().astype(int)
+            found = [_cut_stretch(source, found[k]) for k in some.tolist()]
+        return found
     rows = np.arange(len(frames) if frames is not None else 0)
     count = N_STRETCHES if len(source) > MAX_EVENTS else 1
     most, found = MAX_EVENTS // count, []
@@ -186,13 +201,15 @@ def _read_events(
     """
     source, first, last = recording.events, stretch.first, stretch.last
     counts, kept = np.zeros((2, parts, len(index)), np.int32), []
-    t0, t1 = source[first:last].t[[0, -1]] if parts > 1 and last > first else (0, 0)
-    cuts = np.linspace(t0, t1 + 1, parts + 1)[1:-1]
+    cuts = np.empty(0)
+    if parts > 1 and last > first:
+        t0, t1 = (int(source[row : row + 1].t[0]) for row in (first, last - 1))
+        cuts = np.linspace(t0, t1 + 1, parts + 1)[1:-1]
     for row in range(first, last, MAX_EVENTS):
         events = source[row : min(row + MAX_EVENTS, last)]
         place = events.y.astype(np.int64) * recording.width + events.x
         begins = [0, *np.searchsorted(events.t, cuts).tolist(), len(place)]
-        for part in range(parts):
+        for part in range(len(begins) - 1):
             within = slice(begins[part], begins[part + 1])
             for k, of in enumerate((events.p[within], ~events.p[within])):
                 counts[k, part] += np.bincount(place[within][of], minlength=len(index))

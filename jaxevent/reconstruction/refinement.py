@@ -189,7 +189,8 @@ def choose(
         steps: Values by name that each step tries beside those chosen before.
 
     Returns:
-        The values that lower the squared error by a tenth; none where the recording is too short to tell.
+        The values that lower the squared error by a tenth; none where the recording is too short to
+        tell.
     """
     parts = choose_parts(recording, float(params.clock_offset), FRAMES_TO_CHOOSE)
     if not parts:

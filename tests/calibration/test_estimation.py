@@ -277,6 +277,18 @@ def test_a_sample_of_dense_events_has_fewer_pixels_but_whole_intervals(recording
         np.testing.assert_array_equal(sample.places[stretch.pixel], place[known])
 
 
+@pytest.mark.parametrize("most", [60_000, 10_000])
+def test_of_dense_events_few_stretches_are_read(recording, most, monkeypatch):
+    """The last one ends early where two frames have more events between them than that."""
+    monkeypatch.setattr("jaxevent.calibration.sampling.MAX_EVENTS", 20_000)
+    monkeypatch.setattr("jaxevent.calibration.sampling.MAX_READ_EVENTS", most)
+    sample = take_sample(recording)
+    assert 0 < sample.counts.sum() <= most and len(sample.stretches) < 8
+    times = recording.events.t
+    inside = [np.sum((times >= s.span[0]) & (times <= s.span[1])) for s in sample.stretches]
+    assert sample.counts.sum() == sum(inside)
+
+
 def odd_recordings(recording):
     events, frames = recording.events, recording.frames
     none = dict(zip("txyp", np.empty((4, 0), int), strict=True))
