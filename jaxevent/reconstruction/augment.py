@@ -201,12 +201,13 @@ def _numbers_if_needed(
     found = calibration.select(names)
     if found.missing or validator is None:
         return CalibratedValues({} if found.missing else found.found, found.missing)
+    rho = found.found.get("rho_ref")
     # The shortest gaps between events bound a dead time from above alone.
-    dead = [{}] + [{"rho_ref": part * found.found.get("rho_ref", 0.0)} for part in (1.0, 0.5)]
+    dead = [{}] if rho is None else [{}, {"rho_ref": rho}, {"rho_ref": rho / 2}]
     thresholds = [
-        {name: one for name, one in {**pair, **lost}.items() if name in found.found}
+        {**{name: c for name, c in pair.items() if name in found.found}, **lost}
         for pair in calibration.threshold_candidates()
-        for lost in (dead if "rho_ref" in found.found else dead[:1])
+        for lost in dead
     ]
     # The calibrated delay makes up in part for the dead time that the predictor leaves out.
     delays = [{"event_delay": 0.0}] if delay_is_open else []

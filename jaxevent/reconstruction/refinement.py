@@ -109,6 +109,11 @@ def choose_parts(
     return found
 
 
+def _all_errors(parts: list[HiddenFrames], method: Any, params: Any) -> NDArray[np.float64]:
+    """Return the errors of all predicted frames of some parts."""
+    return np.concatenate([part.errors(method, params) for part in parts])
+
+
 def refine(
     method: Any, recording: Recording, params: Any, names: Sequence[str], more: Sequence[Any] = ()
 ) -> dict[str, float]:
@@ -129,9 +134,6 @@ def refine(
         return {}
     interval = parts[0].interval_s
 
-    def errors(at: Any) -> NDArray[np.float64]:
-        return np.concatenate([part.errors(method, at) for part in parts])
-
     def move(at: Any, steps: NDArray[np.float64]) -> Any:
         values = {}
         for name, step in zip(names, steps.tolist(), strict=True):
@@ -146,13 +148,13 @@ def refine(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        known = [(errors(at), at) for at in (params, *more)]
+        known = [(_all_errors(parts, method, at), at) for at in (params, *more)]
         e, at = min(known, key=lambda one: float((one[0] ** 2).mean()))
         best, damping = float((e**2).mean()), 0.01
         for _ in range(N_STEPS):
             # Errors have kinks, so that a derivative on one side is biased by the step.
             sides = [
-                [errors(move(at, sign * LOG_STEP * unit)) for sign in (-1, 1)]
+                [_all_errors(parts, method, move(at, sign * LOG_STEP * unit)) for sign in (-1, 1)]
                 for unit in np.eye(len(names))
             ]
             J = np.stack([(right - left) / (2 * LOG_STEP) for left, right in sides])
@@ -162,7 +164,7 @@ def refine(
             for _ in range(N_TRIES):
                 H = A + damping * (np.diag(np.diag(A)) + 0.1 * np.diag(A).mean() * np.eye(len(A)))
                 new = move(at, np.clip(-np.linalg.pinv(H) @ g, -MAX_STEP, MAX_STEP))
-                found = errors(new)
+                found = _all_errors(parts, method, new)
                 error = float((found**2).mean())
                 if error < best:
                     gain, best, at, e = 1 - error / best, error, new, found
@@ -197,8 +199,7 @@ def choose(
         return {}
 
     def loss(values: Mapping[str, float]) -> float:
-        errors = [part.errors(method, params.replace(**values)) for part in parts]
-        return float((np.concatenate(errors) ** 2).mean())
+        return float((_all_errors(parts, method, params.replace(**values)) ** 2).mean())
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
