@@ -149,8 +149,22 @@ def test_the_page_of_guards_lists_the_faults_that_can_be_put_in():
         assert one.old in (ROOT / one.file).read_text(), one.fault
 
 
-def test_links_outside_of_the_site_lead_somewhere():
-    """MkDocs checks those of its pages."""
+def test_links_within_the_site_lead_to_its_pages():
+    """MkDocs checks them, too, where the extra `docs` is installed."""
+    link = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+    known = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*") if page.is_file()}
+    known |= {page.removesuffix(".py") + ".md" for page in known if page.endswith(".py")}
+    known |= {"parameters.md", "measures.md", "security.md", "changelog.md"}  # made by the build
+    count = 0
+    for page in DOCS.rglob("*.md"):
+        for place in link.findall(page.read_text()):
+            where = os.path.normpath(page.relative_to(DOCS).parent / place)
+            assert where in known, (page.name, place)
+            count += 1
+    assert count > 80
+
+
+def test_links_of_other_pages_lead_somewhere():
     link = re.compile(r"\]\(((?:https://github.com/jaxevent/jaxevent/blob/main/)?)([^)#]+)[^)]*\)")
     pages = [*ROOT.glob("*.md"), *(ROOT / "experiments" / "studies").glob("*.md")]
     count = 0
