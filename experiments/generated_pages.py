@@ -1,6 +1,6 @@
 """Pages and tables made from the code when the site is built: parameters, measures, methods.
 
-`python experiments/generated_pages.py` prints the parameters. `on_files` and `on_page_markdown` are
+`python experiments/generated_pages.py` prints the parameters. Functions named `on_...` are
 hooks of MkDocs (`mkdocs.yml`). The changelog and the security page are those of the repository.
 """
 
@@ -123,6 +123,14 @@ def on_page_markdown(markdown: str, **context: Any) -> str:
     for family in METHOD_HOMES:
         markdown = markdown.replace(f"<!-- methods: {family} -->", methods_table(family))
     return markdown
+
+
+def on_post_page(output: str, **context: Any) -> str:
+    """Keep pages from asking GitHub for the number of stars, as the theme does otherwise."""
+    return output.replace(' data-md-component="source"', "")
+
+
+on_post_template = on_post_page  # of the page of missing pages
 
 
 if __name__ == "__main__":

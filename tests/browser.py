@@ -1,11 +1,11 @@
 """Chromium without a window, spoken to through its debugging pipe: no driver is needed."""
 
-import base64
 import json
 import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +102,9 @@ class Browser:
             width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
         )  # fmt: skip
         self.call("Page.navigate", url=path.as_uri())
-        while self._next().get("method") != "Page.loadEventFired":
-            pass
+        # The event of a page that loads fast can come before the answer, and is then gone.
+        while self.ask("document.readyState") != "complete":
+            time.sleep(0.01)
 
     def ask(self, script: str) -> Any:
         """The value of an expression of JavaScript."""
@@ -139,8 +140,3 @@ class Browser:
             self.call(
                 "Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=code, **text
             )
-
-    def picture(self, path: Path) -> None:
-        """Write the whole page as PNG."""
-        shot = self.call("Page.captureScreenshot", captureBeyondViewport=True)
-        path.write_bytes(base64.b64decode(shot["data"]))
