@@ -99,7 +99,7 @@ def check_times(times: Times, start_us: int, stop_us: int, name: str) -> None:
         raise InputError(
             f"{name}: times from {us.min()} to {us.max()} us were requested, but it lasts from "
             f"{start_us} to {stop_us} us; give times of the recording's clock inside it (integers "
-            "are microseconds, floats seconds), or extrapolate=True"
+            "are microseconds, floats seconds), or, in Python, extrapolate=True"
         )
 
 

@@ -64,10 +64,10 @@ class CommandParser(argparse.ArgumentParser):
             options = [name for name in self._option_string_actions if name.startswith("--")]
             name = unknown[0].partition("=")[0]
             near = difflib.get_close_matches(name, options, 1)
-            self.error(
-                f"unrecognized arguments: {' '.join(unknown)}"
-                + (f"; did you mean {near[0]}?" if name.startswith("-") and near else "")
-            )
+            advice = f"; did you mean {near[0]}?" if name.startswith("-") and near else ""
+            if name.replace(".", "").isdigit():
+                advice = "; several values of an option are one list, such as 1.0,1.5"
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{advice}")
         return found, unknown
 
 
