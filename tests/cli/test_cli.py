@@ -223,7 +223,7 @@ def test_bad_arguments(argv, capsys):
         ("camera mrge", "jaxevent camera [options]", "did you mean 'merge'?"),
         ("track a.h5 --modl x", "jaxevent track [options]", "did you mean --method?"),
         ("track a.h5 b.h5", "jaxevent track [options]", "unrecognized arguments: b.h5\n"),
-        ("flow a.h5 --times 1.0 1.5", "jaxevent flow [options]", "are one list, such as 1.0,1.5"),
+        ("flow a.h5 --out f --times 1 2", "jaxevent flow [options]", "are one list, such as 1.0,"),
     ],
 )
 def test_wrong_names_are_told_by_the_command_that_was_meant(argv, usage, said, capsys):
