@@ -36,6 +36,9 @@ def read_notebook(path: Path, execute: bool) -> Any:
                 "extra_arguments": ["--log-level=ERROR"],
             }
             NotebookClient(notebook, **options).execute()
+        for cell in notebook.cells:  # without progress bars and warnings of this machine
+            if cell.cell_type == "code":
+                cell.outputs = [one for one in cell.outputs if one.get("name") != "stderr"]
     return notebook
 
 
@@ -47,7 +50,7 @@ def fence(text: str, language: str) -> str:
 def format_output(output: Any, stem: str, pictures: dict[str, bytes]) -> str:
     """Format a cell's output as Markdown; adds its picture to `pictures`."""
     if output.output_type == "stream":
-        return fence(output.text, "text") if output.name == "stdout" else ""
+        return fence(output.text, "text")
     data = output.get("data", {})
     if "image/png" in data:
         name = f"{stem}_{len(pictures)}.png"

@@ -31,3 +31,13 @@ def with_article(name: str) -> str:
 def plural(noun: str, number: int) -> str:
     """Return the word for a number of things: one track, two tracks."""
     return noun if number == 1 else noun + "s"
+
+
+def format_seconds(us: Any) -> str:
+    """Write a time of microseconds in seconds, to the microsecond: 250000 is "0.25"."""
+    return f"{int(us) / 1e6:.6f}".rstrip("0").removesuffix(".")
+
+
+def format_span(t: Any) -> str:
+    """Write the first and last of sorted times (us) in seconds: "0.1 to 0.2 s"."""
+    return f"{format_seconds(t[0])} to {format_seconds(t[-1])} s"

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.display import HtmlRepr, describe_type, plural
+from jaxevent.display import HtmlRepr, describe_type, format_seconds, format_span, plural
 from jaxevent.errors import InputError, InputWarning, OrderError
 from jaxevent.time_units import doubt_given_unit
 
@@ -106,7 +106,9 @@ def check_times(times: Times, start_us: int, stop_us: int, name: str) -> None:
 def _span(what: str, number: int, t: Any) -> str:
     """Describe a number of things and their times, as in "2 events from 0.1 to 0.2 s"."""
     text = f"{number:,} {plural(what, number)}"
-    return f"{text} from {t[0] / 1e6:g} to {t[-1] / 1e6:g} s" if number else text
+    if number < 2:
+        return f"{text} at {format_seconds(t[0])} s" if number else text
+    return f"{text} from {format_span(t)}"
 
 
 def _doubt_times(events: NDArray[np.int64], frames: "Frames") -> str | None:
@@ -115,7 +117,7 @@ def _doubt_times(events: NDArray[np.int64], frames: "Frames") -> str | None:
     if len(events) and len(t):
         gap = max(t[0] - events[-1], events[0] - t[-1])
         if gap > max(events[-1] - events[0], MAX_FRAME_GAP_US):
-            ends = [f"{at[0] / 1e6:g} to {at[-1] / 1e6:g} s" for at in (t, events)]
+            ends = [format_span(at) for at in (t, events)]
             return f"frames are from {ends[0]}, events from {ends[1]}"
     if len(t) > 1 and np.median(frames.exposure) > (spacing := np.median(np.diff(t))):
         longest = np.median(frames.exposure) / 1e6
@@ -974,8 +976,7 @@ class Recording(HtmlRepr):
         for name, part in cuts.items():
             whole = getattr(self, name)
             if part is None and whole is not None and len(whole):
-                span = f"{whole.t[0] / 1e6:g} to {whole.t[-1] / 1e6:g} s"
-                left_out[name] = f"its {len(whole):,} {name} from {span} are {why}"
+                left_out[name] = f"its {len(whole):,} {name} from {format_span(whole.t)} are {why}"
         return left_out
 
     def with_frames(self, rows: slice | NDArray) -> "Recording":

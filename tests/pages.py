@@ -38,6 +38,7 @@ def shortened(text: str, path: Path) -> str:
         ("--duration 0.3", "--duration 0.2"),
         ("dot[:0.1]", "dot[:0.06]"),
         ("duration=0.3", "duration=0.26"),
+        ("iterations = 60", "iterations = 5"),
     ):
         text = text.replace(long, short)
     return text

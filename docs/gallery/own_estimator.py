@@ -1,9 +1,11 @@
 # %% [markdown]
 # # An estimator of your own
 #
-# Any function of a recording and times is a method for `evaluate`. Times are (T,), int64 us on the
-# events' clock. It returns images (T, height, width) of intensity, 0 black and 1 white, or a tuple
-# of them and their variance of the same shape. This one adds the events since the last frame to it.
+# Any function of a recording and times is a method for `evaluate`. Times are (T,), int64 us: the
+# stamps of hidden frames, to which the function adds the offset of the clocks itself, as to those
+# of the frames that it gets. It returns images (T, height, width) of intensity, 0 black and 1
+# white, or a tuple of them and their variance of the same shape. This one adds the events since the
+# last frame to it.
 
 # %%
 import dataclasses
@@ -26,7 +28,8 @@ recording = jaxevent.events.crop(packaged[0.6:0.9], 70, 90, 60, 45)
 def integrate(recording, times):
     params = akf.Params.for_recording(recording)  # clock and thresholds
     frames, events = recording.frames, recording.events
-    stamps = frames.t + round(1e6 * float(params.clock_offset))
+    offset = round(1e6 * float(params.clock_offset))  # us, from stamps to the events' clock
+    stamps, times = frames.t + offset, times + offset
     steps = np.where(events.p, params.c_on, -params.c_off)  # of ln(I + I0)
     pixel = events.y.astype(int) * recording.width + events.x
     size = recording.height * recording.width
@@ -94,7 +97,7 @@ for name, method in {"akf": akf, "forgetful": forgetful}.items():
         color=line.get_color(), label="2 standard deviations",
     )  # fmt: skip
 axis.set(xlabel="time (ms)", ylabel="ln(I + I0)", title=f"pixel x = {x}, y = {y}")
-axis.legend(ncols=2)
+axis.legend(ncols=2, loc="upper left", bbox_to_anchor=(1, 1))
 
 # %% [markdown]
 # Trackers, motion models and methods with parameters of their own: [Extending](../extending.md).

@@ -201,6 +201,7 @@ def run(
     names = estimator.names_left_open(table) if calibrate else ()
     if names:
         check_clocks(recording, values.clock_offset)
+    clock = time.perf_counter()
     sample = take_sample(recording)
     _warn_of_faults(recording, sample)
     found = calibrated_values(recording, values, names, sample)
@@ -209,7 +210,6 @@ def run(
         print(arguments.describe_calibration(found))
     values = values.replace(**found.found)
     chosen = choose_times(values)
-    clock = time.perf_counter()
     video = estimator.estimate(recording, values, progress=show_progress())
     colours = None
     if colour:

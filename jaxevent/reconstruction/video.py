@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxevent import threads
 from jaxevent.deprecated import renamed_methods
 from jaxevent.devices import has_accelerator
-from jaxevent.display import HtmlRepr
+from jaxevent.display import HtmlRepr, format_span
 from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
 from jaxevent.events.blocks import read_blocks
@@ -261,7 +261,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
 
     def __repr__(self) -> str:
         r = self.recording
-        span = f"{r.start * 1e-6:g} to {r.stop * 1e-6:g} s"
+        span = format_span((r.start, r.stop))
         kind = type(self).__name__
         return f"{kind}({self.estimator.name} of {r.name}, {r.width}x{r.height}, {span})"
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
+from jaxevent.display import format_span
 from jaxevent.errors import InputError
 from jaxevent.io import load
 from jaxevent.io.images import Scale, is_series, kept_colours, read_series
@@ -297,8 +298,8 @@ def apply_registration(
     if not len(rows):
         raise InputError(
             f"{other.name}: with the offset {found.offset:g} s its frames are from "
-            f"{t[0] * 1e-6:g} to {t[-1] * 1e-6:g} s, the events from {begin * 1e-6:g} to "
-            f"{end * 1e-6:g} s; give the offset that is added to the frames' time stamps"
+            f"{format_span(t)}, the events from {format_span((begin, end))}; give the offset that "
+            "is added to the frames' time stamps"
         )
     covered = ~np.isnan(found.grid[..., 0])
     if not covered.any():

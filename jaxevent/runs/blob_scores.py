@@ -50,6 +50,7 @@ from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_ran
 from jaxevent.blob.scores import score_tracks
 from jaxevent.blob.track import MIN_THETA_AXIS_RATIO
 from jaxevent.blob.tracks import Tracks
+from jaxevent.display import format_span
 from jaxevent.errors import InputError
 from jaxevent.io.tables import read_table
 from jaxevent.recording import Recording
@@ -203,7 +204,7 @@ class Targets:
         inside = (first <= known.t) & (known.t <= last)
         if not inside.any():
             raise InputError(
-                f"{path}: no position is within {first * 1e-6:g} to {(last + 1) * 1e-6:g} s, the "
+                f"{path}: no position is within {format_span((first, last + 1))}, the "
                 f"events' time in {recording.name}; times are seconds on its clock"
             )
         more = {name: value[inside] for name, value in known.more.items()}

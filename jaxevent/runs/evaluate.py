@@ -7,7 +7,7 @@
     stream = "left"                                 # only for files of several cameras
     metrics = ["authors_ssim"]                      # further ones: of images those in MEASURES; of
                                                     # your own: "package.module:function"
-    optional_metrics = ["lpips"]                    # of them those whose extra is installed
+    optional_metrics = ["lpips"]                    # those whose extra is installed
     gap = 4                                         # with "held-out": every 4th frame is given,
                                                     # the others are hidden; omitted: 2
     moving = true                                   # with "held-out": the error where something

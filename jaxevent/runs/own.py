@@ -11,7 +11,8 @@ A metric is a function `metric(estimate, truth)` of two arrays that returns a nu
 A method is an `Estimator`, or a function `method(recording, times)` that returns an estimate at
 `times` (T,), int64 us: the mean, or a tuple (mean, covariance) with the shapes of
 `jaxevent.estimator.Estimate`. Of blobs the mean may be positions (T, targets, 2) alone; NaN where
-a target is not tracked, or where the motion is lost.
+a target is not tracked, or where the motion is lost. Times are on the events' clock. Only those of
+hidden frames are their stamps, to which the function adds the offset of the clocks itself.
 """
 
 import dataclasses

@@ -1,9 +1,9 @@
 """Protocols of reconstruction: the input of a method, and the true images to compare with.
 
 "held-out" gives frames 0, 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their
-time stamps plus the method's `clock_offset`. With a `gap` g it gives every g-th frame, 0, g, 2 g,
-..., and asks for all others. Images are clipped to [0, 1], the range of the truth, before they are
-scored.
+time stamps plus the method's `clock_offset`; a function of your own gets the stamps. With a `gap` g
+it gives every g-th frame, 0, g, 2 g, ..., and asks for all others. Images are clipped to [0, 1],
+the range of the truth, before they are scored.
 
 "reference" gives the whole recording and asks for the HDR images that it keeps in
 `Recording.extra`, float linear intensities of which 1 is the frames' white, without clipping:

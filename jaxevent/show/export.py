@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import N_THREADS
+from jaxevent.display import format_span
 from jaxevent.errors import InputError
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
-from jaxevent.recording import Recording, microseconds
-from jaxevent.show.images import display_limits, tone_map, video_writer, write_png
+from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.show.images import Tone, display_limits, tone_map, video_writer, write_png
 
 
 def image_times(
@@ -65,7 +66,7 @@ def within(
     end = np.inf if stop is None else microseconds(float(stop), "--stop")
     chosen = times[(times >= first) & (times < end)]
     if not len(chosen):
-        span = f"from {times[0] / 1e6:g} to {times[-1] / 1e6:g} s" if len(times) else "none"
+        span = f"from {format_span(times)}" if len(times) else "none"
         bounds = (("from --start", start), ("to --stop", stop))
         asked = " ".join(f"{words} {float(s):g} s" for words, s in bounds if s is not None)
         raise InputError(
@@ -103,6 +104,36 @@ def writer(out: Path) -> Writer:
             "leave out the suffix for a folder of PNG images"
         )
     return kinds[out.suffix.lower()]
+
+
+def save_video(
+    video: ImageSequence, times: Times, path: str | Path, *, tone: Tone | None = None
+) -> None:
+    """Write images of a reconstruction to a file, as `jaxevent reconstruct` does.
+
+        show.save_video(video, np.arange(1.0, 1.5, 0.01), "slow.mp4")
+
+    Args:
+        video: A reconstruction.
+        times: Times of the images, integers in us or floats in s.
+        path: An MP4 file, played at the rate of the times but at most at 60 images per second; a
+            folder of PNG images; or an HDF5 file of exact images and variances. It is replaced.
+        tone: Tone of `jaxevent.show.images.tone_map` for MP4 and PNG. None: "display"; "relative"
+            or "changes" where no frames tell the brightness.
+
+    Raises:
+        InputError: A time is outside the recording, there is none, the suffix is unknown, HDF5 is
+            given a tone, or the extra "video" is missing.
+    """
+    out, wanted = Path(path), np.sort(np.atleast_1d(microseconds(times)))
+    write, recording = writer(out), video.recording
+    if not len(wanted):
+        raise InputError(f"{out}: there are no times; give at least one")
+    if tone is not None and write is write_hdf5:
+        raise InputError(f"{out}: a tone is for images to look at; HDF5 holds linear intensity")
+    if tone is None:
+        tone = default_tone(video.estimator.has_covariance, recording)
+    write(video, wanted, out, tone, recording.name, None)
 
 
 def write_hdf5(

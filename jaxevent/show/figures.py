@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.blob.tracks import Tracks
-from jaxevent.display import describe_type, plural
+from jaxevent.display import describe_type, format_seconds, format_span, plural
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.scores import warn_of_gyro_axes
 from jaxevent.egomotion.truth import KnownMotion
@@ -150,9 +150,10 @@ def plot_image(video: ImageSequence, time: Times, *, tone: Tone | None = None) -
                 ends = norm.vmin, norm.vmax
                 inside = [t for t in ticker.MaxNLocator(4).tick_values(*ends) if t <= ends[1]]
                 bar.set_ticks([t for t in inside if t >= ends[0]])
-    at = int(microseconds(np.ravel(np.asarray(time))[0])) * 1e-6
+    at = format_seconds(microseconds(np.ravel(np.asarray(time))[0]))
     name = video.recording.name
-    figure.suptitle(f"{name} by {method.name} at {at:.6g} s", fontsize=10)
+    unknown = "" if valid.all() else "; hatched: not known"
+    figure.suptitle(f"{name} by {method.name} at {at} s{unknown}", fontsize=10)
     return figure
 
 
@@ -223,7 +224,7 @@ def plot_tracks(tracks: Tracks, ids: Sequence[int] | None = None, *, most: int =
     times = np.linspace(tracks.start, tracks.stop - 1, N_PATH_TIMES).round().astype(np.int64)
     states = tracks(times, ids)
     draw_paths(axis, recording, times, list(ids), (states.mean, states.valid))
-    span = f"{tracks.start * 1e-6:.6g} to {tracks.stop * 1e-6:.6g} s"
+    span = format_span((tracks.start, tracks.stop))
     axis.set_title(f"{recording.name}: {len(ids)} of {len(tracks)} tracks, {span}", fontsize=10)
     return figure
 
@@ -317,7 +318,7 @@ def _(recording: Recording) -> str:
     start, stop = recording.start, recording.stop
     rows = [
         ("sensor", f"{recording.width} x {recording.height} px"),
-        ("time", f"{start / 1e6:.6g} to {stop / 1e6:.6g} s"),
+        ("time", format_span((start, stop))),
         ("events", f"{len(recording.events):,}"),
         ("frames", f"{0 if recording.frames is None else len(recording.frames):,}"),
     ]
@@ -335,7 +336,7 @@ def _(video: ImageSequence) -> str:
     rows = [
         ("method", video.estimator.name),
         ("images", f"{recording.width} x {recording.height} px, at any time"),
-        ("time", f"{recording.start / 1e6:.6g} to {recording.stop / 1e6:.6g} s"),
+        ("time", format_span((recording.start, recording.stop))),
     ]
     return _block(recording.name, rows, lambda: plot_image(video, middle))
 
@@ -348,7 +349,7 @@ def _(tracks: Tracks) -> str:
     rows = [
         (
             f"track {tracks.id[i]}",
-            f"{tracks.birth[i] / 1e6:.6g} to {tracks.death[i] / 1e6:.6g} s, {tracks.ended[i]}",
+            f"{format_span((tracks.birth[i], tracks.death[i]))}, {tracks.ended[i]}",
         )
         for i in order
     ]
@@ -437,7 +438,7 @@ def _title(part: Events | Recording, events: Events) -> str:
     name = f"{part.name}: " if isinstance(part, Recording) else ""
     span = ""
     if len(events):
-        span = f", {events.t[0] * 1e-6:.6g} to {events.t[-1] * 1e-6:.6g} s"
+        span = f", {format_span(events.t)}"
     return f"{name}{len(events):,} events{span}"
 
 

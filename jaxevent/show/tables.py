@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
@@ -174,7 +175,7 @@ def legend(columns: Sequence[Column]) -> str:
 def short_names(recordings: Iterable[str]) -> dict[str, str]:
     """Return short names by recording: the file's name, or the path where several have it."""
     given = list(dict.fromkeys(recordings))
-    short = [PurePath(one).name for one in given]
+    short = [PurePath(os.path.expandvars(one)).name for one in given]
     return {
         one: name if short.count(name) == 1 else one for one, name in zip(given, short, strict=True)
     }

@@ -4,9 +4,11 @@ import dataclasses
 import sys
 from typing import get_args
 
+import h5py
 import numpy as np
 import pytest
 from noise import HEIGHT, WIDTH, small
+from PIL import Image
 from refusals import refuses
 
 import jaxevent
@@ -91,8 +93,29 @@ def test_an_image_and_its_uncertainty():
     np.testing.assert_allclose(image.filled(np.nan), np.where(
         video(0.02).valid[0], video(0.02).mean[0], np.nan))  # fmt: skip
     np.testing.assert_allclose(deviation.compressed(), 0.2)
-    assert figure.get_suptitle() == "small by akf at 0.02 s"
+    assert figure.get_suptitle() == "small by akf at 0.02 s; hatched: not known"
     assert all(axis.patch.get_hatch() for axis in figure.axes[:2])
+
+
+def test_a_video_is_saved_by_the_kind_of_its_name(tmp_path):
+    video = jaxevent.blend.estimate(small())
+    t = video.recording.frames.t[:2]
+    expected = video(t).mean
+    show.save_video(video, t[::-1], tmp_path / "exact.h5")
+    with h5py.File(tmp_path / "exact.h5") as file:
+        np.testing.assert_array_equal(file["t"], t)
+        np.testing.assert_array_equal(file["image"], np.asarray(expected, np.float32))
+    show.save_video(video, t, tmp_path / "shown", tone="linear")
+    shown = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "shown").glob("*.png"))]
+    np.testing.assert_array_equal(shown, tone_map(expected, "linear"))
+    for said, times, name, options in (
+        ("end the name in .h5 or .mp4", t, "video.avi", {}),
+        ("give at least one", [], "video.mp4", {}),
+        ("HDF5 holds linear intensity", t, "toned.h5", {"tone": "log"}),
+        ("times from 9000000", [9.0], "late", {}),
+    ):
+        refuses(said, show.save_video, video, times, tmp_path / name, **options)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["exact.h5", "shown"]
 
 
 def test_tones_of_an_image_are_those_of_the_commands():
