@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -173,7 +174,7 @@ def columns_of(events: Any) -> dict[str, Any]:
         if names is not None:
             held = f"with {', '.join(map(str, names))[:80] or 'no columns'}"
         raise InputError(
-            f"events, a {type(events).__name__} {held}".rstrip()
+            f"events, {describe_type(events)} {held}".rstrip()
             + ", has no columns named t, x, y and p; give each on its own: "
             "from_arrays(t, x, y, p, width=..., height=...)"
         )

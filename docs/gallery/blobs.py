@@ -23,12 +23,9 @@ table.head()
 # The table is an ordinary DataFrame: group it, select from it, save it.
 
 # %%
-table.groupby("id").agg(
-    start=("t", "min"),
-    stop=("t", "max"),
-    rows=("t", "size"),
-    speed=("vx", lambda v: v.abs().mean()),
-)
+table.assign(speed=np.hypot(table["vx"], table["vy"])).groupby("id").agg(
+    start=("t", "min"), stop=("t", "max"), rows=("t", "size"), speed=("speed", "mean")
+)  # px/s
 
 # %% [markdown]
 # Compare with the truth. If the reported deviations are right, errors divided by them have a root

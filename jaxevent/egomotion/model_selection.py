@@ -344,7 +344,7 @@ def select_by_z(
     if not sure:
         lines.append(
             "this is not sure: general motion with little parallax may explain the events as well; "
-            "--model general shows whether there is any"
+            "the model general shows whether there is any"
         )
     return ModelSelection(chosen, tuple(lines), z)
 

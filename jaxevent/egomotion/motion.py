@@ -297,10 +297,10 @@ class MotionEstimate(HtmlRepr):
         cause, other = "at several depths", "general"
         if self.model.uniform and found.both_directions:
             cause, other = "both ways if the camera rolls", "rotation"
-        needs = "" if recording.camera else " --focal PX"
+        needs = "" if recording.camera else ", which needs the camera's focal length,"
         line = (
             f"the image does not move {expected}: parts of it move at {found.slow:.0f} to "
-            f"{found.fast:.0f} px/s, as {cause}; sigmas include that, and --model {other}{needs} "
+            f"{found.fast:.0f} px/s, as {cause}; sigmas include that, and the model {other}{needs} "
             "may explain it"
         )
         covariance = self.covariance + along + across

@@ -69,6 +69,9 @@ N_REFINED_HEADINGS = 6  # from which a general motion is refined
 MIN_INCONSISTENCY_Z = 3.0  # from which parts of the image move apart
 # Of the model's displacement; a roll moves half of the patches backwards.
 TRIED_SPEED_RATIOS = np.concatenate([-np.geomspace(3.0, 0.3, 25), np.geomspace(0.3, 3.0, 25)])
+# Ratios half a step to either side of 1 are the two nearest: parts that differ by no more are seen
+# to move as the model has it, however significant that difference.
+MIN_SPREAD = float(TRIED_SPEED_RATIOS[-1] / TRIED_SPEED_RATIOS[-2] - 1) / 2
 
 # Of `measure_image_speed`: the latest events, sensor and camera, and result.
 _latest: tuple[Any, Any, "ImageSpeed | None"] = (lambda: None, None, None)
@@ -432,7 +435,7 @@ class FlowConsistency:
     @property
     def is_inconsistent(self) -> bool:
         """Return whether the image does not move as one."""
-        return self.z > MIN_INCONSISTENCY_Z
+        return self.z > MIN_INCONSISTENCY_Z and self.spread > MIN_SPREAD
 
 
 def flow_consistency(

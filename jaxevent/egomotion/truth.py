@@ -336,7 +336,7 @@ def known_motion(
         recording: A recording with poses or an IMU, unless `source` is a table.
         model: Motion model, or its name; `Model.truth_sources` lists the sources that suit it.
         source: "poses", "gyro", "auto" (poses, else the gyro), a table, or the path of one.
-        bias: (3,) bias of the gyro, rad/s.
+        bias: (3,) bias of the gyro in its own axes, rad/s.
         span: Time over which velocities are measured from poses, s.
         rotation: (3, 3) from the gyro's axes to the camera's, or a name of `IMU_AXES`. None takes
             them to be the same; `score_motion` and `plot_motion` warn where others fit far better.

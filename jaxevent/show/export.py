@@ -131,9 +131,8 @@ def save_video(
         raise InputError(f"{out}: there are no times; give at least one")
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: a tone is for images to look at; HDF5 holds linear intensity")
-    if tone is None:
-        tone = default_tone(video.estimator.has_covariance, recording)
-    write(video, wanted, out, tone, recording.name, None)
+    shown = tone or default_tone(video.estimator.has_covariance, recording)
+    write(video, wanted, out, shown, recording.name, None)
 
 
 def write_hdf5(

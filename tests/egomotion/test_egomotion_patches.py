@@ -12,6 +12,7 @@ from jaxevent.egomotion.bundle.hypotheses import WindowTest, combine_z
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, B, rotation_basis
 from jaxevent.egomotion.model_selection import select_by_z, select_model
+from jaxevent.egomotion.models import Rotation
 from jaxevent.egomotion.motion import (
     RELATIVE_LENS_ERROR,
     CovarianceCalibration,
@@ -19,6 +20,7 @@ from jaxevent.egomotion.motion import (
     is_observable,
 )
 from jaxevent.egomotion.patches import (
+    MIN_INCONSISTENCY_Z,
     edge_event_fraction,
     flow_consistency,
     measure_image_speed,
@@ -27,6 +29,7 @@ from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Frames, Imu, Poses, Recording
 from jaxevent.show.motion import WrittenMotion
 from jaxevent.show.motion_figures import motion_figure
+from jaxevent.simulate.motion import motion_scene
 
 WIDTH, HEIGHT, F = 120, 96, 100.0
 CAMERA = PinholeCamera(F, F, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -141,14 +144,26 @@ def test_models_are_distinguished():
     along = several.spread**2 * (1 + 0.1**2) * (one @ one)
     unit = one / np.linalg.norm(one)
     assert unit @ wider.covariance[0] @ unit == pytest.approx(1 + along)
-    assert "depths" in line and "--model general --focal PX may explain it" in line
+    assert (
+        "depths" in line
+        and "the model general, which needs the camera's focal length, may explain it" in line
+    )
     turn = estimate_of("rotation", t, [0.2, -0.3, 1.5])
     same, line = turn.with_flow_consistency(turning)
     assert (same.covariance == turn.covariance).all() and not line
     turn = estimate_of("rotation", t, [0.0, -0.7, 0])  # translation may have made all of it
     wider, line = turn.with_flow_consistency(sliding)
     assert wider.covariance[0, 1, 1] == pytest.approx(1 + 0.49 * 1.01)
-    assert "rotation" in line and "--model general may explain it" in line
+    assert "rotation" in line and "the model general may explain it" in line
+
+
+def test_a_rotation_is_not_doubted_for_less_than_the_tried_speeds_resolve():
+    recording, _ = motion_scene(
+        "rotation", "varying", 3002, size=(120, 90), focal=100.0, duration=0.3
+    )
+    found = flow_consistency(recording, Rotation)
+    assert found.z > MIN_INCONSISTENCY_Z and not found.is_inconsistent
+    assert dataclasses.replace(found, spread=0.06).is_inconsistent
 
 
 @pytest.mark.parametrize(
