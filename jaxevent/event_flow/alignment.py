@@ -306,11 +306,11 @@ class Clock(NamedTuple):
 
     @property
     def rises(self) -> bool:
-        """Whether s goes one way all the time."""
+        """True if s never falls."""
         return bool((np.diff(self.s) > 0).all())
 
     def turned(self, at: int) -> "Iterator[tuple[Clock, float]]":
-        """Yield clocks that rest where events are few, and run backwards from then on.
+        """Make clocks that rest where events are few, and run backwards from then on.
 
         Args:
             at: Time at which s = 0, us.
@@ -356,7 +356,14 @@ class WindowEvents(NamedTuple):
         return cls(x, y, events.t, p)
 
     def reversed_after(self, t: float) -> "WindowEvents":
-        """Return the events with polarities reversed after a time (us)."""
+        """Return the events with polarities reversed after a time.
+
+        Args:
+            t: The time, us.
+
+        Returns:
+            The events.
+        """
         return self._replace(p=np.where(self.t > t, -self.p, self.p))
 
 
@@ -489,7 +496,17 @@ class Alignment:
         return s / speed if speed > MIN_CLOCK_SPEED else clock.s
 
     def score(self, events: WindowEvents, clock: Clock, u: NDArray, cell: int) -> float:
-        """Return the score per event of a displacement, in cells of a size (px)."""
+        """Return the score of a displacement.
+
+        Args:
+            events: The events.
+            clock: Their clock.
+            u: (rows, columns, 2) displacement of nodes, px.
+            cell: Size of cells, px.
+
+        Returns:
+            The score per event.
+        """
         x, y, t, p = events
         s = np.interp(t, clock.t, clock.s).astype(np.float32)
         warped = np.empty((len(x), 2), np.float32)
