@@ -23,7 +23,7 @@ from jaxevent.metrics import mse, ssim
 from jaxevent.show.images import new_figure, save_figure, write_png
 
 TEXELS = 2  # per pixel at the depth of the farthest plane
-SCENES = ("rotation", "slider", "objects", "hdr", "large", "turn")
+SCENES = ("rotation", "slider", "objects", "hdr", "large", "turn", "return")
 TIMES = 6  # at which a scene's truth is given
 
 
@@ -218,7 +218,8 @@ def make_source(name, seed):
     - objects: objects move and turn, before a background that is still for even seeds;
     - hdr: a rotation over a scene of 3 to 4 decades of intensity;
     - large: slider with 640x480 pixels;
-    - turn: the motion is horizontal first, then vertical.
+    - turn: the motion is horizontal first, then vertical;
+    - return: slider that stops for some time and then goes back.
     """
     rng = np.random.default_rng([seed, SCENES.index(name)])
     size, focal, duration, side = (240, 180), 200.0, 0.6, 1024
@@ -251,16 +252,25 @@ def make_source(name, seed):
         x, y = speed * np.sign(along)
         return np.stack([x * (1 - late), y * late, *np.zeros((4, len(t)))], 1)
 
-    motion = {"rotation": turning, "hdr": turning, "turn": turned}.get(name, sliding)
+    def returning(t):
+        draw = np.random.default_rng([seed, 2])
+        stop, ramp, rest = (draw.uniform(*span) for span in ((0.33, 0.38), (0.01, 0.02), (0, 0.05)))
+        there = 1 / (1 + np.exp((t - stop) / ramp))
+        back = 1 / (1 + np.exp((stop + 4 * ramp + rest - t) / ramp))
+        x, y = along * speed * [1, 0.3]
+        return (there - back)[:, None] * [x, y, 0, 0, 0, 0]
+
+    motions = {"rotation": turning, "hdr": turning, "turn": turned, "return": returning}
+    motion = motions.get(name, sliding)
     if name == "objects":
         mean = np.r_[along * speed * 0.5 * (seed % 2), np.zeros(4)]
         motion = _vary(rng, 6, mean, 0.3 * mean)
-    slant = rng.normal(0, 0.15, 2) if name in ("slider", "large") else np.zeros(2)
+    slant = rng.normal(0, 0.15, 2) if name in ("slider", "large", "return") else np.zeros(2)
     texture = np.stack([canvas, np.ones_like(canvas)], -1)
     origin = rng.uniform(0, side, 2)
     layers = [Layer(texture, np.array([*slant, 1]), origin, _spline(still, duration), True)]
     for distance in np.sort(rng.uniform(0.4, 0.9, rng.integers(4, 7)))[::-1]:
-        if name not in ("slider", "objects", "large"):
+        if name not in ("slider", "objects", "large", "return"):
             break
         radius = rng.uniform(0.07, 0.18) * size[1] * TEXELS
         cut = cut_object(canvas, radius, rng)

@@ -22,6 +22,10 @@ own motion, and other depths, are outliers of the fit:
 
     min_m  sum w (u + d - m)^T H (u + d - m),    w = 1 / (1 + |u - m|^2 / edge^2)               (4)
 
+A camera that stops and turns back within a window has a clock that rests and then runs backwards.
+Edges that come back make events of the other polarity, so the polarities after the turn are
+reversed there, and (1) holds again.
+
 The covariance of a displacement is that of an estimate from the nodes within a Gaussian of reach r,
 which have the information I_r together, are n_r in effect, and differ by D_r in the mean square:
 
@@ -31,6 +35,8 @@ The first term is the noise of events, the second what smoothness and unequal mo
 is uncertain by its clock, too: by the mean square of what smoothing takes from the clock's rates.
 """
 
+import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +50,7 @@ N_STEPS = 5  # Gauss-Newton steps at each size of cells
 CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
 CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
 CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
+LONG_REST, MAX_RESTS = 1.5, 4  # usual intervals of a clock, of a rest and of its pieces
 MIN_CLOCK_SPEED = 0.5  # of the clock before alignment, or else that is taken
 N_SWEEPS = 30  # of Gauss-Seidel
 N_SURFACE_FITS = 2  # in each step
@@ -294,8 +301,31 @@ class Clock(NamedTuple):
 
     @property
     def mean_rate(self) -> float:
-        """Mean rate of s over the window, 1/s."""
-        return float((self.s[-1] - self.s[0]) / (self.t[-1] - self.t[0])) * 1e6
+        """Mean of the absolute rate of s over the window, 1/s."""
+        return float(np.abs(np.diff(self.s)).sum() / (self.t[-1] - self.t[0])) * 1e6
+
+    @property
+    def rises(self) -> bool:
+        """True if s never falls."""
+        return bool((np.diff(self.s) > 0).all())
+
+    def turned(self, at: int) -> "Iterator[tuple[Clock, float]]":
+        """Make clocks that rest where events are few, and run backwards from then on.
+
+        Args:
+            at: Time at which s = 0, us.
+
+        Yields:
+            A clock for each interval that is longer than its neighbours, and its middle, us.
+        """
+        length, steps = np.diff(self.t), np.diff(self.s)
+        usual, around = np.median(length), np.pad(length, 1)
+        few = (length > np.maximum(around[:-2], around[2:])) & (length > LONG_REST * usual)
+        for k in np.flatnonzero(few).tolist():
+            n = min(math.ceil(length[k] / usual), MAX_RESTS)
+            t = np.insert(self.t, k + 1, np.linspace(self.t[k], self.t[k + 1], n + 1)[1:-1])
+            s = np.cumsum(np.concatenate([[0.0], steps[:k], np.zeros(n), -steps[k + 1 :]]))
+            yield Clock(t, s - np.interp(at, t, s)), (self.t[k] + self.t[k + 1]) / 2
 
     def rate(self, t: float) -> tuple[float, float]:
         """Return how fast s goes at a time (us), 1/s, and the variance of that, 1/s^2."""
@@ -324,6 +354,17 @@ class WindowEvents(NamedTuple):
         p = (p - p.mean()) / max(float(p.std()), 1e-3)
         x, y, p = (np.asarray(c, np.float32) for c in (events.x, events.y, p))
         return cls(x, y, events.t, p)
+
+    def reversed_after(self, t: float) -> "WindowEvents":
+        """Return the events with polarities reversed after a time.
+
+        Args:
+            t: The time, us.
+
+        Returns:
+            The events.
+        """
+        return self._replace(p=np.where(self.t > t, -self.p, self.p))
 
 
 class Displacement(NamedTuple):
@@ -453,6 +494,29 @@ class Alignment:
         s = s - np.interp(at, clock.t, s)
         speed = (s @ clock.s) / max(clock.s @ clock.s, 1e-9)
         return s / speed if speed > MIN_CLOCK_SPEED else clock.s
+
+    def score(self, events: WindowEvents, clock: Clock, u: NDArray, cell: int) -> float:
+        """Return the score of a displacement.
+
+        Args:
+            events: The events.
+            clock: Their clock.
+            u: (rows, columns, 2) displacement of nodes, px.
+            cell: Size of cells, px.
+
+        Returns:
+            The score per event.
+        """
+        x, y, t, p = events
+        s = np.interp(t, clock.t, clock.s).astype(np.float32)
+        warped = np.empty((len(x), 2), np.float32)
+        image = np.zeros((3, *_image_shape(self.shape, cell)), np.float32)
+        _warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
+        blurred = image.copy()
+        for channel, passes in zip(blurred, N_BLURS, strict=True):
+            _blur(channel, np.empty_like(channel), passes)
+        total = (image[0] * blurred[0] / (blurred[1] + NUMBER_FLOOR)).sum()
+        return float(total) / max(len(x), 1)
 
     def __call__(
         self,

@@ -56,7 +56,7 @@ class Anchor(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Displacements per second."""
+        """Displacements per second, less than 0 where the clock runs backwards."""
         return self.aligned.clock.rate(self.t)[0]
 
 
@@ -103,29 +103,45 @@ class EventFlow:
 
         They grow until points are displaced far enough, or to `most` events.
         """
-        start, rate, half = None, 0.0, 0
+        start, clock, half = None, None, 0
         for level in LEVELS:
             half = int(self._base * 2.0**level)
-            found = self._refine(row, half, start, rate, grow=True)
-            start, rate = self._align.shrink(found.aligned), found.aligned.clock.mean_rate
+            found = self._refine(row, half, start, clock, grow=True)
+            start, clock = self._align.shrink(found.aligned), found.aligned.clock
             whole = row + half >= len(self.recording.events) and row - half <= 0
             if half == most or (
                 most is None
                 and (whole or self._align.typical(found.aligned) >= float(self.params.displacement))
             ):
                 break
-        return Chain(self._refine(row, half, start, rate), half)
+        return Chain(self._refine(row, half, start, clock), half)
 
     def _refine(
-        self, row: int, half: int, start: NDArray | None, rate: float, grow: bool = False
+        self,
+        row: int,
+        half: int,
+        start: NDArray | None,
+        before: Clock | None,
+        grow: bool = False,
     ) -> Anchor:
-        """Align the window around an event from displacements that went at a rate (1/s)."""
+        """Align the window around an event from displacements that had another clock."""
         at, events = self._events(row, half)
         clock = Clock.of(events, at, half)
-        if start is not None:
-            start = start * (rate / clock.mean_rate)
+        if start is not None and before is not None:
+            start = start * (before.mean_rate / clock.mean_rate)
         window, cells = WindowEvents.of(events), CELLS if grow else LAST_CELLS
-        return Anchor(row, at, self._align(window, clock, at, start, cells, not grow))
+        found = self._align(window, clock, at, start, cells, not grow)
+        if start is not None and before is not None and not grow:
+            tried = [] if before.rises else [(window, clock, -start)]
+            for turned, stop in clock.turned(at):
+                back = window.reversed_after(stop)
+                tried += [(back, turned, start), (back, turned, -start)]
+            scores = [self._align.score(*one, cells[0]) for one in tried]
+            if tried and max(scores) > self._align.score(window, clock, start, cells[0]):
+                other, clock, start = tried[int(np.argmax(scores))]
+                again = self._align(other, clock, at, start, cells, True)
+                found = max(found, again, key=lambda one: one.score)
+        return Anchor(row, at, found)
 
     def _make_chain(self, number: int) -> Chain:
         return self._seek(number * CHAIN_WINDOWS * self._base)
@@ -137,7 +153,7 @@ class EventFlow:
             return first
         before = self._anchor(number, k - 1)
         row = number * CHAIN_WINDOWS * self._base + k * half
-        found = self._refine(row, half, before.aligned.u, before.aligned.clock.mean_rate)
+        found = self._refine(row, half, before.aligned.u, before.aligned.clock)
         if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
             other = self._seek(row, half).first
             if other.aligned.score > found.aligned.score:
@@ -260,7 +276,7 @@ class EventFlow:
             found = self._fields(anchors, wanted[row : row + 1])
             mean[row], covariance[row] = (self._align.fill(one[0]) for one in found)
             if anchors:
-                rate = np.interp(t, [anchor.t for anchor in anchors], [a.rate for a in anchors])
+                rate = np.interp(t, [a.t for a in anchors], [abs(a.rate) for a in anchors])
                 valid[row] = np.linalg.eigvalsh(covariance[row])[..., 1] < MAX_VARIANCE * rate**2
         return mean, covariance, valid
 

@@ -66,6 +66,19 @@ def test_flow_follows_acceleration():
     assert np.hypot(x[0] - 20 - moved[0], y[0] - 20 - moved[1]) < 0.6
 
 
+def test_flow_turns_back_with_the_camera():
+    """What came comes back after a stop, with the other polarity."""
+    velocity, stop = np.array([90.0, -40.0]), 200_000
+    e = moving_points(velocity).events
+    back = 2 * stop + 50_000 - e.t[::-1], e.x[::-1], e.y[::-1], ~e.p[::-1]
+    both = zip((e.t, e.x, e.y, e.p), back, strict=True)
+    flow = flow_from_events(record(*map(np.concatenate, both)))
+    for t, true in ((0.1, velocity), (0.18, velocity), (0.27, -velocity), (0.35, -velocity)):
+        assert np.median(np.linalg.norm(flow.flow([t])[0] - true, axis=-1)) < 25
+    x, y = flow.paths(150_000, 300_000, 300_000).carry([30.0], [20.0], [150_000])
+    assert np.hypot(x[0] - 30, y[0] - 20) < 0.5
+
+
 def test_carry_solves_the_differential_equation():
     rng = np.random.default_rng(0)
     knots = np.array([0, 4_000, 15_000, 20_000])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxevent.calibration import check_consistency
 from jaxevent.reconstruction.events_only.params import Params
 from jaxevent.reconstruction.events_only.silence import explained_share
 from jaxevent.reconstruction.events_only.windows import WindowSolver
@@ -27,6 +28,52 @@ def test_noise_is_flat_and_unknown(n):
     assert np.isfinite(solution.log_image).all() and np.isfinite(solution.variance).all()
     assert np.abs(solution.log_image).max() < 0.2 * c
     assert np.sqrt(np.median(solution.variance)) > 1.5 * c
+
+
+def bad_input(kind):
+    """Events that pass along a row of edges, with something wrong, and the fault's name."""
+    rng = np.random.default_rng(100)
+    k, column, y = (v.ravel() for v in np.mgrid[:12, :64, :48])
+    t, x, p = (column + 6 * k) * 2000 + 100 * (y % 7), column, k % 2 == 0
+    if kind == "one pixel":
+        x, y, p = np.full_like(x, 10), np.full_like(y, 12), rng.random(len(t)) < 0.5
+    elif kind == "all ON":
+        p = np.ones(len(t), bool)
+    elif kind == "bursts":
+        at = np.repeat([70_000, 120_000], SHAPE[0] * SHAPE[1])
+        pixels = np.tile(np.arange(SHAPE[0] * SHAPE[1]), 2)
+        t, x, y = np.r_[t, at], np.r_[x, pixels % 64], np.r_[y, pixels // 64]
+        p = np.r_[p, np.ones(len(at), bool)]
+    else:
+        pixels = np.repeat(rng.choice(SHAPE[0] * SHAPE[1], SHAPE[0] * SHAPE[1] // 5, False), 60)
+        t = np.r_[t, rng.integers(0, t.max(), len(pixels))]
+        x, y = np.r_[x, pixels % 64], np.r_[y, pixels // 64]
+        p = np.r_[p, rng.random(len(pixels)) < 0.5]
+    order = np.argsort(t, kind="stable")
+    columns = (v[order] for v in (t, x, y, p))
+    return Recording.from_arrays(*columns, width=64, height=48)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault"),
+    [
+        ("one pixel", "hot pixels"),
+        ("all ON", "lost polarity"),
+        ("bursts", "event bursts"),
+        ("20 % hot pixels", "hot pixels"),
+    ],
+)
+def test_bad_input_is_told_and_gives_finite_images(kind, fault):
+    recording = bad_input(kind)
+    assert fault in [found.name for found in check_consistency(recording)]
+    windows = WindowSolver(recording, Params())
+    solution = windows((recording.start + recording.stop) // 2).solution
+    assert np.isfinite(solution.log_image).all() and np.isfinite(solution.variance).all()
+    assert solution.variance.min() > 0
+    if kind in ("one pixel", "all ON"):  # what shows no motion
+        c = windows.thresholds.mean()
+        assert np.abs(solution.log_image).max() < 0.2 * c
+        assert np.sqrt(np.median(solution.variance)) > 1.5 * c
 
 
 def test_share_of_an_edge_on_its_path_and_off_it():
