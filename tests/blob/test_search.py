@@ -150,7 +150,8 @@ def test_paths_in_contact_all_their_lives_are_one():
     one, other = _path(t, x, 30.0, 3.0, 30), _path(t, x, 39.0, 3.0, 10)
     far, crossing = _path(t, x, 45.0, 3.0, 10), _path(t, x[::-1], 39.0, 3.0, 10)
     resting = [_path(t, 20.0, y, 3.0, 10) for y in (30.0, 39.0)]
-    for pair in ([one, far], [one, crossing], resting):
+    overtaking = _path(t, 11 + 1.36e-3 * t, 31.0, 3.0, 10)
+    for pair in ([one, far], [one, crossing], [one, overtaking], resting):
         assert len(merge_parts(pair)) == 2
     (both,) = merge_parts([other, one])
     np.testing.assert_allclose(both.p, np.stack([x, np.full(len(t), 32.25)], 1))
@@ -174,6 +175,17 @@ def test_two_that_begin_together_and_part_are_two():
     apart = ends[:, :, None] - truth(t)[:, None, :, :2]
     near = np.hypot(apart[..., 0], apart[..., 1]).min(1)
     assert (near < 2).all()
+
+
+def test_two_outlines_that_begin_in_one_blob_and_part_are_two():
+    starts = [((46.0, 44.0), (-20.0, 0.0)), ((54.0, 46.0), (20.0, 5.0))]
+    targets = [Target(LinearMotion(p, v, size=(3.3, 3.3)), 4e3, "ring") for p, v in starts]
+    recording, truth = scene(targets, 1.5)
+    found = blob.find(recording, progress=False)
+    assert len(found) == 2
+    t = np.array([900_000, 1_400_000])
+    apart = np.stack([path.at(t) for path in found.paths], 1)[:, :, None] - truth(t)[:, None, :, :2]
+    assert (np.hypot(apart[..., 0], apart[..., 1]).min(1) < 1).all()
 
 
 def test_what_is_seen_shortly_and_goes_no_way_is_left_out():

@@ -90,6 +90,11 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     p, q = both[0].p, both[1].p
     apart = np.hypot(*(p - q).T)
     sizes = np.stack([path.size[:, 0] for path in both])
+    nearest, farthest = np.quantile(apart, (0.02, 0.98))
+    # Parts that are beside each other are never in one place, as targets that pass are.
+    short = min(float(np.median(path.size[:, 1])) for path in both)
+    if nearest < contact * short and farthest > np.median(sizes, 1).sum():
+        return False, False
     edge = _is_edge(one, other) or _is_edge(other, one)
     small, large = np.sort(np.median(sizes, 1))
     reach = float(np.quantile(apart / sizes.sum(0), share))
@@ -98,10 +103,9 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
         return True, False
     # Pieces slide along an edge, but less far than they go with it.
     far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
-    changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
     far *= (end - begin) / max(t[-1] - t[0], 1)  # of all of its windows
     together = far > CONFIG.common_way_sizes * small
-    together &= bool(changed < max(large, far if edge else far / 2))
+    together &= bool(farthest - nearest < max(large, far if edge else far / 2))
     if touch and together and (edge or _separate_nats(both) <= CONFIG.log_bayes_factor):
         return True, False
     within = np.quantile(apart / sizes.max(0), share) < contact
