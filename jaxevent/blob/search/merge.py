@@ -91,9 +91,10 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     apart = np.hypot(*(p - q).T)
     sizes = np.stack([path.size[:, 0] for path in both])
     nearest, farthest = np.quantile(apart, (0.02, 0.98))
-    # Parts that are beside each other are never in one place, as targets that pass are.
+    # Parts that are beside each other for long are never in one place, as targets that pass are.
     short = min(float(np.median(path.size[:, 1])) for path in both)
-    if nearest < contact * short and farthest > np.median(sizes, 1).sum():
+    beside = np.quantile(apart / sizes.sum(0), 1 - CONFIG.considerable) > 1
+    if beside and nearest < contact * short:
         return False, False
     edge = _is_edge(one, other) or _is_edge(other, one)
     small, large = np.sort(np.median(sizes, 1))

@@ -214,7 +214,7 @@ class WindowTracker:
                 apart, sizes = np.hypot(*(two.p[1] - two.p[0])), np.sqrt(larger_variance(two.C))
                 if apart < 1.5 * CONFIG.contact_distance * sizes.sum():
                     continue
-                nats = min(nats, self.log_threshold / CONFIG.min_confirm_windows)
+                nats = min(nats, self.log_threshold / CONFIG.min_windows)
             key = int(tracks.id[i])
             nats += before.get(key, 0.0)
             if nats > self.log_threshold:
