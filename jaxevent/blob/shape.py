@@ -7,6 +7,8 @@ moments do: if the weights of the target's parts change by a share e, its varian
 e, and its mean by about e of its size. So a change d of the logarithms of sizes, by which the
 variances change by 2 d, adds (2 d)^2 of the ellipse's covariance to that of the position, beyond
 what the sizes' own errors explain, and at most all of it, for the middle is within the ellipse.
+
+Of an object of which only one edge is seen the middle is about twice the edge's deviation away.
 """
 
 from typing import Any, NamedTuple
@@ -28,18 +30,22 @@ class UsualSizes(NamedTuple):
     slope: NDArray[np.float64]  # (2,) 1/px/s, of a target that approaches or leaves; 0 of others
     low: NDArray[np.float64]  # (2,) 1/px
     high: NDArray[np.float64]  # (2,) 1/px
+    lone_edge: bool  # whether it is one edge of an object of which no more is seen
 
     def at(self, t: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return sizes (times, 2) px at times (s)."""
         return 1 / np.clip(self.level + self.slope * t[:, None], self.low, self.high)
 
 
-def fit_usual_sizes(t: NDArray[np.floating], sizes: NDArray[np.floating]) -> UsualSizes | None:
+def fit_usual_sizes(
+    t: NDArray[np.floating], sizes: NDArray[np.floating], lone_edge: bool = False
+) -> UsualSizes | None:
     """Fit the usual sizes of a track by medians, of pairs for the slope (Theil and Sen).
 
     Args:
         t: (times,) s.
         sizes: (times, 2) px.
+        lone_edge: Whether the target is one edge of an object of which no more is seen.
 
     Returns:
         The usual sizes; None for fewer than `MIN_SHAPE_TIMES` times.
@@ -54,7 +60,7 @@ def fit_usual_sizes(t: NDArray[np.floating], sizes: NDArray[np.floating]) -> Usu
     steady = [abs(np.corrcoef(np.arange(len(t)), rank)[0, 1]) for rank in ranks.T]
     slope = np.where(np.array(steady) > MIN_RANK_CORRELATION, slope, 0.0)
     level = np.median(inverse - slope * t[:, None], axis=0)
-    return UsualSizes(level, slope, inverse.min(0), inverse.max(0))
+    return UsualSizes(level, slope, inverse.min(0), inverse.max(0), lone_edge)
 
 
 def shape_covariance(
@@ -78,4 +84,6 @@ def shape_covariance(
     c, s = np.cos(mean[:, 6]), np.sin(mean[:, 6])
     axes = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1)
     variances = np.minimum(share, 1)[:, None] * known**2
+    if usual.lone_edge:
+        variances = variances + (2 * known.max(1, keepdims=True)) ** 2
     return np.einsum("tij,tj,tkj->tik", axes, variances, axes)

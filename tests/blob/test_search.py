@@ -320,6 +320,25 @@ def test_the_two_edges_of_a_slow_disc_are_one():
     np.testing.assert_allclose(path.size[0], [9.8, 6.9], rtol=0.3)
 
 
+@pytest.mark.parametrize(
+    ("on", "heading", "alone"), [(0.99, 0, True), (0.5, 0, False), (0.99, 1, False)]
+)
+def test_an_edge_across_its_way_of_one_polarity_is_alone(on, heading, alone):
+    rng = np.random.default_rng(2)
+    n, duration = 6000, 1.0
+    t = np.sort(rng.uniform(0, duration, n))
+    p = np.stack([25 + rng.normal(0, 0.5, n), 30 + rng.uniform(-8, 8, n)], 1)
+    p[:, heading] += 30 * t
+    noise = rng.uniform(0, 1, (3000, 2)) * (np.array(SMALL) - 1)
+    t = np.concatenate([t, rng.uniform(0, duration, len(noise))])
+    x, y = np.rint(np.concatenate([p, noise])).T.astype(np.uint16)
+    order = np.argsort(t)
+    signs = rng.random(len(t)) < np.where(np.arange(len(t)) < n, on, 0.5)
+    events = Events(*(v[order] for v in ((1e6 * t).astype(np.int64), x, y, signs)))
+    (path,) = blob.find(Recording("edge", *SMALL, events), progress=False).paths
+    assert path.lone_edge == alone
+
+
 @pytest.mark.slow
 def test_recordings_of_few_events_have_no_targets():
     for count in (0, 1, 99):

@@ -142,12 +142,9 @@ def _is_edge(one: TargetPath, other: TargetPath) -> bool:
 
     Edges along the motion send few events: two that are long along it may follow each other.
     """
-    size = np.median(one.size[:, 0])
-    way = one.p[-1] - one.p[0]
-    along = way @ np.median(one.C, 0) @ way / max(float(way @ way), 1e-9)
-    across = along < (1 - CONFIG.considerable) * size**2
-    across |= np.median(other.n) < CONFIG.considerable * np.median(one.n)
-    return bool(np.median(one.size[:, 0] / one.size[:, 1]) > CONFIG.edge_aspect and across)
+    long = np.median(one.size[:, 0] / one.size[:, 1]) > CONFIG.edge_aspect
+    few = np.median(other.n) < CONFIG.considerable * np.median(one.n)
+    return bool(long and (one.is_across_way or few))
 
 
 def _turn_together(p: NDArray, q: NDArray, reach: float | int) -> bool:
