@@ -13,6 +13,7 @@ and if what is bright in that map is connected: birds that circle alike turn as 
 
 import copy
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -50,29 +51,40 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
         paths: Paths of targets, all seen in the same windows.
         frame: Their events, which show pieces of outlines; None: only the paths are compared.
     """
-    paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
+    paths = sorted(paths, key=lambda path: path.n.sum(), reverse=True)
     balances: list[float] = []  # of each path, once they are asked for
-    while k < len(paths):
-        for i in range(k + 1, len(paths)):
-            whole = None
-            are_parts, may_be_pieces = _compare(paths[k], paths[i])
-            if are_parts:
-                whole = merge_paths(paths[k], paths[i])
-            elif may_be_pieces and frame:
-                balances = balances or frame.balances(paths)
-                if differ(balances[k], balances[i]):
-                    others = [path for j, path in enumerate(paths) if j not in (k, i)]
-                    whole = frame.whole(paths[k], paths[i], others)
-            if whole is not None:
-                # The whole may now be in contact with what none of its parts was.
-                if balances:
-                    n = [paths[j].n.sum() for j in (k, i)]
-                    balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
-                del paths[i]
-                paths[k], k = whole, -1
-                break
-        k += 1
+    # The whole may be in contact with what none of its parts was.
+    while (found := _first_whole(paths, balances, frame)) is not None:
+        k, i, whole = found
+        if balances:
+            n = [paths[j].n.sum() for j in (k, i)]
+            balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
+        paths[k] = whole
+        del paths[i]
     return paths
+
+
+def _first_whole(
+    paths: list[TargetPath], balances: list[float], frame: OwnFrame | None
+) -> tuple[int, int, TargetPath] | None:
+    """Return the indices of the first two paths that are parts of one object, and its path.
+
+    `balances` are filled in when they are needed.
+    """
+    for k, i in itertools.combinations(range(len(paths)), 2):
+        are_parts, may_be_pieces = _compare(paths[k], paths[i])
+        if are_parts:
+            return k, i, merge_paths(paths[k], paths[i])
+        if not (may_be_pieces and frame):
+            continue
+        if not balances:
+            balances += frame.balances(paths)
+        if differ(balances[k], balances[i]):
+            others = [path for j, path in enumerate(paths) if j not in (k, i)]
+            whole = frame.whole(paths[k], paths[i], others)
+            if whole is not None:
+                return k, i, whole
+    return None
 
 
 def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
