@@ -20,6 +20,7 @@ N_SHAPE_TIMES = 256  # times of a recording at which sizes are read
 MIN_SHAPE_TIMES = 8  # of them in a track's life, for its usual sizes to be known
 MAX_FITTED_TIMES = 64
 MIN_RANK_CORRELATION = 0.85  # of sizes and time, for a target that approaches or leaves
+EDGE_DISTANCE_SIZES = 2.0  # of an edge, from it to its object's middle; 1.9 of half a disc
 SIGNIFICANT_VARIANCES = 3.0  # squared changes from which a shape differs
 
 
@@ -30,7 +31,7 @@ class UsualSizes(NamedTuple):
     slope: NDArray[np.float64]  # (2,) 1/px/s, of a target that approaches or leaves; 0 of others
     low: NDArray[np.float64]  # (2,) 1/px
     high: NDArray[np.float64]  # (2,) 1/px
-    lone_edge: bool  # whether it is one edge of an object of which no more is seen
+    away: NDArray[np.float64]  # (2,) larger sizes by which an object's middle is off its lone edge
 
     def at(self, t: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return sizes (times, 2) px at times (s)."""
@@ -60,7 +61,8 @@ def fit_usual_sizes(
     steady = [abs(np.corrcoef(np.arange(len(t)), rank)[0, 1]) for rank in ranks.T]
     slope = np.where(np.array(steady) > MIN_RANK_CORRELATION, slope, 0.0)
     level = np.median(inverse - slope * t[:, None], axis=0)
-    return UsualSizes(level, slope, inverse.min(0), inverse.max(0), lone_edge)
+    away = np.full(2, EDGE_DISTANCE_SIZES if lone_edge else 0.0)
+    return UsualSizes(level, slope, inverse.min(0), inverse.max(0), away)
 
 
 def shape_covariance(
@@ -84,6 +86,5 @@ def shape_covariance(
     c, s = np.cos(mean[:, 6]), np.sin(mean[:, 6])
     axes = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1)
     variances = np.minimum(share, 1)[:, None] * known**2
-    if usual.lone_edge:
-        variances = variances + (2 * known.max(1, keepdims=True)) ** 2
+    variances = variances + (usual.away * known.max(1, keepdims=True)) ** 2
     return np.einsum("tij,tj,tkj->tik", axes, variances, axes)
