@@ -31,7 +31,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from blob_scenes import DISCS, OBJECTS, SCENES, VARIED
+from blob_scenes import DISCS, MEETINGS, OBJECTS, SCENES, VARIED
 from common import command_line, markdown_table
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -268,12 +268,13 @@ def main() -> None:
     parser.add_argument("--varied", action="store_true", help="all of VARIED instead")
     parser.add_argument("--objects", action="store_true", help="all of OBJECTS instead")
     parser.add_argument("--discs", action="store_true", help="all of DISCS instead")
+    parser.add_argument("--meetings", action="store_true", help="all of MEETINGS instead")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     args = parser.parse_args()
-    rows, scenes = [], SCENES | VARIED | OBJECTS | DISCS
+    rows, scenes = [], SCENES | VARIED | OBJECTS | DISCS | MEETINGS
     chosen = OBJECTS if args.objects else VARIED if args.varied else SCENES
-    chosen = DISCS if args.discs else chosen
+    chosen = MEETINGS if args.meetings else DISCS if args.discs else chosen
     find(SCENES["disc"](args.first)[0], progress=False)  # compiles
     for name in args.scenes or chosen:
         for seed in range(args.first, args.first + args.seeds):

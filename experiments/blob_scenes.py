@@ -3,9 +3,9 @@
 `SCENES` has each kind of target once, on which the search was built, `VARIED` came later: other
 sensors, outlines, bars, pairs of edges, one polarity only, targets that come and go, flicker, a
 background that moves with the camera, very short and very long recordings, stars; `OBJECTS` are
-rigid bodies, flocks, hands and targets that leave. Constants were chosen on seeds below 20, and of
-`OBJECTS` and `DISCS`, outlines of few events, on seeds from 100 on. Each is called with a seed and
-gives the recording and its truth.
+rigid bodies, flocks, hands and targets that leave, `DISCS` outlines of few events, and `MEETINGS`
+outlines that meet. Constants were chosen on seeds below 20, and of these three on seeds from 100
+on. Each is called with a seed and gives the recording and its truth.
 """
 
 import dataclasses
@@ -805,3 +805,127 @@ DISCS: dict[str, Scene] = {
         (12, 40, 1), (12, 40, 3), (45, 60, 1),
     )
 }  # fmt: skip
+
+
+def _small_discs(seed: int) -> tuple[Recording, BlobTruth]:
+    """Twelve discs of 3 to 5 px on curves of their own, some in contact at the start."""
+    rng = np.random.default_rng([seed, 301])
+    targets = []
+    for place in _places(rng, ((40, 40), (306, 220)), 18):
+        size = rng.uniform(3, 5) / np.sqrt(1.5)
+        motion = LissajousMotion(
+            tuple(place), tuple(rng.uniform(15, 35, 2)), tuple(rng.uniform(0.15, 0.4, 2)),
+            tuple(rng.uniform(0, 6, 2)), size=(size, size / np.sqrt(2)),
+        )  # fmt: skip
+        targets.append(Target(motion, rng.uniform(1.5e3, 3e3), "disc"))
+    return simulate_blobs(targets, DAVIS, 2.0, 5e3, seed)
+
+
+def _parting_discs(seed: int) -> tuple[Recording, BlobTruth]:
+    """Twelve discs of 4 px that go straight on, some in contact at the start."""
+    rng = np.random.default_rng([seed, 302])
+    targets = []
+    size = 4 / np.sqrt(1.5)
+    for place in _places(rng, ((60, 50), (286, 210)), 14):
+        angle = rng.uniform(0, 2 * np.pi)
+        v = rng.uniform(20, 50) * np.array([np.cos(angle), np.sin(angle)])
+        motion = LinearMotion(tuple(place - v * 0.5), tuple(v), size=(size, size / np.sqrt(2)))
+        targets.append(Target(motion, 2e3, "disc"))
+    return simulate_blobs(targets, DAVIS, 1.5, 3e3, seed)
+
+
+def _places(
+    rng: np.random.Generator, box: tuple[tuple[int, int], tuple[int, int]], apart: float
+) -> list[NDArray[np.float64]]:
+    """Twelve places between the corners of a box, so far (px) from each other."""
+    places: list[NDArray[np.float64]] = []
+    while len(places) < 12:
+        place = rng.uniform(box[0], box[1])
+        if all(np.hypot(*(place - other)) > apart for other in places):
+            places.append(place)
+    return places
+
+
+@dataclasses.dataclass(frozen=True)
+class _LegMotion:
+    """The middle of a leg of so many px that swings about a hip, which moves along the rows."""
+
+    hip: tuple[float, float]
+    speed: float
+    length: float
+    phase: float
+
+    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        out, rate, half = np.zeros((len(t), 8)), 2 * np.pi * 1.4, self.length / 2
+        angle = 0.45 * np.sin(rate * t + self.phase)
+        spin = 0.45 * rate * np.cos(rate * t + self.phase)
+        out[:, 0] = self.hip[0] + self.speed * t - half * np.sin(angle)
+        out[:, 1] = self.hip[1] + half * np.cos(angle)
+        out[:, 2] = self.speed - half * np.cos(angle) * spin
+        out[:, 3] = -half * np.sin(angle) * spin
+        out[:, 4:6], out[:, 6], out[:, 7] = 1.0, angle, spin
+        return out
+
+
+@dataclasses.dataclass(frozen=True)
+class Walker:
+    """Outlines of a body, a head and two legs that swing, from `start` (px) along the rows."""
+
+    start: tuple[float, float]
+    speed: float
+    phase: float
+    height: float = 1.0
+
+    def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.zeros((len(t), 8))
+        out[:, 0], out[:, 1] = self.start[0] + self.speed * t, self.start[1] + 4 * self.height
+        out[:, 2], out[:, 6] = self.speed, np.pi / 2
+        out[:, 4:6] = 19 * self.height, 6.5 * self.height
+        return out
+
+    def visible(self, t: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.ones(t.shape, bool)
+
+    def events(self, duration, rng):
+        (x, y), v, h = self.start, (self.speed, 0.0), self.height
+        body = np.array([(-6, -14), (6, -14), (7, 10), (-7, 10), (-6, -14)]) * h
+        head = _circle(4.0, 12) * [h, 1.125 * h]
+        leg = np.array([(-2.5, -12), (2.5, -12), (2, 12), (-2, 12), (-2.5, -12)]) * h
+        swings: list[Any] = [
+            _LegMotion((x, y + 10 * h), self.speed, 24 * h, self.phase + half)
+            for half in (0, np.pi)
+        ]
+        parts = [
+            Outline(LinearMotion((x, y), v), 13_500, body),
+            Outline(LinearMotion((x, y - 20 * h), v), 4500, head),
+            *(Outline(swing, 6000, leg) for swing in swings),
+        ]
+        each = [part.events(duration, rng) for part in parts]
+        t, xi, on = (np.concatenate(column) for column in zip(*each, strict=True))
+        order = np.argsort(t, kind="stable")
+        return t[order], xi[order], on[order]
+
+
+def _walkers(overtake: bool) -> Scene:
+    """Two who walk past each other, or one who overtakes the other."""
+
+    def scene(seed: int) -> tuple[Recording, BlobTruth]:
+        rng = np.random.default_rng([seed, 304 if overtake else 303])
+        targets: list[Any] = []
+        ranges = ((35, 45), (75, 95)) if overtake else ((50, 90), (-90, -50))
+        for low, high in ranges:
+            v = rng.uniform(low, high)
+            x = 173 - v * 1.5 + rng.uniform(-15, 15)
+            place = x, 120 + rng.uniform(-6, 6)
+            targets.append(Walker(place, v, rng.uniform(0, 6), rng.uniform(0.85, 1.15)))
+        return simulate_blobs(targets, DAVIS, 3.0, 5e3, seed)
+
+    return scene
+
+
+MEETINGS: dict[str, Scene] = {
+    "12 small discs": _small_discs,
+    "12 small discs that part": _parting_discs,
+    "two walkers pass": _walkers(False),
+    "one walker overtakes": _walkers(True),
+}

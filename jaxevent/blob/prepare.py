@@ -151,6 +151,7 @@ class ChunkPacker:
         detect = seeds is None if detect is None else detect
         self.recording, self.start, self.stop = recording, begin, end
         self.joined = self.found_ends = None
+        self.found_edges: list[bool] = []
         self.overrides: dict[str, Numeric] = {}
         if found is not None and len(found):
             self.joined = tabulate_paths(found.paths)
@@ -158,6 +159,7 @@ class ChunkPacker:
             self.found_ends = np.array(
                 [end if p.end >= end - p.window else p.end for p in found.paths], np.int64
             )
+            self.found_edges = [path.lone_edge for path in found.paths]
             self.overrides |= found.per_target_values(params)
         self.seeds = read_seeds(recording, seeds, begin, end)
         # Without births and tentative tracks less is to be decided.

@@ -7,6 +7,8 @@ moments do: if the weights of the target's parts change by a share e, its varian
 e, and its mean by about e of its size. So a change d of the logarithms of sizes, by which the
 variances change by 2 d, adds (2 d)^2 of the ellipse's covariance to that of the position, beyond
 what the sizes' own errors explain, and at most all of it, for the middle is within the ellipse.
+
+Of an object of which only one edge is seen the middle is about twice the edge's deviation away.
 """
 
 from typing import Any, NamedTuple
@@ -18,6 +20,7 @@ N_SHAPE_TIMES = 256  # times of a recording at which sizes are read
 MIN_SHAPE_TIMES = 8  # of them in a track's life, for its usual sizes to be known
 MAX_FITTED_TIMES = 64
 MIN_RANK_CORRELATION = 0.85  # of sizes and time, for a target that approaches or leaves
+EDGE_DISTANCE_SIZES = 2.0  # of an edge, from it to its object's middle; 1.9 of half a disc
 SIGNIFICANT_VARIANCES = 3.0  # squared changes from which a shape differs
 
 
@@ -28,18 +31,22 @@ class UsualSizes(NamedTuple):
     slope: NDArray[np.float64]  # (2,) 1/px/s, of a target that approaches or leaves; 0 of others
     low: NDArray[np.float64]  # (2,) 1/px
     high: NDArray[np.float64]  # (2,) 1/px
+    away: NDArray[np.float64]  # (2,) larger sizes by which an object's middle is off its lone edge
 
     def at(self, t: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return sizes (times, 2) px at times (s)."""
         return 1 / np.clip(self.level + self.slope * t[:, None], self.low, self.high)
 
 
-def fit_usual_sizes(t: NDArray[np.floating], sizes: NDArray[np.floating]) -> UsualSizes | None:
+def fit_usual_sizes(
+    t: NDArray[np.floating], sizes: NDArray[np.floating], lone_edge: bool = False
+) -> UsualSizes | None:
     """Fit the usual sizes of a track by medians, of pairs for the slope (Theil and Sen).
 
     Args:
         t: (times,) s.
         sizes: (times, 2) px.
+        lone_edge: Whether the target is one edge of an object of which no more is seen.
 
     Returns:
         The usual sizes; None for fewer than `MIN_SHAPE_TIMES` times.
@@ -54,7 +61,8 @@ def fit_usual_sizes(t: NDArray[np.floating], sizes: NDArray[np.floating]) -> Usu
     steady = [abs(np.corrcoef(np.arange(len(t)), rank)[0, 1]) for rank in ranks.T]
     slope = np.where(np.array(steady) > MIN_RANK_CORRELATION, slope, 0.0)
     level = np.median(inverse - slope * t[:, None], axis=0)
-    return UsualSizes(level, slope, inverse.min(0), inverse.max(0))
+    away = np.full(2, EDGE_DISTANCE_SIZES if lone_edge else 0.0)
+    return UsualSizes(level, slope, inverse.min(0), inverse.max(0), away)
 
 
 def shape_covariance(
@@ -78,4 +86,5 @@ def shape_covariance(
     c, s = np.cos(mean[:, 6]), np.sin(mean[:, 6])
     axes = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1)
     variances = np.minimum(share, 1)[:, None] * known**2
+    variances = variances + (usual.away * known.max(1, keepdims=True)) ** 2
     return np.einsum("tij,tj,tkj->tik", axes, variances, axes)

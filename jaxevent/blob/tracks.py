@@ -386,7 +386,8 @@ class Tracks(HtmlRepr):
         t, sizes = (np.concatenate(column) for column in zip(*read, strict=True))
         alive = (self.birth <= t[:, None]) & (t[:, None] < self.death)
         return [
-            fit_usual_sizes(t[alive[:, k]] * 1e-6, sizes[alive[:, k], k]) for k in range(len(self))
+            fit_usual_sizes(t[alive[:, k]] * 1e-6, sizes[alive[:, k], k], edge)
+            for k, edge in enumerate(self._packer.found_edges)
         ]
 
     @property

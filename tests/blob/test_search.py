@@ -150,7 +150,8 @@ def test_paths_in_contact_all_their_lives_are_one():
     one, other = _path(t, x, 30.0, 3.0, 30), _path(t, x, 39.0, 3.0, 10)
     far, crossing = _path(t, x, 45.0, 3.0, 10), _path(t, x[::-1], 39.0, 3.0, 10)
     resting = [_path(t, 20.0, y, 3.0, 10) for y in (30.0, 39.0)]
-    for pair in ([one, far], [one, crossing], resting):
+    overtaking = _path(t, 11 + 1.36e-3 * t, 31.0, 3.0, 10)
+    for pair in ([one, far], [one, crossing], [one, overtaking], resting):
         assert len(merge_parts(pair)) == 2
     (both,) = merge_parts([other, one])
     np.testing.assert_allclose(both.p, np.stack([x, np.full(len(t), 32.25)], 1))
@@ -174,6 +175,17 @@ def test_two_that_begin_together_and_part_are_two():
     apart = ends[:, :, None] - truth(t)[:, None, :, :2]
     near = np.hypot(apart[..., 0], apart[..., 1]).min(1)
     assert (near < 2).all()
+
+
+def test_two_outlines_that_begin_in_one_blob_and_part_are_two():
+    starts = [((46.0, 44.0), (-20.0, 0.0)), ((54.0, 46.0), (20.0, 5.0))]
+    targets = [Target(LinearMotion(p, v, size=(3.3, 3.3)), 4e3, "ring") for p, v in starts]
+    recording, truth = scene(targets, 1.5)
+    found = blob.find(recording, progress=False)
+    assert len(found) == 2
+    t = np.array([900_000, 1_400_000])
+    apart = np.stack([path.at(t) for path in found.paths], 1)[:, :, None] - truth(t)[:, None, :, :2]
+    assert (np.hypot(apart[..., 0], apart[..., 1]).min(1) < 1).all()
 
 
 def test_what_is_seen_shortly_and_goes_no_way_is_left_out():
@@ -306,6 +318,25 @@ def test_the_two_edges_of_a_slow_disc_are_one():
     assert np.hypot(*apart.mean(0)) < 1.5
     # Of a rim with |cos| of the angle to the heading, along it and across.
     np.testing.assert_allclose(path.size[0], [9.8, 6.9], rtol=0.3)
+
+
+@pytest.mark.parametrize(
+    ("on", "heading", "alone"), [(0.99, 0, True), (0.5, 0, False), (0.99, 1, False)]
+)
+def test_an_edge_across_its_way_of_one_polarity_is_alone(on, heading, alone):
+    rng = np.random.default_rng(2)
+    n, duration = 6000, 1.0
+    t = np.sort(rng.uniform(0, duration, n))
+    p = np.stack([25 + rng.normal(0, 0.5, n), 30 + rng.uniform(-8, 8, n)], 1)
+    p[:, heading] += 30 * t
+    noise = rng.uniform(0, 1, (3000, 2)) * (np.array(SMALL) - 1)
+    t = np.concatenate([t, rng.uniform(0, duration, len(noise))])
+    x, y = np.rint(np.concatenate([p, noise])).T.astype(np.uint16)
+    order = np.argsort(t)
+    signs = rng.random(len(t)) < np.where(np.arange(len(t)) < n, on, 0.5)
+    events = Events(*(v[order] for v in ((1e6 * t).astype(np.int64), x, y, signs)))
+    (path,) = blob.find(Recording("edge", *SMALL, events), progress=False).paths
+    assert path.lone_edge == alone
 
 
 @pytest.mark.slow

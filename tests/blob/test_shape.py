@@ -51,6 +51,12 @@ def test_covariance_of_a_known_change():
     np.testing.assert_allclose(more, share * np.diag([9.0, 36.0]), atol=1e-12)
 
 
+def test_the_middle_of_an_object_is_two_sizes_from_its_lone_edge():
+    usual = fit_usual_sizes(T, np.tile([6.0, 3.0], (len(T), 1)), lone_edge=True)
+    more = shape_covariance(usual, T[:2], *states([[6.0, 3.0]] * 2, theta=0.3))
+    np.testing.assert_allclose(more, np.tile(144 * np.eye(2), (2, 1, 1)), atol=1e-9)
+
+
 def test_changes_that_sizes_are_uncertain_by_add_nothing():
     usual = fit_usual_sizes(T, np.tile([6.0, 3.0], (len(T), 1)))
     now = np.array([[6.0, 3.0], [6.0, 3.0]]) * np.exp([[0.08], [0.2]])

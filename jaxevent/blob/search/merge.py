@@ -13,6 +13,7 @@ and if what is bright in that map is connected: birds that circle alike turn as 
 
 import copy
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -50,29 +51,40 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
         paths: Paths of targets, all seen in the same windows.
         frame: Their events, which show pieces of outlines; None: only the paths are compared.
     """
-    paths, k = sorted(paths, key=lambda path: path.n.sum(), reverse=True), 0
+    paths = sorted(paths, key=lambda path: path.n.sum(), reverse=True)
     balances: list[float] = []  # of each path, once they are asked for
-    while k < len(paths):
-        for i in range(k + 1, len(paths)):
-            whole = None
-            are_parts, may_be_pieces = _compare(paths[k], paths[i])
-            if are_parts:
-                whole = merge_paths(paths[k], paths[i])
-            elif may_be_pieces and frame:
-                balances = balances or frame.balances(paths)
-                if differ(balances[k], balances[i]):
-                    others = [path for j, path in enumerate(paths) if j not in (k, i)]
-                    whole = frame.whole(paths[k], paths[i], others)
-            if whole is not None:
-                # The whole may now be in contact with what none of its parts was.
-                if balances:
-                    n = [paths[j].n.sum() for j in (k, i)]
-                    balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
-                del paths[i]
-                paths[k], k = whole, -1
-                break
-        k += 1
+    # The whole may be in contact with what none of its parts was.
+    while (found := _first_whole(paths, balances, frame)) is not None:
+        k, i, whole = found
+        if balances:
+            n = [paths[j].n.sum() for j in (k, i)]
+            balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
+        paths[k] = whole
+        del paths[i]
     return paths
+
+
+def _first_whole(
+    paths: list[TargetPath], balances: list[float], frame: OwnFrame | None
+) -> tuple[int, int, TargetPath] | None:
+    """Return the indices of the first two paths that are parts of one object, and its path.
+
+    `balances` are filled in when they are needed.
+    """
+    for k, i in itertools.combinations(range(len(paths)), 2):
+        are_parts, may_be_pieces = _compare(paths[k], paths[i])
+        if are_parts:
+            return k, i, merge_paths(paths[k], paths[i])
+        if not (may_be_pieces and frame):
+            continue
+        if not balances:
+            balances += frame.balances(paths)
+        if differ(balances[k], balances[i]):
+            others = [path for j, path in enumerate(paths) if j not in (k, i)]
+            whole = frame.whole(paths[k], paths[i], others)
+            if whole is not None:
+                return k, i, whole
+    return None
 
 
 def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
@@ -90,6 +102,12 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     p, q = both[0].p, both[1].p
     apart = np.hypot(*(p - q).T)
     sizes = np.stack([path.size[:, 0] for path in both])
+    nearest, farthest = np.quantile(apart, (0.02, 0.98))
+    # Parts that are beside each other for long are never in one place, as targets that pass are.
+    short = min(float(np.median(path.size[:, 1])) for path in both)
+    beside = np.quantile(apart / sizes.sum(0), 1 - CONFIG.considerable) > 1
+    if beside and nearest < contact * short:
+        return False, False
     edge = _is_edge(one, other) or _is_edge(other, one)
     small, large = np.sort(np.median(sizes, 1))
     reach = float(np.quantile(apart / sizes.sum(0), share))
@@ -98,10 +116,9 @@ def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
         return True, False
     # Pieces slide along an edge, but less far than they go with it.
     far = min(float(np.ptp(path, axis=0).max()) for path in (p, q))
-    changed = np.ptp(np.quantile(apart, (0.02, 0.98)))
     far *= (end - begin) / max(t[-1] - t[0], 1)  # of all of its windows
     together = far > CONFIG.common_way_sizes * small
-    together &= bool(changed < max(large, far if edge else far / 2))
+    together &= bool(farthest - nearest < max(large, far if edge else far / 2))
     if touch and together and (edge or _separate_nats(both) <= CONFIG.log_bayes_factor):
         return True, False
     within = np.quantile(apart / sizes.max(0), share) < contact
@@ -137,12 +154,9 @@ def _is_edge(one: TargetPath, other: TargetPath) -> bool:
 
     Edges along the motion send few events: two that are long along it may follow each other.
     """
-    size = np.median(one.size[:, 0])
-    way = one.p[-1] - one.p[0]
-    along = way @ np.median(one.C, 0) @ way / max(float(way @ way), 1e-9)
-    across = along < (1 - CONFIG.considerable) * size**2
-    across |= np.median(other.n) < CONFIG.considerable * np.median(one.n)
-    return bool(np.median(one.size[:, 0] / one.size[:, 1]) > CONFIG.edge_aspect and across)
+    long = np.median(one.size[:, 0] / one.size[:, 1]) > CONFIG.edge_aspect
+    few = np.median(other.n) < CONFIG.considerable * np.median(one.n)
+    return bool(long and (one.is_across_way or few))
 
 
 def _turn_together(p: NDArray, q: NDArray, reach: float | int) -> bool:

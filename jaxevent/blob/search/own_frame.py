@@ -54,6 +54,22 @@ class OwnFrame:
             sums += [np.bincount(owners, weights, len(sums[0])) for weights in (signs, signs**2)]
         return (sums[0] / np.maximum(sums[1], 1))[1:].tolist()
 
+    def mark_lone_edges(self, paths: list[TargetPath]) -> list[TargetPath]:
+        """Mark paths that are long across their way and have nearly all events of one polarity."""
+        sizes = [np.median(path.size, 0) for path in paths]
+        thin = [wide < CONFIG.majority * long for long, wide in sizes]
+        across = [one and path.is_across_way for one, path in zip(thin, paths, strict=True)]
+        if not any(across):
+            return paths
+        # The balance is the difference of both shares.
+        least = 2 * CONFIG.nearly_all - 1
+        marks = [
+            edge and abs(balance) > least
+            for edge, balance in zip(across, self.balances(paths), strict=True)
+        ]
+        pairs = zip(paths, marks, strict=True)
+        return [dataclasses.replace(path, lone_edge=mark) for path, mark in pairs]
+
     def whole(
         self, one: TargetPath, other: TargetPath, others: list[TargetPath]
     ) -> TargetPath | None:

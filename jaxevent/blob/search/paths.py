@@ -31,6 +31,7 @@ class TargetPath:
         velocity_noise: px^2/s^3, density of the white noise that drives the velocity.
         polarity: Polarity of the target's events, 1 ON and 0 OFF; None for both.
         turn_rate: rad/s at which it turns in place, from x to y; None if it is not known to turn.
+        lone_edge: Whether it seems to be one edge of an object of which no more is seen.
     """
 
     t: NDArray[np.int64]
@@ -42,6 +43,7 @@ class TargetPath:
     velocity_noise: float
     polarity: int | None = None
     turn_rate: float | None = None
+    lone_edge: bool = False
 
     agility = RenamedAttribute("velocity_noise")
     turn = RenamedAttribute("turn_rate")
@@ -60,6 +62,13 @@ class TargetPath:
     def size(self) -> NDArray[np.float64]:
         """(rows, 2) px, standard deviations along the principal axes, the larger first."""
         return np.sqrt(np.maximum(np.linalg.eigvalsh(self.C)[:, ::-1], 0))
+
+    @property
+    def is_across_way(self) -> bool:
+        """True if it is longer across its way than along it."""
+        way = self.p[-1] - self.p[0]
+        along = way @ np.median(self.C, 0) @ way / max(float(way @ way), 1e-9)
+        return bool(along < (1 - CONFIG.considerable) * np.median(self.size[:, 0]) ** 2)
 
     def at(self, t: NDArray[np.int64]) -> NDArray[np.float64]:
         """Interpolate positions (times, 2) linearly at times (us)."""

@@ -390,7 +390,8 @@ def _search_section(
             whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
         at_rest = background.scene is None
         frame = OwnFrame(stream, background, selection.scale) if at_rest else None
-        near = whole = merge_parts(whole, frame)
+        whole = merge_parts(whole, frame)
+        near = whole = frame.mark_lone_edges(whole) if frame else whole
         if background.scene is not None:
             whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]

@@ -173,7 +173,7 @@ class WindowTracker:
         assignments = assign(gates, events, labels, blobs)
         if len(self.tracks.id):
             self._update(gates, clutter, assignments)
-            if self.scale.compact:
+            if self.scale.compact or self.background.scene is None:
                 self._split_tracks(events, gates, assignments)
             self._remove(self._find_ended())
         free, least = assignments.free, 1 - CONFIG.claimed_share
@@ -203,11 +203,18 @@ class WindowTracker:
         """Split each track whose events are likelier those of two targets than of one.
 
         The evidence of windows is summed while it is positive. A part has the history of the whole.
+        Where targets are no ellipses, what is no farther apart than pieces of one outline stays
+        one, and several windows must show two.
         """
         tracks, before, two = self.tracks, self.evidence, Blobs.empty(2)
         self.evidence, parts = {}, []
         for i in np.flatnonzero(tracks.confirmed & (tracks.misses == 0) & ~gates.shared):
             nats = split_blob(events, assigned.owner, int(i), two)
+            if not gates.compact:
+                apart, sizes = np.hypot(*(two.p[1] - two.p[0])), np.sqrt(larger_variance(two.C))
+                if apart < 1.5 * CONFIG.contact_distance * sizes.sum():
+                    continue
+                nats = min(nats, self.log_threshold / CONFIG.min_windows)
             key = int(tracks.id[i])
             nats += before.get(key, 0.0)
             if nats > self.log_threshold:
