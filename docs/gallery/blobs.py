@@ -28,6 +28,16 @@ table.assign(speed=np.hypot(table["vx"], table["vy"])).groupby("id").agg(
 )  # px/s
 
 # %% [markdown]
+# Speed is not in the table, since its deviation needs the covariance of both components. Rows at
+# close times share their error, so the mean over a track is not much better known than one row.
+
+# %%
+mean, covariance, valid = tracks([0.03])
+velocity, C = mean[0, 0, 2:4], covariance[0, 0, 2:4, 2:4]
+speed = np.hypot(*velocity)
+print(f"{speed:.0f} +- {np.sqrt(velocity @ C @ velocity) / speed:.0f} px/s at 0.03 s")
+
+# %% [markdown]
 # Compare with the truth. If the reported deviations are right, errors divided by them have a root
 # mean square of about 1.
 

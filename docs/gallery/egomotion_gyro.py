@@ -27,8 +27,9 @@ recording = dataclasses.replace(recording, imu=Imu(t, gyro, np.zeros_like(gyro))
 recording
 
 # %% [markdown]
-# `planes` fits the normal flow of events and is the fastest. `contrast` and `voting` are more
-# accurate and are called in the same way.
+# `planes` fits the normal flow of events and is the fastest. `contrast` and `voting` are called in
+# the same way, and are more accurate on larger sensors. `voting` finds the motion first, here in
+# about 0.1 s: until then `valid` is false.
 
 # %%
 motion = egomotion.planes.estimate(recording, model="rotation")

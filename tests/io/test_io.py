@@ -926,10 +926,10 @@ def test_a_recording_is_shown_in_a_line():
     none = Events.empty()
     place = np.zeros(2, np.uint16)
     two = Events(np.array([5, 2_000_000]), place, place, np.zeros(2, bool))
-    assert repr(two[1:]) == "<1 event from 2 to 2 s>"
+    assert repr(two[1:]) == "<1 event at 2 s>"
     extra = {"hdr": np.zeros(3)}
     shown = repr(Recording("two", 3, 4, two, extra=extra))
-    assert shown == "<two: 3x4, 2 events from 5e-06 to 2 s, hdr>"
+    assert shown == "<two: 3x4, 2 events from 0.000005 to 2 s, hdr>"
     many = Recording("many", 3, 4, none, extra=dict.fromkeys("abcd", np.zeros(1)))
     assert repr(many) == "<many: 3x4, 0 events, 4 arrays in extra>"
     assert repr(Recording("none", 3, 4, none)) == "<none: 3x4, 0 events>"
