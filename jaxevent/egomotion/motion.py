@@ -82,21 +82,29 @@ def table_columns(
 class CovarianceCalibration(NamedTuple):
     """Coefficients that turn the covariance C of a fit into that of the errors of a motion m.
 
-    The calibrated covariance is factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b').
-    Here d is the change of the motion within the time span of an estimate, and b the deviation of
-    its middle from a straight line. `experiments/studies/predicted_errors.md` has their choice.
+    The calibrated covariance is
+
+        factor C + share^2 |m|^2 + speed^2 m m' + change^2 (d d' + b b')
+            + flow_change^2 (d' M d + b' M b) M^-1.
+
+    Here d is the change of the motion within the time span of an estimate, b the deviation of its
+    middle from a straight line, and v' M v the mean square of the flow of a motion v.
+    `experiments/studies/predicted_errors.md` has their choice.
 
     Attributes:
         factor: Factor of the covariance of the fit.
         share: Relative error, the same in all directions.
         speed: Relative error of the size of the motion.
-        change: Error as a fraction of the change of the motion.
+        change: Error as a fraction of the change of the motion, along that change.
+        flow_change: Error of the flow as a fraction of its change, along any motion: what of a
+            change one component does not follow, others with a like flow take for theirs.
     """
 
     factor: float = 1.0
     share: float = 0.0
     speed: float = 0.0
     change: float = 0.0
+    flow_change: float = 0.0
 
     def with_lens(self, camera: PinholeCamera | None) -> "CovarianceCalibration":
         """Return the coefficients with the error that the camera's calibration leaves."""
@@ -197,6 +205,7 @@ class MotionEstimate(HtmlRepr):
         calibration: CovarianceCalibration,
         length: float | int | NDArray[np.floating] = 0.0,
         lone_change: NDArray[np.floating] | None = None,
+        flow_metric: NDArray[np.floating] | None = None,
     ) -> "MotionEstimate":
         """Replace the covariance of the fits by that of the errors.
 
@@ -205,6 +214,8 @@ class MotionEstimate(HtmlRepr):
             length: Time span of the data of an estimate, s; one number or (n,).
             lone_change: (d,) or (n, d) change of the motion within the time span, measured there;
                 it counts where it is more than that between neighbours.
+            flow_metric: (d, d) matrix M of the mean square flow, of any unit; needed where
+                `flow_change` is not 0.
 
         Returns:
             The estimate with the calibrated covariance.
@@ -234,6 +245,9 @@ class MotionEstimate(HtmlRepr):
         covariance = calibration.factor * self.covariance
         for d in (change, bend):
             covariance = covariance + calibration.change**2 * d[:, :, None] * d[:, None, :]
+            if flow_metric is not None:
+                square = calibration.flow_change**2 * np.einsum("ti,ij,tj->t", d, flow_metric, d)
+                covariance = covariance + square[:, None, None] * np.linalg.inv(flow_metric)
         eye = np.eye(mean.shape[1])
         covariance = covariance + calibration.share**2 * (mean**2).sum(1)[:, None, None] * eye
         covariance = covariance + calibration.speed**2 * mean[:, :, None] * mean[:, None, :]

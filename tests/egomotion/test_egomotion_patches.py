@@ -19,6 +19,7 @@ from jaxevent.egomotion.motion import (
     MotionEstimate,
     is_observable,
 )
+from jaxevent.egomotion.particle_filter.estimator import mean_square_flow
 from jaxevent.egomotion.patches import (
     MIN_INCONSISTENCY_Z,
     edge_event_fraction,
@@ -262,8 +263,23 @@ def test_calibrated_covariance():
     fast = estimate_of("planar", t, mean + [0, 1])
     told = fast.with_calibrated_covariance(CovarianceCalibration(speed=0.5))
     np.testing.assert_allclose(told.covariance[1] - np.eye(2), [[1.0, 0.5], [0.5, 0.25]])
+    # A component whose flow is a third as large errs three times as much for the same flow.
+    metric = np.diag([9.0, 1.0])
+    told = motion.with_calibrated_covariance(
+        CovarianceCalibration(flow_change=0.2), 0.1, flow_metric=metric
+    )
+    np.testing.assert_allclose(told.covariance[1], np.eye(2) + 0.04 * np.diag([1.0, 9.0]))
     lost = estimate_of("planar", t, mean, np.nan)
     assert not lost(t).valid.any()  # without a sigma
+
+
+def test_mean_square_flow_is_that_of_a_sensor():
+    y, x = np.mgrid[:90, :120].astype(float)
+    xi = np.stack([x - 59.5, y - 44.5], -1)
+    found = mean_square_flow(Rotation(100.0), xi)
+    rows = rotation_basis(xi.reshape(-1, 2), 100.0).reshape(-1, 3)
+    expected = rows.T @ rows / xi[..., 0].size
+    np.testing.assert_allclose(found, expected, rtol=0.1, atol=0.02 * expected.max())
 
 
 def test_lone_estimate_is_extended():

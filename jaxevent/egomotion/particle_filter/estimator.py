@@ -56,7 +56,10 @@ MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 # The maximum of the votes is up to about half a per cent beside the motion.
 PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
-CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)  # other models'
+FLOW_STEP_PX = 8  # between pixels at which the mean square flow is taken
+GENERAL_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)
+# Of other models, whose components have flows that resemble each other in parts of the image.
+CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, flow_change=0.1)
 
 _run = eqx.filter_jit(filtering.run)
 _init = eqx.filter_jit(filtering.init)
@@ -498,7 +501,8 @@ class ChunkRunner:
             if not self.model.half_line:
                 mean = filtering.undo_averages(motion, span, self.params)
                 motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
-        found = calibrate(motion, self.camera, span)
+        metric = None if self.model.half_line else mean_square_flow(self.model, self.sampler.xi)
+        found = calibrate(motion, self.camera, span, metric)
         seen, valid = found.observed_t, found.valid.copy()
         for begin, end in silent:
             valid[(seen > begin) & (seen < end)] = False
@@ -624,6 +628,7 @@ def calibrate(
     motion: MotionEstimate,
     camera: PinholeCamera | None,
     length: NDArray[np.floating] | None = None,
+    flow_metric: NDArray[np.floating] | None = None,
 ) -> MotionEstimate:
     """Return the motion with the covariance of its errors.
 
@@ -632,15 +637,34 @@ def calibrate(
         camera: The calibration.
         length: (n,) time span of an estimate's events, s, in which changes between the neighbours,
             before and after, count; None: they do not.
+        flow_metric: (d, d) `mean_square_flow` of a model whose flow is linear; None: of another.
 
     Returns:
         The motion with the calibrated covariance.
     """
     calibration = PLANAR_CALIBRATION if motion.model.uniform else CAMERA_MOTION_CALIBRATION
+    if motion.model.half_line:
+        calibration = GENERAL_CALIBRATION
     calibration = calibration.with_lens(camera)
     if length is None:
         return motion.with_calibrated_covariance(calibration._replace(change=0.0))
-    return motion.with_calibrated_covariance(calibration, length)
+    return motion.with_calibrated_covariance(calibration, length, flow_metric=flow_metric)
+
+
+def mean_square_flow(model: Model, xi: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the matrix M of which v' M v is the mean square flow of a motion v.
+
+    Args:
+        model: A model of d components whose flow is linear in them.
+        xi: (height, width, 2) undistorted positions of all pixels, px.
+
+    Returns:
+        The matrix (d, d).
+    """
+    xi = xi[::FLOW_STEP_PX, ::FLOW_STEP_PX]
+    basis = np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
+    rows = basis.reshape(-1, basis.shape[-1]).astype(float)
+    return rows.T @ rows / (len(rows) / 2)
 
 
 def join_reports(model: Model, parts: list[tuple[NDArray, Any, NDArray]]) -> MotionEstimate:
