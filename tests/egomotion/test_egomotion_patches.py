@@ -277,9 +277,9 @@ def test_mean_square_flow_is_that_of_a_sensor():
     y, x = np.mgrid[:90, :120].astype(float)
     xi = np.stack([x - 59.5, y - 44.5], -1)
     found = mean_square_flow(Rotation(100.0), xi)
-    rows = rotation_basis(xi.reshape(-1, 2), 100.0).reshape(-1, 3)
-    expected = rows.T @ rows / xi[..., 0].size
-    np.testing.assert_allclose(found, expected, rtol=0.1, atol=0.02 * expected.max())
+    for motion in ([1.0, 0.0, 0.0], [0.2, -0.5, 3.0]):
+        flow = np.asarray(rotation_basis(xi, 100.0)) @ motion
+        np.testing.assert_allclose(motion @ found @ motion, (flow**2).sum(-1).mean(), rtol=1e-5)
 
 
 def test_lone_estimate_is_extended():

@@ -56,7 +56,6 @@ MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
 RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 # The maximum of the votes is up to about half a per cent beside the motion.
 PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
-FLOW_STEP_PX = 8  # between pixels at which the mean square flow is taken
 GENERAL_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)
 # Of other models, whose components have flows that resemble each other in parts of the image.
 CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, flow_change=0.1)
@@ -661,7 +660,6 @@ def mean_square_flow(model: Model, xi: NDArray[np.floating]) -> NDArray[np.float
     Returns:
         The matrix (d, d).
     """
-    xi = xi[::FLOW_STEP_PX, ::FLOW_STEP_PX]
     basis = np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
     rows = basis.reshape(-1, basis.shape[-1]).astype(float)
     return rows.T @ rows / (len(rows) / 2)
