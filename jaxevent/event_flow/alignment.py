@@ -306,7 +306,7 @@ class Clock(NamedTuple):
 
     @property
     def rises(self) -> bool:
-        """True if s never falls."""
+        """True if s rises throughout."""
         return bool((np.diff(self.s) > 0).all())
 
     def turned(self, at: int) -> "Iterator[tuple[Clock, float]]":
