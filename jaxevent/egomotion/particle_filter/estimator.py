@@ -57,8 +57,8 @@ RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to t
 # The maximum of the votes is up to about half a per cent beside the motion.
 PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
 GENERAL_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)
-# Of other models, whose components have flows that resemble each other in parts of the image.
-CAMERA_MOTION_CALIBRATION = CovarianceCalibration(0.7, share=0.005, flow_change=0.1)
+# Of models of linear flow, whose components' flows resemble each other in parts of the image.
+LINEAR_CALIBRATION = CovarianceCalibration(0.7, share=0.005, flow_change=0.1)
 
 _run = eqx.filter_jit(filtering.run)
 _init = eqx.filter_jit(filtering.init)
@@ -500,7 +500,9 @@ class ChunkRunner:
             if not self.model.half_line:
                 mean = filtering.undo_averages(motion, span, self.params)
                 motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
-        metric = None if self.model.half_line else mean_square_flow(self.model, self.sampler.xi)
+        metric = None
+        if not (self.model.uniform or self.model.half_line):
+            metric = mean_square_flow(self.model, self.sampler.xi)
         found = calibrate(motion, self.camera, span, metric)
         seen, valid = found.observed_t, found.valid.copy()
         for begin, end in silent:
@@ -636,14 +638,18 @@ def calibrate(
         camera: The calibration.
         length: (n,) time span of an estimate's events, s, in which changes between the neighbours,
             before and after, count; None: they do not.
-        flow_metric: (d, d) `mean_square_flow` of a model whose flow is linear; None: of another.
+        flow_metric: (d, d) `mean_square_flow`; None of models whose flow is the same everywhere,
+            or not linear.
 
     Returns:
         The motion with the calibrated covariance.
     """
-    calibration = PLANAR_CALIBRATION if motion.model.uniform else CAMERA_MOTION_CALIBRATION
-    if motion.model.half_line:
+    if motion.model.uniform:
+        calibration = PLANAR_CALIBRATION
+    elif motion.model.half_line:
         calibration = GENERAL_CALIBRATION
+    else:
+        calibration = LINEAR_CALIBRATION
     calibration = calibration.with_lens(camera)
     if length is None:
         return motion.with_calibrated_covariance(calibration._replace(change=0.0))
@@ -660,7 +666,7 @@ def mean_square_flow(model: Model, xi: NDArray[np.floating]) -> NDArray[np.float
     Returns:
         The matrix (d, d).
     """
-    basis = np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
+    basis = _basis_at(model, xi)
     rows = basis.reshape(-1, basis.shape[-1]).astype(float)
     return rows.T @ rows / (len(rows) / 2)
 
@@ -699,7 +705,11 @@ def _basis_at_corners(model: Model, sampler: CandidateSampler) -> NDArray[np.flo
         np.rint(np.linspace(0, n - 1, k + 1)).astype(int)
         for n, k in zip(sampler.xi.shape[:2], parts, strict=True)
     )
-    xi = sampler.xi[np.ix_(lines, columns)]
+    return _basis_at(model, sampler.xi[np.ix_(lines, columns)])
+
+
+def _basis_at(model: Model, xi: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the model's basis (..., 2, d) at undistorted positions (..., 2) px."""
     return np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
 
 
