@@ -5,62 +5,93 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined, run_over_rows
 
 
-@njit_noalloc_inlined
-def _velocity_at(velocity, spacing, k, weight, x, y):
-    """Return the velocity (px/s) at a place, bilinear, between the knots k and k + 1."""
-    h, w = velocity.shape[1], velocity.shape[2]
-    first = 0.5 * spacing if spacing > 1 else 0.0
-    x, y = (x - first) / spacing, (y - first) / spacing
-    x, y = min(max(x, 0.0), w - 1.0), min(max(y, 0.0), h - 1.0)
-    i, j = min(int(x), max(w - 2, 0)), min(int(y), max(h - 2, 0))
-    fx, fy = x - i, y - j
-    i2, j2, k2 = min(i + 1, w - 1), min(j + 1, h - 1), min(k + 1, velocity.shape[0] - 1)
-    a, b, c, d = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
-    u = v = 0.0
-    if weight < 1:
-        m = 1 - weight
-        p, q = velocity[k, j], velocity[k, j2]
-        u = m * (a * p[i, 0] + b * p[i2, 0] + c * q[i, 0] + d * q[i2, 0])
-        v = m * (a * p[i, 1] + b * p[i2, 1] + c * q[i, 1] + d * q[i2, 1])
-    if weight > 0:
-        p, q = velocity[k2, j], velocity[k2, j2]
-        u += weight * (a * p[i, 0] + b * p[i2, 0] + c * q[i, 0] + d * q[i2, 0])
-        v += weight * (a * p[i, 1] + b * p[i2, 1] + c * q[i, 1] + d * q[i2, 1])
+BLOCK_POINTS = 64  # that pass through a stretch of time one beside the other
+
+
+@njit_fastmath_inlined
+def _velocity_at(fields, weight, x, y):
+    """Return the velocity at coordinates of nodes, bilinear, between two fields."""
+    before, after = fields
+    height, width = before.shape[0], before.shape[1]
+    zero, one = np.float32(0), np.float32(1)
+    x, y = min(max(x, zero), np.float32(width - 1)), min(max(y, zero), np.float32(height - 1))
+    i, j = min(np.int32(x), np.int32(width - 2)), min(np.int32(y), np.int32(height - 2))
+    fx, fy = x - np.float32(i), y - np.float32(j)
+    left, up = np.uint32(i), np.uint32(j)
+    right, down = left + np.uint32(1), up + np.uint32(1)
+    a, b, c, d = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
+    early = one - weight
+    u = early * (
+        a * before[up, left, 0]
+        + b * before[up, right, 0]
+        + c * before[down, left, 0]
+        + d * before[down, right, 0]
+    )
+    u += weight * (
+        a * after[up, left, 0]
+        + b * after[up, right, 0]
+        + c * after[down, left, 0]
+        + d * after[down, right, 0]
+    )
+    v = early * (
+        a * before[up, left, 1]
+        + b * before[up, right, 1]
+        + c * before[down, left, 1]
+        + d * before[down, right, 1]
+    )
+    v += weight * (
+        a * after[up, left, 1]
+        + b * after[up, right, 1]
+        + c * after[down, left, 1]
+        + d * after[down, right, 1]
+    )
     return u, v
 
 
-@njit_noalloc
-def _integrate_paths(x, y, t, knots, velocity, spacing, at, out_x, out_y):
-    """Integrate dx/dt = v(x, t) from t to `at`, by the midpoint rule between times of knots."""
-    n_knots = len(knots)
-    for n in range(len(x)):
-        px, py, now = float(x[n]), float(y[n]), t[n]
-        while now != at:
-            # The stretch between knots on the way to `at`; -1 and n_knots - 1 are outside.
-            k = -1
-            if at > now:
-                while k + 1 < n_knots and knots[k + 1] <= now:
-                    k += 1
-                end = at if k == n_knots - 1 else min(at, knots[k + 1])
-            else:
-                while k + 1 < n_knots and knots[k + 1] < now:
-                    k += 1
-                end = at if k == -1 else max(at, knots[k])
-            low = max(k, 0)
-            scale = shift = 0.0
-            if 0 <= k < n_knots - 1:
-                scale = 1.0 / (knots[k + 1] - knots[k])
-                shift = now - knots[k]
-            step = end - now
-            u, v = _velocity_at(velocity, spacing, low, shift * scale, px, py)
-            half = 0.5e-6 * step
-            middle = (shift + 0.5 * step) * scale
-            u, v = _velocity_at(velocity, spacing, low, middle, px + half * u, py + half * v)
-            px, py, now = px + 2 * half * u, py + 2 * half * v, end
-        out_x[n], out_y[n] = px, py
+@njit_fastmath_inlined
+def _integrate_block(s, flow, along, x, y):
+    """Take points later (`along` 1) or earlier (-1) to the time 0; others stay in place."""
+    knots, velocity = flow
+    last, half, zero = len(knots) - 1, np.float32(0.5), np.float32(0)
+    far = s[0]
+    for n in range(len(s)):
+        far = min(far, s[n]) if along > 0 else max(far, s[n])
+    for turn in range(last + 2):
+        # The stretch begins at the knot k; -1 and the last one are outside.
+        k = turn - 1 if along > 0 else last - turn
+        begin = knots[k] if k >= 0 else min(far, zero)
+        end = knots[k + 1] if k < last else max(far, zero)
+        goal = min(zero, end) if along > 0 else max(zero, begin)
+        entry = begin if along > 0 else end
+        if (goal - far) * along <= 0 or (goal - entry) * along <= 0:
+            continue
+        low = max(k, 0)
+        fields = velocity[low], velocity[min(low + 1, last)]
+        start, scale = knots[low], zero
+        if k >= 0 and k < last:
+            scale = np.float32(1) / (end - begin)
+        for n in range(len(s)):
+            now = max(s[n], begin) if along > 0 else min(s[n], end)
+            step = max((goal - now) * along, zero) * along
+            u, v = _velocity_at(fields, (now - start) * scale, x[n], y[n])
+            middle = (now + half * step - start) * scale
+            u, v = _velocity_at(fields, middle, x[n] + half * step * u, y[n] + half * step * v)
+            x[n], y[n] = x[n] + step * u, y[n] + step * v
+
+
+@njit_fastmath
+def _integrate_paths(begin, end, s, flow, x, y):
+    """Integrate dx/ds = v(x, s) from s to 0, in place, by the midpoint rule between knots.
+
+    Points are in blocks, of which those from `begin` to `end` are taken.
+    """
+    for block in range(begin, end):
+        first, last = block * BLOCK_POINTS, min((block + 1) * BLOCK_POINTS, len(s))
+        for along in (np.float32(1), np.float32(-1)):
+            _integrate_block(s[first:last], flow, along, x[first:last], y[first:last])
 
 
 class WindowPaths(NamedTuple):
@@ -95,11 +126,13 @@ class WindowPaths(NamedTuple):
         Returns:
             Columns and rows (n,) at the time `at`, px; they may lie outside the sensor.
         """
-        out_x, out_y = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
-        places = (np.ascontiguousarray(c, np.float32) for c in (x, y))
-        stamps = np.ascontiguousarray(t, np.int64)
-        velocity = np.ascontiguousarray(self.velocity, np.float32)
-        _integrate_paths(
-            *places, stamps, self.knots, velocity, float(self.spacing), self.at, out_x, out_y
-        )
+        # In coordinates of nodes, of which there are at least two each way, and s from `at`.
+        first = 0.5 * self.spacing if self.spacing > 1 else 0.0
+        places = [((np.asarray(c) - first) / self.spacing).astype(np.float32) for c in (x, y)]
+        pads = [(0, max(2 - n, 0)) for n in self.velocity.shape[1:3]]
+        velocity = np.pad(self.velocity / self.spacing, ((0, 0), *pads, (0, 0)), "edge")
+        s, knots = ((np.subtract(c, self.at) * 1e-6).astype(np.float32) for c in (t, self.knots))
+        flow, blocks = (knots, velocity.astype(np.float32)), -(-len(s) // BLOCK_POINTS)
+        run_over_rows(_integrate_paths, blocks, s, flow, *places)
+        out_x, out_y = (c * np.float32(self.spacing) + np.float32(first) for c in places)
         return out_x, out_y
