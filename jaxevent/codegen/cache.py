@@ -49,9 +49,10 @@ def cfunc(signature: Any, **options: Any) -> Callable[[Callable], Any]:
 
     def compile_one(function: Callable) -> Any:
         files = _files_of(function)
-        if files is None:
-            return numba.cfunc(signature, **options)(function)
-        return internals.cached_cfunc(function, signature, options, files)
+        with support.garbage_collection_paused:
+            if files is None:
+                return numba.cfunc(signature, **options)(function)
+            return internals.cached_cfunc(function, signature, options, files)
 
     return compile_one
 
