@@ -55,6 +55,7 @@ class HiddenFrames:
         """Return the errors of the predicted frames, intensities clipped to the frames' range."""
         late = round(float(params.clock_offset) * 1e6)
         images = method.estimate(self.given, params, progress=False)
+        images.is_checked = True  # thresholds that are tried may well be wrong
         mean, _, _ = images(self.hidden.t + late, extrapolate=True)
         image = np.nan_to_num(np.asarray(mean, np.float64), nan=0.5)
         return (image.clip(0, self.white) - self.truth).ravel()

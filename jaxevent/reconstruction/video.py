@@ -210,6 +210,9 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
     of the sequence, and is made anew of these. Raises `InputError` if the recording lacks what the
     estimator needs. The first reading warns if events contradict frames at the given thresholds,
     see `consistency`.
+
+    Attributes:
+        is_checked: Whether events were compared with frames, or need not be.
     """
 
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
@@ -232,7 +235,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         self.estimator, self.recording, self.params = estimator, recording, params
         self.progress = progress
         self._image_delay_us = EventTiming.of(params).image_delay_us
-        self._compared, self._is_live = not estimator.fuses, False
+        self.is_checked, self._is_live = not estimator.fuses, False
         self._turns = TurnLock(f"images of {recording.name}")
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -378,8 +381,8 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
             raise InputError("times must be sorted to be read in batches; sort them")
         among_events = self._among_events(times, extrapolate)
         with self._turns:
-            compared, self._compared = self._compared, True
-        if not compared and (doubt := self._doubt()) is not None:
+            checked, self.is_checked = self.is_checked, True
+        if not checked and (doubt := self._doubt()) is not None:
             warnings.warn(doubt, InputWarning, stacklevel=2)
         start, stop = time_span(self.recording, self.params.clock_offset)
         with bar(total=len(times), desc="images", unit="image", progress=self.progress) as shown:

@@ -209,7 +209,9 @@ def _figure(name: str, samples: Mapping[str, Sample], path: Path) -> None:
 def _video(recording: Recording, path: Path) -> float:
     """Write 200 images per second of the recording, shown at 30; return the slow-down."""
     rate, fps, longest = 200.0, 30.0, 180
-    video = find("akf").estimate(recording, progress=False)
+    method: Any = find("akf")
+    params = method.Params.for_recording(held_out(recording)[0])  # those of the table
+    video = method.estimate(recording, params, progress=False)
     zoom = 2 if recording.width < 480 else 1
     with video_writer(path, fps) as write:
         for _, image in display_images(video, image_times(recording, rate)[:longest], "display"):
