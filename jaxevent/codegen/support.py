@@ -15,8 +15,14 @@ import warnings
 from typing import Any
 
 __all__ = [
-    *("HAS_INTERNALS", "HAS_NUMBA", "compiler_lock", "garbage_collection_paused", "intrinsic"),
-    *("ir", "numba", "types"),
+    "HAS_INTERNALS",
+    "HAS_NUMBA",
+    "compiler_lock",
+    "garbage_collection_paused",
+    "intrinsic",
+    "ir",
+    "numba",
+    "types",
 ]
 
 TESTED_NUMBA_RELEASES = (
@@ -62,7 +68,6 @@ if numba is not None:
     warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
     with contextlib.suppress(ImportError, AttributeError):  # private: may go in any release
         compiler_lock = importlib.import_module("numba.core.compiler_lock").global_compiler_lock
-
 
 
 class _Pause:

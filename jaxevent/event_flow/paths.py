@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined, run_over_rows
 
-
 BLOCK_POINTS = 64  # that pass through a stretch of time one beside the other
 
 

@@ -1,5 +1,6 @@
 """Kernels with another numba than those that are known, and without numba."""
 
+import gc
 import subprocess
 import sys
 
@@ -89,3 +90,27 @@ def test_without_numba_xla_makes_the_images():
     count, finite, refused = printed(NONE + IMAGES).splitlines()
     assert count == "1 numba cannot be imported" and finite == "True"
     assert "numba has no kernel for the method 'akf'" in refused
+
+
+@pytest.mark.skipif(not support.HAS_NUMBA, reason="needs numba")
+def test_no_garbage_is_collected_while_numba_compiles():
+    seen = []
+
+    @support.intrinsic
+    def watched(context, x):
+        seen.append(gc.isenabled())
+        return x(x), lambda context, builder, signature, arguments: arguments[0]
+
+    one = support.numba.njit(lambda x: watched(x))
+    two = support.numba.njit(lambda x: one(x) + watched(x))
+    assert gc.isenabled() and two(1.0) == 2.0 and gc.isenabled()
+    with pytest.raises(support.numba.TypingError):
+        support.numba.njit(lambda x: x.unknown)(1.0)
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        two(1)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+    assert seen and not any(seen)
