@@ -36,8 +36,13 @@ from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
 
 mc = find("mc", "reconstruction")
-fuse = jax.jit(fusion.fuse)
+compiled_fuse = jax.jit(fusion.fuse)
 COST = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
+
+
+def fuse(params, L, V, along, at, reach=np.inf):
+    """Fuse by a program that all tests of as many instants share."""
+    return compiled_fuse(params, L, V, along, at, np.full(L.shape[1:], reach, np.float32))
 
 
 def texture(height, width, seed=0):
@@ -344,8 +349,7 @@ def test_a_stationary_point_is_that_of_its_smoother():
     L[4, 10, 12] += 0.5
     at, V = make_layout(9, 2, 1, 5), np.full_like(L, 0.01)
     moving, staying, far = (
-        np.asarray(fuse(only("none"), L, V, still(L), at, np.full((20, 24), px**2, np.float32)).L)
-        for px in (2.0, 0.02, np.inf)
+        np.asarray(fuse(only("none"), L, V, still(L), at, px**2).L) for px in (2.0, 0.02, np.inf)
     )
     np.testing.assert_allclose(moving, far, atol=1e-4)
     assert np.abs(far - L[2])[:, :6].min() > 1e-3
@@ -520,17 +524,21 @@ def exposed(half=0.5, common=0.0):
     return np.log(intensity(0) + I0).astype(np.float32), adjacent, adjacent_frames, paths
 
 
-def constrain(params, L, P, case, samples):
+constrain_jax = jax.jit(exposures.constrain_image_jax, static_argnums=3)
+
+
+def constrain(params, L, P, case, pure=True):
     """Constrain an image in loops, and check that JAX does the same."""
     _, adjacent, adjacent_frames, paths = case
     ones = jnp.ones((7, *L.shape), np.float32)
     fused = fusion.FusedImage(jnp.asarray(L), jnp.asarray(P), ones[:5], ones[:2])
     model = exposures.ExposureModel(adjacent, adjacent_frames, paths)
-    quick = exposures.constrain_image(params, fused, model, samples)
-    purely = jax.jit(exposures.constrain_image_jax, static_argnames="samples")
-    pure = purely(params, fused, model._replace(paths=jnp.asarray(paths, float)), samples=samples)
-    for one, other in ((quick.L, pure.L), (quick.P, pure.P)):
-        np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-4)
+    quick = exposures.constrain_image(params, fused, model, 7)
+    if pure:
+        model = model._replace(paths=jnp.asarray(paths, float))
+        other = constrain_jax(params, fused, model, 7)
+        np.testing.assert_allclose(quick.L, other.L, rtol=2e-4, atol=2e-4)
+        np.testing.assert_allclose(quick.P, other.P, rtol=2e-4, atol=2e-4)
     return np.asarray(quick.L), np.asarray(quick.P)
 
 
@@ -564,17 +572,17 @@ def test_images_are_fitted_to_blurred_frames():
     truth = case[0]
     blurred = gaussian_filter(truth, 1.5).astype(np.float32)
     P = np.full_like(truth, 0.02)
-    L, after = constrain(Params(smear=0.3), blurred, P, case, 7)
+    L, after = constrain(Params(smear=0.3), blurred, P, case)
 
     def error(image):
         return float(((image - truth)[4:-4, 6:-6] ** 2).mean())
 
     assert error(L) < 0.6 * error(blurred)  # what blurs across the motion is lost on frames
     assert (after >= P).all() and after.max() > 1.1 * 0.02
-    same, _ = constrain(Params(), truth, P, case, 7)
+    same, _ = constrain(Params(), truth, P, case)
     assert error(same) < 0.02 * error(blurred)
     sharp = case[:1] + (case[1]._replace(half=np.float32([0.01, 0.01])),) + case[2:]
-    unchanged, _ = constrain(Params(), blurred, P, sharp, 7)
+    unchanged, _ = constrain(Params(), blurred, P, sharp)
     np.testing.assert_allclose(unchanged, blurred, atol=1e-6)
 
 
@@ -585,15 +593,19 @@ def test_clipped_pixels_bound_the_image():
     params = Params(margin=2.0, sigma_floor=1e-3)
     bound = float(np.log((255 - 2) / 255 + float(params.I0)))
     L, P = np.full_like(truth, bound - 0.6), np.full_like(truth, 0.04)
-    alone = adjacent._replace(present=np.float32([1, 0]))
-    got, _ = constrain(params, L, P, (truth, alone, white, p), 1)
+    # One frame, exposed for an instant.
+    alone = adjacent._replace(
+        present=np.float32([1, 0]), half=0 * adjacent.half, drift=0 * adjacent.drift
+    )
+    case = truth, alone, white, p
+    got, _ = constrain(params, L, P, case)
     grid = np.linspace(bound, bound + 3, 20_000)
     density = np.exp(-0.5 * (grid - (bound - 0.6)) ** 2 / 0.04)
     expected = (grid * density).sum() / density.sum()
     np.testing.assert_allclose(got[6:-6, 8:-8], expected, atol=0.01)
-    above, _ = constrain(params, L + 1.2, P, (truth, alone, white, p), 1)
+    above, _ = constrain(params, L + 1.2, P, case)
     np.testing.assert_allclose(above, L + 1.2, atol=0.01)
-    off, _ = constrain(params.replace(one_sided=False), L, P, (truth, alone, white, p), 1)
+    off, _ = constrain(params.replace(one_sided=False), L, P, case, pure=False)
     np.testing.assert_array_equal(off, L)
 
 
@@ -872,10 +884,11 @@ def test_prepared_images_of_frames_that_are_not_steady(monkeypatch):
 def test_images_are_of_learned_thresholds(monkeypatch):
     """The video and prepared images take what is learned; tests/reconstruction/test_thresholds."""
     times, at = prepared()[0], params()
+    usual = video()(times).mean
     factors = np.random.default_rng(2).uniform(1, 4, (2, 40 * 48)).astype(np.float32)
     monkeypatch.setattr(target_motion, "learn_thresholds", lambda *_: factors)
     images = mc.estimate(slide(), at, progress=False)(times).mean
-    assert np.abs(images - video()(times).mean).max() > 0.01
+    assert np.abs(images - usual).max() > 0.01
     features, out = mc.prepare(slide(), times, at)
     estimate = jax.jit(lambda p: mc.read(p, mc.run(p, features)[0], out))(at)
     np.testing.assert_allclose(estimate.mean.reshape(2, 40, 48), images, atol=2e-3)

@@ -721,9 +721,11 @@ def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
     _, *changes_of_data = changes
     eq = linearise_jax(p, images, cost)
 
+    _, change = jax.linearize(lambda q: normal_equation_residual(q, images, cost), p)
+
     def times(dp: Array) -> Array:
         """Return A dp."""
-        return -jax.jvp(lambda q: normal_equation_residual(q, images, cost), (p,), (dp,))[1]
+        return -change(dp)
 
     def solve_all(product: Callable[[Array], Array], right: Array) -> Array:
         def precondition(other: Array) -> Array:

@@ -336,15 +336,29 @@ def path_positions(paths: Array, times: PathTimes) -> tuple[Array, Array]:
 def sample_bilinear(images: Array, Y: Array, X: Array) -> Array:
     """Read images (K, h, w) at the points Y and X (K, ...) of each, bilinear; differentiable."""
     _, h, w = images.shape
+    y0, x0, fy, fx = _locate_cells(h, w, Y, X)
+    y1, x1 = y0 + (h > 1), x0 + (w > 1)
+    top = (1 - fx) * _take(images, y0, x0) + fx * _take(images, y0, x1)
+    bottom = (1 - fx) * _take(images, y1, x0) + fx * _take(images, y1, x1)
+    return (1 - fy) * top + fy * bottom
+
+
+def _locate_cells(h: int, w: int, Y: Array, X: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the first pixel y, x of the cell around each point, and y and x (0..1) in the cell."""
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
     y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
     x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
-    y1, x1 = jnp.minimum(y0 + 1, h - 1), jnp.minimum(x0 + 1, w - 1)
-    fy, fx = Y - y0, X - x0
-    k = jnp.arange(len(images))[:, None, None]
-    top = (1 - fx) * images[k, y0, x0] + fx * images[k, y0, x1]
-    bottom = (1 - fx) * images[k, y1, x0] + fx * images[k, y1, x1]
-    return (1 - fy) * top + fy * bottom
+    return y0, x0, Y - y0, X - x0
+
+
+def _take(images: Array, y: Array, x: Array) -> Array:
+    """Read images (K, h, w) at pixels (..., K, h, w) that are in them.
+
+    Checks of their range would make three of four operations, and as many in derivatives.
+    """
+    count, h, w = images.shape
+    pixel = (jnp.arange(count)[:, None, None] * h + y) * w + x
+    return jnp.ravel(images).at[pixel].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def is_in_image(Y: Array, X: Array, height: int, width: int) -> Array:
@@ -360,13 +374,9 @@ def warp_images_jax(
     Y, X = path_positions(paths, times)
     inside = is_in_image(Y, X, h, w)
     V, clear = sample_bilinear(V, Y, X), sample_bilinear(clear, Y, X)
-    Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
-    y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
-    x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
-    fy, fx = Y - y0, X - x0
-    k = jnp.arange(len(L))[:, None, None]
-    row = [jnp.clip(y0 + i, 0, h - 1) for i in range(-1, 3)]
-    column = [jnp.clip(x0 + j, 0, w - 1) for j in range(-1, 3)]
+    y0, x0, fy, fx = _locate_cells(h, w, Y, X)
+    row = jnp.stack([jnp.clip(y0 + i, 0, h - 1) for i in range(-1, 3)])
+    column = jnp.stack([jnp.clip(x0 + j, 0, w - 1) for j in range(-1, 3)])
 
     def cubic(f: Array) -> Array:
         a = CUBIC_SLOPE
@@ -377,6 +387,6 @@ def warp_images_jax(
         return jnp.stack([first, second, third, 1 - first - second - third])
 
     # Around the points: (rows, columns, k, h, w).
-    taps = L[k, jnp.stack(row)[:, None], jnp.stack(column)]
+    taps = _take(L, row[:, None], column)
     bicubic = (cubic(fy)[:, None] * cubic(fx) * taps).sum((0, 1))
     return WarpedImages(bicubic, V, clear, inside.astype(L.dtype))
