@@ -14,7 +14,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import candidates, voting
 from jaxevent.egomotion.candidates import CandidateSampler
 from jaxevent.egomotion.estimator import InconsistentMotionWarning, LostMotionWarning
-from jaxevent.egomotion.models import MODELS, General, Planar
+from jaxevent.egomotion.models import MODELS, General, Planar, Rotation
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.filtering import smooth
@@ -615,6 +615,36 @@ def test_means_over_the_ages_of_candidates_are_undone():
     alone = filtering.undo_averages(part, np.full(701, span), params)
     np.testing.assert_array_equal(found[:700], alone[:700])
     np.testing.assert_array_equal(found[~valid], mean[~valid])
+
+
+def test_ages_that_differ_across_the_image_make_no_roll():
+    """Least squares over pixels, each of which tells a mean over its own ages, are undone."""
+    f, baseline, late = 130.0, 6.5, 0.02
+    y, x = (part.ravel() for part in np.mgrid[-56:57:8, -76:77:8].astype(float))
+    basis = np.asarray(Rotation(f).basis(np.stack([x, y], -1)), np.float64)
+    t = np.arange(0, 600_000, 3000)
+
+    def turn(at):
+        return np.stack([-0.8 + 0 * at, 0.4 + 0.6 * np.sin(2 * np.pi * 2 * at), 0.9 + 0 * at], -1)
+
+    seen, span = np.empty((len(t), 3)), np.empty(len(t))
+    for row, now in enumerate(1e-6 * t):
+        speed = np.linalg.norm(basis @ turn(now), axis=-1)
+        age = np.minimum(baseline / speed, 0.1)
+        age *= 2 * late * speed.sum() / (speed * age).sum()
+        told = turn(now + late - age[:, None] * (np.arange(50) + 0.5) / 50).mean(1)
+        flow = np.einsum("pid,pd->pi", basis, told)
+        weight = np.sqrt(speed) * age
+        sides = (weight[:, None] * flow).ravel()
+        seen[row] = np.linalg.lstsq((weight[:, None, None] * basis).reshape(-1, 3), sides)[0]
+        span[row] = 2 * late
+    true = turn(1e-6 * t)
+    assert np.abs(seen - true)[30:-30, 2].max() > 0.04
+    covariance = np.tile(1e-6 * np.eye(3), (len(t), 1, 1))
+    motion = MotionEstimate.from_arrays("rotation", t, seen, covariance)
+    params = voting.Params.of({"baseline": baseline, "tau_max": 0.1})
+    found = filtering.undo_averages(motion, span, params, basis)
+    assert np.abs(found - true)[30:-30].max() < 0.01
 
 
 def test_general_particles():

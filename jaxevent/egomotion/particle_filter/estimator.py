@@ -47,6 +47,7 @@ GATE_SIGMAS = 3.5  # sigma_x, margin of candidates around the expected flow
 CANDIDATE_CELL_PX = (
     16  # approximate size of the parts of the sensor with a range of candidates each
 )
+N_PARTS = 10  # of the sensor in x and y, whose events are as old as their own flow makes them
 MAX_AGE_BASELINES = 1.2  # largest age of candidates, in baselines of the fast quarter of the image
 MAX_CANDIDATE_AGE_S = 1.0
 TIME_PENALTY_RATIO = 25.0  # r_t per median image speed
@@ -498,7 +499,8 @@ class ChunkRunner:
         if smooth:
             motion = filtering.smooth(motion, self.params)
             if not self.model.half_line:
-                mean = filtering.undo_averages(motion, span, self.params)
+                basis = None if self.model.uniform else self._basis_at_parts()
+                mean = filtering.undo_averages(motion, span, self.params, basis)
                 motion = dataclasses.replace(motion, mean=mean.astype(motion.mean.dtype))
         metric = None
         if not (self.model.uniform or self.model.half_line):
@@ -508,6 +510,13 @@ class ChunkRunner:
         for begin, end in silent:
             valid[(seen > begin) & (seen < end)] = False
         return dataclasses.replace(found, covariance=found.covariance + drift, valid=valid)
+
+    def _basis_at_parts(self) -> NDArray[np.floating]:
+        """Return the model's basis (pixels, 2, d) in the middles of equal parts of the sensor."""
+        xi = self.sampler.xi
+        rows, columns = ((np.arange(N_PARTS) + 0.5) * n / N_PARTS for n in xi.shape[:2])
+        basis = _basis_at(self.model, xi[np.ix_(rows.astype(int), columns.astype(int))])
+        return basis.reshape(-1, *basis.shape[2:]).astype(float)
 
     def _find_gaps(self, t: NDArray[np.int64]) -> NDArray[np.intp]:
         """Return the batches before which the sensor was silent for about as long as one lasts.

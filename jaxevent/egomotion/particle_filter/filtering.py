@@ -25,7 +25,9 @@ SEARCH_NOISE_SIGMAS = 0.1  # noise of a search, per batch, in standard deviation
 MAX_LOG_WEIGHT_STD = 0.5  # of a batch over particles, in a search
 MIN_RELATIVE_HISTORY = 0.99  # of the oldest candidates of a search
 KNOTS_PER_LAG = 4  # of the motion whose means over candidates' ages are estimated
+SINGLE_PRECISION = 1e-6  # of covariances
 MIN_RELATIVE_VARIANCE = 1e-9  # of an estimate, as part of that of the motion between knots
+MAX_LAG_RATIO = 4.0  # of a pixel, by the mean
 MIN_RUN_ESTIMATES = 16  # in a row, from which such means are undone
 
 
@@ -458,22 +460,38 @@ def smooth(motion: MotionEstimate, params: Params | None = None) -> MotionEstima
     )
 
 
-def undo_averages(motion: MotionEstimate, span: NDArray[np.floating], params: Params) -> NDArray:
+def undo_averages(
+    motion: MotionEstimate,
+    span: NDArray[np.floating],
+    params: Params,
+    basis: NDArray[np.floating] | None = None,
+) -> NDArray:
     """Return the motions of which smoothed estimates are the means over the ages of candidates.
 
     Where the image is slow, candidates are as old as the motion takes to change, so that estimates
-    are flatter than it. Motions y at knots, of which a span holds 2 `KNOTS_PER_LAG`, minimise
+    are flatter than it. Where the flow U(p) differs between pixels p, with B(p) the model's basis,
+    slow pixels tell of older motions than fast ones, and a change of one component looks like
+    another component. A pixel's events of time t say what the mean is over the ages of its own
+    candidates, up to tau(p) = b / |U(p)|, and all of them together
 
-        sum_k |x_k - (B y)_k|^2 / s_k^2 + sum_k |y_k+1 - y_k|^2 / (q h_k),
+        C y = M^-1 sum_p w(p) B(p)' B(p) mean(y over [t - l(p), t]),  M = sum_p w(p) B(p)' B(p),
 
-    where B takes the mean over the span about a knot, q is the process noise of `params`, and h_k
-    the time between knots. Estimates within a span share events, so their errors are about alike:
-    s_k^2 is their variance times the knots of a span.
+    with l(p) in proportion to tau(p) and its mean over events the span of an estimate. A pixel
+    makes |U| events per time, and each fixes its flow to 1 / tau: w = |U| tau^2. Motions y at
+    knots, of which a span holds 2 `KNOTS_PER_LAG`, minimise
+
+        sum_k |x_k - (C y)_k|^2 / S_k + sum_k |y_k+1 - y_k|^2 / (q h_k),
+
+    where q is the process noise of `params`, and h_k the time between knots. Estimates within a
+    span share events, so their errors are about alike: S_k is their covariance times the knots of a
+    span.
 
     Args:
         motion: Smoothed estimates of a model whose flow is linear in its components.
         span: (n,) length of the time span of an estimate's events, s.
         params: The filter's parameters.
+        basis: (pixels, 2, d) the model's basis at pixels spread over the sensor; None where the
+            flow is the same everywhere.
 
     Returns:
         (n, d) motions.
@@ -497,30 +515,90 @@ def undo_averages(motion: MotionEstimate, span: NDArray[np.floating], params: Pa
         total = np.concatenate(
             [0 * x[:1], np.cumsum(np.diff(t)[:, None] * (x[1:] + x[:-1]) / 2, 0)]
         )
-        variance = np.diagonal(motion.covariance[rows], axis1=1, axis2=2)
+        ends = np.stack([np.interp(at, t, column) for column in total.T], 1)
+        cells = np.diff(ends, axis=0) / np.diff(at)[:, None]
+        nearest = np.clip(np.searchsorted(t, middle), 0, len(t) - 1)
+        S = 2 * KNOTS_PER_LAG * motion.covariance[rows][nearest].astype(float)
         noise = np.asarray(model.diffusion(params, jnp.asarray(x.mean(0)))) ** 2
+        weights = _mean_weights(cells, params, basis)
+        y = _solve_averages(cells, S, h[:, None] * noise, weights)
         for k in range(x.shape[1]):
-            cells = np.diff(np.interp(at, t, total[:, k])) / np.diff(at)
-            s2 = 2 * KNOTS_PER_LAG * np.interp(middle, t, variance[:, k])
-            y = _solve_averages(cells, s2, noise[k] * h)
-            mean[rows, k] = np.interp(t, middle, y)
+            mean[rows, k] = np.interp(t, middle, y[:, k])
     return mean
 
 
-def _solve_averages(x: NDArray, s2: NDArray, q: NDArray) -> NDArray[np.float64]:
-    """Return the values whose means over spans are x (n,), with variances q (n - 1,) of steps."""
-    reach = KNOTS_PER_LAG
-    n = len(x) + 2 * reach  # with knots beyond both ends
+def _mean_weights(
+    x: NDArray, params: Params, basis: NDArray[np.floating] | None
+) -> NDArray[np.float64]:
+    """Return what motions at knots k - back to k + `KNOTS_PER_LAG` count in x_k, for x (n, d).
+
+    Returns:
+        (n, knots, d, d) weights, whose sum over knots is 1.
+    """
+    (n, d), after = x.shape, KNOTS_PER_LAG
+    if basis is None:
+        knots = np.arange(-after, after + 1)
+        return np.tile(_box_weights(np.ones(1), knots)[0][:, None, None] * np.eye(d), (n, 1, 1, 1))
+    knots = np.arange(-round(after * (2 * MAX_LAG_RATIO - 1)), after + 1)
+    square = np.einsum("pid,pie->pde", basis, basis)
+    slowest, found = float(params.baseline) / float(params.tau_max), np.empty((n, len(knots), d, d))
+    for k in range(n):
+        speed = np.linalg.norm(basis @ x[k], axis=-1)
+        age = 1 / np.maximum(speed, slowest)
+        ratio = age * (speed.sum() / max((speed * age).sum(), 1e-12))
+        ratio = np.minimum(ratio, MAX_LAG_RATIO)
+        share = (ratio**2 * speed)[:, None, None] * square
+        share = np.linalg.solve(share.sum(0) + 1e-9 * np.eye(d), share)
+        found[k] = np.einsum("pk,pde->kde", _box_weights(ratio, knots), share)
+    return found
+
+
+def _box_weights(ratio: NDArray, knots: NDArray) -> NDArray[np.float64]:
+    """Return what values at knots count in means over spans (p, knots).
+
+    Values between knots are interpolated. Spans end at `KNOTS_PER_LAG` and are `ratio` (p,) times
+    twice as long.
+    """
+    length = 2 * KNOTS_PER_LAG * ratio[:, None]
+    return (
+        _hat_integral(KNOTS_PER_LAG - knots) - _hat_integral(KNOTS_PER_LAG - length - knots)
+    ) / length
+
+
+def _hat_integral(z: NDArray) -> NDArray[np.float64]:
+    """Return the integral to z of the function that is 1 at 0 and falls to 0 at -1 and 1."""
+    z = np.clip(z, -1, 1)
+    return 0.5 + z - np.sign(z) * z**2 / 2
+
+
+def _solve_averages(
+    x: NDArray, S: NDArray, q: NDArray, weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the values (n, d) of which weighted sums are x (n, d).
+
+    Args:
+        x: The sums.
+        S: (n, d, d) their covariances.
+        q: (n - 1, d) variances of steps.
+        weights: (n, knots, d, d) of `_mean_weights`.
+    """
+    after = KNOTS_PER_LAG
+    back = weights.shape[1] - after - 1
+    (n, d), total = x.shape, len(x) + back + after  # with knots beyond both ends
     # Particles that all agree have no variance, of which no sum is positive definite.
-    s2 = np.maximum(s2, MIN_RELATIVE_VARIANCE * q.mean())
-    weights = np.r_[0.5, np.ones(2 * reach - 1), 0.5] / (2 * reach)
-    steps = np.pad(1 / q, reach, mode="edge")
-    band, side = np.zeros((2 * reach + 1, n)), np.zeros(n)
-    for i, a in enumerate(weights):
-        side[i : i + len(x)] += a * x / s2
-        for j, b in enumerate(weights[: i + 1]):
-            band[i - j, j : j + len(x)] += a * b / s2
-    band[0, :-1] += steps
-    band[0, 1:] += steps
-    band[1, :-1] -= steps
-    return solveh_banded(band, side, lower=True)[reach:-reach]
+    rounding = SINGLE_PRECISION * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(d)
+    information = np.linalg.inv(S + rounding + MIN_RELATIVE_VARIANCE * np.diag(q.mean(0)))
+    rows = weights.transpose(0, 2, 1, 3).reshape(n, d, -1)
+    weighted = np.einsum("nde,nek->ndk", information, rows)
+    width = rows.shape[2]
+    band, side = np.zeros((width, total * d)), np.zeros(total * d)
+    for i in range(width):
+        side[i : i + n * d : d] += (weighted[:, :, i] * x).sum(1)
+        for j in range(i + 1):
+            band[i - j, j : j + n * d : d] += (rows[:, :, i] * weighted[:, :, j]).sum(1)
+    steps = np.pad(1 / q, [(back, after), (0, 0)], mode="edge").ravel()
+    band[0, :-d] += steps
+    band[0, d:] += steps
+    band[d, :-d] -= steps
+    found = solveh_banded(band, side, lower=True)
+    return found.reshape(total, d)[back : back + n]
