@@ -617,7 +617,7 @@ def test_means_over_the_ages_of_candidates_are_undone():
     np.testing.assert_array_equal(found[~valid], mean[~valid])
 
 
-def test_ages_that_differ_across_the_image_make_no_roll():
+def test_ages_that_differ_across_the_image_make_no_roll(monkeypatch):
     """Least squares over pixels, each of which tells a mean over its own ages, are undone."""
     f, baseline, late = 130.0, 6.5, 0.02
     y, x = (part.ravel() for part in np.mgrid[-56:57:8, -76:77:8].astype(float))
@@ -645,6 +645,11 @@ def test_ages_that_differ_across_the_image_make_no_roll():
     params = voting.Params.of({"baseline": baseline, "tau_max": 0.1})
     found = filtering.undo_averages(motion, span, params, basis)
     assert np.abs(found - true)[30:-30].max() < 0.01
+    # Pieces of a long recording are those of the whole.
+    monkeypatch.setattr(filtering, "PIECE_KNOTS", 50)
+    monkeypatch.setattr(filtering, "MARGIN_KNOTS", 64)
+    pieces = filtering.undo_averages(motion, span, params, basis)
+    assert 0 < np.abs(pieces - found).max() < 1e-4
 
 
 def test_general_particles():

@@ -28,6 +28,9 @@ KNOTS_PER_LAG = 4  # of the motion whose means over candidates' ages are estimat
 SINGLE_PRECISION = 1e-6  # of covariances
 MIN_RELATIVE_VARIANCE = 1e-9  # of an estimate, as part of that of the motion between knots
 MAX_LAG_RATIO = 4.0  # of a pixel, by the mean
+# Knots that are solved for together, so that memory does not grow with the recording, and those
+# beside them, which they depend on.
+PIECE_KNOTS, MARGIN_KNOTS = 4096, 256
 MIN_RUN_ESTIMATES = 16  # in a row, from which such means are undone
 
 
@@ -520,8 +523,13 @@ def undo_averages(
         nearest = np.clip(np.searchsorted(t, middle), 0, len(t) - 1)
         S = 2 * KNOTS_PER_LAG * motion.covariance[rows][nearest].astype(float)
         noise = np.asarray(model.diffusion(params, jnp.asarray(x.mean(0)))) ** 2
-        weights = _mean_weights(cells, params, basis)
-        y = _solve_averages(cells, S, h[:, None] * noise, weights)
+        steps, y = h[:, None] * noise, np.empty_like(cells)
+        for begin in range(0, count, PIECE_KNOTS):
+            end = min(begin + PIECE_KNOTS, count)
+            low, high = max(begin - MARGIN_KNOTS, 0), min(end + MARGIN_KNOTS, count)
+            some, weights = cells[low:high], _mean_weights(cells[low:high], params, basis)
+            piece = _solve_averages(some, S[low:high], steps[low : high - 1], weights)
+            y[begin:end] = piece[begin - low : end - low]
         for k in range(x.shape[1]):
             mean[rows, k] = np.interp(t, middle, y[:, k])
     return mean
