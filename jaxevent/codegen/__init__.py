@@ -110,6 +110,16 @@ N_THREADS = (
 )
 
 
+def read_only(array: NDArray) -> NDArray:
+    """Return a view of an array that nobody may write, as JAX's arrays are.
+
+    numba compiles a function once more for each kind of array.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 def row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
     """Return scratch (rows, ...) for kernels of `run_over_rows`: parts use that of their first row.
 

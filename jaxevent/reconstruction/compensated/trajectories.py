@@ -26,7 +26,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import (
+    njit_noalloc,
+    njit_noalloc_inlined,
+    read_only,
+    row_scratch,
+    run_over_rows,
+)
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
     PackedImages,
@@ -93,7 +99,8 @@ def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
         (K, h, w, 4) L, V, and the gradient of L along x and y, 1/px.
     """
     out = np.empty((*L.shape, 4), np.float32)
-    run_over_rows(_pack, L.shape[1], np.asarray(L, np.float32), np.asarray(V, np.float32), out)
+    given = (read_only(np.asarray(values, np.float32)) for values in (L, V))
+    run_over_rows(_pack, L.shape[1], *given, out)
     return out
 
 

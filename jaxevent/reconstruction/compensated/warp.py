@@ -15,7 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import (
+    njit_noalloc,
+    njit_noalloc_inlined,
+    read_only,
+    row_scratch,
+    run_over_rows,
+)
 from jaxevent.reconstruction.features import Numeric
 
 CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
@@ -300,7 +306,7 @@ def warp_images(
     """
     _, h, w = L.shape
     out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
-    inputs = (L, V, clear, clear.any((1, 2)), times, paths)
+    inputs = (read_only(L), read_only(V), clear, clear.any((1, 2)), times, paths)
     run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
 

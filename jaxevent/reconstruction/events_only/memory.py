@@ -73,7 +73,7 @@ def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
     weight = np.where(rows.kind == EVENT, 1, silence).astype(np.float32) * rows.weight / c**2
     _add_rows(rows, weight, c, information, eta)
     gradient = np.empty_like(eta)
-    _solve_gradient(information, eta, LEAST_INFORMATION / c**2, gradient)
+    _solve_gradient(information, eta, float(LEAST_INFORMATION / c**2), gradient)
     return GradientPrior(gradient, information)
 
 
