@@ -26,6 +26,7 @@ T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
 
 MAX_VALUE = 1e15  # a value must be smaller, so that its square is in the range of float32
+MAX_SHOWN_NUMBERS = 8  # of one parameter
 CALIBRATION_TABLE = "calibration"  # name of the table that jaxevent calibrate writes
 THRESHOLDS = frozenset({"c_on", "c_off"})  # numbers of a calibration that hold for one `I0`
 NO_GRADIENT_REASON = "acts when data are prepared or by comparisons, and has no gradient to follow"
@@ -416,7 +417,9 @@ class Parameters(_ParameterArrays):
                 name: _format_leaf(self.raw[name], self.numbers[name]) for name in self.numbers
             }
             zeros = [name for name, text in parts.items() if text == "0"]
-            some = ", ".join(f"{name}={text}" for name, text in parts.items() if text != "0")
+            some = ", ".join(
+                f"{name}={_shorten(text)}" for name, text in parts.items() if text != "0"
+            )
             rest = f"0: {', '.join(zeros)}" if zeros else ""
             return (
                 f"<gradient by {type(self).__qualname__}.raw, where positive numbers are logarithms"
@@ -427,7 +430,7 @@ class Parameters(_ParameterArrays):
         for name in self.settings():
             text = _format_setting(self, name)
             where = same if text == _format_setting(defaults, name) else changed
-            where.append(f"{name}={text}")
+            where.append(f"{name}={_shorten(text)}")
         rest = f"defaults: {', '.join(same)}" if same else ""
         return f"{type(self).__qualname__}({'; '.join(filter(None, [', '.join(changed), rest]))})"
 
@@ -674,6 +677,14 @@ def _format_setting(params: Parameters, name: str) -> str:
     return (
         _format_leaf(value, params.numbers[name]) if name in params.numbers else format_value(value)
     )
+
+
+def _shorten(text: str) -> str:
+    """Leave out most of a formatted list of many numbers."""
+    numbers = text.split(", ")
+    if len(numbers) <= MAX_SHOWN_NUMBERS:
+        return text
+    return f"{', '.join(numbers[:3])}, ... {len(numbers)} numbers]"
 
 
 def format_value(value: Any) -> str:

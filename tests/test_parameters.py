@@ -172,3 +172,13 @@ def test_a_step_is_no_parameters_and_its_sum_with_some_is():
     assert not moved.is_gradient and float(moved.offset) == pytest.approx(-0.9)
     assert repr(moved).startswith("Given(offset=-0.9, sigma=0.4524, ")
     assert repr(jax.tree.map(lambda leaf: None, params)).startswith("Given(")
+
+
+def test_a_repr_shows_few_of_many_numbers():
+    params = jaxevent.mc.Params()
+    weights = np.asarray(params.choice).tolist()
+    assert f"choice=[{weights[0]:.4g}, " in repr(params) and len(repr(params)) < 800
+    assert f", ... {len(weights)} numbers]" in repr(params)
+    # A change of a number that is not shown is a change.
+    changed = params.replace(choice=[*weights[:-1], weights[-1] + 1])
+    assert repr(changed).startswith("Params(choice=[")

@@ -52,7 +52,15 @@ class HiddenFrames:
         self.white, self.truth = 1 / gain, linear / gain
 
     def errors(self, method: Any, params: Any) -> NDArray[np.float64]:
-        """Return the errors of the predicted frames, intensities clipped to the frames' range."""
+        """Return the errors of the predicted frames, intensities clipped to the frames' range.
+
+        Args:
+            method: The reconstruction method.
+            params: Its parameters.
+
+        Returns:
+            (frames * pixels,) errors, as parts of the frames' white at a gain of 1.
+        """
         late = round(float(params.clock_offset) * 1e6)
         images = method.estimate(self.given, params, progress=False)
         images.is_checked = True  # thresholds that are tried may well be wrong

@@ -8,6 +8,9 @@ A metric is a function `metric(estimate, truth)` of two arrays that returns a nu
 | blob | positions (T, targets, 2) in px, NaN where unknown | every recording |
 | egomotion | components (T, d) of the model, at times that are not lost | every recording |
 
+An attribute says which values are good, so that reports mark the best: `metric.higher_is_better =
+True`, or False.
+
 A method is an `Estimator`, or a function `method(recording, times)` that returns an estimate at
 `times` (T,), int64 us: the mean, or a tuple (mean, covariance) with the shapes of
 `jaxevent.estimator.Estimate`. Of blobs the mean may be positions (T, targets, 2) alone; NaN where
@@ -49,6 +52,12 @@ class Metric:
 
     name: str
     function: Callable[[Any, Any], Any]
+
+    @property
+    def higher_is_better(self) -> bool | None:
+        """Whether higher is better, as an attribute of the function says; None without one."""
+        given = getattr(self.function, "higher_is_better", None)
+        return None if given is None else bool(given)
 
     def __call__(self, estimate: NDArray, truth: NDArray, recording: str) -> float:
         """Compute the metric; raise `InputError` naming metric and recording if it gives no number.
@@ -136,9 +145,16 @@ def named_metric(given: Any, function: Any, name: str | None = None) -> Metric:
     return Metric(name, function)
 
 
-def own_names(metrics: Iterable[Metric]) -> dict[str, list[str]]:
-    """Return the entry of a row that names the user's metrics; empty without any."""
-    names = [metric.name for metric in metrics]
+def own_names(metrics: Iterable[Metric]) -> dict[str, dict[str, bool | None]]:
+    """Return the entry of a row that names the user's metrics; empty without any.
+
+    Args:
+        metrics: The user's metrics.
+
+    Returns:
+        Under "own_metrics", for each name whether higher is better; None where it is not known.
+    """
+    names = {metric.name: metric.higher_is_better for metric in metrics}
     return {"own_metrics": names} if names else {}
 
 

@@ -37,7 +37,7 @@ MIN_LOG_CHANGE = 0.01  # of ln(1 + I), a tenth of a threshold; smaller ones do n
 
 
 def display_limits(
-    images: ArrayLike, how: str = "linear", variance: ArrayLike | None = None
+    images: ArrayLike, tone: str = "linear", variance: ArrayLike | None = None
 ) -> tuple[float, float]:
     """Compute the intensities shown as black and as white.
 
@@ -51,7 +51,7 @@ def display_limits(
 
     Args:
         images: A sample (..., height, width) of the images, floats.
-        how: The tone.
+        tone: The tone.
         variance: Variances of the logarithms, of the images' shape; used by "relative" alone.
 
     Returns:
@@ -60,24 +60,24 @@ def display_limits(
     Raises:
         InputError: The tone is unknown, or the images are not floats or hold NaN.
     """
-    images, logarithmic = _clip_infinite(images), _is_logarithmic(how)
-    if how == "linear":
+    images, logarithmic = _clip_infinite(images), _is_logarithmic(tone)
+    if tone == "linear":
         return 0.0, 1.0
-    if how == "changes":
-        size = np.abs(_to_tone_scale(images.astype(np.float64), how))
+    if tone == "changes":
+        size = np.abs(_to_tone_scale(images.astype(np.float64), tone))
         size = size[size > MIN_LOG_CHANGE]
         most = float(np.percentile(size, 95)) if len(size) else 1.0
         return math.expm1(-most), math.expm1(most)
-    if how == "display":
+    if tone == "display":
         return 0.0, _bright(images)
     values = images[images > 0] if logarithmic else images.ravel()
     if not len(values):
         return (2.0**-MAX_OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
-    rare = 1.0 if how == "relative" else 0.5
+    rare = 1.0 if tone == "relative" else 0.5
     low, high = np.percentile(values.astype(np.float64), [rare, 100 - rare]).tolist()
     if logarithmic:
         low = max(low, high * 2.0**-MAX_OCTAVES)
-        if how == "relative" and np.isfinite(variance := _fill_unknown(variance, images)).any():
+        if tone == "relative" and np.isfinite(variance := _fill_unknown(variance, images)).any():
             apart = FADE_SPAN * math.sqrt(np.median(variance[np.isfinite(variance)]))
             more = math.exp(max(apart - math.log(high / low), 0.0) / 2)
             low, high = low / more, high * more
@@ -87,7 +87,7 @@ def display_limits(
 
 def tone_map(
     images: ArrayLike,
-    how: str = "linear",
+    tone: str = "linear",
     limits: tuple[float | int, float | int] | None = None,
     variance: ArrayLike | None = None,
 ) -> NDArray[np.uint8]:
@@ -104,7 +104,7 @@ def tone_map(
 
     Args:
         images: (..., height, width) linear intensity, floats.
-        how: The tone.
+        tone: The tone.
         limits: Intensities of black and white; by default `display_limits` of these images.
         variance: Variances of the logarithms, of the images' shape; used by "relative" alone.
 
@@ -115,22 +115,22 @@ def tone_map(
         InputError: The tone is unknown, the images are not floats or hold NaN, or the limits are
             out of order or, with a logarithm, not positive.
     """
-    images, logarithmic = _clip_infinite(images), _is_logarithmic(how)
-    low, high = limits or display_limits(images, how, variance)
+    images, logarithmic = _clip_infinite(images), _is_logarithmic(tone)
+    low, high = limits or display_limits(images, tone, variance)
     if not (-math.inf < low < high < math.inf) or (logarithmic and low <= 0):
         raise InputError(
-            f"the display limits {low} and {high} do not suit the tone {how!r}; give two finite"
+            f"the display limits {low} and {high} do not suit the tone {tone!r}; give two finite"
             f"{' positive' if logarithmic else ''} intensities, black below white"
         )
-    shown = _to_tone_scale(np.clip(images, low, high), how)
-    low, high = _to_tone_scale(np.array([low, high]), how).tolist()
+    shown = _to_tone_scale(np.clip(images, low, high), tone)
+    low, high = _to_tone_scale(np.array([low, high]), tone).tolist()
     shown = np.clip((shown - low) / (high - low), 0, 1)
-    if how == "relative":
+    if tone == "relative":
         quarter = math.log(2) * (high - low) / FADE_SPAN
         shown = 0.5 + (shown - 0.5) / (1 + _fill_unknown(variance, images) / quarter**2)
-    if how == "clahe":
+    if tone == "clahe":
         shown = _equalise(shown)
-    if how == "display":
+    if tone == "display":
         shown = np.where(shown < 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
     return np.rint(shown * 255).astype(np.uint8)
 
@@ -149,11 +149,11 @@ def _clip_infinite(images: ArrayLike) -> NDArray[np.floating]:
     return checked(images, "images")
 
 
-def _to_tone_scale(intensity: NDArray[np.floating], how: str) -> NDArray[np.floating]:
+def _to_tone_scale(intensity: NDArray[np.floating], tone: str) -> NDArray[np.floating]:
     """Return the quantity that a tone shows linearly."""
-    if how == "changes":
+    if tone == "changes":
         return np.log1p(np.maximum(intensity, 2.0**-MAX_OCTAVES - 1))
-    return np.log2(intensity) if _is_logarithmic(how) else intensity
+    return np.log2(intensity) if _is_logarithmic(tone) else intensity
 
 
 def _fill_unknown(variance: ArrayLike | None, images: NDArray) -> NDArray[np.floating]:
@@ -162,11 +162,11 @@ def _fill_unknown(variance: ArrayLike | None, images: NDArray) -> NDArray[np.flo
     return np.where(np.isnan(given), 0.0, np.broadcast_to(given, images.shape))
 
 
-def _is_logarithmic(how: str) -> bool:
+def _is_logarithmic(tone: str) -> bool:
     """Return whether a tone scales logarithms; raise `InputError` if it is unknown."""
-    if how not in get_args(Tone):
-        raise InputError(f"there is no tone {how!r}; choose one of {', '.join(get_args(Tone))}")
-    return how in ("log", "clahe", "relative")
+    if tone not in get_args(Tone):
+        raise InputError(f"there is no tone {tone!r}; choose one of {', '.join(get_args(Tone))}")
+    return tone in ("log", "clahe", "relative")
 
 
 def _equalise(images: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -228,21 +228,32 @@ def _failures(
     return parts
 
 
+def _own_metrics(rows: Sequence[Mapping[str, Any]]) -> dict[str, bool | None]:
+    """Return for each metric of the user's own whether higher is better, None if not known."""
+    return {name: higher for row in rows for name, higher in row.get("own_metrics", {}).items()}
+
+
+def _higher_is_better(measure: str, own: Mapping[str, bool | None]) -> bool | None:
+    """Return whether higher is better; None of a metric that does not say it."""
+    return own.get(measure, measure in HIGHER_IS_BETTER)
+
+
 def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
     """Tabulate the means of each method, the best of every measure marked.
 
-    Metrics of the user's own are not marked, as it is not known whether more of them is better.
+    Metrics of the user's own are marked where they say whether higher is better.
     """
     found = means(rows)
     measures = [column for column in columns if column[1] in found[0]]
-    unmarked = COST_COLUMNS.union(*(row.get("own_metrics", ()) for row in rows))
+    own = _own_metrics(rows)
+    unmarked = COST_COLUMNS.union(name for name, higher in own.items() if higher is None)
     most = max(one["recordings"] for one in found)
     best = {}
     for _, place, _, _ in measures:
         values = [one[place] for one in found if one["recordings"] == most]
         values = [value for value in values if value is not None]
         if len(values) > 1 and place not in unmarked:
-            best[place] = (max if place in HIGHER_IS_BETTER else min)(values)
+            best[place] = (max if _higher_is_better(place, own) else min)(values)
     lines = []
     several = len({row["recording"] for row in rows}) > 1
     for one in found:
@@ -391,9 +402,9 @@ def _rounded(values: Any) -> Any:
     return [float(f"{one:.5g}") if math.isfinite(one) else None for one in values]
 
 
-def _is_logarithmic(measure: str, own: Collection[str], values: NDArray[np.float64]) -> bool:
+def _is_logarithmic(higher_is_better: bool | None, values: NDArray[np.float64]) -> bool:
     """Return whether a plot of an error needs a logarithmic scale."""
-    if measure in HIGHER_IS_BETTER or measure in own or not len(values):
+    if higher_is_better is not False or not len(values):
         return False
     return bool(values.min() > 0 and values.max() > MIN_LOG_RATIO * values.min())
 
@@ -406,7 +417,7 @@ def _spreads(
     A box reaches from the first to the third quartile, whiskers to the last value within 1.5 times
     the box's length. The mean is that of the table, in the table's unit.
     """
-    own = {name for row in rows for name in row.get("own_metrics", ())}
+    own = _own_metrics(rows)
     places = {place for _, place, _, _ in COLUMNS}
     further = [name for row in rows for name in _series(row) if name in places or name in own]
     spreads = []
@@ -437,11 +448,12 @@ def _spreads(
                 box |= {"far": _rounded(far)}
         if not every:
             continue
-        better = "" if measure in own else f", {HIGHER if measure in HIGHER_IS_BETTER else LOWER}"
+        higher = _higher_is_better(measure, own)
+        better = "" if higher is None else f", {HIGHER if higher else LOWER}"
         spreads.append(
             {
                 "title": column[0] + better,
-                "log": _is_logarithmic(measure, own, np.concatenate(every)),
+                "log": _is_logarithmic(higher, np.concatenate(every)),
                 "boxes": boxes,
             }
         )
@@ -472,7 +484,7 @@ def _curves(
         return None
     return {
         "title": title,
-        "log": _is_logarithmic(measure, (), np.concatenate(every)),
+        "log": _is_logarithmic(_higher_is_better(measure, {}), np.concatenate(every)),
         "lines": lines,
     }
 

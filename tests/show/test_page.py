@@ -53,6 +53,31 @@ def report() -> str:
     return page(rows, pictures, "held-out", "recordings = []\n", ["here"], title)
 
 
+@pytest.mark.parametrize(
+    ("higher", "marked", "title"),
+    [
+        (True, ["0.9000"], ", higher is better"),
+        (False, ["0.2000"], ", lower is better"),
+        (None, [], ""),
+    ],
+)
+def test_the_best_of_an_own_metric_is_marked_if_it_says_which(higher, marked, title):
+    row = {"recording": "a", "params": {}, "frames": 1, "events": 9, "seconds": 1.0}
+    rows = [
+        {
+            **row,
+            "method": name,
+            "gain": gain,
+            "own_metrics": {"gain": higher},
+            "per_frame": {"t": [0], "gain": [gain]},
+        }
+        for name, gain in (("akf", 0.2), ("cf", 0.9))
+    ]
+    text = page(rows, [None, None], "held-out", "", [], "gain")
+    assert re.findall(r'class="?best"?>([^<]*)<', text) == marked
+    assert f'"title":"gain{title}"' in text
+
+
 @pytest.fixture(scope="module")
 def path(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("page") / "report.html"
