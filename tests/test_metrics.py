@@ -20,11 +20,12 @@ from jaxevent.metrics import (
     masked_mse,
     matlab_ssim,
     mse,
+    psnr,
     regions,
     ssim,
 )
 
-MEASURES = [mse, ssim, log_mse, log_ssim, global_ssim]
+MEASURES = [mse, psnr, ssim, log_mse, log_ssim, global_ssim]
 
 
 def slow_ssim(image, truth):
@@ -73,6 +74,7 @@ def test_mse_in_closed_form():
     truth = np.zeros((2, 3, 4, 5))
     image = truth + np.arange(6).reshape(2, 3, 1, 1) / 10
     np.testing.assert_allclose(mse(image, truth), np.arange(6).reshape(2, 3) ** 2 / 100)
+    np.testing.assert_allclose(psnr(image[0, 1:], truth[0, 1:]), [20, 20 - 10 * np.log10(4)])
     # A ramp against its mean has the variance (n^2 - 1) / 12 of n equal steps.
     ramp = np.broadcast_to(np.arange(9.0), (4, 9))
     np.testing.assert_allclose(mse(ramp, np.full((4, 9), 4.0)), (9**2 - 1) / 12)
@@ -91,7 +93,8 @@ def test_each_image_counts_by_itself(measure):
 
 
 @pytest.mark.parametrize(
-    "measure, best", [(mse, 0.0), (ssim, 1.0), (log_mse, 0.0), (log_ssim, 1.0), (global_ssim, 1.0)]
+    "measure, best",
+    [(mse, 0.0), (psnr, 120.0), (ssim, 1.0), (log_mse, 0.0), (log_ssim, 1.0), (global_ssim, 1.0)],
 )
 def test_identical_images_are_best(measure, best):
     image, truth = pairs(2)

@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
         metavar="NAME",
         nargs="+",
         default=[],
-        help="metrics in addition to the file's: for images lpips, hdr_quality, global_ssim, "
+        help="metrics in addition to the file's: for images psnr, lpips, hdr_quality, global_ssim, "
         "matlab_ssim (MATLAB's), authors_ssim and masked_mse (of the AKF's authors), or "
         "your own: package.module:function",
     )

@@ -26,6 +26,7 @@ from jaxevent.metrics import (
     masked_mse,
     matlab_ssim,
     mse,
+    psnr,
     regions,
     ssim,
 )
@@ -63,6 +64,7 @@ from jaxevent.show.page import spread_rows
 # Further measures of an image and the truth, each a number per image; the first two need an extra.
 # Where an HDR reference has no value both images are 0, which is all that the authors' error needs.
 MEASURE_FUNCTIONS: dict[str, Callable[..., NDArray[np.float64]]] = {
+    "psnr": psnr,
     "lpips": lpips,
     "hdr_quality": hdr_quality,
     "global_ssim": global_ssim,

@@ -47,8 +47,8 @@ HIGHER, LOWER = "higher is better", "lower is better"
 # Errors shown in full colour: of intensity, and of ln(I + 0.003) against an HDR reference.
 FULL_SCALE_ERROR = {False: 0.1, True: 1.0}
 HIGHER_IS_BETTER = {  # of these more is better
-    "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "covered",
-    "mota", "idf1", "hota",
+    "ssim", "log_ssim", "global_ssim", "authors_ssim", "matlab_ssim", "hdr_quality", "psnr",
+    "covered", "mota", "idf1", "hota",
 }  # fmt: skip
 
 

@@ -26,6 +26,7 @@ COLUMNS: list[Column] = [
     ("well MSE x 1e-2", "regions.well.mse", 100, 3),
     ("moving MSE x 1e-2", "moving.mse", 100, 3),
     ("moving share", "moving.share", 1, 4),
+    ("PSNR dB", "psnr", 1, 2),
     ("LPIPS", "lpips", 1, 3),
     ("JOD", "hdr_quality", 1, 2),
     ("global SSIM", "global_ssim", 1, 3),
