@@ -75,6 +75,13 @@ class Estimate(ShortRepr):
     covariance: Any
     valid: Any
 
+    @property
+    def variance(self) -> Any:
+        """Variances of the mean's numbers, of its shape: the covariance's diagonal."""
+        if np.ndim(self.covariance) == np.ndim(self.mean):
+            return self.covariance
+        return self.covariance.diagonal(axis1=-2, axis2=-1)
+
     def __iter__(self) -> Iterator[Any]:
         return iter((self.mean, self.covariance, self.valid))
 

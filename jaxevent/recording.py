@@ -564,7 +564,9 @@ def _integer_times(values: Any, what: str) -> NDArray[np.int64]:
     return arrays.as_times(t, what)
 
 
-def _set_rows(part: Any, what: str, **columns: tuple[tuple[int, ...], Any]) -> None:
+def _set_rows(
+    part: Any, what: str, may_be_nan: str | None = None, **columns: tuple[tuple[int, ...], Any]
+) -> None:
     """Set checked times and, by name, columns of a shape per row and a type; or `InputError`."""
     t = _integer_times(part.t, f"{what}: t")
     row = arrays.first_decrease(t)
@@ -577,7 +579,10 @@ def _set_rows(part: Any, what: str, **columns: tuple[tuple[int, ...], Any]) -> N
         values = arrays.as_array(getattr(part, name), f"{what}: {name}")
         wanted = (len(t), *shape)
         kept = values.astype(kind) if np.isfinite(values).all() else values
-        if values.shape != wanted or not (kept == values).all():
+        known = kept == values
+        if name == may_be_nan and values.dtype.kind == "f":
+            known |= np.isnan(values)
+        if values.shape != wanted or not known.all():
             raise InputError(
                 f"{what}: {name} is {values.dtype} of shape {values.shape}; it must be finite "
                 f"{np.dtype(kind)} of shape {wanted}, one row for each of {len(t)} times"
@@ -611,13 +616,18 @@ class Poses(_TimedRows):
 
 @dataclasses.dataclass(frozen=True)
 class Imu(_TimedRows):
-    """Inertial measurements: t (us), gyro (samples, 3) in rad/s, acc (samples, 3) in m/s^2."""
+    """Inertial measurements: t (us), gyro (samples, 3) in rad/s, acc (samples, 3) in m/s^2.
+
+    The acceleration may be left out, and is NaN where it was not measured.
+    """
 
     gyro: NDArray[np.float64]
-    acc: NDArray[np.float64]
+    acc: NDArray[np.float64] | None = None
 
     def __post_init__(self):
-        _set_rows(self, "IMU", gyro=((3,), np.float64), acc=((3,), np.float64))
+        if self.acc is None:
+            object.__setattr__(self, "acc", np.full(np.shape(self.gyro), np.nan))
+        _set_rows(self, "IMU", "acc", gyro=((3,), np.float64), acc=((3,), np.float64))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -117,6 +117,10 @@ def test_an_estimate_is_the_tuple_of_its_fields():
         assert part is other
     with pytest.raises(IndexError):
         one[3]
+    assert one.variance is one.covariance  # of images
+    covariance = np.arange(18.0).reshape(2, 3, 3)
+    motion = Estimate(np.zeros((2, 3)), covariance, np.ones(2, bool))
+    np.testing.assert_array_equal(motion.variance, [[0, 4, 8], [9, 13, 17]])
 
 
 def test_methods_show_their_names_and_suggest_one():

@@ -23,7 +23,7 @@ t = np.arange(0, 300_000, 1000)  # us, 1 kHz
 true = np.asarray(camera.twist(t)[1])  # rad/s
 BIAS = np.array([0.03, -0.02, 0.05])
 gyro = true + BIAS + rng.normal(0, 0.05, true.shape)
-recording = dataclasses.replace(recording, imu=Imu(t, gyro, np.zeros_like(gyro)))
+recording = dataclasses.replace(recording, imu=Imu(t, gyro))
 recording
 
 # %% [markdown]

@@ -933,3 +933,17 @@ def test_a_recording_is_shown_in_a_line():
     many = Recording("many", 3, 4, none, extra=dict.fromkeys("abcd", np.zeros(1)))
     assert repr(many) == "<many: 3x4, 0 events, 4 arrays in extra>"
     assert repr(Recording("none", 3, 4, none)) == "<none: 3x4, 0 events>"
+
+
+def test_an_imu_may_lack_its_acceleration(tmp_path):
+    t, gyro = np.arange(3), np.arange(9.0).reshape(3, 3)
+    recording = replace(random_recording(1, 20, 0, False), imu=Imu(t, gyro))
+    assert np.isnan(recording.imu.acc).all()
+    save(recording, tmp_path / "imu.h5")
+    back = io.load(tmp_path / "imu.h5").imu
+    np.testing.assert_array_equal(back.gyro, gyro)
+    assert back.acc.shape == (3, 3) and np.isnan(back.acc).all()
+    with pytest.raises(InputError, match="IMU: gyro is float64 .* must be finite"):
+        Imu(t, gyro * np.nan)
+    with pytest.raises(InputError, match="IMU: acc is float64 of shape .3,."):
+        Imu(t, gyro, np.zeros(3))
