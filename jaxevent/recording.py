@@ -622,7 +622,7 @@ class Imu(_TimedRows):
     """
 
     gyro: NDArray[np.float64]
-    acc: NDArray[np.float64] | None = None
+    acc: NDArray[np.float64] = None  # ty: ignore[invalid-assignment]
 
     def __post_init__(self):
         if self.acc is None:
