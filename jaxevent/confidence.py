@@ -35,7 +35,6 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 from jaxtyping import Array
 from numpy.typing import NDArray
 
@@ -226,11 +225,11 @@ class _Sample:
     @property
     def quantile(self) -> float:
         """Half width of the interval in standard deviations."""
+        from scipy.special import ndtri, stdtrit
+
         tail = 0.5 + CONFIDENCE_LEVEL / 2
         degrees = self.count - max(len(self.at), 1)
-        return float(
-            scipy.special.stdtrit(degrees, tail) if self.robust else scipy.special.ndtri(tail)
-        )
+        return float(stdtrit(degrees, tail) if self.robust else ndtri(tail))
 
     def raw(self, at: NDArray[np.float64]) -> dict[str, Array]:
         """Return the unconstrained numbers at a point, by name."""

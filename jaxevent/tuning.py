@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
@@ -856,8 +855,10 @@ def _search_minimum(
     k = int(np.argmin(losses))
     best = min((losses[k], grid[k]), (objective(value), value))
     if turn:
+        from scipy.optimize import minimize_scalar  # half a second that few runs need
+
         reach, middle = step / 2 ** (turn - 1), min(max(best[1], low), high)
-        found = scipy.optimize.minimize_scalar(
+        found = minimize_scalar(
             objective,
             bounds=(max(low, middle - reach), min(high, middle + reach)),
             method="bounded",
