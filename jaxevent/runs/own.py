@@ -55,7 +55,7 @@ class Metric:
 
     @property
     def higher_is_better(self) -> bool | None:
-        """Whether higher is better, as an attribute of the function says; None without one."""
+        """True if higher is better, as an attribute of the function says; None without one."""
         given = getattr(self.function, "higher_is_better", None)
         return None if given is None else bool(given)
 
