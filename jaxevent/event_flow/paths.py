@@ -16,7 +16,8 @@ def _velocity_at(fields, weight, x, y):
     before, after = fields
     height, width = before.shape[0], before.shape[1]
     zero, one = np.float32(0), np.float32(1)
-    x, y = min(max(x, zero), np.float32(width - 1)), min(max(y, zero), np.float32(height - 1))
+    x, y = x if x > zero else zero, y if y > zero else zero  # 0 of a NaN, too
+    x, y = min(x, np.float32(width - 1)), min(y, np.float32(height - 1))
     i, j = min(np.int32(x), np.int32(width - 2)), min(np.int32(y), np.int32(height - 2))
     fx, fy = x - np.float32(i), y - np.float32(j)
     left, up = np.uint32(i), np.uint32(j)
