@@ -148,8 +148,12 @@ class SignatureFiles:
         except OSError:
             return None
         payload = content[_HASH:]
-        own = hmac.compare_digest(content[:_HASH], self._hash(key, payload))
-        return pickle.loads(payload) if own else None
+        if not hmac.compare_digest(content[:_HASH], self._hash(key, payload)):
+            return None
+        try:
+            return pickle.loads(payload)
+        except ImportError:  # another process compiled it, of a module that is not found here
+            return None
 
     def _path(self, key: Any) -> Path | None:
         """Return the file of a key.

@@ -11,6 +11,16 @@ BLOCK_POINTS = 64  # that pass through a stretch of time one beside the other
 
 
 @njit_fastmath_inlined
+def _interpolate(field, place, part, component):
+    """Return a component of a field in the cell that begins at the node `place` (x, y)."""
+    (x, y), (fx, fy) = place, part
+    right, below, one = x + np.uint32(1), y + np.uint32(1), np.float32(1)
+    first = field[y, x, component] * (one - fx) + field[y, right, component] * fx
+    second = field[below, x, component] * (one - fx) + field[below, right, component] * fx
+    return first * (one - fy) + second * fy
+
+
+@njit_fastmath_inlined
 def _velocity_at(fields, weight, x, y):
     """Return the velocity at coordinates of nodes, bilinear, between two fields."""
     before, after = fields
@@ -20,34 +30,10 @@ def _velocity_at(fields, weight, x, y):
     x, y = min(x, np.float32(width - 1)), min(y, np.float32(height - 1))
     i, j = min(np.int32(x), np.int32(width - 2)), min(np.int32(y), np.int32(height - 2))
     fx, fy = x - np.float32(i), y - np.float32(j)
-    left, up = np.uint32(i), np.uint32(j)
-    right, down = left + np.uint32(1), up + np.uint32(1)
-    a, b, c, d = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
+    place, part = (np.uint32(i), np.uint32(j)), (fx, fy)
     early = one - weight
-    u = early * (
-        a * before[up, left, 0]
-        + b * before[up, right, 0]
-        + c * before[down, left, 0]
-        + d * before[down, right, 0]
-    )
-    u += weight * (
-        a * after[up, left, 0]
-        + b * after[up, right, 0]
-        + c * after[down, left, 0]
-        + d * after[down, right, 0]
-    )
-    v = early * (
-        a * before[up, left, 1]
-        + b * before[up, right, 1]
-        + c * before[down, left, 1]
-        + d * before[down, right, 1]
-    )
-    v += weight * (
-        a * after[up, left, 1]
-        + b * after[up, right, 1]
-        + c * after[down, left, 1]
-        + d * after[down, right, 1]
-    )
+    u = early * _interpolate(before, place, part, 0) + weight * _interpolate(after, place, part, 0)
+    v = early * _interpolate(before, place, part, 1) + weight * _interpolate(after, place, part, 1)
     return u, v
 
 
