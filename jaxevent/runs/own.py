@@ -296,7 +296,16 @@ def module_hash(path: str) -> str | None:
 
 
 def describe_failure(where: str, error: BaseException, function: Callable[..., Any]) -> str:
-    """Describe an exception of a user's function, with the last line in the function's own file."""
+    """Describe an exception of a user's function, with the last line in the function's own file.
+
+    Args:
+        where: Recording and function, for the beginning of the sentence.
+        error: The exception.
+        function: The user's function.
+
+    Returns:
+        A sentence.
+    """
     lines = traceback.extract_tb(error.__traceback__)[1:]
     file = getattr(getattr(function, "__code__", None), "co_filename", None)
     own = [line for line in lines if line.filename == file] or lines

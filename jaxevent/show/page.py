@@ -484,7 +484,9 @@ def _curves(
         return None
     return {
         "title": title,
-        "log": _is_logarithmic(_higher_is_better(measure, {}), np.concatenate(every)),
+        "log": _is_logarithmic(
+            _higher_is_better(measure, _own_metrics(rows)), np.concatenate(every)
+        ),
         "lines": lines,
     }
 

@@ -145,7 +145,16 @@ def init_near(params: Params, particles: Float[Array, "N d"]) -> ParticleState:
 
 
 def init_uniform(params: Params, model: Model, noise: RandomNumbers) -> Float[Array, "N d"]:
-    """Place the particles (N, d) of a search."""
+    """Place the particles of a search.
+
+    Args:
+        params: Parameters, which hold the range of motions.
+        model: The model of d components.
+        noise: Random numbers of N particles.
+
+    Returns:
+        (N, d) particles.
+    """
     return jax.vmap(functools.partial(model.initial_particle, params))(noise.cloud)
 
 

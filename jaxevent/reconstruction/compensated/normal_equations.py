@@ -190,7 +190,13 @@ class _SampleScratch(NamedTuple):
 
     @classmethod
     def allocate(cls, rows: int, instants: int, width: int) -> "_SampleScratch":
-        """Allocate scratch memory for `run_over_rows`."""
+        """Allocate scratch memory for `run_over_rows`.
+
+        Args:
+            rows: Rows that kernels may begin with.
+            instants: Number of instants, K.
+            width: Width of the images, px.
+        """
         shapes = (instants, width), (2, width)
         return cls(RowScratch.allocate(rows, width), *(row_scratch(rows, *s) for s in shapes))
 

@@ -459,7 +459,13 @@ class _SearchScratch(NamedTuple):
 
     @classmethod
     def allocate(cls, shape: tuple[int, int], instants: int, taps: int) -> "_SearchScratch":
-        """Allocate scratch memory for `run_over_rows`."""
+        """Allocate scratch memory for `run_over_rows`.
+
+        Args:
+            shape: Rows and columns of the points.
+            instants: Number of instants.
+            taps: Length of the blur along a row, px.
+        """
         rows, columns = shape
         return cls(
             RowScratch.allocate(rows, columns),

@@ -75,7 +75,13 @@ class RowScratch(NamedTuple):
 
 @njit_noalloc_inlined
 def gradient_at_pixel(image, y, x):
-    """Return the gradient along x and y at a pixel; five taps, exact up to degree 4."""
+    """Return the gradient along x and y at a pixel; five taps, exact up to degree 4.
+
+    Args:
+        image: (h, w) float32.
+        y: Row of the pixel.
+        x: Its column.
+    """
     h, w = image.shape
     up, down, up2, down2 = max(y - 1, 0), min(y + 1, h - 1), max(y - 2, 0), min(y + 2, h - 1)
     left, right, left2, right2 = max(x - 1, 0), min(x + 1, w - 1), max(x - 2, 0), min(x + 2, w - 1)
@@ -86,7 +92,16 @@ def gradient_at_pixel(image, y, x):
 
 
 def pad_edges(images: Array, axis: int, n_pixels: int) -> Array:
-    """Pad images by `n_pixels` copies of the border at both ends of an axis."""
+    """Pad images by copies of the border.
+
+    Args:
+        images: Images.
+        axis: The axis that becomes longer.
+        n_pixels: Copies at each of its ends.
+
+    Returns:
+        The padded images.
+    """
     widths = [(0, 0)] * images.ndim
     widths[axis] = (n_pixels, n_pixels)
     return jnp.pad(images, widths, mode="edge")
@@ -105,7 +120,14 @@ def gradient_jax(images: Array) -> tuple[Array, Array]:
 
 @njit_noalloc_inlined
 def bilinear_cell(X, Y, h, w):
-    """Return the four pixels around a point, or at the border: x0, y0, x1, y1, and fx, fy in it."""
+    """Return the four pixels around a point, or at the border: x0, y0, x1, y1, and fx, fy in it.
+
+    Args:
+        X: Column of the point, px.
+        Y: Its row, px.
+        h: Height of the image, px.
+        w: Its width, px.
+    """
     zero = np.float32(0)
     X = min(max(X, zero), np.float32(w - 1))
     Y = min(max(Y, zero), np.float32(h - 1))
@@ -123,7 +145,13 @@ def bilinear_weights(fx, fy):
 
 @njit_noalloc_inlined
 def blend_nodes(p, cell, out_path):
-    """Write the four numbers of a path between the nodes (rows, columns, 4) of a cell."""
+    """Write the four numbers of a path between the nodes of a cell.
+
+    Args:
+        p: (rows, columns, 4) paths of nodes.
+        cell: Column and row of the first node and of the last, and x and y (0..1) between them.
+        out_path: (4,) output.
+    """
     j, i, j1, i1, fx, fy = cell
     for c in range(4):
         top = p[i, j, c] + fx * (p[i, j1, c] - p[i, j, c])
@@ -133,7 +161,14 @@ def blend_nodes(p, cell, out_path):
 
 @njit_noalloc_inlined
 def interpolate_path(p, node_y, node_x, out_path):
-    """Write the path at a place between nodes, which is given in units of nodes."""
+    """Write the path at a place between nodes.
+
+    Args:
+        p: (rows, columns, 4) paths of nodes.
+        node_y: Row of the place, in nodes.
+        node_x: Its column, in nodes.
+        out_path: (4,) output.
+    """
     rows, columns, _ = p.shape
     node_y = min(max(node_y, np.float32(0)), np.float32(rows - 1))
     node_x = min(max(node_x, np.float32(0)), np.float32(columns - 1))
@@ -187,7 +222,16 @@ def resize_nodes(
 
 
 def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
-    """Interpolate the paths of nodes to all pixels, as `interpolate_paths` does."""
+    """Interpolate the paths of nodes to all pixels, as `interpolate_paths` does.
+
+    Args:
+        p: (rows, columns, 4) paths of nodes, px.
+        height: Height of the image, px.
+        width: Its width, px.
+
+    Returns:
+        (height, width, 4) paths of pixels, px.
+    """
     Y = jnp.broadcast_to(jnp.arange(height)[:, None] / 2 - 0.25, (4, height, width))
     X = jnp.broadcast_to(jnp.arange(width) / 2 - 0.25, (4, height, width))
     return jnp.moveaxis(sample_bilinear(jnp.moveaxis(p, -1, 0), Y, X), 0, -1)
@@ -197,8 +241,13 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
 def locate_points(y, times, k, image_shape, n_points, scratch_row):
     """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
 
-    `times` are `PathTimes`, and k is the instant's index. `scratch_row` holds the parts of a
-    `RowScratch` for one row.
+    Args:
+        y: The row, px.
+        times: `PathTimes`.
+        k: Index of the instant.
+        image_shape: Height and width of the image, px.
+        n_points: Number of points.
+        scratch_row: The parts of a `RowScratch` for one row.
     """
     h, w = image_shape
     s, common_x, common_y = times.s[k], times.common[k, 0], times.common[k, 1]
@@ -340,7 +389,16 @@ def path_positions(paths: Array, times: PathTimes) -> tuple[Array, Array]:
 
 
 def sample_bilinear(images: Array, Y: Array, X: Array) -> Array:
-    """Read images (K, h, w) at the points Y and X (K, ...) of each, bilinear; differentiable."""
+    """Read images at points of their own, bilinear; differentiable.
+
+    Args:
+        images: (K, h, w).
+        Y: (K, h', w') rows of the points, px.
+        X: (K, h', w') their columns, px.
+
+    Returns:
+        (K, h', w').
+    """
     _, h, w = images.shape
     y0, x0, fy, fx = _locate_cells(h, w, Y, X)
     y1, x1 = y0 + (h > 1), x0 + (w > 1)
@@ -368,14 +426,32 @@ def _take(images: Array, y: Array, x: Array) -> Array:
 
 
 def is_in_image(Y: Array, X: Array, height: int, width: int) -> Array:
-    """Return which points lie in an image of that size."""
+    """Return which points lie in an image.
+
+    Args:
+        Y: Rows of the points, px.
+        X: Their columns, px.
+        height: Height of the image, px.
+        width: Its width, px.
+    """
     return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
 
 
 def warp_images_jax(
     L: Array, V: Array, clear: Array, times: PathTimes, paths: Array
 ) -> WarpedImages:
-    """Read images along the paths of pixels, as `warp` does; differentiable."""
+    """Read images along the paths of pixels, as `warp_images` does; differentiable.
+
+    Args:
+        L: (K, h, w) log intensity.
+        V: (K, h, w) its variance, (ln I)^2.
+        clear: (K, h, w) 1 where a frame shows the pixel unclipped.
+        times: Their K times.
+        paths: (h, w, 4), px.
+
+    Returns:
+        The images at the target's points.
+    """
     _, h, w = L.shape
     Y, X = path_positions(paths, times)
     inside = is_in_image(Y, X, h, w)

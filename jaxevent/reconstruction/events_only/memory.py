@@ -328,7 +328,14 @@ class Windows(Protocol):
         ...
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> Paths:
-        """Return the paths between two times (us) towards `at`, by events up to `until`."""
+        """Return the paths of points through a window.
+
+        Args:
+            start: Beginning of the window, us.
+            stop: Its end, us.
+            at: Time to which points are carried, us.
+            until: Time of the last event that flow may rest on, us; None: any.
+        """
         ...
 
 
