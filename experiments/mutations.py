@@ -173,8 +173,8 @@ MUTATIONS = (
     Mutation(
         "a file of compiled code is unpickled whoever wrote it",
         "jaxevent/codegen/cache.py",
-        "return pickle.loads(payload) if own else None",
-        "return pickle.loads(payload)",
+        "if not hmac.compare_digest(content[:_HASH], self._hash(key, payload)):",
+        "if not content:",
         "tests/codegen/test_compiled_cache.py -k signed",
     ),
     Mutation(
