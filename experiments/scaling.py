@@ -1,17 +1,21 @@
 """Cost of each family against events, pixels, images, targets and cores, with slopes.
 
     python experiments/scaling.py --out scaling [--only akf aks mc events-only track find voting]
+        [--cores]
 
 CPU seconds of this process, the least of two turns after one that compiles. A slope is that of ln
 CPU seconds over ln size between the two largest sizes: 1 is linear, 0 no cost. All else stays as it
 is while one is changed: random events of `bench_images.stream`; for `mc` and `events-only` the
 packaged recording, with every second or fourth event, or side by side with itself; for motion and
 targets scenes of `jaxevent.simulate`. The busiest thread's part of all CPU seconds bounds the gain
-of more cores.
+of more cores. `--cores` shows the clock's seconds instead, of the largest task of each family's
+first row, in processes that may use one core and two; nothing else may run beside it.
 """
 
 import dataclasses
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -191,12 +195,51 @@ def scaling_bench() -> tuple[dict[str, float], dict[str, float]]:
     return {}, ratios
 
 
+def clock_seconds(family: str) -> float:
+    """Return the seconds of the largest task of a family's first row, the least of three."""
+    *_, task = next(iter(FAMILIES[family]().values())).values()
+    task()
+    best = np.inf
+    for _ in range(3):
+        start = time.perf_counter()
+        task()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def core_row(family: str) -> list[Any]:
+    """Measure a family on one core and on two: the clock's seconds, and their ratio."""
+    seconds = []
+    for n_cores in (1, 2):
+        # Libraries count the cores that they may use when they are imported.
+        code = (
+            "import os; allowed = sorted(os.sched_getaffinity(0)); "
+            f"os.sched_setaffinity(0, allowed[:{n_cores}]); "
+            f"import scaling; print(scaling.clock_seconds({family!r}))"
+        )
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(
+            command, cwd=os.path.dirname(__file__), check=True, stdout=subprocess.PIPE, text=True
+        )
+        seconds.append(float(done.stdout.split()[-1]))
+    row = [family, *seconds, seconds[0] / seconds[1]]
+    print(row, flush=True)
+    return row
+
+
 def main() -> None:
-    options = command_line(__doc__, out=True, parts=FAMILIES).parse_args()
-    rows = [row for family in options.only for row in rows_of(family)]
-    header = ["family", "changed", "sizes", "CPU s", "slope", "gain of cores at most"]
-    text = f"{machine()}\n\n{markdown_table(header, rows, 4)}\n"
-    write_text(options.out / "scaling.md", text)
+    parser = command_line(__doc__, out=True, parts=FAMILIES)
+    parser.add_argument("--cores", action="store_true", help="the clock on one core and on two")
+    options = parser.parse_args()
+    if options.cores:
+        rows = [core_row(family) for family in options.only]
+        table = markdown_table(["family", "s, one core", "s, two cores", "ratio"], rows)
+    else:
+        rows = [row for family in options.only for row in rows_of(family)]
+        header = ["family", "changed", "sizes", "CPU s", "slope", "gain of cores at most"]
+        table = markdown_table(header, rows, 4)
+    text = f"{machine()}\n\n{table}\n"
+    write_text(options.out / ("cores.md" if options.cores else "scaling.md"), text)
     print(text)
 
 
