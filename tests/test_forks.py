@@ -56,6 +56,25 @@ def test_rows_are_divided_among_new_threads(monkeypatch):
         np.testing.assert_array_equal(out, np.arange(64))
 
 
+def test_items_that_threads_of_the_parent_were_to_compute(monkeypatch):
+    monkeypatch.setattr(codegen, "N_THREADS", 2)
+    allowed = threading.Event()
+
+    def square(k):
+        assert k == 0 or allowed.wait(60)
+        return k * k
+
+    found = codegen.map_ahead(square, range(6))
+    assert next(found) == 0
+
+    def rest():
+        allowed.set()
+        return list(found)
+
+    assert in_child(rest) == [1, 4, 9, 16, 25]
+    assert rest() == [1, 4, 9, 16, 25]
+
+
 @pytest.mark.slow
 def test_tracks():
     recording = texture.moving()[0.0:0.08]

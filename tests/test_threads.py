@@ -4,6 +4,7 @@ import contextlib
 import copy
 import dataclasses
 import itertools
+import threading
 import time
 
 import formats
@@ -14,8 +15,9 @@ import texture
 from together import THREADS, assert_equal, at_once
 
 import jaxevent
+from jaxevent import codegen
+from jaxevent.codegen import map_ahead, run_over_rows
 from jaxevent.codegen import module as kernel_module
-from jaxevent.codegen import run_over_rows
 from jaxevent.errors import InputError
 from jaxevent.io import decoded
 from jaxevent.reconstruction.engine import filter_loop, filter_program, smoother_program
@@ -40,6 +42,46 @@ RESULTS = [
 @pytest.fixture(autouse=True)
 def precision(float32):
     """As users have it."""
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3])
+def test_an_item_is_made_while_the_one_before_is_computed(cores, monkeypatch):
+    monkeypatch.setattr(codegen, "N_THREADS", cores)
+    made, maker = [], threading.get_ident()
+    later_made = [threading.Event() for _ in range(9)]
+
+    def items():
+        for k in range(9):
+            assert threading.get_ident() == maker
+            made.append(k)
+            later_made[k].set()
+            yield k
+
+    def square(k):
+        if cores > 1 and k < 8:
+            assert later_made[k + 1].wait(60)  # for ever, if nothing were made ahead
+        return k * k
+
+    for k, found in enumerate(map_ahead(square, items())):
+        assert found == k * k
+        assert len(made) == min(k + cores, 9)  # no more are held
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_a_failure_comes_where_its_result_is_due(cores, monkeypatch):
+    monkeypatch.setattr(codegen, "N_THREADS", cores)
+
+    def items():
+        yield from range(4)
+        raise KeyError("items")
+
+    found = map_ahead(lambda k: 1 // (k - 2), items())
+    assert [next(found), next(found)] == [-1, -1]
+    with pytest.raises(ZeroDivisionError):
+        next(found)
+    found = map_ahead(lambda k: k, items())
+    with pytest.raises(KeyError, match="items"):
+        list(found)
 
 
 @pytest.mark.slow

@@ -1,20 +1,24 @@
-"""Compiled loops of the host: numba's decorators, threads over rows, and scratch.
+"""Compiled loops of the host: numba's decorators, threads over rows and items, and scratch.
 
 The other modules of the package compile functions that JAX traces (docs/codegen.md).
 """
 
+import collections
 import functools
 import inspect
 import os
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import cache, support
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 # numba makes two functions more of each. The one for those that call it by its address is left out;
 # without the one for Python a call from there would end the process.
@@ -153,6 +157,56 @@ def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
             job.result()
     finally:
         wait(jobs)  # interrupted, too: what they write is the caller's
+
+
+def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Yield `function(item)` for each item, in order, while later items are made.
+
+    The caller's thread makes the items. Others compute, each one item at a time, so that as many
+    items as there are cores are held.
+
+    Args:
+        function: Function of one item alone; it should release the interpreter's lock.
+        items: The items.
+
+    Yields:
+        The results.
+
+    Raises:
+        Exception: What making an item or the function raises, when its result is due.
+    """
+    process = os.getpid()
+    pool = ThreadPoolExecutor(N_THREADS)
+    pending: collections.deque[tuple[T, Future[R]]] = collections.deque()
+
+    def first_result() -> R:
+        item, future = pending.popleft()
+        # A forked process has none of the threads.
+        return future.result() if os.getpid() == process else function(item)
+
+    rest, failure = iter(items), None
+    try:
+        while True:
+            try:
+                item = next(rest)
+            except StopIteration:
+                break
+            except Exception as error:
+                failure = error
+                break
+            if N_THREADS == 1 or os.getpid() != process:
+                yield from (first_result() for _ in range(len(pending)))
+                yield function(item)
+                continue
+            pending.append((item, pool.submit(function, item)))
+            if len(pending) == N_THREADS:
+                yield first_result()
+        while pending:
+            yield first_result()
+        if failure is not None:
+            raise failure
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 if hasattr(os, "register_at_fork"):  # the threads stay behind

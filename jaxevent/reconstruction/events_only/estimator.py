@@ -123,7 +123,7 @@ class EventsOnly(ImageEstimator[Params]):
             InputError: The recording has no events, or times lie outside it.
         """
         windows, wanted, params = self._open(recording, times, params, extrapolate)
-        solved = [windows(t) for t in wanted.tolist()]
+        solved = list(windows.each(wanted.tolist()))
         equations, _ = self._stack(windows, solved, params)
         scale = IntensityScale.of(solved, float(params.I0))
         return WindowFeatures(equations), PreparedTimes(np.arange(len(wanted)), scale)
@@ -174,7 +174,7 @@ class EventsOnly(ImageEstimator[Params]):
             InputError: As `prepare`.
         """
         windows, wanted, params = self._open(recording, times, params)
-        solved = [windows(t, variance=False, held_out=_choose_held_out) for t in wanted.tolist()]
+        solved = list(windows.each(wanted.tolist(), variance=False, held_out=_choose_held_out))
         return HeldOutEvents(*self._stack(windows, solved, params, _choose_held_out))
 
     def log_likelihood(self, params: Params, features: HeldOutEvents) -> Float[Array, ""]:

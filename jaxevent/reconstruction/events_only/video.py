@@ -101,8 +101,7 @@ class EventsOnlyVideo(ImageSequence[Params]):
         return np.dtype(jnp.result_type(float))
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
-        for n, t in enumerate(times.tolist()):
-            window = self._windows(t)
+        for n, window in enumerate(self._windows.each(times.tolist())):
             scale = IntensityScale.of([window], float(self.params.I0))
             L, P = (v[None].astype(self.dtype) for v in window.solution[:2])
             yield times[n : n + 1], _read_compiled(self.params, L, P, scale)

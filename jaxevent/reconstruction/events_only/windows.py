@@ -1,12 +1,13 @@
 """The windows of a recording's events: equations, and their solutions on the host."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.calibration.event_calibration import calibrate_events
+from jaxevent.codegen import map_ahead
 from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
 from jaxevent.reconstruction.events_only.frames import FrameMeasurements, FrameScale
 from jaxevent.reconstruction.events_only.memory import KeyMemories, fuse
@@ -109,8 +110,6 @@ class WindowSolver:
     ) -> SolvedWindow:
         """Solve for the image at a time.
 
-        A window begins at a key of the memory, and ends at one or, where images are causal, at t.
-
         Args:
             t: Time, us.
             variance: Whether the variance is wanted.
@@ -118,6 +117,33 @@ class WindowSolver:
 
         Returns:
             The window's equations and solution.
+        """
+        return self._set_up(t, held_out).solve(variance)
+
+    def each(
+        self,
+        times: Iterable[int],
+        *,
+        variance: bool = True,
+        held_out: Callable[[Rows], NDArray] | None = None,
+    ) -> Iterator[SolvedWindow]:
+        """Solve for the images at some times, each while the equations of later ones are set up.
+
+        Args:
+            times: Times, us.
+            variance: Whether the variances are wanted.
+            held_out: Chooses rows (booleans) that the solutions do not see.
+
+        Yields:
+            The windows' equations and solutions.
+        """
+        windows = (self._set_up(t, held_out) for t in times)
+        return map_ahead(lambda window: window.solve(variance), windows)
+
+    def _set_up(self, t: int, held_out: Callable[[Rows], NDArray] | None) -> "_Window":
+        """Set up the equations of the image at a time (us).
+
+        A window begins at a key of the memory, and ends at one or, where images are causal, at t.
         """
         memory, place = self.memory, self.recording.events.index(t)
         ahead = 0 if self.causal else min(self.n_side, len(self.recording.events) - place)
@@ -140,5 +166,18 @@ class WindowSolver:
         if held_out is not None:
             kept = ~held_out(rows)
             seen = rows._replace(**{name: getattr(rows, name)[kept] for name in ROW_COLUMNS})
-        solution = solve(seen, prior, self.numbers, variance=variance)
-        return SolvedWindow(rows, prior, solution, scale)
+        return _Window(rows, seen, prior, scale, self.numbers)
+
+
+class _Window(NamedTuple):
+    """The equations of a window."""
+
+    rows: Rows
+    seen: Rows  # those that the solution sees
+    prior: GradientPrior
+    scale: FrameScale | None
+    params: SolverParams
+
+    def solve(self, variance: bool) -> SolvedWindow:
+        solution = solve(self.seen, self.prior, self.params, variance=variance)
+        return SolvedWindow(self.rows, self.prior, solution, self.scale)
