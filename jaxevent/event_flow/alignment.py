@@ -327,15 +327,17 @@ class Clock(NamedTuple):
             s = np.cumsum(np.concatenate([[0.0], steps[:k], np.zeros(n), -steps[k + 1 :]]))
             yield Clock(t, s - np.interp(at, t, s)), (self.t[k] + self.t[k + 1]) / 2
 
-    def rate(self, t: float) -> tuple[float, float]:
-        """Return how fast s goes at a time (us), 1/s, and the variance of that, 1/s^2."""
+    def rates(self) -> NDArray[np.float64]:
+        """Return how fast s goes at the times of the clock.
+
+        Returns:
+            (2, K) the rate, 1/s, and its variance, 1/s^2.
+        """
         order = 1 if len(self.t) < 3 else 2
-        rates = np.gradient(self.s, self.t, edge_order=order)
+        rates = 1e6 * np.gradient(self.s, self.t, edge_order=order)
         # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
         smooth = _smooth(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
-        variance = _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))
-        rate, spread = (float(np.interp(t, self.t, one)) for one in (smooth, variance))
-        return rate * 1e6, spread * 1e12
+        return np.stack([smooth, _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))])
 
 
 class WindowEvents(NamedTuple):

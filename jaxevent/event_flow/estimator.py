@@ -53,11 +53,12 @@ class Anchor(NamedTuple):
     row: int  # of the event there
     t: int  # us
     aligned: Displacement
+    rates: NDArray[np.float64]  # (2, K) of its clock, and their variances
 
     @property
     def rate(self) -> float:
         """Displacements per second, less than 0 where the clock runs backwards."""
-        return self.aligned.clock.rate(self.t)[0]
+        return float(np.interp(self.t, self.aligned.clock.t, self.rates[0]))
 
 
 class Chain(NamedTuple):
@@ -141,7 +142,7 @@ class EventFlow:
                 other, clock, start = tried[int(np.argmax(scores))]
                 again = self._align(other, clock, at, start, cells, True)
                 found = max(found, again, key=lambda one: one.score)
-        return Anchor(row, at, found)
+        return Anchor(row, at, found, found.clock.rates())
 
     def _make_chain(self, number: int) -> Chain:
         return self._seek(number * CHAIN_WINDOWS * self._base)
@@ -205,22 +206,21 @@ class EventFlow:
         self, anchors: list[Anchor], knots: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return velocity and covariance of all nodes at some times (us)."""
-        velocity = np.zeros((len(knots), *self._align.nodes, 2))
-        covariance = np.zeros((*velocity.shape, 2))
         if not anchors:
-            covariance[:] = UNKNOWN_VARIANCE * np.eye(2)
-        times, stamps = [anchor.t for anchor in anchors], knots.tolist()
-        for anchor, one in zip(anchors, np.eye(len(anchors)), strict=True):
-            weights = np.interp(stamps, times, one)
-            spread = anchor.aligned.covariance * anchor.rate**2
-            for n in np.flatnonzero(weights > 0).tolist():
-                u = anchor.aligned.u
-                rate, variance = anchor.aligned.clock.rate(stamps[n])
-                velocity[n] += weights[n] * rate * u
-                covariance[n] += weights[n] * (
-                    spread + variance * u[..., :, None] * u[..., None, :]
-                )
-        return velocity, covariance
+            velocity = np.zeros((len(knots), *self._align.nodes, 2))
+            return velocity, np.broadcast_to(UNKNOWN_VARIANCE * np.eye(2), (*velocity.shape, 2))
+        times, own = [anchor.t for anchor in anchors], np.eye(len(anchors))
+        weights = np.array([np.interp(knots, times, one) for one in own])
+        rates, variances = (
+            np.array([np.interp(knots, a.aligned.clock.t, a.rates[k]) for a in anchors])
+            for k in range(2)
+        )
+        u = np.stack([anchor.aligned.u for anchor in anchors])
+        spread = np.stack([anchor.aligned.covariance * anchor.rate**2 for anchor in anchors])
+        squares = u[..., :, None] * u[..., None, :]
+        covariance = np.tensordot(weights, spread, (0, 0))
+        covariance += np.tensordot(weights * variances, squares, (0, 0))
+        return np.tensordot(weights * rates, u, (0, 0)), covariance
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
         """Return the paths of the points that events of a window saw.

@@ -15,6 +15,7 @@ class Translation:
     """Paths of points that move with one velocity, px/s, towards the time 0."""
 
     covariance = None
+    spacing = 1.0
 
     def __init__(self, velocity):
         self.velocity = velocity

@@ -27,6 +27,7 @@ class Turning:
     """Motion of the whole image: a `Paths` towards the time `at` and a `FlowSource`."""
 
     covariance = None  # the paths are known
+    spacing = 1.0
 
     def __init__(self, at=0):
         self.at = at

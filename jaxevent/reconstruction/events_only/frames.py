@@ -18,7 +18,7 @@ from scipy.ndimage import map_coordinates
 from jaxevent.event_flow import WindowPaths
 from jaxevent.reconstruction.events_only.memory import MemoryParams, carry
 from jaxevent.reconstruction.events_only.prior import GradientPrior
-from jaxevent.reconstruction.events_only.rows import EVENT, Rows
+from jaxevent.reconstruction.events_only.rows import EVENT, Rows, carry_pixels
 from jaxevent.recording import Recording
 
 PIXEL_NOISE = 0.01  # of intensity, standard deviation
@@ -129,10 +129,8 @@ class FrameMeasurements:
 
 def _sample(F: NDArray, paths: WindowPaths, t: int) -> NDArray[np.float32]:
     """Return an image at the end of paths as seen at their time t, NaN where it is unknown."""
-    y, x = np.indices(F.shape, np.float32).reshape(2, -1)
-    x, y = paths.carry(x, y, np.full(x.size, t, np.int64))
-    moved = map_coordinates(F, [y, x], order=1, mode="constant", cval=np.nan)
-    return moved.reshape(F.shape).astype(np.float32)
+    places = np.moveaxis(carry_pixels(paths, F.shape, t), -1, 0)[::-1]
+    return map_coordinates(F, places, order=1, mode="constant", cval=np.nan).astype(np.float32)
 
 
 def _changes(rows: Rows, F: NDArray[np.float32]) -> tuple[NDArray, NDArray]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior
-from jaxevent.reconstruction.events_only.rows import EVENT, Paths, Rows
+from jaxevent.reconstruction.events_only.rows import EVENT, Paths, Rows, carry_pixels
 from jaxevent.reconstruction.events_only.silence import explained_share
 from jaxevent.recording import Events, Recording
 
@@ -241,11 +241,9 @@ def carry(
     Returns:
         The memory at the new time. What was outside the image is not known.
     """
-    shape = memory.gradient.shape[:2]
-    y, x = np.indices(shape, np.float32).reshape(2, -1)
-    x, y = (v.reshape(shape) for v in paths.carry(x, y, np.full(x.size, at, np.int64)))
+    places = carry_pixels(paths, memory.gradient.shape[:2], at)
     out = GradientPrior(np.zeros_like(memory.gradient), np.zeros_like(memory.information))
-    _carry(x, y, memory, (np.float32(noise[0]), np.float32(noise[1])), out)
+    _carry(places, memory, (np.float32(noise[0]), np.float32(noise[1])), out)
     return out
 
 
@@ -262,13 +260,13 @@ def _cubic(f):
 
 
 @njit_noalloc
-def _carry(px, py, memory, noise, out):
-    height, width = px.shape
+def _carry(places, memory, noise, out):
+    height, width = places.shape[:2]
     g, L = memory.gradient, memory.information
     q, P = noise
     for row in range(height):
         for column in range(width):
-            x, y = px[row, column], py[row, column]
+            x, y = places[row, column, 0], places[row, column, 1]
             if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
                 continue
             i, j = min(int(x), width - 2), min(int(y), height - 2)
@@ -464,10 +462,7 @@ class KeyMemories:
         height, width = shape = self.windows.shape
         until = self.time(key + side + 2)
         paths = self.windows.paths(min(times), max(times), times[2], until=until)
-        pixels = [v.ravel().astype(np.float32) for v in np.indices(shape)[::-1]]
-        begin, middle = (
-            np.stack(paths.carry(*pixels, np.full(height * width, time)), -1) for time in times[:2]
-        )
+        begin, middle = (carry_pixels(paths, shape, t).reshape(-1, 2) for t in times[:2])
         at_event = np.stack(paths.carry(x.astype(np.float32), y.astype(np.float32), t), -1)
         pixel = y.astype(np.int32) * width + x
         on, off = self.windows.thresholds.reshape(2, -1)

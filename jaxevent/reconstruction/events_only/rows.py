@@ -52,6 +52,11 @@ class Paths(Protocol):
         """Return the covariance of the velocity, (K, height, width, 2, 2), (px/s)^2, or None."""
         ...
 
+    @property
+    def spacing(self) -> float:
+        """Return the distance of the nodes between which velocity is bilinear, px."""
+        ...
+
     def carry(self, x: NDArray, y: NDArray, t: NDArray) -> tuple[NDArray, NDArray]:
         """Return the positions at the target time of what pixels (x, y) see at times t."""
         ...
@@ -68,6 +73,31 @@ class Rows(NamedTuple):
     weight: Float[np.ndarray, " rows"]  # reciprocal variance, against that of a common row
     kind: NDArray[np.uint8]
     pixel: Int32[np.ndarray, " rows"]  # flat index of the pixel x
+
+
+def carry_pixels(
+    paths: Paths, shape: tuple[int, int], t: int
+) -> Float[np.ndarray, "height width 2"]:
+    """Carry all pixels along their paths from one time, between nodes by interpolation.
+
+    Args:
+        paths: Paths towards the target time.
+        shape: (height, width) of the sensor.
+        t: Time at which the pixels are in place, us.
+
+    Returns:
+        Where they are at the target time, x before y, px.
+    """
+    step = max(int(paths.spacing) // 2, 1)
+    y, x = step * np.indices([(n + step - 2) // step + 1 for n in shape], np.float32)
+    there = np.stack(paths.carry(x.ravel(), y.ravel(), np.full(x.size, t)), -1)
+    there = there.astype(np.float32).reshape(*x.shape, 2)
+    for axis in (0, 1) if step > 1 else ():
+        k = np.arange(shape[axis])
+        part = (k % step / np.float32(step)).astype(np.float32).reshape(-1, *[1] * (2 - axis))
+        before, after = there.take(k // step, axis), there.take(-(-k // step), axis)
+        there = before + part * (after - before)
+    return there
 
 
 def make_rows(
@@ -98,9 +128,7 @@ def make_rows(
         (2, height, width),
     )
     threshold = float(c.mean())
-    y, x = np.indices(shape, np.float32).reshape(2, -1)
-    begin = np.stack(paths.carry(x, y, np.full(x.size, span[0])), -1)
-    end = np.stack(paths.carry(x, y, np.full(x.size, span[1])), -1)
+    begin, end = (carry_pixels(paths, shape, t).reshape(-1, 2) for t in span)
     at_event = np.stack(
         paths.carry(events.x.astype(np.float32), events.y.astype(np.float32), events.t), -1
     )
@@ -129,7 +157,7 @@ def make_rows(
     last = np.full(height * width, NONE, np.int32)
     if muted is not None:
         last[muted.ravel()] = MUTED
-    ends = (begin.astype(np.float32), at_event.astype(np.float32), end.astype(np.float32))
+    ends = (begin, at_event.astype(np.float32), end)
     times = (1e-6 * (events.t - span[0]), 1e-6 * (span[1] - span[0]), doubt)
     n = _lay_rows(pixel, change.astype(np.float32), ends, times, last, rows)
     rows = Rows(shape, threshold, *(column[:n] for column in rows[2:]))

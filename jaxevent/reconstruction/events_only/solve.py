@@ -12,10 +12,15 @@ reweighted least squares replace E by the quadratic with
 
     r_k = w_k / (1 + e_k^2 / (2 tail^2)),    s = gradient / (2 (q + edge^2))
 
-for rows, and for each of the four differences of a cell. Conjugate gradients solve its normal
-equations A u = b, preconditioned by the sum of the reciprocal diagonals of P' A P: the columns of P
-are pixels, and blocks of 2, 4, 8, ... pixels a side (Bramble, Pasciak and Xu 1990), so that large
-regions, which only their edges tie together, move as a whole.
+for rows, and for each of the four differences of a cell. Its residual b - A u is minus the gradient
+of E, and a step as long as A says never raises E. So conjugate gradients go on from one set of
+weights to the next, with the directions of Polak and Ribiere (1969).
+
+Directions are preconditioned by the sum of the reciprocal diagonals of P' A P: the columns of P are
+pixels, and bilinear hats on grids of 2, 4, 8, ... pixels (Bramble, Pasciak and Xu 1990), so that
+large regions, which only their edges tie together, move as a whole. A hat is wide against a row's
+displacement d, so that on the grid of 2^l pixels the diagonal is 4^-l of the sum of r_k |d|^2 and
+of the weights of differences around it.
 
 At the solution dE/du = A u - b = 0 with the weights of u itself.
 """
@@ -30,13 +35,15 @@ from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 
-REWEIGHTINGS = 20
-CG_LIMITS = (1e-3, 25)  # relative residual, and iterations
-BLOCK_BITS = 1  # sides of blocks are powers of 2 to this
+REWEIGHTINGS = 40  # at most
+STEPS = 3  # of conjugate gradients with the same weights
+LEAST_CHANGE = 0.002  # of the image by a reweighting, root mean square in thresholds, to go on
+UPDATE_EVERY = 4  # so many reweightings the preconditioner takes the weights; each of the first
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
+SAMPLE_STEPS = 25  # of conjugate gradients for each
 # Chosen on simulated scenes (experiments/studies/events_only.md): how much larger errors are than
 # independent rows and the curvature at the solution say, and what is not known without any row.
-VARIANCE_FACTOR = 1.5
+VARIANCE_FACTOR = 1.15
 UNSEEN_VARIANCE = 25.0  # squared thresholds
 UNSEEN_INFORMATION = 0.13  # of rows about a pixel, in squared thresholds, from which it is seen
 BLUR_PX = 1.5  # of variance and information
@@ -61,39 +68,49 @@ class _System(NamedTuple):
     weight: NDArray[np.float32]
     across: NDArray[np.float32]  # (height, width) weights of differences with the pixel right
     down: NDArray[np.float32]  # and with the pixel below
-    information: NDArray[np.float32]  # (height, width, 3) xx, xy, yy, or without rows if none
+    information: NDArray[np.float32]  # (3, height, width) xx, xy, yy, or without rows if none
+    flux: NDArray[np.float32]  # (2, width), to work in
     leak: np.float32
 
 
 class _ScratchArrays(NamedTuple):
-    images: NDArray[np.float32]  # (5, height, width); the first has the reciprocal diagonal of A
-    reciprocal: NDArray[np.float32]  # of the diagonals of P' A P, one size of blocks after another
-    sums: NDArray[np.float32]  # over blocks
+    images: NDArray[np.float32]  # (6, height, width): reciprocal diagonal, r, that before, p, Ap, z
+    reciprocal: NDArray[np.float32]  # of the diagonals of P' A P, from grid to coarser grid
+    grids: NDArray[np.float32]  # values there
+    line: NDArray[np.float32]  # a row of a grid
 
 
 class _Preconditioner:
-    """Diagonals of pixels and blocks."""
+    """Diagonals of pixels and of coarser grids."""
 
     def __init__(self, system: _System):
-        self.shape = height, width = system.across.shape
-        sizes, bits = [], BLOCK_BITS
-        while 1 << bits < max(height, width):
-            sizes.append((((height - 1) >> bits) + 1) * (((width - 1) >> bits) + 1))
-            bits += BLOCK_BITS
-        images = np.zeros((5, height, width), np.float32)
-        self.arrays = _ScratchArrays(images, *np.zeros((2, sum(sizes)), np.float32))
-        parts = np.split(self.arrays.reciprocal, np.cumsum(sizes))[:-1]
-        self.parts = [images[0].reshape(-1), *parts]
-        self.of_rows = [np.zeros_like(part) for part in self.parts]
-        for k, part in enumerate(self.of_rows):
-            _add_row_diagonal(system, k * BLOCK_BITS, part)
+        shape = height, width = system.across.shape
+        count = 0
+        while max(shape) > 1:
+            shape = (shape[0] + 1) // 2, (shape[1] + 1) // 2
+            count += shape[0] * shape[1]
+        images = np.zeros((6, height, width), np.float32)
+        self.arrays = _ScratchArrays(
+            images, *np.zeros((2, count), np.float32), np.zeros(width, np.float32)
+        )
+        self.of_rows, self.bend = np.zeros((2, height, width), np.float32)
+        _add_row_diagonal(system, self.of_rows.reshape(-1), self.bend.reshape(-1))
 
     def update(self, system: _System) -> None:
-        """Take the image's part of A; the rows' part is that of their first weights."""
-        for k, (part, of_rows) in enumerate(zip(self.parts, self.of_rows, strict=True)):
-            part[:] = of_rows
-            _add_image_diagonal(system, k * BLOCK_BITS, part)
-            np.divide(1, part, out=part, where=part > 0)
+        """Take the weights of the image's part of A; rows keep those that they had first."""
+        diagonal, bend = self.arrays.images[0], self.bend + system.across + system.down
+        diagonal[:] = self.of_rows
+        _add_image_diagonal(system, diagonal)
+        np.divide(1, diagonal, out=diagonal, where=diagonal > 0)
+        if system.information.shape[1]:
+            bend += system.information[0] + system.information[2]
+        scale, begin = np.float32(1), 0
+        while max(bend.shape) > 1:
+            for axis in range(2):
+                bend = np.add.reduceat(bend, np.arange(0, bend.shape[axis], 2), axis)
+            scale, end = scale / 4, begin + bend.size
+            self.arrays.reciprocal[begin:end] = 1 / (scale * bend.ravel() + system.leak / scale)
+            begin = end
 
 
 def solve(
@@ -126,11 +143,11 @@ def solve(
     order = np.argsort(rows.corner[:, 0], kind="stable")
     base = np.where(rows.kind == EVENT, 1, params.silence).astype(np.float32) * rows.weight
     base, change = base[order], rows.change[order]
-    information = np.zeros((0, width, 3), np.float32)
+    information = np.zeros((3, 0, width), np.float32)
     pull = np.zeros(rows.shape, np.float32)
     if prior is not None:
         L = (prior.information * c**2).astype(np.float32)
-        information = np.ascontiguousarray(L.reshape(height, width, 4)[..., [0, 1, 3]])
+        information = np.stack([L[..., 0, 0], L[..., 0, 1], L[..., 1, 1]])
         g = np.einsum("hwij,hwj->hwi", L, prior.gradient / c).astype(np.float32)
         _add_gradient_transposed(g, pull)
     system = _System(
@@ -139,22 +156,27 @@ def solve(
         base,
         *np.zeros((2, height, width), np.float32),
         information,
+        np.zeros((2, width), np.float32),
         np.float32(params.leak),
     )
     preconditioner = _Preconditioner(system)
     system = system._replace(weight=np.empty_like(base))
-    residual, b = np.empty_like(base), np.empty_like(u)
+    residual, b, before = np.empty_like(base), np.empty_like(u), np.empty_like(u)
     numbers = tuple(np.float32(v) for v in (params.tail, params.gradient, params.edge))
-    iterations = 0
-    for _ in range(REWEIGHTINGS):
+    iterations, rho = 0, 0.0
+    for n in range(REWEIGHTINGS):
         _reweight(system, u, (change, base), numbers, residual)
-        b[:] = pull
+        if n < 3 or n % UPDATE_EVERY == 0:
+            preconditioner.update(system)
+        b[:], before[:] = pull, u
         _add_transposed(system, change * system.weight, b)
-        preconditioner.update(system)
-        iterations += _conjugate_gradients(system, b, u, preconditioner.arrays, CG_LIMITS)
+        rho = _conjugate_gradients(system, b, u, preconditioner.arrays, (rho, STEPS))
+        iterations += STEPS
+        if np.sqrt(np.mean((u - before) ** 2)) < LEAST_CHANGE:
+            break
     _reweight(system, u, (change, base), numbers, residual)
     V = np.full(rows.shape, np.inf, np.float32)
-    unseen = _unseen_variance(system, preconditioner.of_rows[0]) * c**2
+    unseen = _unseen_variance(system, preconditioner.of_rows) * c**2
     if variance:
         samples = _sample_variance(system, preconditioner, order, np.random.default_rng(seed))
         V = VARIANCE_FACTOR * c**2 * samples + unseen
@@ -167,8 +189,8 @@ def _unseen_variance(system, of_rows):
     from scipy.ndimage import gaussian_filter
 
     seen, nothing = of_rows.copy(), np.zeros_like(system.across)
-    _add_image_diagonal(system._replace(across=nothing, down=nothing, leak=np.float32(0)), 0, seen)
-    seen = gaussian_filter(seen.reshape(system.across.shape), BLUR_PX)
+    _add_image_diagonal(system._replace(across=nothing, down=nothing, leak=np.float32(0)), seen)
+    seen = gaussian_filter(seen, BLUR_PX)
     return UNSEEN_VARIANCE * np.exp(-seen / UNSEEN_INFORMATION)
 
 
@@ -196,7 +218,7 @@ def _sample_variance(system, preconditioner, order, rng):
 
     height, width = system.across.shape
     total = np.zeros((height, width))
-    factor = factor_information(*np.moveaxis(system.information, -1, 0))
+    factor = factor_information(*system.information)
     preconditioner.update(system)
     for _ in range(SAMPLES):
         b = np.zeros((height, width), np.float32)
@@ -208,10 +230,10 @@ def _sample_variance(system, preconditioner, order, rng):
         b[:, 1:] += across[:, :-1]
         b[1:] += down[:-1]
         n = rng.standard_normal((height, width, 2), np.float32)
-        if len(system.information):
+        if system.information.shape[1]:
             _add_gradient_transposed(np.einsum("hwij,hwj->hwi", factor, n), b)
         z = np.zeros_like(b)
-        _conjugate_gradients(system, b, z, preconditioner.arrays, CG_LIMITS)
+        _conjugate_gradients(system, b, z, preconditioner.arrays, (0.0, SAMPLE_STEPS))
         total += (z - z.mean()) ** 2
     return gaussian_filter(total / SAMPLES, BLUR_PX).astype(np.float32)
 
@@ -318,18 +340,30 @@ def _apply(system, u, out):
         if y + 1 < height:
             for x in range(width):
                 out[y, x] -= system.down[y, x] * (u[y + 1, x] - u[y, x])
-    for y in range(len(system.information)):
+    for y in range(system.information.shape[1]):
         above, below, sy = _neighbours(y, height)
-        for x in range(width):
+        along, down = system.flux[0], system.flux[1]
+        for x in range(1, width - 1):
+            along[x] = np.float32(0.5) * (u[y, x + 1] - u[y, x - 1])
+        for x in (0, width - 1):
             left, right, sx = _neighbours(x, width)
-            xx, xy = system.information[y, x, 0], system.information[y, x, 1]
-            yy = system.information[y, x, 2]
-            gx, gy = sx * (u[y, right] - u[y, left]), sy * (u[below, x] - u[above, x])
-            hx, hy = sx * (xx * gx + xy * gy), sy * (xy * gx + yy * gy)
-            out[y, right] += hx
-            out[y, left] -= hx
-            out[below, x] += hy
-            out[above, x] -= hy
+            along[x] = sx * (u[y, right] - u[y, left])
+        for x in range(width):
+            xx, xy = system.information[0, y, x], system.information[1, y, x]
+            yy = system.information[2, y, x]
+            gx, gy = along[x], sy * (u[below, x] - u[above, x])
+            along[x], down[x] = xx * gx + xy * gy, sy * (xy * gx + yy * gy)
+        for x in range(width):
+            out[below, x] += down[x]
+            out[above, x] -= down[x]
+        for x in range(1, width - 1):
+            out[y, x + 1] += np.float32(0.5) * along[x]
+        for x in range(1, width - 1):
+            out[y, x - 1] -= np.float32(0.5) * along[x]
+        for x in (0, width - 1):
+            left, right, sx = _neighbours(x, width)
+            out[y, right] += sx * along[x]
+            out[y, left] -= sx * along[x]
     flat, image = out.reshape(-1), u.reshape(-1)
     for k in range(len(system.weight)):
         pixels, a = _row(system, k)
@@ -337,107 +371,139 @@ def _apply(system, u, out):
 
 
 @njit_fastmath
-def _add_row_diagonal(system, bits, out):
-    """Add diag(P' D' W D P) to `out`, with blocks of 2^bits pixels a side as columns of P."""
-    height, width = system.across.shape
-    columns = ((width - 1) >> bits) + 1
-    reciprocal = np.float32(1) / np.float32(width)
+def _add_row_diagonal(system, diagonal, bend):
+    """Add diag(D' W D) to `diagonal`, and half of w |b - a|^2 to `bend` at both ends of rows."""
+    width = system.across.shape[1]
+    reciprocal, half = np.float32(1) / np.float32(width), np.float32(0.5)
     for k in range(len(system.weight)):
         pixels, a = _row(system, k)
-        ya = int((np.float32(pixels[0]) + np.float32(0.5)) * reciprocal)
-        yb = int((np.float32(pixels[4]) + np.float32(0.5)) * reciprocal)
-        xa, xb = int(pixels[0]) - ya * width, int(pixels[4]) - yb * width
-        xc, yc = min(xa + 1, width - 1) >> bits, (min(ya + 1, height - 1) >> bits) * columns
-        xd, yd = min(xb + 1, width - 1) >> bits, (min(yb + 1, height - 1) >> bits) * columns
-        xa, ya, xb, yb = xa >> bits, (ya >> bits) * columns, xb >> bits, (yb >> bits) * columns
-        if xa == xb and xa == xc and xa == xd and ya == yb and ya == yc and ya == yd:
-            continue  # a row inside one block does not move with it
-        blocks = (ya + xa, ya + xc, yc + xa, yc + xc, yb + xb, yb + xd, yd + xb, yd + xd)
-        # (sum a)^2 over each block, as the sum of all products of two entries of a block.
+        ya = np.floor((np.float32(pixels[0]) + half) * reciprocal)
+        yb = np.floor((np.float32(pixels[4]) + half) * reciprocal)
+        dy = ya + system.fraction[k, 0, 1] - yb - system.fraction[k, 1, 1]
+        dx = np.float32(pixels[0]) - ya * width - (np.float32(pixels[4]) - yb * width)
+        dx += system.fraction[k, 0, 0] - system.fraction[k, 1, 0]
+        part = half * system.weight[k] * (dx * dx + dy * dy)
+        bend[pixels[0]] += part
+        bend[pixels[4]] += part
+        i, j = np.int64(pixels[0]), np.int64(pixels[4])
+        right, below = np.int64(pixels[1]) - i, np.int64(pixels[2]) - i
+        at = i, i + right, i + below, i + below + right, j, j + right, j + below, j + below + right
+        # The square of the sum of the entries at each pixel.
         for m in range(8):
             total = np.float32(0)
             for n in range(8):
-                if blocks[n] == blocks[m]:
+                if at[n] == at[m]:
                     total += a[n]
-            out[blocks[m]] += system.weight[k] * a[m] * total
+            diagonal[at[m]] += system.weight[k] * a[m] * total
 
 
 @njit_fastmath
-def _add_image_diagonal(system, bits, out):
-    """Add diag(P' B P) to `out`, where B is A without its rows."""
-    height, width = system.across.shape
-    columns = ((width - 1) >> bits) + 1
+def _add_image_diagonal(system, out):
+    """Add the diagonal of A without its rows to `out`."""
+    height, width = out.shape
     for y in range(height):
-        i = (y >> bits) * columns
         for x in range(width):
-            out[i + (x >> bits)] += system.leak
-        for x in range(((1 << bits) - 1), width - 1, 1 << bits):
-            out[i + (x >> bits)] += system.across[y, x]
-            out[i + (x >> bits) + 1] += system.across[y, x]
-        if y + 1 < height and (y + 1) >> bits != y >> bits:
-            for x in range(width):
-                out[i + (x >> bits)] += system.down[y, x]
-                out[i + columns + (x >> bits)] += system.down[y, x]
-    for y in range(len(system.information)):
+            out[y, x] += system.leak + system.across[y, x] + system.down[y, x]
+            if x > 0:
+                out[y, x] += system.across[y, x - 1]
+            if y > 0:
+                out[y, x] += system.down[y - 1, x]
+    for y in range(system.information.shape[1]):
         above, below, sy = _neighbours(y, height)
-        above, below = (above >> bits) * columns, (below >> bits) * columns
         for x in range(width):
             left, right, sx = _neighbours(x, width)
-            left, right, i = left >> bits, right >> bits, (y >> bits) * columns
-            xx, yy = system.information[y, x, 0], system.information[y, x, 2]
+            xx, yy = system.information[0, y, x], system.information[2, y, x]
             if left != right:
-                out[i + left] += sx * sx * xx
-                out[i + right] += sx * sx * xx
+                out[y, left] += sx * sx * xx
+                out[y, right] += sx * sx * xx
             if above != below:
-                out[above + (x >> bits)] += sy * sy * yy
-                out[below + (x >> bits)] += sy * sy * yy
+                out[above, x] += sy * sy * yy
+                out[below, x] += sy * sy * yy
+
+
+@njit_fastmath_inlined
+def _coarse_rows(y, n):
+    """Return the nearer and the farther of the n coarse rows around a fine one."""
+    near = y >> 1
+    return near, min(max(near + ((y & 1) << 1) - 1, 0), n - 1)
+
+
+@njit_fastmath_inlined
+def _restrict(fine, coarse, line):
+    """Add a grid to one of half its nodes each way, the transpose of `_interpolate`."""
+    near, far = np.float32(0.75), np.float32(0.25)
+    (height, width), (rows, columns) = fine.shape, coarse.shape
+    for y in range(height):
+        j, other = _coarse_rows(y, rows)
+        for i in range(columns):
+            line[i] = 0
+        line[0] = fine[y, 0]
+        for i in range(columns - 1):
+            line[i] += near * fine[y, 2 * i + 1] + far * fine[y, 2 * i + 2]
+        for i in range(columns - 1):
+            line[i + 1] += far * fine[y, 2 * i + 1] + near * fine[y, 2 * i + 2]
+        if width % 2 == 0:
+            line[columns - 1] += fine[y, width - 1]
+        for i in range(columns):
+            coarse[j, i] += near * line[i]
+            coarse[other, i] += far * line[i]
+
+
+@njit_fastmath_inlined
+def _interpolate(coarse, fine, line):
+    """Add a grid to one of twice its nodes each way, bilinear between centres of cells."""
+    near, far = np.float32(0.75), np.float32(0.25)
+    (height, width), (rows, columns) = fine.shape, coarse.shape
+    for y in range(height):
+        j, other = _coarse_rows(y, rows)
+        for i in range(columns):
+            line[i] = near * coarse[j, i] + far * coarse[other, i]
+        fine[y, 0] += line[0]
+        for i in range(columns - 1):
+            fine[y, 2 * i + 1] += near * line[i] + far * line[i + 1]
+            fine[y, 2 * i + 2] += far * line[i] + near * line[i + 1]
+        if width % 2 == 0:
+            fine[y, width - 1] += line[columns - 1]
+
+
+@njit_fastmath_inlined
+def _fill_grids(scratch, r):
+    """Restrict an image to all coarser grids."""
+    grids = scratch.grids
+    begin, end, fine = 0, 0, r
+    for k in range(len(grids)):
+        grids[k] = 0
+    while end < len(grids):
+        rows, columns = (fine.shape[0] + 1) >> 1, (fine.shape[1] + 1) >> 1
+        begin, end = end, end + rows * columns
+        coarse = grids[begin:end].reshape(rows, columns)
+        _restrict(fine, coarse, scratch.line)
+        fine = coarse
 
 
 @njit_fastmath
 def _precondition(scratch, r, z):
-    """Write the reciprocal diagonals of pixels and blocks, applied to r, to z."""
+    """Write the reciprocal diagonals of pixels and coarser grids, applied to r, to z."""
+    grids = scratch.grids
     height, width = r.shape
-    inverse, sums = scratch.images[0], scratch.sums
-    rows, columns = height, width
-    begin, end = 0, 0
-    # Sums over blocks, each size from the one below.
-    while max(rows, columns) > 1 and end < len(sums):
-        fine, fine_columns, fine_rows = begin, columns, rows
-        rows, columns = ((rows - 1) >> BLOCK_BITS) + 1, ((columns - 1) >> BLOCK_BITS) + 1
-        begin, end = end, end + rows * columns
-        for k in range(begin, end):
-            sums[k] = 0
-        for y in range(fine_rows):
-            i = begin + (y >> BLOCK_BITS) * columns
-            for x in range(fine_columns):
-                sums[i + (x >> BLOCK_BITS)] += (
-                    r[y, x] if begin == 0 else sums[fine + y * fine_columns + x]
-                )
-    for k in range(len(sums)):
-        sums[k] *= scratch.reciprocal[k]
-    # Corrections of each size are added to the one below.
-    bits = 0
-    while 1 << (bits + BLOCK_BITS) < max(height, width):
-        bits += BLOCK_BITS
-    while bits > BLOCK_BITS:
-        rows, columns = ((height - 1) >> bits) + 1, ((width - 1) >> bits) + 1
-        bits -= BLOCK_BITS
-        fine_rows, fine_columns = ((height - 1) >> bits) + 1, ((width - 1) >> bits) + 1
-        begin = end - rows * columns
-        fine = begin - fine_rows * fine_columns
-        for y in range(fine_rows):
-            i = begin + (y >> BLOCK_BITS) * columns
-            for x in range(fine_columns):
-                sums[fine + y * fine_columns + x] += sums[i + (x >> BLOCK_BITS)]
-        end = begin
-    columns = ((width - 1) >> BLOCK_BITS) + 1
+    _fill_grids(scratch, r)
+    for k in range(len(grids)):
+        grids[k] *= scratch.reciprocal[k]
     for y in range(height):
-        i = (y >> BLOCK_BITS) * columns
         for x in range(width):
-            z[y, x] = inverse[y, x] * r[y, x]
-        if len(sums):
-            for x in range(width):
-                z[y, x] += sums[i + (x >> BLOCK_BITS)]
+            z[y, x] = scratch.images[0, y, x] * r[y, x]
+    level, end = 0, len(grids)
+    while (max(height, width) - 1) >> level:
+        level += 1
+    for bits in range(level, 0, -1):
+        rows, columns = ((height - 1) >> bits) + 1, ((width - 1) >> bits) + 1
+        begin, fine = end - rows * columns, z
+        coarse = grids[begin:end].reshape(rows, columns)
+        if bits > 1:
+            rows, columns = ((height - 1) >> (bits - 1)) + 1, ((width - 1) >> (bits - 1)) + 1
+            fine = grids[begin - rows * columns : begin].reshape(rows, columns)
+        _interpolate(coarse, fine, scratch.line)
+        end = begin
 
 
 @njit_fastmath
@@ -477,34 +543,34 @@ def _dot(a, b):
 
 
 @njit_fastmath
-def _conjugate_gradients(system, b, u, scratch, stop):
-    """Solve A u = b from u on, in place; return the number of iterations."""
-    tolerance, limit = stop
-    r, p, Ap, z = scratch.images[1], scratch.images[2], scratch.images[3], scratch.images[4]
-    fu, fb, fr = u.reshape(-1), b.reshape(-1), r.reshape(-1)
-    fp, fA, fz = p.reshape(-1), Ap.reshape(-1), z.reshape(-1)
+def _conjugate_gradients(system, b, u, scratch, stage):
+    """Take steps towards A u = b, in place; go on with the directions of the call before.
+
+    Weights may have changed since. `stage` has what that call returned, or 0, and how many steps.
+    """
+    rho, steps = np.float32(stage[0]), stage[1]
+    r, before, z = scratch.images[1], scratch.images[2], scratch.images[5]
+    p, Ap = scratch.images[3], scratch.images[4]
+    fu, fr, fb, fz = u.reshape(-1), r.reshape(-1), before.reshape(-1), z.reshape(-1)
+    fp, fA, right = p.reshape(-1), Ap.reshape(-1), b.reshape(-1)
     n = len(fu)
-    _precondition(scratch, b, z)
-    norm = _dot(fb, fz)
     _apply(system, u, Ap)
     for k in range(n):
-        fr[k] = fb[k] - fA[k]
-    _precondition(scratch, r, z)
-    rho = _dot(fr, fz)
-    for k in range(n):
-        fp[k] = fz[k]
-    for iteration in range(limit):
-        if rho <= tolerance * tolerance * norm:
-            return iteration
-        _apply(system, p, Ap)
-        alpha = rho / _dot(fp, fA)
-        for k in range(n):
-            fu[k] += alpha * fp[k]
-            fr[k] -= alpha * fA[k]
+        fr[k] = right[k] - fA[k]
+    for _ in range(steps):
         _precondition(scratch, r, z)
         new = _dot(fr, fz)
-        beta = new / rho
+        if new <= 0:
+            return new
+        # Directions of Polak and Ribiere, as the matrix changes.
+        beta = max((new - _dot(fb, fz)) / rho, np.float32(0)) if rho > 0 else np.float32(0)
         for k in range(n):
             fp[k] = fz[k] + beta * fp[k]
+        _apply(system, p, Ap)
+        alpha = _dot(fr, fp) / _dot(fp, fA)
+        for k in range(n):
+            fb[k] = fr[k]
+            fu[k] += alpha * fp[k]
+            fr[k] -= alpha * fA[k]
         rho = new
-    return limit
+    return rho
