@@ -83,7 +83,7 @@ class CellField(NamedTuple):
     """Values of cells of the scene at one moment, for kernels."""
 
     values: NDArray[np.float64]  # (rows, columns)
-    cell: int  # px
+    cell_bits: int  # cells have 2^cell_bits px
     factor: float | int
     map: NDArray[np.float64]  # (2, 3), from pixels to px in the cells
 
@@ -91,7 +91,9 @@ class CellField(NamedTuple):
 @njit_noalloc_inlined
 def value_at(field: Any, x: Any, y: Any) -> Any:
     """Return the value of a field at a pixel."""
-    return field.values[cell_at(field.map, x, y, field.cell, field.values.shape)] * field.factor
+    return (
+        field.values[cell_at(field.map, x, y, field.cell_bits, field.values.shape)] * field.factor
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,11 +146,13 @@ class Background:
         """Return `rate_at` of one time (s) as a field."""
         now = min(max(int(t / self.duration * N_TIME_SLICES), 0), N_TIME_SLICES - 1)
         factor = float(self.activity[now])
-        return CellField(self._mean_rates(over), FINE_CELL_PX, factor, self._map_at(t))
+        return CellField(
+            self._mean_rates(over), FINE_CELL_PX.bit_length() - 1, factor, self._map_at(t)
+        )
 
     def field_of(self, values: NDArray[np.float64], cell: int, t: float | int) -> CellField:
         """Return the field of other values of the scene, in cells of `cell` px, at a time (s)."""
-        return CellField(values, cell, 1.0, self._map_at(t))
+        return CellField(values, cell.bit_length() - 1, 1.0, self._map_at(t))
 
     def _mean_rates(self, over: int) -> NDArray[np.float64]:
         """Return rates averaged over squares of so many px, if the scene moves."""
@@ -370,11 +374,7 @@ def measure_dispersions(
     spans = [np.stack([t - w / 2, t + w / 2], 1) for t, w in zip(centres, windows, strict=True)]
     spans = np.concatenate(spans)
     N = np.zeros((len(spans), *background.calm.shape[1:]), np.int32)
-    if background.scene is None:
-        stream.count_in_spans(spans, CELL_PX, N)
-    else:
-        parts = spans_at_rest(spans, background.scene, background.corner)
-        stream.count_in_cells(parts, CELL_PX, N)
+    stream.count_in_cells(spans_at_rest(spans, background.scene, background.corner), CELL_PX, N)
     out, first = [], 0
     for t in centres:
         out.append(_dispersion(N[first : first + len(t)], background, background.slice_at(t)))
