@@ -128,31 +128,27 @@ class Background:
         part = np.asarray(t) / self.duration * N_TIME_SLICES
         return np.clip(part, 0, N_TIME_SLICES - 1).astype(np.int64)
 
-    def rate_at(
-        self, x: NDArray | float | int, y: NDArray | float | int, t: Any, over: int = FINE_CELL_PX
-    ) -> Any:
+    def rate_at(self, x: NDArray | float | int, y: NDArray | float | int, t: Any) -> Any:
         """Return rates at pixels, 1/(px s).
 
         Args:
             x: Pixels, px.
             y: Pixels, px.
             t: Times, s, one or as many as pixels.
-            over: Side (px) of the square over which the rate of a moving scene is averaged.
         """
-        cells = look_up(self._mean_rates(over), FINE_CELL_PX, *self.to_scene(x, y, t))
+        cells = look_up(self.rate, FINE_CELL_PX, *self.to_scene(x, y, t))
         return cells * self.activity[self.slice_at(t)]
 
-    def rate_field(self, t: float | int, over: int = FINE_CELL_PX) -> CellField:
-        """Return `rate_at` of one time (s) as a field."""
-        now = min(max(int(t / self.duration * N_TIME_SLICES), 0), N_TIME_SLICES - 1)
-        factor = float(self.activity[now])
+    def rate_field(self, t: float | int, over: int) -> CellField:
+        """Return rates of one time (s), of a moving scene as means of squares of `over` px."""
+        factor = float(self.activity[self.slice_at(t)])
         return CellField(
             self._mean_rates(over), FINE_CELL_PX.bit_length() - 1, factor, self._map_at(t)
         )
 
-    def field_of(self, values: NDArray[np.float64], cell: int, t: float | int) -> CellField:
-        """Return the field of other values of the scene, in cells of `cell` px, at a time (s)."""
-        return CellField(values, cell.bit_length() - 1, 1.0, self._map_at(t))
+    def field_of(self, values: NDArray[np.float64], t: float | int) -> CellField:
+        """Return the field of other values of the scene, in cells of 16 px, at a time (s)."""
+        return CellField(values, CELL_PX.bit_length() - 1, 1.0, self._map_at(t))
 
     def _mean_rates(self, over: int) -> NDArray[np.float64]:
         """Return rates averaged over squares of so many px, if the scene moves."""
@@ -375,11 +371,11 @@ def measure_dispersions(
     spans = np.concatenate(spans)
     N = np.zeros((len(spans), *background.calm.shape[1:]), np.int32)
     stream.count_in_cells(spans_at_rest(spans, background.scene, background.corner), CELL_PX, N)
-    out, first = [], 0
-    for t in centres:
-        out.append(_dispersion(N[first : first + len(t)], background, background.slice_at(t)))
-        first += len(t)
-    return out
+    each = np.split(N, np.cumsum([len(t) for t in centres])[:-1])
+    return [
+        _dispersion(n, background, background.slice_at(t))
+        for n, t in zip(each, centres, strict=True)
+    ]
 
 
 def _dispersion(
@@ -387,9 +383,9 @@ def _dispersion(
 ) -> NDArray[np.float64]:
     """Compute the dispersion of counts (windows, rows, columns) of windows in given slices."""
     calm, activity = background.calm[slices], background.activity[slices]
-    sums = np.zeros((6, *N.shape[1:]))
+    sums = np.zeros((4, *N.shape[1:]))
     _sum_calm_counts(N, calm, activity, background.bright, sums)
-    _, squares, expected, fullest, windows, _ = sums
+    squares, expected, fullest, windows = sums
     full = expected >= CONFIG.min_dispersion_events
     own = np.where(full, squares / np.maximum(expected, CONFIG.min_dispersion_events), 1.0)
     usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
@@ -402,28 +398,23 @@ def _dispersion(
 def _sum_calm_counts(N: Any, calm: Any, activity: Any, bright: Any, sums: Any) -> None:
     """Fill in sums over the calm windows of each cell.
 
-    The sums are: mean count, squares about it, expected events, nats of the fullest window of a
-    bright cell, number of windows, and their activity.
+    The sums are: squares about the mean count, expected events, nats of the fullest window of a
+    bright cell, and the number of windows.
     """
-    windows, rows, columns = N.shape
-    mean, squares, expected = sums[0], sums[1], sums[2]
-    fullest, seen, active = sums[3], sums[4], sums[5]
-    for k in range(windows):
-        for i in range(rows):
-            for j in range(columns):
+    squares, expected, fullest, seen = sums[0], sums[1], sums[2], sums[3]
+    for i in range(N.shape[1]):
+        for j in range(N.shape[2]):
+            total = active = 0.0
+            for k in range(len(N)):
                 if calm[k, i, j]:
-                    mean[i, j] += N[k, i, j]
-                    active[i, j] += activity[k]
+                    total += N[k, i, j]
+                    active += activity[k]
                     seen[i, j] += 1
-    for i in range(rows):
-        for j in range(columns):
-            mean[i, j] /= max(active[i, j], 1.0)
-    for k in range(windows):
-        for i in range(rows):
-            for j in range(columns):
+            mean = total / max(active, 1.0)
+            for k in range(len(N)):
                 if calm[k, i, j]:
-                    mu = mean[i, j] * activity[k]
+                    mu = mean * activity[k]
                     squares[i, j] += (N[k, i, j] - mu) ** 2
                     expected[i, j] += mu
-                    if bright[i, j] and N[k, i, j] > mu:
+                    if bright[i, j]:
                         fullest[i, j] = max(fullest[i, j], poisson_nats(N[k, i, j], mu))

@@ -45,10 +45,11 @@ class Scale:
         """Least dispersion of the sensor's cells."""
         return float(self.dispersion.min())
 
-    @property
-    def dispersion_gain(self) -> float:
-        """Cells of 16 px in 3x3 of the scale's cells, at least 1."""
-        return max(1.0, (3 * self.cell / CELL_PX) ** 2)
+    @functools.cached_property
+    def wide_dispersion(self) -> NDArray[np.float64]:
+        """(rows, columns) dispersion in 3x3 of the scale's cells, where that of cells adds up."""
+        gain = max(1.0, (3 * self.cell / CELL_PX) ** 2)
+        return self.min_dispersion + (self.dispersion - self.min_dispersion) * gain
 
 
 class Blobs(NamedTuple):
@@ -83,11 +84,10 @@ class ClutterModel(NamedTuple):
     """Clutter of one window and the threshold of detection, for kernels."""
 
     rates: CellField  # 1/(px s)
-    dispersion: CellField  # variance over mean of counts
+    dispersion: CellField  # variance over mean of counts in 3x3 cells
     cell_bits: int  # cells have 2^cell_bits px
     row_cells: int  # cells of a row, with the border
     exposure: float | int  # s px^2, of 3x3 cells
-    dispersion_gain: float | int  # of 3x3 cells, see `Scale`
     min_dispersion: float | int
     min_events: float | int  # expected events of 3x3 cells where the clutter is least
     log_threshold: float | int  # nats
@@ -109,8 +109,8 @@ def clutter_model(
     tests = -(-shape[0] // g) * -(-shape[1] // g) * background.duration / scale.window
     rates = background.rate_field(t, 3 * g)
     return ClutterModel(
-        rates, background.field_of(scale.dispersion, CELL_PX, t), g.bit_length() - 1,
-        -(-shape[1] // g) + 2, float(exposure), scale.dispersion_gain, scale.min_dispersion,
+        rates, background.field_of(scale.wide_dispersion, t), g.bit_length() - 1,
+        -(-shape[1] // g) + 2, float(exposure), scale.min_dispersion,
         float(background.min_rate * rates.factor * exposure),
         float(np.log(tests / CONFIG.false_alarms)),
     )  # fmt: skip
@@ -118,13 +118,8 @@ def clutter_model(
 
 @njit_noalloc
 def clutter_at(clutter: Any, x: Any, y: Any) -> Any:
-    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel.
-
-    In 3x3 cells the dispersion of cells adds up.
-    """
-    excess = value_at(clutter.dispersion, x, y) - clutter.min_dispersion
-    dispersion = clutter.min_dispersion + excess * clutter.dispersion_gain
-    return value_at(clutter.rates, x, y), dispersion
+    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel."""
+    return value_at(clutter.rates, x, y), value_at(clutter.dispersion, x, y)
 
 
 def detect(

@@ -146,7 +146,6 @@ class WindowTracker:
             for k in range(windows):
                 self._step(k * w)
                 shown.update(1)
-        self._remove(np.ones(len(self.tracks.id), bool))
         if not self.rows:
             return []
         rows = _WindowRows._make(np.concatenate(column) for column in zip(*self.rows, strict=True))
@@ -175,7 +174,7 @@ class WindowTracker:
             self._update(gates, clutter, assignments)
             if self.scale.compact or self.background.scene is None:
                 self._split_tracks(events, gates, assignments)
-            self._remove(self._find_ended())
+            self.tracks = self.tracks.take(~self._find_ended())
         free, least = assignments.free, 1 - CONFIG.claimed_share
         new = (free >= CONFIG.min_blob_events) & (free >= least * assignments.counts)
         if new.any():
@@ -195,6 +194,7 @@ class WindowTracker:
             enough &= tracks.hits >= CONFIG.majority * age
             enough &= tracks.nats > self.log_threshold
             tracks.confirmed[now & enough] = True
+            self.confirmed |= set(tracks.id[tracks.confirmed].tolist())
         t, m = np.full(len(now), gates.t), gates.p + measured.z
         columns = (t, tracks.id, tracks.p, tracks.v, tracks.C, measured.n, m, measured.R)
         self.rows.append(_WindowRows._make(value[now] for value in columns))
@@ -223,6 +223,7 @@ class WindowTracker:
                     at = i if k == 0 else 0
                     one.p[at], one.C[at], one.n[at] = two.p[k], two.C[k], two.n[k]
                 part.id[0], self.next_id = self.next_id, self.next_id + 1
+                self.confirmed.add(int(part.id[0]))
                 parts.append(part)
             elif nats > 0:
                 self.evidence[key] = nats
@@ -240,13 +241,6 @@ class WindowTracker:
         coast = np.minimum(longest, 2 * tracks.hits)
         coast = np.where(tracks.confirmed, coast, CONFIG.still_windows)
         return outside | (tracks.misses > coast)
-
-    def _remove(self, ended: NDArray) -> None:
-        """Remove tracks that ended, and remember those that were confirmed."""
-        if not ended.any():
-            return
-        over, self.tracks = self.tracks.take(ended), self.tracks.take(~ended)
-        self.confirmed |= set(over.id[over.confirmed].tolist())
 
     def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
         """Start a track at each blob, at a time (s)."""
