@@ -432,7 +432,7 @@ def drop_of(parts, paths):
     us, (x, y) = np.rint(1e6 * t[order]).astype(np.int64), np.rint(xi[order]).T.astype(np.uint16)
     events = Events(us, x, y, on[order])[x < SMALL[0]]
     recording = Recording("lamps", *SMALL, events)
-    return drop_lamps(paths, recording, np.zeros(SMALL[::-1], bool))
+    return drop_lamps(paths, Stream(recording, int(us[0]), int(us[-1]) + 1))
 
 
 AT = np.arange(10_000, 2_000_000, 20_000)

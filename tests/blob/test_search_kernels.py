@@ -297,9 +297,9 @@ def lagging(tail):
 
 
 def test_where_events_of_one_polarity_lag_the_other_tells_the_place():
-    cold = np.zeros((HEIGHT, WIDTH), bool)
     recording, path = lagging(tail=8.0)
-    (told,) = prefer_sharper([path], recording, cold)
+    stream = Stream(recording, 0, 1_000_000)
+    (told,) = prefer_sharper([path], stream)
     assert told.polarity == 1
     np.testing.assert_allclose(told.p[:, 0], 20 + 40e-6 * path.t, atol=0.8)
     np.testing.assert_allclose(told.C[0], np.diag([1.5**2 + 1 / 6] * 2), atol=0.4)
@@ -307,9 +307,10 @@ def test_where_events_of_one_polarity_lag_the_other_tells_the_place():
     kept = ChunkPacker(recording, moment.Params(), found=found).pack_all()
     assert (kept.polarity[kept.valid] > 0).all() and kept.valid.sum() > 1500
     # No events of hot pixels, and no change where both are alike.
-    assert prefer_sharper([path], recording, ~cold)[0] is path
+    stream.hot = np.ones((HEIGHT, WIDTH), bool)
+    assert prefer_sharper([path], stream)[0] is path
     recording, path = lagging(tail=0.5)
-    assert prefer_sharper([path], recording, cold)[0] is path
+    assert prefer_sharper([path], Stream(recording, 0, 1_000_000))[0] is path
 
 
 def one_target(P, hits=9):

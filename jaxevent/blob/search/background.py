@@ -43,7 +43,7 @@ class SceneMotion:
         """Largest distance (px) of the reference points from their places at the start."""
         return float(np.hypot(*(self._reference() - REFERENCE_POINTS_PX[:, None]).T).max())
 
-    @property
+    @functools.cached_property
     def speed(self) -> float:
         """Median speed (px/s) of the reference points over time."""
         moved = np.diff(self._reference(), axis=1)
@@ -51,32 +51,28 @@ class SceneMotion:
 
     def _reference(self) -> NDArray[np.float64]:
         """(4, n, 2) px, places of the reference points."""
-        moved = np.einsum("nij,kj->kni", self.maps[:, :, :2], REFERENCE_POINTS_PX)
-        return moved + self.maps[:, :, 2]
+        return np.stack(move_places(self.maps, *REFERENCE_POINTS_PX.T[..., None]), -1)
 
-    def _coefficients(self, t: Any) -> Any:
-        """Interpolate the maps linearly at times (s), as ((a, b, e), (c, d, f))."""
+    def at(self, t: NDArray | float | int) -> NDArray[np.float64]:
+        """Interpolate the maps (..., 2, 3) linearly at times (s)."""
         t = np.asarray(t, float)
         k = np.clip(np.searchsorted(self.t, t) - 1, 0, len(self.t) - 2)
         part = np.asarray((t - self.t[k]) / (self.t[k + 1] - self.t[k]))
-        maps = self.maps[k] + part[..., None, None] * (self.maps[k + 1] - self.maps[k])
-        return np.moveaxis(maps, (-2, -1), (0, 1))
+        return self.maps[k] + part[..., None, None] * (self.maps[k + 1] - self.maps[k])
 
-    def to_scene(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Map pixels at times (s) to places of the scene."""
-        (a, b, e), (c, d, f) = self._coefficients(t)
-        x, y, over = x - e, y - f, a * d - b * c
-        return (d * x - b * y) / over, (a * y - c * x) / over
+    def to_scene(
+        self, t: NDArray | float | int, corner: tuple[int, int] = (0, 0)
+    ) -> NDArray[np.float64]:
+        """Return maps (..., 2, 3) from pixels at times (s) to px of the scene from a corner."""
+        A, b = np.split(self.at(t), [2], -1)
+        A = np.linalg.inv(A)
+        return np.concatenate([A, -A @ b - np.reshape(corner, (2, 1))], -1)
 
-    def to_sensor(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Map places of the scene to pixels at times (s)."""
-        (a, b, e), (c, d, f) = self._coefficients(t)
-        return a * x + b * y + e, c * x + d * y + f
 
-    def still_times(self, begin: float | int, end: float | int) -> NDArray[np.float64]:
-        """Divide a span (s) so that the scene hardly moves between the times returned."""
-        number = 1 + int(self.speed * (end - begin) / CONFIG.resolution_px)
-        return np.linspace(begin, end, number + 1)
+def move_places(maps: NDArray, x: Any, y: Any) -> tuple[Any, Any]:
+    """Apply maps (..., 2, 3) to places."""
+    (a, b, e), (c, d, f) = np.moveaxis(maps, (-2, -1), (0, 1))
+    return a * x + b * y + e, c * x + d * y + f
 
 
 class CellField(NamedTuple):
@@ -162,7 +158,7 @@ class Background:
 
     def _map_at(self, t: float | int) -> NDArray[np.float64]:
         """Return the map (2, 3) from pixels at a time (s) to px from `corner`."""
-        return np.eye(2, 3) if self.scene is None else _map_to_scene(self.scene, self.corner, t)
+        return np.eye(2, 3) if self.scene is None else self.scene.to_scene(t, self.corner)
 
     @functools.cached_property
     def min_rate(self) -> float:
@@ -190,17 +186,7 @@ class Background:
         """Map pixels at times (s) to px from `corner`."""
         if self.scene is None:
             return x, y
-        x, y = self.scene.to_scene(x, y, t)
-        return x - self.corner[0], y - self.corner[1]
-
-
-def _map_to_scene(
-    scene: SceneMotion, corner: tuple[int, int], t: float | int
-) -> NDArray[np.float64]:
-    """Return the map (2, 3) from pixels at a time (s) to px of the scene from a corner."""
-    x, y = scene.to_scene(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), t)
-    first = [x[0] - corner[0], y[0] - corner[1]]
-    return np.stack([[x[1] - x[0], y[1] - y[0]], [x[2] - x[0], y[2] - y[0]], first], 1)
+        return move_places(self.scene.to_scene(t, self.corner), x, y)
 
 
 def spans_at_rest(
@@ -209,10 +195,11 @@ def spans_at_rest(
     """Divide spans (n, 2) s so that the scene is at rest in each part, counted in its span."""
     if scene is None:
         return CountedSpans(spans, np.tile(np.eye(2, 3), (len(spans), 1, 1)), np.arange(len(spans)))
-    times = [scene.still_times(*span) for span in spans]
+    number = 1 + (scene.speed * np.ptp(spans, axis=1) / CONFIG.resolution_px).astype(np.int64)
+    times = [np.linspace(*span, n + 1) for span, n in zip(spans, number, strict=True)]
     parts = np.concatenate([np.stack([t[:-1], t[1:]], 1) for t in times])
-    maps = np.stack([_map_to_scene(scene, corner, t) for t in parts.mean(1)])
-    return CountedSpans(parts, maps, np.repeat(np.arange(len(spans)), [len(t) - 1 for t in times]))
+    maps = scene.to_scene(parts.mean(1), corner)
+    return CountedSpans(parts, maps, np.repeat(np.arange(len(spans)), number))
 
 
 def count_in_slices(

@@ -27,7 +27,7 @@ from jaxevent.blob.search.paths import (
     merge_paths,
     tabulate_paths,
 )
-from jaxevent.blob.search.stream import Stream, WindowEvents, batches_near_paths
+from jaxevent.blob.search.stream import Stream, WindowEvents
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,10 +47,8 @@ class OwnFrame:
     def balances(self, paths: list[TargetPath]) -> list[float]:
         """Compute the balance of polarities of each path's events: 1 if all are ON, -1 if OFF."""
         sums = np.zeros((2, len(paths) + 1))
-        table, gate = tabulate_paths(paths), CONFIG.gate_sigmas
-        for _, part, owner in batches_near_paths(self.stream.recording.events, table, gate):
-            seen = ~self.stream.hot[part.y, part.x]
-            owners, signs = owner[seen, 0] + 1, np.where(part.p[seen], 1, -1)
+        for part, owner in self.stream.near(tabulate_paths(paths), CONFIG.gate_sigmas):
+            owners, signs = owner[:, 0] + 1, np.where(part.p, 1, -1)
             sums += [np.bincount(owners, weights, len(sums[0])) for weights in (signs, signs**2)]
         return (sums[0] / np.maximum(sums[1], 1))[1:].tolist()
 

@@ -320,8 +320,9 @@ def find(
     if len(sections) > 1 and found:
         windows = 1e6 * stream.duration / found[0].window
         found = stitch_paths(found, (stream.width, stream.height), windows)
-    found, lamps = drop_lamps(found, recording, hot)
-    found = prefer_sharper(found, recording, hot)
+    stream.hot = hot
+    found, lamps = drop_lamps(found, stream)
+    found = prefer_sharper(found, stream)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
     rate, number = events / stream.duration, int(hot.sum())
     return TargetSearchResult(

@@ -113,10 +113,29 @@ class Stream:
         stream = copy.copy(self)
         if until is not None:
             stream._last = self._index(until)
-        rows = stream._first, stream._last
-        near = batches_near_paths(self._events, tabulate_paths(paths), sigmas, rows)
-        stream._leave_out((row, owner[:, 0] != NO_OWNER_INDEX) for row, _, owner in near)
+        table = tabulate_paths(paths)
+        stream._leave_out(
+            (row, owner_candidates(part, table, sigmas)[:, 0] != NO_OWNER_INDEX)
+            for row, part in stream._batches()
+        )
         return stream
+
+    def near(
+        self, table: PathTable, sigmas: float | int, every: int = 1
+    ) -> Iterator[tuple[Events, NDArray[np.int32]]]:
+        """Yield events in batches, with the paths that they may belong to.
+
+        Args:
+            table: Rows of the paths.
+            sigmas: Radius of the gate, standard deviations.
+            every: Step between the events that are taken.
+
+        Yields:
+            Events, and their `owner_candidates`.
+        """
+        for row, part in self._batches():
+            part = self._read(row, row + len(part))[::every]
+            yield part, owner_candidates(part, table, sigmas)
 
     def _leave_out(self, masks: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         """Leave out events, told by the first row of each batch and a mask of its events."""
@@ -211,40 +230,8 @@ class Stream:
 
     def _batches(self) -> Iterator[tuple[int, Events]]:
         """Yield the first rows of batches, and their events, also those left out."""
-        return read_batches(self._events, self._first, self._last)
-
-
-def read_batches(events: EventSource, first: int, last: int) -> Iterator[tuple[int, Events]]:
-    """Yield the first rows of batches of a range of rows, and their events."""
-    for row in range(first, last, EVENTS_PER_READ):
-        yield row, events[row : min(row + EVENTS_PER_READ, last)]
-
-
-def batches_near_paths(
-    events: EventSource,
-    table: PathTable,
-    sigmas: float | int,
-    rows: tuple[int, int] | None = None,
-    *,
-    every: int = 1,
-) -> Iterator[tuple[int, Events, NDArray[np.int32]]]:
-    """Yield events in batches, with the paths that they may belong to.
-
-    Args:
-        events: Events of a recording.
-        table: Rows of the paths.
-        sigmas: Radius of the gate, standard deviations.
-        rows: First and last row of the events; None for those in the paths' lives.
-        every: Step between the events that are taken.
-
-    Yields:
-        The first row of a batch, its events, and their `owner_candidates`.
-    """
-    if rows is None:
-        rows = events.index(int(table.begins.min())), events.index(int(table.ends.max()))
-    for row, part in read_batches(events, *rows):
-        part = part if every == 1 else part[::every]
-        yield row, part, owner_candidates(part, table, sigmas)
+        for row in range(self._first, self._last, EVENTS_PER_READ):
+            yield row, self._events[row : min(row + EVENTS_PER_READ, self._last)]
 
 
 @njit_noalloc
