@@ -12,6 +12,7 @@ from scipy import stats
 
 from jaxevent import blob
 from jaxevent.blob.filter import EventBatch
+from jaxevent.blob.owners import NO_OWNER_INDEX, owner_candidates
 from jaxevent.blob.search.background import (
     clutter_evidence,
     find_hot_lines,
@@ -20,12 +21,10 @@ from jaxevent.blob.search.background import (
 )
 from jaxevent.blob.search.merge import merge_parts, stitch_paths
 from jaxevent.blob.search.paths import (
-    NO_OWNER_INDEX,
     TRIED_VELOCITY_NOISES,
     TargetPath,
     fit_velocity_noise,
     log_likelihood,
-    owner_candidates,
     tabulate_paths,
 )
 from jaxevent.blob.search.polarity import drop_lamps

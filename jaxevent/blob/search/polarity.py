@@ -20,14 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.blob.owners import NO_OWNER_INDEX
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import Blobs, add_moments
-from jaxevent.blob.search.paths import (
-    NO_OWNER_INDEX,
-    TargetPath,
-    fit_velocity_noise,
-    tabulate_paths,
-)
+from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise, tabulate_paths
 from jaxevent.blob.search.stream import Stream
 from jaxevent.codegen import njit_noalloc
 

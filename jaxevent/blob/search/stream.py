@@ -7,13 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.paths import (
-    NO_OWNER_INDEX,
-    PathTable,
-    TargetPath,
-    owner_candidates,
-    tabulate_paths,
-)
+from jaxevent.blob.owners import NO_OWNER_INDEX, PathTable, owner_candidates
+from jaxevent.blob.search.paths import TargetPath, tabulate_paths
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events, EventSource, Recording
 
