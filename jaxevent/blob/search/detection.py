@@ -60,9 +60,9 @@ class Blobs(NamedTuple):
     C: NDArray[np.float64]  # (blobs, 2, 2) px^2, covariances
 
     @classmethod
-    def empty(cls, number: int) -> "Blobs":
-        """Allocate the moments of so many blobs."""
-        return cls(np.empty(number), np.empty((number, 2)), np.empty((number, 2, 2)))
+    def zeros(cls, number: int) -> "Blobs":
+        """Allocate the moments of so many blobs without events."""
+        return cls(np.zeros(number), np.zeros((number, 2)), np.zeros((number, 2, 2)))
 
 
 class DetectionScratch(NamedTuple):
@@ -258,7 +258,7 @@ def measure_blobs(
         labels: Blob of each, from 1 on; 0 for none.
         number: Number of blobs.
     """
-    blobs = Blobs.empty(number)
+    blobs = Blobs.zeros(number)
     sum_blobs(events.x, events.y, _weights(events), labels, number, blobs)
     return blobs
 
@@ -375,25 +375,12 @@ def _clear_blobs(blobs: Any, number: int) -> None:
         blobs.C[k, 0, 0] = blobs.C[k, 0, 1] = blobs.C[k, 1, 1] = 0.0
 
 
-def contact_distance(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
-    """Compute distances of ellipses over the sum of their standard deviations between them.
-
-    Args:
-        pa: (..., 2) px, centres.
-        Ca: (..., 2, 2) px^2, covariances.
-        pb: (..., 2) px, centres of the others.
-        Cb: (..., 2, 2) px^2, their covariances.
-    """
-    d = pb - pa
-    length = np.hypot(d[..., 0], d[..., 1])
-    u = d / np.maximum(length, 1e-9)[..., None]
-    reach = [np.sqrt(np.einsum("...i,...ij,...j", u, C, u)) for C in (Ca, Cb)]
-    return length / np.maximum(reach[0] + reach[1], 1e-9)
-
-
 @njit_noalloc_inlined
 def in_contact(p: Any, C: Any, j: int, k: int) -> bool:
-    """Return whether the `contact_distance` of two ellipses of a list is small."""
+    """Return whether two ellipses of a list are near each other.
+
+    Near is twice the sum of their standard deviations along the line between them.
+    """
     x, y, reach = p[k, 0] - p[j, 0], p[k, 1] - p[j, 1], 0.0
     for i in (j, k):
         reach += np.sqrt(C[i, 0, 0] * x * x + 2 * C[i, 0, 1] * x * y + C[i, 1, 1] * y * y)

@@ -55,17 +55,15 @@ class OwnFrame:
     def mark_lone_edges(self, paths: list[TargetPath]) -> list[TargetPath]:
         """Mark paths that are long across their way and have nearly all events of one polarity."""
         sizes = [np.median(path.size, 0) for path in paths]
-        thin = [wide < CONFIG.majority * long for long, wide in sizes]
-        across = [one and path.is_across_way for one, path in zip(thin, paths, strict=True)]
+        across = [
+            wide < CONFIG.majority * long and path.is_across_way
+            for (long, wide), path in zip(sizes, paths, strict=True)
+        ]
         if not any(across):
             return paths
         # The balance is the difference of both shares.
-        least = 2 * CONFIG.nearly_all - 1
-        marks = [
-            edge and abs(balance) > least
-            for edge, balance in zip(across, self.balances(paths), strict=True)
-        ]
-        pairs = zip(paths, marks, strict=True)
+        marks = across & (np.abs(self.balances(paths)) > 2 * CONFIG.nearly_all - 1)
+        pairs = zip(paths, marks.tolist(), strict=True)
         return [dataclasses.replace(path, lone_edge=mark) for path, mark in pairs]
 
     def whole(

@@ -115,7 +115,7 @@ def prefer_sharper(paths: list[TargetPath], stream: Stream) -> list[TargetPath]:
     some = max(1, int(least / CONFIG.min_recording_events))
     sharper = paths
     for every in dict.fromkeys((some, 1)):
-        sums = Blobs(*(np.zeros((2 * len(table.t), *size)) for size in ((), (2,), (2, 2))))
+        sums = Blobs.zeros(2 * len(table.t))
         for part, owner in stream.near(table, CONFIG.gate_sigmas, every):
             events = part.t, part.x, part.y, part.p
             _add_residuals(events, owner, table, first[:-1].copy(), sums)

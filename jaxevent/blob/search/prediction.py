@@ -57,9 +57,8 @@ class ScalePrediction(NamedTuple):
 
     density: NDArray[np.float64]  # (pixels, 4) 1/px^2, by ellipses and by each kernel
     scored: ScoredEvents
-    expected: float  # events of the blobs
-    large: float  # events in blobs of three and more,
-    split: float  # and in those of them that are in contact with another one
+    sums: NDArray[np.float64]  # (3,) events of the blobs, those in blobs of three and more, and
+    # those in such blobs that are in contact with another one
 
 
 class PredictionScore(NamedTuple):
@@ -103,7 +102,7 @@ class _PredictionScratch(NamedTuple):
         tables = tuple(map(_kernel_weights, KERNEL_RADII_PX, KERNEL_BINS_PX))
         bins = tuple(_bins(*(n // len(one) + one.shape[-1] for n in shape)) for one in tables)
         return cls(
-            DetectionScratch.empty(pixels), Blobs.empty(pixels), Blobs.empty(pixels),
+            DetectionScratch.empty(pixels), Blobs.zeros(pixels), Blobs.zeros(pixels),
             np.empty((pixels, 2)), np.empty((pixels, 2, 2)), np.empty((2, pixels)),
             np.empty(pixels, np.int32), np.empty(pixels), np.empty(pixels, bool),
             np.empty(scored, np.int64), bins, tables,
@@ -153,7 +152,7 @@ def predict(
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
         density, sums = np.zeros((number, N_DENSITIES)), np.zeros(3)
         _predict(before, scored.pixels, rows, clutter, cells, scratch, (density, sums))
-        out.append(ScalePrediction(density, scored, *sums.tolist()))
+        out.append(ScalePrediction(density, scored, sums))
     return out
 
 
@@ -168,10 +167,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
     b = np.concatenate([one.background for one in scored])
     most = CONFIG.max_scored_events
     weight = np.concatenate([max(1.0, one.number / most) * one.pixels.n for one in scored])
-    expected, large, split = (
-        np.array([getattr(one, name) for one in predictions])
-        for name in ("expected", "large", "split")
-    )
+    expected, large, split = np.array([one.sums for one in predictions]).T
     gains, near = np.zeros(len(predictions)), np.empty(len(b), np.int64)
     shares = np.full((2, N_DENSITIES), 1 / (N_DENSITIES))
     _sum_gains(density, b, weight, ends, (near, shares), gains)

@@ -310,7 +310,7 @@ def _edge_share(rate: NDArray[np.float64], mean: float) -> float:
     ndimage.label(excess > 0, np.ones((3, 3)), labels)
     number = int(labels.max())
     y, x = np.nonzero(excess)
-    parts = Blobs.empty(number)
+    parts = Blobs.zeros(number)
     sum_blobs(x, y, excess[y, x], labels[y, x], number, parts)
     square = larger_variance(parts.C)
     rest = np.maximum(np.trace(parts.C, axis1=1, axis2=2) - square, 0)
