@@ -81,7 +81,6 @@ class _PredictionScratch(NamedTuple):
     S: NDArray[np.float64]  # (pixels, 2, 2) px^2, and covariances of their events
     moved: NDArray[np.float64]  # (2, pixels) px, places of pixels that move with their blobs
     events: NDArray[np.int32]  # (pixels,) and their events
-    reach: NDArray[np.float64]  # (pixels,) px, sizes of the blobs
     touches: NDArray[np.bool_]  # (pixels,) whether a blob is in contact with another
     near: NDArray[np.int64]  # scored pixels near blobs
     bins: tuple[NDArray[np.int32], ...]  # zeros, one image of bins for each kernel
@@ -104,7 +103,7 @@ class _PredictionScratch(NamedTuple):
         return cls(
             DetectionScratch.empty(pixels), Blobs.zeros(pixels), Blobs.zeros(pixels),
             np.empty((pixels, 2)), np.empty((pixels, 2, 2)), np.empty((2, pixels)),
-            np.empty(pixels, np.int32), np.empty(pixels), np.empty(pixels, bool),
+            np.empty(pixels, np.int32), np.empty(pixels, bool),
             np.empty(scored, np.int64), bins, tables,
         )  # fmt: skip
 
@@ -344,19 +343,14 @@ def _count_split(number: int, scratch: Any) -> tuple[float, float]:
 
     Pieces along an outline are in contact with each other, both of its sides are not.
     """
-    (n, p, C), reach, touches = scratch.last, scratch.reach, scratch.touches
+    (n, p, C), touches = scratch.last, scratch.touches
     least, large, split = CONFIG.min_blob_events, 0.0, 0.0
     for k in range(number):
-        reach[k], touches[k] = np.sqrt(larger_variance_of(C[k])), False
-    for k in range(number):
+        touches[k] = False
         for j in range(k):
-            if n[k] < least or n[j] < least or (touches[k] and touches[j]):
-                continue
-            ux, uy = p[j, 0] - p[k, 0], p[j, 1] - p[k, 1]
-            if ux * ux + uy * uy >= (CONFIG.contact_distance * (reach[k] + reach[j])) ** 2:
-                continue
-            if in_contact(p, C, j, k):
-                touches[k] = touches[j] = True
+            if min(n[k], n[j]) >= least and not (touches[k] and touches[j]):
+                if in_contact(p, C, j, k):
+                    touches[k] = touches[j] = True
     for k in range(number):
         if n[k] >= least:
             large += n[k]
