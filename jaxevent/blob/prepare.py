@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.blob.owners import NO_OWNER_INDEX, owner_candidates
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.search import TargetSearchResult
-from jaxevent.blob.search.paths import NO_OWNER_INDEX, owner_candidates, tabulate_paths
+from jaxevent.blob.search.paths import tabulate_paths
 from jaxevent.blob.seeds import read_seeds, tracking_span
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError

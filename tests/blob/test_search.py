@@ -12,6 +12,7 @@ from scipy import stats
 
 from jaxevent import blob
 from jaxevent.blob.filter import EventBatch
+from jaxevent.blob.owners import NO_OWNER_INDEX, owner_candidates
 from jaxevent.blob.search.background import (
     clutter_evidence,
     find_hot_lines,
@@ -20,12 +21,10 @@ from jaxevent.blob.search.background import (
 )
 from jaxevent.blob.search.merge import merge_parts, stitch_paths
 from jaxevent.blob.search.paths import (
-    NO_OWNER_INDEX,
     TRIED_VELOCITY_NOISES,
     TargetPath,
     fit_velocity_noise,
     log_likelihood,
-    owner_candidates,
     tabulate_paths,
 )
 from jaxevent.blob.search.polarity import drop_lamps
@@ -432,7 +431,7 @@ def drop_of(parts, paths):
     us, (x, y) = np.rint(1e6 * t[order]).astype(np.int64), np.rint(xi[order]).T.astype(np.uint16)
     events = Events(us, x, y, on[order])[x < SMALL[0]]
     recording = Recording("lamps", *SMALL, events)
-    return drop_lamps(paths, recording, np.zeros(SMALL[::-1], bool))
+    return drop_lamps(paths, Stream(recording, int(us[0]), int(us[-1]) + 1))
 
 
 AT = np.arange(10_000, 2_000_000, 20_000)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxevent import blob
-from jaxevent.blob.search.background import Background, SceneMotion
+from jaxevent.blob.search.background import Background, SceneMotion, move_places
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.scene import (
     _required_gain,
@@ -77,10 +77,10 @@ def test_the_scene_goes_as_it_was_made_to():
     true = maps(scene.t)
     moved = np.einsum("nij,kj->nki", true[:, :, :2], start) + true[:, None, :, 2]
     for k, corner in enumerate(corners):
-        x, y = scene.to_sensor(corner[0], corner[1], scene.t)
+        x, y = move_places(scene.maps, *corner)
         assert np.hypot(*(np.stack([x, y], 1) - moved[:, k]).T).max() < 2.5
         np.testing.assert_allclose(
-            np.stack(scene.to_scene(x, y, scene.t), 1),
+            np.stack(move_places(scene.to_scene(scene.t), x, y), 1),
             np.broadcast_to(corner, moved[:, k].shape),
             atol=1e-9,
         )
@@ -99,9 +99,9 @@ def test_a_moving_map_holds_the_rates_of_places():
     background = measure_moving_background(Stream(recording, 0, 800_000), SceneMotion(t, M))
     true = 4e5 / SIZE.prod()
     assert background.mean_rate == pytest.approx(true, rel=0.15)
-    x = np.arange(2, 126)
+    y, x = np.mgrid[42:54, 2:126]
     for time in np.linspace(0, 0.79, 5):
-        assert background.rate_at(x, 48, time, 12).mean() == pytest.approx(true, rel=0.1)
+        assert background.rate_at(x, y, time).mean() == pytest.approx(true, rel=0.1)
 
 
 def test_what_another_depth_does_is_no_own_way():

@@ -43,7 +43,7 @@ class SceneMotion:
         """Largest distance (px) of the reference points from their places at the start."""
         return float(np.hypot(*(self._reference() - REFERENCE_POINTS_PX[:, None]).T).max())
 
-    @property
+    @functools.cached_property
     def speed(self) -> float:
         """Median speed (px/s) of the reference points over time."""
         moved = np.diff(self._reference(), axis=1)
@@ -51,39 +51,35 @@ class SceneMotion:
 
     def _reference(self) -> NDArray[np.float64]:
         """(4, n, 2) px, places of the reference points."""
-        moved = np.einsum("nij,kj->kni", self.maps[:, :, :2], REFERENCE_POINTS_PX)
-        return moved + self.maps[:, :, 2]
+        return np.stack(move_places(self.maps, *REFERENCE_POINTS_PX.T[..., None]), -1)
 
-    def _coefficients(self, t: Any) -> Any:
-        """Interpolate the maps linearly at times (s), as ((a, b, e), (c, d, f))."""
+    def at(self, t: NDArray | float | int) -> NDArray[np.float64]:
+        """Interpolate the maps (..., 2, 3) linearly at times (s)."""
         t = np.asarray(t, float)
         k = np.clip(np.searchsorted(self.t, t) - 1, 0, len(self.t) - 2)
         part = np.asarray((t - self.t[k]) / (self.t[k + 1] - self.t[k]))
-        maps = self.maps[k] + part[..., None, None] * (self.maps[k + 1] - self.maps[k])
-        return np.moveaxis(maps, (-2, -1), (0, 1))
+        return self.maps[k] + part[..., None, None] * (self.maps[k + 1] - self.maps[k])
 
-    def to_scene(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Map pixels at times (s) to places of the scene."""
-        (a, b, e), (c, d, f) = self._coefficients(t)
-        x, y, over = x - e, y - f, a * d - b * c
-        return (d * x - b * y) / over, (a * y - c * x) / over
+    def to_scene(
+        self, t: NDArray | float | int, corner: tuple[int, int] = (0, 0)
+    ) -> NDArray[np.float64]:
+        """Return maps (..., 2, 3) from pixels at times (s) to px of the scene from a corner."""
+        A, b = np.split(self.at(t), [2], -1)
+        A = np.linalg.inv(A)
+        return np.concatenate([A, -A @ b - np.reshape(corner, (2, 1))], -1)
 
-    def to_sensor(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Map places of the scene to pixels at times (s)."""
-        (a, b, e), (c, d, f) = self._coefficients(t)
-        return a * x + b * y + e, c * x + d * y + f
 
-    def still_times(self, begin: float | int, end: float | int) -> NDArray[np.float64]:
-        """Divide a span (s) so that the scene hardly moves between the times returned."""
-        number = 1 + int(self.speed * (end - begin) / CONFIG.resolution_px)
-        return np.linspace(begin, end, number + 1)
+def move_places(maps: NDArray, x: Any, y: Any) -> tuple[Any, Any]:
+    """Apply maps (..., 2, 3) to places."""
+    (a, b, e), (c, d, f) = np.moveaxis(maps, (-2, -1), (0, 1))
+    return a * x + b * y + e, c * x + d * y + f
 
 
 class CellField(NamedTuple):
     """Values of cells of the scene at one moment, for kernels."""
 
     values: NDArray[np.float64]  # (rows, columns)
-    cell: int  # px
+    cell_bits: int  # cells have 2^cell_bits px
     factor: float | int
     map: NDArray[np.float64]  # (2, 3), from pixels to px in the cells
 
@@ -91,7 +87,9 @@ class CellField(NamedTuple):
 @njit_noalloc_inlined
 def value_at(field: Any, x: Any, y: Any) -> Any:
     """Return the value of a field at a pixel."""
-    return field.values[cell_at(field.map, x, y, field.cell, field.values.shape)] * field.factor
+    return (
+        field.values[cell_at(field.map, x, y, field.cell_bits, field.values.shape)] * field.factor
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,29 +124,27 @@ class Background:
         part = np.asarray(t) / self.duration * N_TIME_SLICES
         return np.clip(part, 0, N_TIME_SLICES - 1).astype(np.int64)
 
-    def rate_at(
-        self, x: NDArray | float | int, y: NDArray | float | int, t: Any, over: int = FINE_CELL_PX
-    ) -> Any:
+    def rate_at(self, x: NDArray | float | int, y: NDArray | float | int, t: Any) -> Any:
         """Return rates at pixels, 1/(px s).
 
         Args:
             x: Pixels, px.
             y: Pixels, px.
             t: Times, s, one or as many as pixels.
-            over: Side (px) of the square over which the rate of a moving scene is averaged.
         """
-        cells = look_up(self._mean_rates(over), FINE_CELL_PX, *self.to_scene(x, y, t))
+        cells = look_up(self.rate, FINE_CELL_PX, *self.to_scene(x, y, t))
         return cells * self.activity[self.slice_at(t)]
 
-    def rate_field(self, t: float | int, over: int = FINE_CELL_PX) -> CellField:
-        """Return `rate_at` of one time (s) as a field."""
-        now = min(max(int(t / self.duration * N_TIME_SLICES), 0), N_TIME_SLICES - 1)
-        factor = float(self.activity[now])
-        return CellField(self._mean_rates(over), FINE_CELL_PX, factor, self._map_at(t))
+    def rate_field(self, t: float | int, over: int) -> CellField:
+        """Return rates of one time (s), of a moving scene as means of squares of `over` px."""
+        factor = float(self.activity[self.slice_at(t)])
+        return CellField(
+            self._mean_rates(over), FINE_CELL_PX.bit_length() - 1, factor, self._map_at(t)
+        )
 
-    def field_of(self, values: NDArray[np.float64], cell: int, t: float | int) -> CellField:
-        """Return the field of other values of the scene, in cells of `cell` px, at a time (s)."""
-        return CellField(values, cell, 1.0, self._map_at(t))
+    def field_of(self, values: NDArray[np.float64], t: float | int) -> CellField:
+        """Return the field of other values of the scene, in cells of 16 px, at a time (s)."""
+        return CellField(values, CELL_PX.bit_length() - 1, 1.0, self._map_at(t))
 
     def _mean_rates(self, over: int) -> NDArray[np.float64]:
         """Return rates averaged over squares of so many px, if the scene moves."""
@@ -162,7 +158,7 @@ class Background:
 
     def _map_at(self, t: float | int) -> NDArray[np.float64]:
         """Return the map (2, 3) from pixels at a time (s) to px from `corner`."""
-        return np.eye(2, 3) if self.scene is None else _map_to_scene(self.scene, self.corner, t)
+        return np.eye(2, 3) if self.scene is None else self.scene.to_scene(t, self.corner)
 
     @functools.cached_property
     def min_rate(self) -> float:
@@ -190,17 +186,7 @@ class Background:
         """Map pixels at times (s) to px from `corner`."""
         if self.scene is None:
             return x, y
-        x, y = self.scene.to_scene(x, y, t)
-        return x - self.corner[0], y - self.corner[1]
-
-
-def _map_to_scene(
-    scene: SceneMotion, corner: tuple[int, int], t: float | int
-) -> NDArray[np.float64]:
-    """Return the map (2, 3) from pixels at a time (s) to px of the scene from a corner."""
-    x, y = scene.to_scene(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), t)
-    first = [x[0] - corner[0], y[0] - corner[1]]
-    return np.stack([[x[1] - x[0], y[1] - y[0]], [x[2] - x[0], y[2] - y[0]], first], 1)
+        return move_places(self.scene.to_scene(t, self.corner), x, y)
 
 
 def spans_at_rest(
@@ -209,10 +195,11 @@ def spans_at_rest(
     """Divide spans (n, 2) s so that the scene is at rest in each part, counted in its span."""
     if scene is None:
         return CountedSpans(spans, np.tile(np.eye(2, 3), (len(spans), 1, 1)), np.arange(len(spans)))
-    times = [scene.still_times(*span) for span in spans]
+    number = 1 + (scene.speed * np.ptp(spans, axis=1) / CONFIG.resolution_px).astype(np.int64)
+    times = [np.linspace(*span, n + 1) for span, n in zip(spans, number, strict=True)]
     parts = np.concatenate([np.stack([t[:-1], t[1:]], 1) for t in times])
-    maps = np.stack([_map_to_scene(scene, corner, t) for t in parts.mean(1)])
-    return CountedSpans(parts, maps, np.repeat(np.arange(len(spans)), [len(t) - 1 for t in times]))
+    maps = scene.to_scene(parts.mean(1), corner)
+    return CountedSpans(parts, maps, np.repeat(np.arange(len(spans)), number))
 
 
 def count_in_slices(
@@ -370,16 +357,12 @@ def measure_dispersions(
     spans = [np.stack([t - w / 2, t + w / 2], 1) for t, w in zip(centres, windows, strict=True)]
     spans = np.concatenate(spans)
     N = np.zeros((len(spans), *background.calm.shape[1:]), np.int32)
-    if background.scene is None:
-        stream.count_in_spans(spans, CELL_PX, N)
-    else:
-        parts = spans_at_rest(spans, background.scene, background.corner)
-        stream.count_in_cells(parts, CELL_PX, N)
-    out, first = [], 0
-    for t in centres:
-        out.append(_dispersion(N[first : first + len(t)], background, background.slice_at(t)))
-        first += len(t)
-    return out
+    stream.count_in_cells(spans_at_rest(spans, background.scene, background.corner), CELL_PX, N)
+    each = np.split(N, np.cumsum([len(t) for t in centres])[:-1])
+    return [
+        _dispersion(n, background, background.slice_at(t))
+        for n, t in zip(each, centres, strict=True)
+    ]
 
 
 def _dispersion(
@@ -387,9 +370,9 @@ def _dispersion(
 ) -> NDArray[np.float64]:
     """Compute the dispersion of counts (windows, rows, columns) of windows in given slices."""
     calm, activity = background.calm[slices], background.activity[slices]
-    sums = np.zeros((6, *N.shape[1:]))
+    sums = np.zeros((4, *N.shape[1:]))
     _sum_calm_counts(N, calm, activity, background.bright, sums)
-    _, squares, expected, fullest, windows, _ = sums
+    squares, expected, fullest, windows = sums
     full = expected >= CONFIG.min_dispersion_events
     own = np.where(full, squares / np.maximum(expected, CONFIG.min_dispersion_events), 1.0)
     usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
@@ -402,28 +385,23 @@ def _dispersion(
 def _sum_calm_counts(N: Any, calm: Any, activity: Any, bright: Any, sums: Any) -> None:
     """Fill in sums over the calm windows of each cell.
 
-    The sums are: mean count, squares about it, expected events, nats of the fullest window of a
-    bright cell, number of windows, and their activity.
+    The sums are: squares about the mean count, expected events, nats of the fullest window of a
+    bright cell, and the number of windows.
     """
-    windows, rows, columns = N.shape
-    mean, squares, expected = sums[0], sums[1], sums[2]
-    fullest, seen, active = sums[3], sums[4], sums[5]
-    for k in range(windows):
-        for i in range(rows):
-            for j in range(columns):
+    squares, expected, fullest, seen = sums[0], sums[1], sums[2], sums[3]
+    for i in range(N.shape[1]):
+        for j in range(N.shape[2]):
+            total = active = 0.0
+            for k in range(len(N)):
                 if calm[k, i, j]:
-                    mean[i, j] += N[k, i, j]
-                    active[i, j] += activity[k]
+                    total += N[k, i, j]
+                    active += activity[k]
                     seen[i, j] += 1
-    for i in range(rows):
-        for j in range(columns):
-            mean[i, j] /= max(active[i, j], 1.0)
-    for k in range(windows):
-        for i in range(rows):
-            for j in range(columns):
+            mean = total / max(active, 1.0)
+            for k in range(len(N)):
                 if calm[k, i, j]:
-                    mu = mean[i, j] * activity[k]
+                    mu = mean * activity[k]
                     squares[i, j] += (N[k, i, j] - mu) ** 2
                     expected[i, j] += mu
-                    if bright[i, j] and N[k, i, j] > mu:
+                    if bright[i, j]:
                         fullest[i, j] = max(fullest[i, j], poisson_nats(N[k, i, j], mu))

@@ -45,10 +45,11 @@ class Scale:
         """Least dispersion of the sensor's cells."""
         return float(self.dispersion.min())
 
-    @property
-    def dispersion_gain(self) -> float:
-        """Cells of 16 px in 3x3 of the scale's cells, at least 1."""
-        return max(1.0, (3 * self.cell / CELL_PX) ** 2)
+    @functools.cached_property
+    def wide_dispersion(self) -> NDArray[np.float64]:
+        """(rows, columns) dispersion in 3x3 of the scale's cells, where that of cells adds up."""
+        gain = max(1.0, (3 * self.cell / CELL_PX) ** 2)
+        return self.min_dispersion + (self.dispersion - self.min_dispersion) * gain
 
 
 class Blobs(NamedTuple):
@@ -59,9 +60,9 @@ class Blobs(NamedTuple):
     C: NDArray[np.float64]  # (blobs, 2, 2) px^2, covariances
 
     @classmethod
-    def empty(cls, number: int) -> "Blobs":
-        """Allocate the moments of so many blobs."""
-        return cls(np.empty(number), np.empty((number, 2)), np.empty((number, 2, 2)))
+    def zeros(cls, number: int) -> "Blobs":
+        """Allocate the moments of so many blobs without events."""
+        return cls(np.zeros(number), np.zeros((number, 2)), np.zeros((number, 2, 2)))
 
 
 class DetectionScratch(NamedTuple):
@@ -83,11 +84,10 @@ class ClutterModel(NamedTuple):
     """Clutter of one window and the threshold of detection, for kernels."""
 
     rates: CellField  # 1/(px s)
-    dispersion: CellField  # variance over mean of counts
+    dispersion: CellField  # variance over mean of counts in 3x3 cells
     cell_bits: int  # cells have 2^cell_bits px
     row_cells: int  # cells of a row, with the border
     exposure: float | int  # s px^2, of 3x3 cells
-    dispersion_gain: float | int  # of 3x3 cells, see `Scale`
     min_dispersion: float | int
     min_events: float | int  # expected events of 3x3 cells where the clutter is least
     log_threshold: float | int  # nats
@@ -109,8 +109,8 @@ def clutter_model(
     tests = -(-shape[0] // g) * -(-shape[1] // g) * background.duration / scale.window
     rates = background.rate_field(t, 3 * g)
     return ClutterModel(
-        rates, background.field_of(scale.dispersion, CELL_PX, t), g.bit_length() - 1,
-        -(-shape[1] // g) + 2, float(exposure), scale.dispersion_gain, scale.min_dispersion,
+        rates, background.field_of(scale.wide_dispersion, t), g.bit_length() - 1,
+        -(-shape[1] // g) + 2, float(exposure), scale.min_dispersion,
         float(background.min_rate * rates.factor * exposure),
         float(np.log(tests / CONFIG.false_alarms)),
     )  # fmt: skip
@@ -118,13 +118,8 @@ def clutter_model(
 
 @njit_noalloc
 def clutter_at(clutter: Any, x: Any, y: Any) -> Any:
-    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel.
-
-    In 3x3 cells the dispersion of cells adds up.
-    """
-    excess = value_at(clutter.dispersion, x, y) - clutter.min_dispersion
-    dispersion = clutter.min_dispersion + excess * clutter.dispersion_gain
-    return value_at(clutter.rates, x, y), dispersion
+    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel."""
+    return value_at(clutter.rates, x, y), value_at(clutter.dispersion, x, y)
 
 
 def detect(
@@ -263,7 +258,7 @@ def measure_blobs(
         labels: Blob of each, from 1 on; 0 for none.
         number: Number of blobs.
     """
-    blobs = Blobs.empty(number)
+    blobs = Blobs.zeros(number)
     sum_blobs(events.x, events.y, _weights(events), labels, number, blobs)
     return blobs
 
@@ -380,25 +375,12 @@ def _clear_blobs(blobs: Any, number: int) -> None:
         blobs.C[k, 0, 0] = blobs.C[k, 0, 1] = blobs.C[k, 1, 1] = 0.0
 
 
-def contact_distance(pa: NDArray, Ca: NDArray, pb: NDArray, Cb: NDArray) -> Any:
-    """Compute distances of ellipses over the sum of their standard deviations between them.
-
-    Args:
-        pa: (..., 2) px, centres.
-        Ca: (..., 2, 2) px^2, covariances.
-        pb: (..., 2) px, centres of the others.
-        Cb: (..., 2, 2) px^2, their covariances.
-    """
-    d = pb - pa
-    length = np.hypot(d[..., 0], d[..., 1])
-    u = d / np.maximum(length, 1e-9)[..., None]
-    reach = [np.sqrt(np.einsum("...i,...ij,...j", u, C, u)) for C in (Ca, Cb)]
-    return length / np.maximum(reach[0] + reach[1], 1e-9)
-
-
 @njit_noalloc_inlined
 def in_contact(p: Any, C: Any, j: int, k: int) -> bool:
-    """Return whether the `contact_distance` of two ellipses of a list is small."""
+    """Return whether two ellipses of a list are near each other.
+
+    Near is twice the sum of their standard deviations along the line between them.
+    """
     x, y, reach = p[k, 0] - p[j, 0], p[k, 1] - p[j, 1], 0.0
     for i in (j, k):
         reach += np.sqrt(C[i, 0, 0] * x * x + 2 * C[i, 0, 1] * x * y + C[i, 1, 1] * y * y)

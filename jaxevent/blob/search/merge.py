@@ -39,7 +39,7 @@ from jaxevent.blob.search.paths import (
     merge_paths,
 )
 from jaxevent.blob.search.scene import BLUR_SIGMAS_BINS, map_gain, measure_moving_background
-from jaxevent.blob.search.stream import Stream
+from jaxevent.blob.search.stream import Stream, WindowEvents
 
 N_ANGLE_BINS = 256  # bins of a turn
 
@@ -341,15 +341,22 @@ def _measure_turn(own: Stream, turn: Turn, window: float) -> SceneMotion:
     rate of pieces is up to twice too small.
     """
     number = int(own.duration / window)
-    polar = _PolarImages(own, turn, window)
+    whole = own.pixel_counts(0, own.duration)
+    far = np.hypot(whole.x - turn.centre[0], whole.y - turn.centre[1])
+    rings = int(np.quantile(far, CONFIG.nearly_all, method="lower") / FINE_CELL_PX) + 1
     order = 1j * np.arange(N_ANGLE_BINS // 2 + 1)
     step = turn.rate * window
     reach = max(2, int(abs(step) / (2 * np.pi) * N_ANGLE_BINS))
     reach = min(reach, N_ANGLE_BINS // 2 - 1)
     near = np.arange(-reach, reach + 1)
-    angles, seen = [0.0], polar.spectrum(0)
+
+    def spectrum(k: int) -> NDArray[np.complex128]:
+        part = own.window(k * window, (k + 1) * window)
+        return _ring_spectrum(part, turn, (k + 0.5) * window, rings)
+
+    angles, seen = [0.0], spectrum(0)
     for k in range(1, number):
-        now = polar.spectrum(k)
+        now = spectrum(k)
         expected = angles[-1] + step
         correlation = np.fft.irfft(
             (now * seen.conj()).sum(0) * np.exp(order * expected), N_ANGLE_BINS
@@ -368,29 +375,19 @@ def _measure_turn(own: Stream, turn: Turn, window: float) -> SceneMotion:
     return SceneMotion(t, maps)
 
 
-class _PolarImages:
-    """Roots of counts of a stream's windows (s), in rings and angles about a point."""
+def _ring_spectrum(part: WindowEvents, turn: Turn, t: float, rings: int) -> NDArray[np.complex128]:
+    """Transform roots of counts in rings and angles about a point to (rings, frequencies).
 
-    def __init__(self, own: Stream, turn: Turn, window: float):
-        self.own, self.turn, self.window = own, turn, window
-        whole = own.pixel_counts(0, own.duration)
-        far = np.sort(np.hypot(whole.x - turn.centre[0], whole.y - turn.centre[1]))
-        self.rings = int(far[int(CONFIG.nearly_all * (len(far) - 1))] / FINE_CELL_PX) + 1
-
-    def spectrum(self, k: int) -> NDArray[np.complex128]:
-        """Transform window k to (rings, frequencies), its events carried to its middle."""
-        part = self.own.window(k * self.window, (k + 1) * self.window)
-        dx, dy = part.x - self.turn.centre[0], part.y - self.turn.centre[1]
-        late = part.t - (k + 0.5) * self.window
-        angle = (np.arctan2(dy, dx) - self.turn.rate * late) / (2 * np.pi) % 1
-        ring = (np.hypot(dx, dy) / FINE_CELL_PX).astype(np.int64)
-        place = ring * N_ANGLE_BINS + (angle * N_ANGLE_BINS).astype(np.int64) % N_ANGLE_BINS
-        size = self.rings * N_ANGLE_BINS
-        counts = np.bincount(place[place < size], minlength=size).reshape(-1, N_ANGLE_BINS)
-        image = ndimage.gaussian_filter1d(
-            np.sqrt(counts), BLUR_SIGMAS_BINS[-1], axis=1, mode="wrap"
-        )
-        return np.fft.rfft(image - image.mean(1, keepdims=True))
+    Events are carried to a time t (s) as they turn.
+    """
+    dx, dy = part.x - turn.centre[0], part.y - turn.centre[1]
+    angle = (np.arctan2(dy, dx) - turn.rate * (part.t - t)) / (2 * np.pi) % 1
+    ring = (np.hypot(dx, dy) / FINE_CELL_PX).astype(np.int64)
+    place = ring * N_ANGLE_BINS + (angle * N_ANGLE_BINS).astype(np.int64) % N_ANGLE_BINS
+    size = rings * N_ANGLE_BINS
+    counts = np.bincount(place[place < size], minlength=size).reshape(-1, N_ANGLE_BINS)
+    image = ndimage.gaussian_filter1d(np.sqrt(counts), BLUR_SIGMAS_BINS[-1], axis=1, mode="wrap")
+    return np.fft.rfft(image - image.mean(1, keepdims=True))
 
 
 def _is_connected(moving: Background, centre: NDArray[np.float64]) -> bool:

@@ -27,7 +27,7 @@ from jaxevent.blob.search.paths import (
     merge_paths,
     tabulate_paths,
 )
-from jaxevent.blob.search.stream import Stream, WindowEvents, batches_near_paths
+from jaxevent.blob.search.stream import Stream, WindowEvents
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,27 +47,23 @@ class OwnFrame:
     def balances(self, paths: list[TargetPath]) -> list[float]:
         """Compute the balance of polarities of each path's events: 1 if all are ON, -1 if OFF."""
         sums = np.zeros((2, len(paths) + 1))
-        table, gate = tabulate_paths(paths), CONFIG.gate_sigmas
-        for _, part, owner in batches_near_paths(self.stream.recording.events, table, gate):
-            seen = ~self.stream.hot[part.y, part.x]
-            owners, signs = owner[seen, 0] + 1, np.where(part.p[seen], 1, -1)
+        for part, owner in self.stream.near(tabulate_paths(paths), CONFIG.gate_sigmas):
+            owners, signs = owner[:, 0] + 1, np.where(part.p, 1, -1)
             sums += [np.bincount(owners, weights, len(sums[0])) for weights in (signs, signs**2)]
         return (sums[0] / np.maximum(sums[1], 1))[1:].tolist()
 
     def mark_lone_edges(self, paths: list[TargetPath]) -> list[TargetPath]:
         """Mark paths that are long across their way and have nearly all events of one polarity."""
         sizes = [np.median(path.size, 0) for path in paths]
-        thin = [wide < CONFIG.majority * long for long, wide in sizes]
-        across = [one and path.is_across_way for one, path in zip(thin, paths, strict=True)]
+        across = [
+            wide < CONFIG.majority * long and path.is_across_way
+            for (long, wide), path in zip(sizes, paths, strict=True)
+        ]
         if not any(across):
             return paths
         # The balance is the difference of both shares.
-        least = 2 * CONFIG.nearly_all - 1
-        marks = [
-            edge and abs(balance) > least
-            for edge, balance in zip(across, self.balances(paths), strict=True)
-        ]
-        pairs = zip(paths, marks, strict=True)
+        marks = across & (np.abs(self.balances(paths)) > 2 * CONFIG.nearly_all - 1)
+        pairs = zip(paths, marks.tolist(), strict=True)
         return [dataclasses.replace(path, lone_edge=mark) for path, mark in pairs]
 
     def whole(

@@ -20,30 +20,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.blob.owners import NO_OWNER_INDEX
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import Blobs, add_moments
-from jaxevent.blob.search.paths import (
-    NO_OWNER_INDEX,
-    TargetPath,
-    fit_velocity_noise,
-    tabulate_paths,
-)
-from jaxevent.blob.search.stream import batches_near_paths
+from jaxevent.blob.search.paths import TargetPath, fit_velocity_noise, tabulate_paths
+from jaxevent.blob.search.stream import Stream
 from jaxevent.codegen import njit_noalloc
-from jaxevent.recording import Recording
 
 MAINS_HZ = np.array([50.0, 60.0])
 
 
-def drop_lamps(
-    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_]
-) -> tuple[list[TargetPath], int]:
+def drop_lamps(paths: list[TargetPath], stream: Stream) -> tuple[list[TargetPath], int]:
     """Drop the paths of lamps on the mains.
 
     Args:
         paths: Paths of targets and lamps.
-        recording: Events.
-        hot: (rows, columns) pixels that are left out.
+        stream: Events.
 
     Returns:
         The other paths, and the number of lamps.
@@ -57,7 +49,7 @@ def drop_lamps(
         return paths, 0
     begin = min(paths[k].begin for k in some)
     lamps = set()
-    each = _mains_coherence([paths[k] for k in some], recording, hot)
+    each = _mains_coherence([paths[k] for k in some], stream)
     for k, coherence in zip(some, each, strict=True):
         # A track that hops between a lamp and targets is that of the lamp if it is mostly there.
         piece = (paths[k].t - begin) // CONFIG.lamp_piece_us
@@ -76,9 +68,7 @@ def _stays(path: TargetPath, rows: NDArray[np.int64]) -> bool:
     return bool(np.median(away) <= CONFIG.gate_sigmas * np.median(path.size[rows, 0]))
 
 
-def _mains_coherence(
-    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _mains_coherence(paths: list[TargetPath], stream: Stream) -> NDArray[np.float64]:
     """Compute the coherence (paths, pieces) of events with the mains; NaN without events.
 
     Pieces begin with the first of the paths. A path whose coherence may be chance has 0.
@@ -90,10 +80,9 @@ def _mains_coherence(
     every = max(1, int(faintest * piece / CONFIG.min_recording_events / 10))
     n = np.zeros((len(paths), pieces))
     z = np.zeros((len(MAINS_HZ), len(paths) * pieces), complex)
-    gate = CONFIG.gate_sigmas
-    for _, part, near in batches_near_paths(recording.events, table, gate, every=every):
+    for part, near in stream.near(table, CONFIG.gate_sigmas, every):
         owner = near[:, 0]
-        seen = (owner != NO_OWNER_INDEX) & ~hot[part.y, part.x]
+        seen = owner != NO_OWNER_INDEX
         t = part.t[seen] - begin
         place = owner[seen] * pieces + t // piece
         n += np.bincount(place, minlength=n.size).reshape(n.shape)
@@ -110,29 +99,26 @@ def _mains_coherence(
     return np.where(sure[:, None], each, 0.0)
 
 
-def prefer_sharper(
-    paths: list[TargetPath], recording: Recording, hot: NDArray[np.bool_]
-) -> list[TargetPath]:
+def prefer_sharper(paths: list[TargetPath], stream: Stream) -> list[TargetPath]:
     """Replace paths by those of the sharper polarity's events, where the other polarity lags.
 
     Args:
         paths: Paths of targets.
-        recording: Events.
-        hot: (rows, columns) pixels that are left out.
+        stream: Events.
     """
     if not paths:
         return paths
     table = tabulate_paths(paths)
-    first, gate = table.first, CONFIG.gate_sigmas
+    first = table.first
     # Few of the events of bright targets suffice to find that no polarity lags.
     least = min(float(np.median(path.n)) for path in paths)
     some = max(1, int(least / CONFIG.min_recording_events))
     sharper = paths
     for every in dict.fromkeys((some, 1)):
-        sums = Blobs(*(np.zeros((2 * len(table.t), *size)) for size in ((), (2,), (2, 2))))
-        for _, part, owner in batches_near_paths(recording.events, table, gate, every=every):
+        sums = Blobs.zeros(2 * len(table.t))
+        for part, owner in stream.near(table, CONFIG.gate_sigmas, every):
             events = part.t, part.x, part.y, part.p
-            _add_residuals(events, owner, table, hot, first[:-1].copy(), sums)
+            _add_residuals(events, owner, table, first[:-1].copy(), sums)
         rows = zip(paths, first[:-1], first[1:], strict=True)
         sharper = [
             _sharper_path(path, Blobs(*(value[2 * a : 2 * b] for value in sums)))
@@ -175,7 +161,7 @@ def _sharper_path(path: TargetPath, sums: Blobs) -> TargetPath:
 
 
 @njit_noalloc
-def _add_residuals(events: Any, owner: Any, table: Any, hot: Any, rows: Any, sums: Any) -> None:
+def _add_residuals(events: Any, owner: Any, table: Any, rows: Any, sums: Any) -> None:
     """Add events' residuals to the sums of their paths' windows, OFF and ON by turns.
 
     Events (t, x, y, p) that may belong to two paths are left out. `rows` are those of the paths
@@ -184,7 +170,7 @@ def _add_residuals(events: Any, owner: Any, table: Any, hot: Any, rows: Any, sum
     t, x, y, p = events
     for i in range(len(t)):
         k = owner[i, 0]
-        if k < 0 or owner[i, 1] >= 0 or hot[y[i], x[i]]:
+        if k < 0 or owner[i, 1] >= 0:
             continue
         last, half = table.first[k + 1] - 1, table.window[k] / 2
         while rows[k] < last and table.t[rows[k]] + half <= t[i]:

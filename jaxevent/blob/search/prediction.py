@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.background import CELL_PX, Background
+from jaxevent.blob.search.background import Background
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import (
     Blobs,
@@ -57,9 +57,8 @@ class ScalePrediction(NamedTuple):
 
     density: NDArray[np.float64]  # (pixels, 4) 1/px^2, by ellipses and by each kernel
     scored: ScoredEvents
-    expected: float  # events of the blobs
-    large: float  # events in blobs of three and more,
-    split: float  # and in those of them that are in contact with another one
+    sums: NDArray[np.float64]  # (3,) events of the blobs, those in blobs of three and more, and
+    # those in such blobs that are in contact with another one
 
 
 class PredictionScore(NamedTuple):
@@ -82,10 +81,8 @@ class _PredictionScratch(NamedTuple):
     S: NDArray[np.float64]  # (pixels, 2, 2) px^2, and covariances of their events
     moved: NDArray[np.float64]  # (2, pixels) px, places of pixels that move with their blobs
     events: NDArray[np.int32]  # (pixels,) and their events
-    reach: NDArray[np.float64]  # (pixels,) px, sizes of the blobs
     touches: NDArray[np.bool_]  # (pixels,) whether a blob is in contact with another
-    order: NDArray[np.int64]  # scored pixels by strips of rows; later those near blobs
-    strips: NDArray[np.int64]  # (2, strips + 1), begin of each strip, and its next free place
+    near: NDArray[np.int64]  # scored pixels near blobs
     bins: tuple[NDArray[np.int32], ...]  # zeros, one image of bins for each kernel
     tables: tuple[NDArray[np.float64], ...]  # `_kernel_weights`
 
@@ -103,12 +100,11 @@ class _PredictionScratch(NamedTuple):
         """
         tables = tuple(map(_kernel_weights, KERNEL_RADII_PX, KERNEL_BINS_PX))
         bins = tuple(_bins(*(n // len(one) + one.shape[-1] for n in shape)) for one in tables)
-        strips = shape[0] // CELL_PX + 2
         return cls(
-            DetectionScratch.empty(pixels), Blobs.empty(pixels), Blobs.empty(pixels),
+            DetectionScratch.empty(pixels), Blobs.zeros(pixels), Blobs.zeros(pixels),
             np.empty((pixels, 2)), np.empty((pixels, 2, 2)), np.empty((2, pixels)),
-            np.empty(pixels, np.int32), np.empty(pixels), np.empty(pixels, bool),
-            np.empty(scored, np.int64), np.empty((2, strips), np.int64), bins, tables,
+            np.empty(pixels, np.int32), np.empty(pixels, bool),
+            np.empty(scored, np.int64), bins, tables,
         )  # fmt: skip
 
 
@@ -149,12 +145,13 @@ def predict(
     """
     number = len(scored.pixels)
     scratch = _PredictionScratch.empty(max(map(len, before)), number, shape)
-    out = []
+    order = np.argsort(scored.pixels.y)
+    rows, out = (order, scored.pixels.y[order]), []
     for clutter in clutters:
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
         density, sums = np.zeros((number, N_DENSITIES)), np.zeros(3)
-        _predict(before, scored.pixels, clutter, cells, scratch, (density, sums))
-        out.append(ScalePrediction(density, scored, *sums.tolist()))
+        _predict(before, scored.pixels, rows, clutter, cells, scratch, (density, sums))
+        out.append(ScalePrediction(density, scored, sums))
     return out
 
 
@@ -169,10 +166,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
     b = np.concatenate([one.background for one in scored])
     most = CONFIG.max_scored_events
     weight = np.concatenate([max(1.0, one.number / most) * one.pixels.n for one in scored])
-    expected, large, split = (
-        np.array([getattr(one, name) for one in predictions])
-        for name in ("expected", "large", "split")
-    )
+    expected, large, split = np.array([one.sums for one in predictions]).T
     gains, near = np.zeros(len(predictions)), np.empty(len(b), np.int64)
     shares = np.full((2, N_DENSITIES), 1 / (N_DENSITIES))
     _sum_gains(density, b, weight, ends, (near, shares), gains)
@@ -223,7 +217,9 @@ def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains
 
 
 @njit_noalloc
-def _predict(before: Any, scored: Any, clutter: Any, cells: Any, scratch: Any, out: Any) -> None:
+def _predict(
+    before: Any, scored: Any, rows: Any, clutter: Any, cells: Any, scratch: Any, out: Any
+) -> None:
     """Add densities (pixels, 4), and sums (3,): expected events, those in large and split blobs."""
     (first, second), (density, sums) = before, out
     labels = scratch.detection.labels
@@ -231,11 +227,11 @@ def _predict(before: Any, scored: Any, clutter: Any, cells: Any, scratch: Any, o
     sum_blobs(first.x, first.y, first.n, labels, earlier, scratch.before)
     number = find_blobs(second.x, second.y, second.n, clutter, cells, scratch.detection)
     sum_blobs(second.x, second.y, second.n, labels, number, scratch.last)
-    near, order = len(scored.x), scratch.order
+    near, order = len(scored.x), scratch.near
     if near == 0 or number == 0:
         return
     _extrapolate(earlier, number, scratch)
-    _add_ellipses(density, scored.x, scored.y, number, scratch)
+    _add_ellipses(density, scored, rows, number, scratch)
     pixels = _move_pixels(second, scratch)
     for j in range(near):
         order[j] = j
@@ -277,36 +273,25 @@ def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
 
 
 @njit_noalloc_inlined
-def _add_ellipses(density: Any, x: Any, y: Any, number: int, scratch: Any) -> None:
+def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: Any) -> None:
     """Add the densities of Gaussian blobs at pixels to the first column.
 
-    Pixels are sorted into strips of `CELL_PX` rows; a blob visits the strips that it reaches.
+    `rows` are the order of pixels by their rows, and these rows: a blob visits those it reaches.
     """
-    n, p, S, order = scratch.last.n, scratch.p, scratch.S, scratch.order
-    first, following = scratch.strips[0], scratch.strips[1]
-    strips = len(first) - 1
-    for j in range(strips + 1):
-        first[j] = 0
-    for j in range(len(x)):
-        first[y[j] // CELL_PX + 1] += 1
-    for j in range(strips):
-        first[j + 1] += first[j]
-        following[j] = first[j]
-    for j in range(len(x)):
-        strip = y[j] // CELL_PX
-        order[following[strip]] = j
-        following[strip] += 1
+    n, p, S, x, y = scratch.last.n, scratch.p, scratch.S, scored.x, scored.y
+    order, sorted_y = rows
     for k in range(number):
         a, b, c = S[k, 0, 0], S[k, 0, 1], S[k, 1, 1]
         determinant = a * c - b * b
         peak = n[k] / (2 * np.pi * np.sqrt(determinant))
         wide, high = np.sqrt(MAX_SQUARED_SIGMAS * a), np.sqrt(MAX_SQUARED_SIGMAS * c)
-        low = min(max(int((p[k, 1] - high) / CELL_PX), 0), strips - 1)
-        top = min(max(int((p[k, 1] + high) / CELL_PX), 0), strips - 1)
-        for i in range(first[low], first[top + 1]):
+        first = np.searchsorted(sorted_y, p[k, 1] - high)
+        for i in range(first, len(order)):
+            if sorted_y[i] >= p[k, 1] + high:
+                break
             j = order[i]
             ex, ey = x[j] - p[k, 0], y[j] - p[k, 1]
-            if abs(ex) < wide and abs(ey) < high:
+            if abs(ex) < wide:
                 squared = (c * ex * ex - 2 * b * ex * ey + a * ey * ey) / determinant
                 if squared < MAX_SQUARED_SIGMAS:
                     density[j, 0] += peak * np.exp(-0.5 * squared)
@@ -358,19 +343,14 @@ def _count_split(number: int, scratch: Any) -> tuple[float, float]:
 
     Pieces along an outline are in contact with each other, both of its sides are not.
     """
-    (n, p, C), reach, touches = scratch.last, scratch.reach, scratch.touches
+    (n, p, C), touches = scratch.last, scratch.touches
     least, large, split = CONFIG.min_blob_events, 0.0, 0.0
     for k in range(number):
-        reach[k], touches[k] = np.sqrt(larger_variance_of(C[k])), False
-    for k in range(number):
+        touches[k] = False
         for j in range(k):
-            if n[k] < least or n[j] < least or (touches[k] and touches[j]):
-                continue
-            ux, uy = p[j, 0] - p[k, 0], p[j, 1] - p[k, 1]
-            if ux * ux + uy * uy >= (CONFIG.contact_distance * (reach[k] + reach[j])) ** 2:
-                continue
-            if in_contact(p, C, j, k):
-                touches[k] = touches[j] = True
+            if min(n[k], n[j]) >= least and not (touches[k] and touches[j]):
+                if in_contact(p, C, j, k):
+                    touches[k] = touches[j] = True
     for k in range(number):
         if n[k] >= least:
             large += n[k]

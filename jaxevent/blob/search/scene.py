@@ -23,6 +23,7 @@ from jaxevent.blob.search.background import (
     Background,
     SceneMotion,
     count_in_slices,
+    move_places,
     pool,
 )
 from jaxevent.blob.search.config import CONFIG
@@ -114,22 +115,16 @@ def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]
     return motion
 
 
-@njit
-def _update_reference(image: Any, motion: Any, now: Any, gain: Any) -> Any:
+def _update_reference(
+    image: NDArray, motion: NDArray, now: NDArray, gain: float
+) -> NDArray[np.float64]:
     """Move an image, and blend it with a new one, which is taken alone where it was not seen."""
-    (rows, columns), out = image.shape, np.empty(image.shape)
-    quarter = (rows + columns) / 4
-    for row in range(rows):
-        y = (row - (rows - 1) / 2) / quarter
-        for column in range(columns):
-            x = (column - (columns - 1) / 2) / quarter
-            dx, dy = motion[1] - motion[0] * y, motion[2] + motion[0] * x
-            before = _interpolate(image, row - dy, column - dx)
-            if before == before:
-                out[row, column] = (1 - gain) * before + gain * now[row, column]
-            else:
-                out[row, column] = now[row, column]
-    return out
+    turn = motion[0] / (sum(image.shape) / 4)
+    A = np.array([[1, -turn], [turn, 1]])
+    middle = (np.array(image.shape) - 1) / 2
+    b = middle - A @ middle - motion[:0:-1]
+    before = ndimage.affine_transform(image, A, b, order=1, cval=np.nan)
+    return np.where(np.isnan(before), now, (1 - gain) * before + gain * now)
 
 
 @njit
@@ -315,7 +310,7 @@ def _edge_share(rate: NDArray[np.float64], mean: float) -> float:
     ndimage.label(excess > 0, np.ones((3, 3)), labels)
     number = int(labels.max())
     y, x = np.nonzero(excess)
-    parts = Blobs.empty(number)
+    parts = Blobs.zeros(number)
     sum_blobs(x, y, excess[y, x], labels[y, x], number, parts)
     square = larger_variance(parts.C)
     rest = np.maximum(np.trace(parts.C, axis1=1, axis2=2) - square, 0)
@@ -359,8 +354,8 @@ def _scene_flow(
     """Compute velocities (rows, 2) px/s of the scene at a path's places."""
     step = path.window * 1e-6
     now = np.clip(t[:, None] + [-step, step], scene.t[0], scene.t[-1])
-    x, y = scene.to_scene(path.p[:, 0], path.p[:, 1], t)
-    x, y = scene.to_sensor(x[:, None], y[:, None], now)
+    x, y = move_places(scene.to_scene(t), *path.p.T)
+    x, y = move_places(scene.at(now), x[:, None], y[:, None])
     flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
     return flow / np.maximum(now[:, 1] - now[:, 0], 1e-9)[:, None]
 
@@ -377,13 +372,13 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
     size = np.array([stream.width, stream.height])
     middles = (np.arange(N_TIME_SLICES) + 0.5) / N_TIME_SLICES * stream.duration
     x, y = (np.array([[0, 1, 0, 1], [0, 0, 1, 1]]) * (size[:, None] - 1))[..., None]
-    places = np.stack(scene.to_scene(x, y, middles))
+    places = np.stack(move_places(scene.to_scene(middles), x, y))
     low = np.floor(places.min((1, 2)))
     columns, rows = ((places.max((1, 2)) - low) // CELL_PX + 1).astype(int).tolist()
     corner = int(low[0]), int(low[1])
 
     y, x = np.mgrid[:rows, :columns] * CELL_PX + CELL_PX / 2
-    x, y = scene.to_sensor(x[..., None] + low[0], y[..., None] + low[1], middles)
+    x, y = move_places(scene.at(middles), x[..., None] + low[0], y[..., None] + low[1])
     seen = np.moveaxis((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]), 2, 0)
     by = CELL_PX // FINE_CELL_PX
     cells = count_in_slices(stream, (rows * by, columns * by), scene, corner)

@@ -19,7 +19,6 @@ from jaxevent.blob.search.detection import (
     Scale,
     clutter_at,
     clutter_model,
-    contact_distance,
     larger_variance,
 )
 from jaxevent.blob.search.merge import merge_parts, merge_turning, stitch_paths
@@ -305,28 +304,25 @@ def find(
         return TargetSearchResult((), (), 0, 0.0, recording)
     found: list[TargetPath] = []
     passes: list[SearchPass] = []
-    hot, events = np.zeros(stream.shape, bool), 0.0
-    moves = full = False
     sections = _split_recording(stream, progress)
     for one in sections:
         new, done = _search_section(one, progress)
         found += new
         passes += done
-        hot |= one.stream.hot
-        rate = one.background.mean_rate
-        events += rate * stream.width * stream.height * one.stream.duration
-        moves |= one.background.scene is not None
-        full |= is_dense(one.background)
+    backgrounds = [one.background for one in sections]
     if len(sections) > 1 and found:
         windows = 1e6 * stream.duration / found[0].window
         found = stitch_paths(found, (stream.width, stream.height), windows)
-    found, lamps = drop_lamps(found, recording, hot)
-    found = prefer_sharper(found, recording, hot)
+    stream.hot = hot = np.any([one.stream.hot for one in sections], 0)
+    found, lamps = drop_lamps(found, stream)
+    found = prefer_sharper(found, stream)
     found.sort(key=lambda path: (path.begin, path.p[0].tolist()))
-    rate, number = events / stream.duration, int(hot.sum())
+    events = sum(one.mean_rate * stream.width * stream.height * one.duration for one in backgrounds)
+    moves = any(one.scene is not None for one in backgrounds)
     return TargetSearchResult(
-        tuple(found), tuple(passes), number, rate, recording, moves, lamps, full
-    )
+        tuple(found), tuple(passes), int(hot.sum()), events / stream.duration, recording, moves,
+        lamps, any(map(is_dense, backgrounds)),
+    )  # fmt: skip
 
 
 class _Section(NamedTuple):
@@ -458,10 +454,8 @@ def _extend_backwards(
         area = np.pi * gate**2 * np.sqrt(np.linalg.det(S))
         rate, F = clutter_at(clutter_model(background, scale, rest.shape, t), p[0], p[1])
         enough = n >= 2 and n >= CONFIG.min_event_share * usual
-        if not enough or clutter_evidence(n, max(rate * w * area, 1e-3), F) < threshold:
-            misses += 1
-            continue
-        z = e[near].mean(0)
+        enough = enough and clutter_evidence(n, max(rate * w * area, 1e-3), F) >= threshold
+        z = e[near].mean(0) if enough else np.full(2, np.inf)
         if z @ z > farthest:
             misses += 1
             continue
@@ -481,8 +475,9 @@ def _is_duplicate(path: TargetPath, found: list[TargetPath]) -> bool:
     for other in found:
         inside = (path.t > other.begin - 2 * other.window) & (path.t < other.end + 2 * other.window)
         row = np.clip(np.searchsorted(other.t, path.t), 0, len(other.t) - 1)
-        apart = contact_distance(path.p, path.C, other.at(path.t), other.C[row])
-        near = inside & (apart < 1.5 * CONFIG.contact_distance)
+        d = other.at(path.t) - path.p
+        reach = sum(np.sqrt(np.einsum("ti,tij,tj->t", d, C, d)) for C in (path.C, other.C[row]))
+        near = inside & ((d * d).sum(1) <= 1.5 * CONFIG.contact_distance * reach)
         if near.mean() >= CONFIG.majority:
             return True
     return False

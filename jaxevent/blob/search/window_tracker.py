@@ -104,27 +104,15 @@ class TrackMeasurements(NamedTuple):
     R: NDArray[np.float64]  # (n,) px^2, its variance
 
 
-class _WindowRows(NamedTuple):
-    """States of the detected tracks after windows."""
-
-    t: NDArray[np.float64]
-    id: NDArray[np.int64]
-    p: NDArray[np.float64]
-    v: NDArray[np.float64]
-    C: NDArray[np.float64]
-    n: NDArray[np.float64]
-    m: NDArray[np.float64]  # (n, 2) px, means of the windows' events
-    R: NDArray[np.float64]  # (n,) px^2, their variances
-
-
 class WindowTracker:
     """Tracker of all targets in a stream: `WindowTracker(stream, background, scale).run(name)`."""
 
     def __init__(self, stream: Stream, background: Background, scale: Scale):
         self.stream, self.background, self.scale = stream, background, scale
-        self.tracks = init_tracks(np.zeros(0, np.int64), 0.0, Blobs.empty(0), scale.window)
+        self.tracks = init_tracks(np.zeros(0, np.int64), 0.0, Blobs.zeros(0), scale.window)
         self.next_id = 0
-        self.rows: list[_WindowRows] = []
+        # States of tracks after windows: t, id, p, v, C, events, their mean (px), its variance.
+        self.rows: list[tuple[NDArray, ...]] = []
         self.evidence: dict[int, float] = {}  # nats for two targets, of some tracks
         self.confirmed: set[int] = set()
         tests = stream.width * stream.height * stream.duration / scale.window
@@ -146,20 +134,18 @@ class WindowTracker:
             for k in range(windows):
                 self._step(k * w)
                 shown.update(1)
-        self._remove(np.ones(len(self.tracks.id), bool))
         if not self.rows:
             return []
-        rows = _WindowRows._make(np.concatenate(column) for column in zip(*self.rows, strict=True))
-        us = self.stream.start + np.rint(rows.t * 1e6).astype(np.int64)
-        paths = []
+        t, ids, p, v, C, n, m, R = (
+            np.concatenate(column) for column in zip(*self.rows, strict=True)
+        )
+        us = self.stream.start + np.rint(t * 1e6).astype(np.int64)
+        paths, window = [], round(1e6 * w)
         for one in sorted(self.confirmed):
-            at = np.flatnonzero(rows.id == one)
-            own = _WindowRows._make(column[at] for column in rows)
-            unit = np.median(larger_variance(own.C)) / w**3
-            noise = fit_velocity_noise(own.t, own.m, own.R, unit)
-            paths.append(
-                TargetPath(us[at], own.p, own.v, own.C, own.n, round(1e6 * w), velocity_noise=noise)
-            )
+            at = np.flatnonzero(ids == one)
+            unit = np.median(larger_variance(C[at])) / w**3
+            noise = fit_velocity_noise(t[at], m[at], R[at], unit)
+            paths.append(TargetPath(us[at], p[at], v[at], C[at], n[at], window, noise))
         return paths
 
     def _step(self, begin: float | int) -> None:
@@ -175,7 +161,7 @@ class WindowTracker:
             self._update(gates, clutter, assignments)
             if self.scale.compact or self.background.scene is None:
                 self._split_tracks(events, gates, assignments)
-            self._remove(self._find_ended())
+            self.tracks = self.tracks.take(~self._find_ended())
         free, least = assignments.free, 1 - CONFIG.claimed_share
         new = (free >= CONFIG.min_blob_events) & (free >= least * assignments.counts)
         if new.any():
@@ -195,9 +181,10 @@ class WindowTracker:
             enough &= tracks.hits >= CONFIG.majority * age
             enough &= tracks.nats > self.log_threshold
             tracks.confirmed[now & enough] = True
+            self.confirmed |= set(tracks.id[tracks.confirmed].tolist())
         t, m = np.full(len(now), gates.t), gates.p + measured.z
         columns = (t, tracks.id, tracks.p, tracks.v, tracks.C, measured.n, m, measured.R)
-        self.rows.append(_WindowRows._make(value[now] for value in columns))
+        self.rows.append(tuple(value[now] for value in columns))
 
     def _split_tracks(self, events: WindowEvents, gates: TrackGates, assigned: Assignments) -> None:
         """Split each track whose events are likelier those of two targets than of one.
@@ -206,7 +193,7 @@ class WindowTracker:
         Where targets are no ellipses, what is no farther apart than pieces of one outline stays
         one, and several windows must show two.
         """
-        tracks, before, two = self.tracks, self.evidence, Blobs.empty(2)
+        tracks, before, two = self.tracks, self.evidence, Blobs.zeros(2)
         self.evidence, parts = {}, []
         for i in np.flatnonzero(tracks.confirmed & (tracks.misses == 0) & ~gates.shared):
             nats = split_blob(events, assigned.owner, int(i), two)
@@ -223,6 +210,7 @@ class WindowTracker:
                     at = i if k == 0 else 0
                     one.p[at], one.C[at], one.n[at] = two.p[k], two.C[k], two.n[k]
                 part.id[0], self.next_id = self.next_id, self.next_id + 1
+                self.confirmed.add(int(part.id[0]))
                 parts.append(part)
             elif nats > 0:
                 self.evidence[key] = nats
@@ -241,13 +229,6 @@ class WindowTracker:
         coast = np.where(tracks.confirmed, coast, CONFIG.still_windows)
         return outside | (tracks.misses > coast)
 
-    def _remove(self, ended: NDArray) -> None:
-        """Remove tracks that ended, and remember those that were confirmed."""
-        if not ended.any():
-            return
-        over, self.tracks = self.tracks.take(ended), self.tracks.take(~ended)
-        self.confirmed |= set(over.id[over.confirmed].tolist())
-
     def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
         """Start a track at each blob, at a time (s)."""
         ids = np.arange(self.next_id, self.next_id + len(blobs.n))
@@ -259,7 +240,7 @@ class WindowTracker:
         self.tracks = self.tracks.append(new)
         R, at = larger_variance(new.C) / 2 / new.n, np.full(len(new.n), t)
         columns = at, new.id, new.p, new.v, new.C, new.n, new.p, R
-        self.rows.append(_WindowRows._make(value.copy() for value in columns))
+        self.rows.append(tuple(value.copy() for value in columns))
 
 
 def init_tracks(ids: NDArray, t: float | int, blobs: Blobs, window: float | int) -> TrackTable:
@@ -354,8 +335,7 @@ def assign(gates: TrackGates, events: WindowEvents, labels: NDArray, blobs: int)
         np.full(len(events), -1), np.zeros((blobs, tracks), np.int64),
         np.zeros(blobs, np.int64), np.zeros(blobs, np.int64),
         np.zeros((blobs, tracks), bool), np.zeros(blobs, bool),
-        Blobs(np.zeros(tracks), np.zeros((tracks, 2)), np.zeros((tracks, 2, 2))),
-        Blobs(np.zeros(tracks), np.zeros((tracks, 2)), np.zeros((tracks, 2, 2))),
+        Blobs.zeros(tracks), Blobs.zeros(tracks),
     )  # fmt: skip
     _assign(events, labels, gates, (shared, np.zeros(len(shared))), out)
     return out
