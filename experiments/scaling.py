@@ -12,6 +12,7 @@ of more cores. `--cores` shows the clock's seconds instead, of the largest task 
 first row, in processes that may use one core and two; nothing else may run beside it.
 """
 
+import contextlib
 import dataclasses
 import os
 import subprocess
@@ -143,9 +144,10 @@ def thread_seconds() -> dict[str, float]:
     """Return the CPU seconds of each thread of this process, by its number."""
     tick, found = os.sysconf("SC_CLK_TCK"), {}
     for task in os.listdir("/proc/self/task"):
-        with open(f"/proc/self/task/{task}/stat") as file:
-            user, system = file.read().rpartition(")")[2].split()[11:13]
-        found[task] = (int(user) + int(system)) / tick
+        with contextlib.suppress(FileNotFoundError):  # of a thread that has ended meanwhile
+            with open(f"/proc/self/task/{task}/stat") as file:
+                user, system = file.read().rpartition(")")[2].split()[11:13]
+            found[task] = (int(user) + int(system)) / tick
     return found
 
 
