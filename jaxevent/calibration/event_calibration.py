@@ -190,6 +190,7 @@ def _estimate_deviations(
     """
     from scipy.ndimage import median_filter
 
+    change = np.where(is_used, change, 0)  # a hot pixel tells nothing of its neighbours, either
     own = change - median_filter(change, (1, 5, 5), mode="reflect")
     own, gain = own[:, is_used], gain[:, is_used]
     products, moments = np.zeros((2, own.shape[1]))

@@ -66,6 +66,29 @@ def correlation(image: np.ndarray, truth: np.ndarray) -> float:
     return float(np.corrcoef(image[inner].ravel(), truth[inner].ravel())[0, 1])
 
 
+def with_hot_pixels(recording: Recording, share: float, each: int) -> Recording:
+    """Add pixels that fire without cause, so many events each."""
+    rng, n = np.random.default_rng(8), SIZE[0] * SIZE[1]
+    place = np.repeat(rng.choice(n, round(share * n), replace=False), each)
+    y, x = np.divmod(place, SIZE[1])
+    noise = rng.integers(0, SPAN_US, len(place)), x, y, rng.random(len(place)) < 0.5
+    old = recording.events[:]
+    columns = [np.r_[getattr(old, name), part] for name, part in zip("txyp", noise, strict=True)]
+    order = np.argsort(columns[0], kind="stable")
+    size = {"width": SIZE[1], "height": SIZE[0]}
+    return Recording.from_arrays(*(column[order] for column in columns), **size)
+
+
+def test_many_hot_pixels_leave_the_image():
+    # Windows count events: with those of hot pixels nothing would move in them.
+    recording = with_hot_pixels(translated(), 0.2, 600)
+    params = PLAIN.replace(c_on=C_ON, c_off=C_OFF, window=1.0, learn=True)
+    mean, _, valid = events_only.estimate(recording, params, motion=EvenFlow())(0.15)
+    L = np.log(mean[0] + float(params.I0))
+    assert correlation(L, log_image(0.15)) > 0.8
+    assert valid.mean() > 0.8
+
+
 @pytest.mark.slow
 def test_images_are_those_of_the_scene_up_to_scale():
     params = PLAIN.replace(c_on=C_ON, c_off=C_OFF, window=1.0)

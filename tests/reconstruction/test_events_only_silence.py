@@ -70,7 +70,7 @@ def test_bad_input_is_told_and_gives_finite_images(kind, fault):
     solution = windows((recording.start + recording.stop) // 2).solution
     assert np.isfinite(solution.log_image).all() and np.isfinite(solution.variance).all()
     assert solution.variance.min() > 0
-    if kind in ("one pixel", "all ON"):  # what shows no motion
+    if kind != "bursts":  # what shows no motion, without what is wrong either
         c = windows.thresholds.mean()
         assert np.abs(solution.log_image).max() < 0.2 * c
         assert np.sqrt(np.median(solution.variance)) > 1.5 * c

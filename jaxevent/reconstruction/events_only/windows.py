@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from jaxevent.calibration.event_calibration import calibrate_events
 from jaxevent.codegen import map_ahead
 from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
+from jaxevent.events import remove_hot_pixels
 from jaxevent.reconstruction.events_only.frames import FrameMeasurements, FrameScale
 from jaxevent.reconstruction.events_only.memory import KeyMemories, fuse
 from jaxevent.reconstruction.events_only.params import Params
@@ -19,7 +20,25 @@ from jaxevent.reconstruction.video import FlowSource
 from jaxevent.recording import Events, Recording
 
 ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
+MAX_HOT_SHARE = 0.05  # of the events, from which a recording is faulty (docs/faults.md)
+N_SAMPLES, SAMPLE_EVENTS = 32, 4096  # from which the share is estimated
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
+
+
+def _without_many_hot(recording: Recording, hot: NDArray[np.bool_]) -> Recording:
+    """Remove the events of hot pixels where they are so many that windows of events get short.
+
+    What remains is in memory. Usual sensors have few, which windows leave out as they are read.
+    """
+    n = len(recording.events)
+    starts = np.linspace(0, max(n - SAMPLE_EVENTS, 0), N_SAMPLES).astype(int).tolist()
+    shares = []
+    for first in starts:
+        events = recording.events[first : first + SAMPLE_EVENTS]
+        shares.append(float(hot[events.y, events.x].mean()) if len(events) else 0.0)
+    if not MAX_HOT_SHARE < np.mean(shares) < 1:
+        return recording
+    return remove_hot_pixels(recording, hot)
 
 
 class SolvedWindow(NamedTuple):
@@ -49,15 +68,17 @@ class WindowSolver:
         causal: bool = False,
         motion: FlowSource | None = None,
     ):
-        self.recording, self.params, self.causal = recording, params, causal
+        self.params, self.causal = params, causal
         self.shape = (recording.height, recording.width)
-        self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         self.n_side = max(round(float(params.window) * self.shape[0] * self.shape[1]), 1)
         self.relative = np.ones((2, *self.shape), np.float32)
         self.muted = np.zeros(self.shape, bool)
         if params.learn:
             found = calibrate_events(recording)
             self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
+            recording = _without_many_hot(recording, found.hot)
+        self.recording = recording
+        self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         c = np.array([params.c_on, params.c_off], np.float32)
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
