@@ -534,43 +534,52 @@ def _reweight(system, u, data, numbers, residual):
             system.down[y, x + 1] += s
 
 
-@njit_fastmath_inlined
-def _dot(a, b):
-    total = np.float32(0)
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
+@njit_fastmath
+def _turn(r, before, z, rho, p):
+    """Turn the direction p by the preconditioned residual z; return r' z.
+
+    `rho` is what the step before returned, or 0. As the matrix changes, directions are those of
+    Polak and Ribiere.
+    """
+    new, same = np.float32(0), np.float32(0)
+    for k in range(len(r)):
+        new += r[k] * z[k]
+        same += before[k] * z[k]
+    beta = max((new - same) / rho, np.float32(0)) if rho > 0 else np.float32(0)
+    for k in range(len(r)):
+        p[k] = z[k] + beta * p[k]
+    return new
 
 
 @njit_fastmath
+def _advance(p, Ap, u, r, before):
+    """Go along the direction p to the minimum there."""
+    along, curvature = np.float32(0), np.float32(0)
+    for k in range(len(p)):
+        along += r[k] * p[k]
+        curvature += p[k] * Ap[k]
+    alpha = along / curvature
+    for k in range(len(p)):
+        before[k] = r[k]
+        u[k] += alpha * p[k]
+        r[k] -= alpha * Ap[k]
+
+
 def _conjugate_gradients(system, b, u, scratch, stage):
     """Take steps towards A u = b, in place; go on with the directions of the call before.
 
     Weights may have changed since. `stage` has what that call returned, or 0, and how many steps.
     """
     rho, steps = np.float32(stage[0]), stage[1]
-    r, before, z = scratch.images[1], scratch.images[2], scratch.images[5]
-    p, Ap = scratch.images[3], scratch.images[4]
-    fu, fr, fb, fz = u.reshape(-1), r.reshape(-1), before.reshape(-1), z.reshape(-1)
-    fp, fA, right = p.reshape(-1), Ap.reshape(-1), b.reshape(-1)
-    n = len(fu)
-    _apply(system, u, Ap)
-    for k in range(n):
-        fr[k] = right[k] - fA[k]
+    _, residual, _, direction, product, preconditioned = scratch.images
+    r, before, p, Ap, z = scratch.images[1:].reshape(5, -1)
+    _apply(system, u, product)
+    np.subtract(b, product, out=residual)
     for _ in range(steps):
-        _precondition(scratch, r, z)
-        new = _dot(fr, fz)
-        if new <= 0:
-            return new
-        # Directions of Polak and Ribiere, as the matrix changes.
-        beta = max((new - _dot(fb, fz)) / rho, np.float32(0)) if rho > 0 else np.float32(0)
-        for k in range(n):
-            fp[k] = fz[k] + beta * fp[k]
-        _apply(system, p, Ap)
-        alpha = _dot(fr, fp) / _dot(fp, fA)
-        for k in range(n):
-            fb[k] = fr[k]
-            fu[k] += alpha * fp[k]
-            fr[k] -= alpha * fA[k]
-        rho = new
+        _precondition(scratch, residual, preconditioned)
+        rho = np.float32(_turn(r, before, z, rho, p))
+        if rho <= 0:
+            break
+        _apply(system, direction, product)
+        _advance(p, Ap, u.reshape(-1), r, before)
     return rho
