@@ -48,6 +48,13 @@ MAX_REPEATED_SHARE, MIN_NET_EVENTS, MIN_CHANGING = 0.05, 2, 50
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 
+# Faults of the events alone, whether frames told them or not.
+EVENT_FAULTS = (
+    *("hot pixels", "missing events", "event bursts"),
+    *("lost polarity", "inverted polarity", "flipped or swapped axes"),
+)
+
+
 class Fault(NamedTuple):
     """A fault of a recording, with the statistic behind it.
 

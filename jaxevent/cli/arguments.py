@@ -6,11 +6,12 @@ import dataclasses
 import difflib
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -219,6 +220,23 @@ def open_named(path: Path, reading: dict[str, Any]) -> tuple[Any, str]:
     """Open a recording as `open_recording`, named by its path for messages; return its name too."""
     recording = open_recording(path, reading)
     return dataclasses.replace(recording, name=str(path)), recording.name
+
+
+def warn_of_faults(recording: Any, sample: Any = None, *, frames: bool = True) -> None:
+    """Warn of each fault of events, frames and clocks, with its statistic and the remedy.
+
+    Args:
+        recording: The recording.
+        sample: A sample of it, if there is one.
+        frames: Whether faults of frames and clocks are told, too.
+    """
+    from jaxevent.calibration import check_consistency
+    from jaxevent.calibration.faults import EVENT_FAULTS
+
+    for fault in check_consistency(recording, sample):
+        # `check_clocks` judges clocks, at the offset that is used.
+        if fault.name in EVENT_FAULTS or (frames and fault.name != "disjoint clocks"):
+            warnings.warn(f"{recording.name}: {fault}", InputWarning, stacklevel=2)
 
 
 def add_output(

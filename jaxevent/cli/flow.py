@@ -1,5 +1,6 @@
 """The command `jaxevent flow`."""
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,7 @@ def run(
     else:
         wanted = image_times(recording, rate, start)
     chosen = within(wanted, start, stop, str(path))
+    arguments.warn_of_faults(dataclasses.replace(recording, name=str(path)), frames=False)
     clock = time.perf_counter()
     write(flow_from_events(recording, values, causal=causal), chosen, out, show_progress())
     seconds = time.perf_counter() - clock

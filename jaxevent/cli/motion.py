@@ -167,6 +167,7 @@ def _write(options: Options, kind: Any) -> None:
     turned = None if options.imu_rotation is None else rotation_of(options.imu_rotation)
     output = Output(options.out, options.rate, options.truth, flow=options.flow)
     whole = _open(options)
+    arguments.warn_of_faults(whole, frames=False)
     bias = _gyro_bias(options, whole)
     recording = _stretch(whole, options.start, options.stop)
     choice = None

@@ -2,13 +2,12 @@
 
 import dataclasses
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
-from jaxevent.errors import InputError, InputWarning
+from jaxevent.errors import InputError
 
 
 def add(commands: Any) -> None:
@@ -140,15 +139,6 @@ def _default_times(
     return image_times(spanned, 100.0 if rate is None else rate, start)
 
 
-def _warn_of_faults(recording: Any, sample: Any) -> None:
-    """Warn of each fault of events, frames and clocks, with its statistic and the remedy."""
-    from jaxevent.calibration import check_consistency
-
-    for fault in check_consistency(recording, sample):
-        if fault.name != "disjoint clocks":  # which `check_clocks` judges at the offset used
-            warnings.warn(f"{recording.name}: {fault}", InputWarning, stacklevel=2)
-
-
 def run(
     *,
     path: Path,
@@ -203,7 +193,7 @@ def run(
         check_clocks(recording, values.clock_offset)
     clock = time.perf_counter()
     sample = take_sample(recording)
-    _warn_of_faults(recording, sample)
+    arguments.warn_of_faults(recording, sample)
     found = calibrated_values(recording, values, names, sample)
     del sample  # before images need the memory
     if found.found or found.missing:

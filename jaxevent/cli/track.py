@@ -167,6 +167,7 @@ def run(
     check_accuracy(accuracy)
     if accuracy is not None and (seeds is not None or detect):
         raise InputError("--accuracy is for targets that are found; leave out --seed and --detect")
+    arguments.warn_of_faults(recording, frames=False)
     span: dict[str, Any] = {"start": start, "stop": stop}
     clock = time.perf_counter()
     options: dict[str, Any] = {"seeds": seeds, "detect": detect, **span}

@@ -15,12 +15,14 @@ from PIL import Image
 import jaxevent
 from jaxevent import akf, aks, cli, events
 from jaxevent.calibration import Fault
+from jaxevent.errors import InputError
 from jaxevent.recording import Frames
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.family import FitData
 from jaxevent.runs.fit import calibrated_plan
 from jaxevent.runs.fit_config import plan_of
 from jaxevent.runs.protocols import held_out
+from jaxevent.simulate.faults import add_hot_pixels, flicker_frames
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +163,30 @@ def test_faults_are_reported(path, tmp_path, capsys, monkeypatch):
     words = ("reconstruct", path, "--method", "high-pass", "--rate", 20, "--out", out)
     _, error = run(capsys, *words)
     assert error.splitlines() == [f"jaxevent: warning: {path}: {fault}" for fault in faults]
+
+
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        ("track", "jaxevent.blob.find"),
+        ("motion", "jaxevent.egomotion.model_selection.select_model"),
+        ("flow", "jaxevent.event_flow.flow_from_events"),
+    ],
+)
+def test_faults_of_events_are_told_before_the_work(
+    command, work, recording, tmp_path, capsys, monkeypatch
+):
+    def stop(*_, **__):
+        raise InputError("the work begins")
+
+    monkeypatch.setattr(work, stop)
+    # What is wrong with frames alone does not matter here.
+    path = tmp_path / "faulty.h5"
+    jaxevent.save(flicker_frames(add_hot_pixels(recording)), path)
+    assert cli.main([command, str(path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.splitlines()
+    assert [line.split(": ")[1:4] for line in error[:-1]] == [["warning", str(path), "hot pixels"]]
+    assert error[-1] == "jaxevent: the work begins"
 
 
 @pytest.mark.slow
