@@ -34,10 +34,8 @@ from jaxevent.show.tables import markdown_table
 
 RECORDING_FILE = resources.files("jaxevent") / "data/slider_depth_crop.h5"
 VIDEO = "video.mp4"
-RESULT_FILES = (
-    *("comparison.png", "events_only.png", "events_only.mp4", VIDEO),
-    *("results.md", "results.json"),
-)
+EVENT_FIGURE, EVENT_VIDEO = "events_only.png", "events_only.mp4"  # of events alone
+RESULT_FILES = ("comparison.png", EVENT_FIGURE, EVENT_VIDEO, VIDEO, "results.md", "results.json")
 NOT_CALIBRATED = ", not calibrated"
 SLOWEST = ("mc", "events-only")  # methods, by the time that they take to compile
 
@@ -69,11 +67,10 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
         ]
         # Those that take longest to compile come first, one to each process.
         started = sorted(labels, key=lambda label: SLOWEST.index(label) if label in SLOWEST else 9)
-        common = {"path": path, "results": results}
-        tasks = [
-            *(Task(label, {"label": label, **common}) for label in started),
-            Task(VIDEO, {"label": VIDEO, **common, "video": out / VIDEO}),
-        ]
+        common = {"path": path, "results": results, "out": out}
+        # Pictures come last: one process draws while the other one still computes.
+        files = [VIDEO, EVENT_FIGURE, EVENT_VIDEO]
+        tasks = [Task(label, {"label": label, **common}) for label in [*started, *files]]
         place = ComputeResources(workers=2) if N_THREADS > 1 else None
         outcomes = run(_run_part, tasks, place=place, retries=0, progress=progress)
         found = {task.name: outcome for task, outcome in zip(tasks, outcomes, strict=True)}
@@ -82,7 +79,7 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
                 raise InputError(f"{label}: {outcome.error}")
         skipped = [
             f"{label} is left out: {found[label].error}"
-            for label in [*labels, VIDEO]
+            for label in [*labels, *files]
             if found[label].skipped
         ]
         done = [label for label in labels if not found[label].skipped]
@@ -99,22 +96,17 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
             label: pickle.loads((results / label).read_bytes()) for label in done
         }
         recording = load(path)
-        _, hidden = held_out(recording)
-        alone = parts["events-only"].estimate
-        toned = [_toned(parts["high-pass"].estimate, "changes"), _toned(alone, "relative")]
-        toned.append(tone_map(hidden.intensity, "display"))
-        doubt = np.sqrt(np.asarray(alone.covariance))
         samples = {label: part.sample for label, part in parts.items()}
-        for name, draw in (
-            ("comparison.png", lambda path: _figure(recording.name, samples, path)),
-            ("events_only.png", lambda path: _figure_of_events(recording.name, toned, doubt, path)),
-            ("events_only.mp4", lambda path: _video_of_events(toned, hidden.t, path)),
-            (VIDEO, lambda _: found[VIDEO].result),
-        ):
+        for name in ("comparison.png", *files[1:], VIDEO):
             if name in found and found[name].skipped:
                 continue
+            drawn = found[name].result if name in found else None
             try:
-                slower = draw(out / name)
+                if name == "comparison.png":
+                    _figure(recording.name, samples, out / name)
+                elif drawn is None:
+                    drawn = _draw_events(name, recording, results, out / name)
+                slower = None if drawn is None else drawn["slower"]
                 slow = "" if slower is None else f" ({slower:.0f} times slower than real time)"
                 written.append(f"{name}{slow}")
             except MissingExtra as error:
@@ -130,13 +122,13 @@ class Part(NamedTuple):
     estimate: Any  # of a method of events alone, at all hidden frames; else None
 
 
-def _run_part(
-    label: str, path: Path, results: Path, video: Path | None = None
-) -> dict[str, Any] | float:
-    """Score one method, whose `Part` goes to a file of its name, or write the video."""
+def _run_part(label: str, path: Path, results: Path, out: Path) -> dict[str, Any] | None:
+    """Score one method, whose `Part` goes to a file of its name, or write a picture or video."""
     recording = load(path)
-    if video is not None:
-        return _video(recording, video)
+    if label == VIDEO:
+        return {"slower": _video(recording, out / label)}
+    if label in (EVENT_FIGURE, EVENT_VIDEO):
+        return _draw_events(label, recording, results, out / label)
     name = label.removesuffix(NOT_CALIBRATED)
     method: Any = find(name)
     params = None if name == label else method.Params()
@@ -152,8 +144,27 @@ def _run_part(
     scored = method if fused else MethodFunction(name, estimate)
     row, some = score_and_sample(recording, scored, params, asked, False)
     part = Part(some[len(some) // 2], kept[0] if kept else None)
-    (results / label).write_bytes(pickle.dumps(part))
+    unfinished = results / f"{label}.part"
+    unfinished.write_bytes(pickle.dumps(part))
+    unfinished.rename(results / label)
     return {**row, "method": label}
+
+
+def _draw_events(
+    name: str, recording: Recording, results: Path, path: Path
+) -> dict[str, float | None] | None:
+    """Draw the figure or the video of events alone; return None while its methods still run."""
+    sources = [results / "high-pass", results / "events-only"]
+    if not all(source.exists() for source in sources):
+        return None
+    changes, alone = (pickle.loads(source.read_bytes()).estimate for source in sources)
+    _, hidden = held_out(recording)
+    toned = [_toned(changes, "changes"), _toned(alone, "relative")]
+    toned.append(tone_map(hidden.intensity, "display"))
+    if name == EVENT_VIDEO:
+        return {"slower": _video_of_events(toned, hidden.t, path)}
+    _figure_of_events(recording.name, toned, np.sqrt(np.asarray(alone.covariance)), path)
+    return {"slower": None}
 
 
 def _toned(estimate: Estimate, tone: str) -> NDArray[np.uint8]:
