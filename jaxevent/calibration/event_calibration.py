@@ -52,6 +52,7 @@ class EventCalibration(NamedTuple):
     | spread | standard deviation of the logarithm of this ratio among pixels |
     | hot | (height, width), true for pixels that fire without cause |
     | read_out | (height, width), true within the rows and columns that the sensor reads out |
+    | hot_share | share of the events that hot pixels made |
     """
 
     thresholds: NDArray[np.float32]
@@ -59,6 +60,7 @@ class EventCalibration(NamedTuple):
     spread: float
     hot: NDArray[np.bool_]
     read_out: NDArray[np.bool_]
+    hot_share: float
 
 
 def count_parts(recording: Recording) -> NDArray[np.int32]:
@@ -95,14 +97,15 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     """
     check_recording(recording, "calibrate_events")
     parts = count_parts(recording)
-    hot = find_hot_pixels(parts.sum(1))
+    hot, counts = find_hot_pixels(parts.sum(1)), parts.sum((0, 1))
     ratio = _estimate_ratio(parts.sum(0), hot)
     root = np.sqrt(ratio.value if ratio.is_identifiable else 1.0)
     change = root * parts[:, 0] - parts[:, 1] / root
     gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
     s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
-    return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(parts.sum((0, 1))))
+    hot_share = float(counts[hot].sum() / max(counts.sum(), 1))
+    return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(counts), hot_share)
 
 
 def _find_read_out(counts: NDArray[np.integer]) -> NDArray[np.bool_]:

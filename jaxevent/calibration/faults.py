@@ -47,7 +47,6 @@ MAX_UNDONE_SHARE = 0.5  # of the events
 MAX_REPEATED_SHARE, MIN_NET_EVENTS, MIN_CHANGING = 0.05, 2, 50
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
-
 # Faults of the events alone, whether frames told them or not.
 EVENT_FAULTS = (
     *("hot pixels", "missing events", "event bursts"),

@@ -220,8 +220,8 @@ def _check_options(options: Options, kind: Any) -> None:
 def _open(options: Options) -> Any:
     """The recording, with its camera; it must hold events, and the IMU that options need."""
     path = options.path
-    recording = arguments.open_recording(path, options.reading)
-    recording = _with_camera(dataclasses.replace(recording, name=str(path)), options.focal)
+    recording, _ = arguments.open_named(path, options.reading)
+    recording = _with_camera(recording, options.focal)
     if not len(recording.events):
         raise InputError(f"{path}: holds no events; choose another recording")
     if recording.imu is None and (options.imu or options.still is not None):

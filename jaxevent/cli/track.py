@@ -1,6 +1,5 @@
 """The command `jaxevent track`."""
 
-import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -159,8 +158,7 @@ def run(
         raise InputError("there is nowhere to write; give a folder or file, --out, or --live")
     each = None if at == "events" else rate
     output = Output(out, each, background, pairs or (), extent, focal, size_factor)
-    recording = arguments.open_recording(path, reading)
-    recording = dataclasses.replace(recording, name=str(path))  # for messages
+    recording, _ = arguments.open_named(path, reading)
     if not len(recording.events):
         raise InputError(f"{path}: holds no events to track; choose another recording")
     recording.refuse_one_time(str(path))

@@ -175,36 +175,31 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     Raises:
         Exception: What making an item or the function raises, when its result is due.
     """
-    process = os.getpid()
-    pool = ThreadPoolExecutor(N_THREADS)
-    pending: collections.deque[tuple[T, Future[R]]] = collections.deque()
+    process, pool = os.getpid(), ThreadPoolExecutor(N_THREADS)
 
-    def first_result() -> R:
-        item, future = pending.popleft()
+    def begin(item: T) -> Callable[[], R]:
+        """Begin to compute an item; return a function that waits for its result."""
+        future = pool.submit(function, item)
         # A forked process has none of the threads.
-        return future.result() if os.getpid() == process else function(item)
+        return lambda: future.result() if os.getpid() == process else function(item)
 
-    rest, failure = iter(items), None
+    def begun() -> Iterator[Callable[[], R]]:
+        try:
+            for item in items:
+                yield begin(item)
+        except Exception as error:
+            failed: Future[R] = Future()
+            failed.set_exception(error)
+            yield failed.result
+
+    results: collections.deque[Callable[[], R]] = collections.deque()
     try:
-        while True:
-            try:
-                item = next(rest)
-            except StopIteration:
-                break
-            except Exception as error:
-                failure = error
-                break
-            if N_THREADS == 1 or os.getpid() != process:
-                yield from (first_result() for _ in range(len(pending)))
-                yield function(item)
-                continue
-            pending.append((item, pool.submit(function, item)))
-            if len(pending) == N_THREADS:
-                yield first_result()
-        while pending:
-            yield first_result()
-        if failure is not None:
-            raise failure
+        for result in begun():
+            results.append(result)
+            if len(results) == N_THREADS:
+                yield results.popleft()()
+        while results:
+            yield results.popleft()()
     finally:
         pool.shutdown(cancel_futures=True)
 

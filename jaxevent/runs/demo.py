@@ -97,16 +97,20 @@ def demo(out: Path, progress: bool | None = None, replace: bool = True) -> None:
         }
         recording = load(path)
         samples = {label: part.sample for label, part in parts.items()}
-        for name in ("comparison.png", *files[1:], VIDEO):
+
+        def draw(name: str) -> float | None:
+            """Draw a file, unless a task has; return how much slower than life it plays."""
+            if name == "comparison.png":
+                return _figure(recording.name, samples, out / name)
+            drawn = found[name].result or _draw_events(name, recording, results, out / name)
+            assert drawn is not None  # all methods have run
+            return drawn["slower"]
+
+        for name in ("comparison.png", EVENT_FIGURE, EVENT_VIDEO, VIDEO):
             if name in found and found[name].skipped:
                 continue
-            drawn = found[name].result if name in found else None
             try:
-                if name == "comparison.png":
-                    _figure(recording.name, samples, out / name)
-                elif drawn is None:
-                    drawn = _draw_events(name, recording, results, out / name)
-                slower = None if drawn is None else drawn["slower"]
+                slower = draw(name)
                 slow = "" if slower is None else f" ({slower:.0f} times slower than real time)"
                 written.append(f"{name}{slow}")
             except MissingExtra as error:

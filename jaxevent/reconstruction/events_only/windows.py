@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.calibration.event_calibration import calibrate_events
+from jaxevent.calibration.faults import MAX_HOT_EVENTS_SHARE
 from jaxevent.codegen import map_ahead
 from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
 from jaxevent.events import remove_hot_pixels
@@ -20,25 +21,7 @@ from jaxevent.reconstruction.video import FlowSource
 from jaxevent.recording import Events, Recording
 
 ROW_COLUMNS = ("corner", "fraction", "change", "weight", "kind", "pixel")
-MAX_HOT_SHARE = 0.05  # of the events, from which a recording is faulty (docs/faults.md)
-N_SAMPLES, SAMPLE_EVENTS = 32, 4096  # from which the share is estimated
 N_MOTION_KNOTS = 5  # times of a window at which a given motion is read
-
-
-def _without_many_hot(recording: Recording, hot: NDArray[np.bool_]) -> Recording:
-    """Remove the events of hot pixels where they are so many that windows of events get short.
-
-    What remains is in memory. Usual sensors have few, which windows leave out as they are read.
-    """
-    n = len(recording.events)
-    starts = np.linspace(0, max(n - SAMPLE_EVENTS, 0), N_SAMPLES).astype(int).tolist()
-    shares = []
-    for first in starts:
-        events = recording.events[first : first + SAMPLE_EVENTS]
-        shares.append(float(hot[events.y, events.x].mean()) if len(events) else 0.0)
-    if not MAX_HOT_SHARE < np.mean(shares) < 1:
-        return recording
-    return remove_hot_pixels(recording, hot)
 
 
 class SolvedWindow(NamedTuple):
@@ -76,7 +59,10 @@ class WindowSolver:
         if params.learn:
             found = calibrate_events(recording)
             self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
-            recording = _without_many_hot(recording, found.hot)
+            # Where hot pixels make many of the events, windows of so many events would get short.
+            # What remains is in memory.
+            if MAX_HOT_EVENTS_SHARE < found.hot_share < 1:
+                recording = remove_hot_pixels(recording, found.hot)
         self.recording = recording
         self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
         c = np.array([params.c_on, params.c_off], np.float32)
