@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.calibration.events_alone import CONFIDENCE_Z
-from jaxevent.calibration.hot import find_hot_pixels
+from jaxevent.calibration.hot import MAX_EVENTS_SHARE, find_hot_pixels
 from jaxevent.calibration.result import CalibrationValue, not_identifiable
+from jaxevent.events import remove_hot_pixels
 from jaxevent.recording import Recording, check_recording
 
 N_PARTS = 8
@@ -97,15 +98,44 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     """
     check_recording(recording, "calibrate_events")
     parts = count_parts(recording)
-    hot, counts = find_hot_pixels(parts.sum(1)), parts.sum((0, 1))
+    counts = parts.sum((0, 1))
+    hot, hot_share = _find_hot(parts)
     ratio = _estimate_ratio(parts.sum(0), hot)
     root = np.sqrt(ratio.value if ratio.is_identifiable else 1.0)
     change = root * parts[:, 0] - parts[:, 1] / root
     gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
     s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
-    hot_share = float(counts[hot].sum() / max(counts.sum(), 1))
     return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(counts), hot_share)
+
+
+def _find_hot(parts: NDArray[np.integer]) -> tuple[NDArray[np.bool_], float]:
+    """Find hot pixels in counts of parts, and their share of the events."""
+    hot, counts = find_hot_pixels(parts.sum(1)), parts.sum((0, 1))
+    return hot, float(counts[hot].sum() / max(counts.sum(), 1))
+
+
+def remove_many_hot_events(
+    recording: Recording, calibration: EventCalibration | None = None
+) -> Recording:
+    """Remove the events of hot pixels, where they make more than a twentieth of all events.
+
+    Methods that read windows of so many events would find short ones otherwise, in which nothing
+    moves.
+
+    Args:
+        recording: The recording.
+        calibration: Result of `calibrate_events` for it; None: hot pixels are found here.
+
+    Returns:
+        The recording without these events; as it is where they are few, or where there are no
+        others.
+    """
+    if calibration is None:
+        hot, share = _find_hot(count_parts(recording))
+    else:
+        hot, share = calibration.hot, calibration.hot_share
+    return remove_hot_pixels(recording, hot) if MAX_EVENTS_SHARE < share < 1 else recording
 
 
 def _find_read_out(counts: NDArray[np.integer]) -> NDArray[np.bool_]:

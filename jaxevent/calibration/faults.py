@@ -21,6 +21,7 @@ from jaxevent.calibration.correspondence import (
     turn_events,
 )
 from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
+from jaxevent.calibration.hot import MAX_EVENTS_SHARE
 from jaxevent.calibration.light import common_change
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
@@ -28,7 +29,6 @@ from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_cl
 from jaxevent.recording import Events, Recording, check_recording
 
 MAX_HOT_SHARE = 0.01  # of the pixels
-MAX_HOT_EVENTS_SHARE = 0.05  # of the events
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
 MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
@@ -112,7 +112,7 @@ def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
     share, number = float(sample.hot.mean()), int(sample.hot.sum())
     events = sample.counts.sum(0)
     of_events = float(events[sample.hot].sum() / max(events.sum(), 1))
-    statistic, limit = of_events, MAX_HOT_EVENTS_SHARE
+    statistic, limit = of_events, MAX_EVENTS_SHARE
     text = f"{number} hot {plural('pixel', number)} made {100 * of_events:.3g} % of the events"
     if share > MAX_HOT_SHARE:
         statistic, limit = share, MAX_HOT_SHARE

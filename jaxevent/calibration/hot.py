@@ -8,6 +8,7 @@ from jaxevent.events import is_hot
 MIN_EVENTS = 3  # of a hot pixel in three quarters of the parts
 RATIO = 3  # to the median pixel of the 5 x 5 around
 MIN_PARTS = 4
+MAX_EVENTS_SHARE = 0.05  # of all events, by hot pixels
 
 
 def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:

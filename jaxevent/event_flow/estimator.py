@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.event_calibration import remove_many_hot_events
 from jaxevent.errors import InputError
 from jaxevent.event_flow.alignment import (
     MAX_VARIANCE,
@@ -301,6 +302,8 @@ def flow_from_events(
 ) -> EventFlow:
     """Estimate dense optical flow from events alone, as a function of time.
 
+    Hot pixels that make more than a twentieth of the events are left out, if there are others.
+
     Args:
         recording: The recording; frames are not used.
         params: The parameters; None: the defaults.
@@ -318,4 +321,4 @@ def flow_from_events(
     params = FlowParams() if params is None else params
     if not isinstance(params, FlowParams):
         raise InputError(f"params are {type(params).__name__}; give FlowParams")
-    return EventFlow(recording, params, causal)
+    return EventFlow(remove_many_hot_events(recording), params, causal)

@@ -12,6 +12,7 @@ from jaxevent.event_flow import FlowParams, WindowPaths, flow_from_events
 from jaxevent.event_flow.alignment import Alignment
 from jaxevent.parameters import Parameters
 from jaxevent.recording import Events, Recording
+from jaxevent.simulate.faults import add_hot_pixels
 
 WIDTH, HEIGHT = 64, 48
 
@@ -53,6 +54,15 @@ def test_flow_of_constant_velocity(velocity):
     e = (mean - velocity)[valid]
     z2 = np.einsum("ni,nij,nj->n", e, np.linalg.inv(covariance[valid]), e) / 2
     assert z2.mean() < 2
+
+
+def test_flow_leaves_many_hot_pixels_out():
+    # Windows count events: with those of hot pixels nothing would move in them.
+    velocity = (150.0, 0.0)
+    flow = flow_from_events(add_hot_pixels(moving_points(velocity), share=0.2, rate=2000.0))
+    mean, _, valid = flow([0.06, 0.1])
+    assert np.median(np.linalg.norm(mean - velocity, axis=-1)) < 15
+    assert valid.mean() > 0.7
 
 
 def test_flow_follows_acceleration():

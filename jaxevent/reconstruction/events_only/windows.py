@@ -6,11 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.event_calibration import calibrate_events
-from jaxevent.calibration.faults import MAX_HOT_EVENTS_SHARE
+from jaxevent.calibration.event_calibration import calibrate_events, remove_many_hot_events
 from jaxevent.codegen import map_ahead
-from jaxevent.event_flow import EventFlow, WindowPaths, flow_from_events
-from jaxevent.events import remove_hot_pixels
+from jaxevent.event_flow import EventFlow, FlowParams, WindowPaths
 from jaxevent.reconstruction.events_only.frames import FrameMeasurements, FrameScale
 from jaxevent.reconstruction.events_only.memory import KeyMemories, fuse
 from jaxevent.reconstruction.events_only.params import Params
@@ -59,12 +57,9 @@ class WindowSolver:
         if params.learn:
             found = calibrate_events(recording)
             self.relative, self.muted = found.thresholds, found.hot | ~found.read_out
-            # Where hot pixels make many of the events, windows of so many events would get short.
-            # What remains is in memory.
-            if MAX_HOT_EVENTS_SHARE < found.hot_share < 1:
-                recording = remove_hot_pixels(recording, found.hot)
+            recording = remove_many_hot_events(recording, found)
         self.recording = recording
-        self.flow = flow_from_events(recording, causal=causal) if motion is None else motion
+        self.flow = EventFlow(recording, FlowParams(), causal) if motion is None else motion
         c = np.array([params.c_on, params.c_off], np.float32)
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
