@@ -15,7 +15,6 @@ from jaxevent.reconstruction.estimator import ImageEstimator
 from jaxevent.reconstruction.events_only.gradient import (
     WindowEquations,
     held_out_likelihood,
-    measure_slope,
     pack_equations,
     sample_variance,
     solve_equations,
@@ -155,7 +154,7 @@ class EventsOnly(ImageEstimator[Params]):
             if held_out is not None:
                 row[: len(one.rows.kind)] = held_out(one.rows)
         equations = jax.tree.map(lambda *leaves: np.stack(leaves), *packed)
-        return measure_slope(equations, params), jax.device_put(held)
+        return jax.device_put((equations, held))
 
     def prepare_likelihood(
         self, recording: Recording, times: Times, params: Params | None = None

@@ -1,11 +1,11 @@
 """The image of a window as a function of parameters, in JAX, with its implicit derivative.
 
-The energy E(u) is that of `solve` (3). Its minimum is found from the host's solution by the same
-reweighting, and differentiated as a root of dE/du: with F(u, p) = dE/du = 0,
+The energy E(u) is that of `solve` (3). The solver on the host finds its minimum, which is
+differentiated as a root of dE/du: with F(u, p) = dE/du = 0,
 
     du/dp = -(dF/du)^-1 dF/dp,
 
-where conjugate gradients solve with the exact second derivative of E.
+where conjugate gradients, on the host too, solve with the exact second derivative of E.
 """
 
 import functools
@@ -15,24 +15,27 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent.reconstruction.events_only.params import Params
+from jaxevent.reconstruction.events_only.prior import SolverParams
 from jaxevent.reconstruction.events_only.rows import EVENT
 from jaxevent.reconstruction.events_only.solve import (
     BLUR_PX,
     SAMPLES,
     VARIANCE_FACTOR,
+    Energy,
     factor_information,
+    find_minimum,
+    solve_linear,
 )
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
 from jaxevent.reconstruction.features import Numeric
 
-REWEIGHTINGS = 100  # at most
-CG_ITERATIONS = 200  # at most
-TOLERANCES = {4: 5e-3, 8: 1e-8}  # relative residuals to stop at, by bytes of a number
+# By bytes of a number: relative residual of a linear problem, and change of an image in thresholds.
+TOLERANCES = {4: 5e-3, 8: 1e-8}
+LEAST_CHANGES = {4: 2e-4, 8: 1e-9}
 LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 
 
@@ -70,7 +73,6 @@ class WindowEquations(NamedTuple):
     information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
     start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
     unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
-    slope: Float[Numeric, "*times"]  # norm of dE/du there, at which JAX stops, too
     relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
     noise: Perturbation
 
@@ -112,7 +114,6 @@ def pack_equations(
         information.astype(dtype),
         (solution.log_image / c).astype(dtype),
         (solution.unseen / c**2).astype(dtype),
-        np.zeros((), dtype),
         relative.mean((1, 2)).astype(dtype),
         Perturbation(
             np.pad(noise.rows, [(0, 0), (0, count - n)]).astype(dtype),
@@ -180,10 +181,14 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
 
 def _residuals(u: Array, equations: WindowEquations, params: Params) -> tuple[Array, Array]:
     """Return the weights of the rows and their residuals in thresholds."""
-    c = threshold(equations, params)
-    change = (params.c_on * equations.on - params.c_off * equations.off) / c
     weight = equations.weight + params.silence * equations.silent
-    return weight, look_up(u, equations.corner, equations.fraction) - change
+    return weight, look_up(u, equations.corner, equations.fraction) - _changes(equations, params)
+
+
+def _changes(equations: WindowEquations, params: Params) -> Array:
+    """Return the changes that rows show, in mean thresholds."""
+    c = threshold(equations, params)
+    return (params.c_on * equations.on - params.c_off * equations.off) / c
 
 
 def threshold(equations: WindowEquations, params: Params) -> Array:
@@ -231,30 +236,56 @@ def _product(
     return jax.linearize(jax.grad(form), jnp.zeros_like(equations.start))[1]
 
 
-def _diagonal(weights: _Weights, equations: WindowEquations, leak: Array) -> Array:
-    """Return about the diagonal of A, which preconditions."""
-    x, y = equations.fraction[..., 0], equations.fraction[..., 1]
-    height, width = equations.start.shape
-    flat = jnp.full(height * width, leak, x.dtype)
-    for shift, share in (
-        (0, (1 - x) * (1 - y)),
-        (1, x * (1 - y)),
-        (width, (1 - x) * y),
-        (width + 1, x * y),
-    ):
-        flat = flat.at[equations.corner + shift].add(weights.rows[:, None] * share**2)
-    across = jnp.pad(weights.across, [(0, 0), (1, 0)]) + jnp.pad(weights.across, [(0, 0), (0, 1)])
-    down = jnp.pad(weights.down, [(1, 0), (0, 0)]) + jnp.pad(weights.down, [(0, 1), (0, 0)])
-    pulled = jnp.trace(equations.information, axis1=-2, axis2=-1) / 2
-    return flat.reshape(height, width) + across + down + pulled
+class _Problem(NamedTuple):
+    """Equations with their parameters in place, as `Energy` has them."""
+
+    corner: Array
+    fraction: Array
+    weight: Array
+    change: Array
+    information: Array
+    pull: Array
+    params: SolverParams
 
 
-def _solve_linear(product: Callable[[Array], Array], right: Array, diagonal: Array) -> Array:
-    def divide(v: Array) -> Array:
-        return v / diagonal
+def _set_parameters(equations: WindowEquations, params: Params) -> _Problem:
+    def pulled(u: Array) -> Array:
+        return jnp.einsum("hwi,hwij,hwj->", _gradient(u), equations.information, equations.pull)
 
-    tolerance = TOLERANCES[right.dtype.itemsize]
-    return cg(product, right, tol=tolerance, maxiter=CG_ITERATIONS, M=divide)[0]
+    L = equations.information
+    return _Problem(
+        equations.corner,
+        equations.fraction,
+        equations.weight + params.silence * equations.silent,
+        _changes(equations, params),
+        jnp.stack([L[..., 0, 0], L[..., 0, 1], L[..., 1, 1]]),
+        jax.grad(pulled)(jnp.zeros_like(equations.start)),
+        params.solver(),
+    )
+
+
+def _make_energy(problem: _Problem) -> Energy:
+    corner, *arrays = (np.asarray(leaf) for leaf in problem[:6])
+    numbers = SolverParams(*(float(value) for value in problem.params))
+    return Energy(corner.astype(np.uint32), *arrays, numbers)
+
+
+def _find_minimum(problem: _Problem, start: Array) -> NDArray:
+    least_change = LEAST_CHANGES[start.dtype.itemsize]
+    return find_minimum(_make_energy(problem), np.asarray(start), least_change)
+
+
+def _solve_linear(exact: bool, problem: _Problem, u: Array, right: Array) -> NDArray:
+    tolerance, images = TOLERANCES[right.dtype.itemsize], (np.asarray(u), np.asarray(right))
+    return solve_linear(_make_energy(problem), *images, tolerance, exact=exact)
+
+
+def _call_solver(solver: Callable, equations: WindowEquations, params: Params, *u: Array) -> Array:
+    """Call a solver on the host with a problem and images."""
+    equations, params = jax.lax.stop_gradient((equations, params))
+    shape = jax.ShapeDtypeStruct(u[0].shape, u[0].dtype)
+    problem = _set_parameters(equations, params)
+    return jax.pure_callback(solver, shape, problem, *u, vmap_method="sequential")
 
 
 def solve_equations(equations: WindowEquations, params: Params) -> Array:
@@ -267,43 +298,8 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
     Returns:
         (height, width) log image, thresholds.
     """
-    found = jax.lax.stop_gradient(_minimise(*jax.lax.stop_gradient((equations, params))))
+    found = _call_solver(_find_minimum, equations, params, equations.start)
     return _implicit_solution(found, equations, params)
-
-
-def _minimise(equations: WindowEquations, params: Params) -> Array:
-    start = equations.start
-    scale = jnp.linalg.norm(_slope(jnp.zeros_like(start), equations, params))
-    least = jnp.maximum(TOLERANCES[start.dtype.itemsize] * scale, equations.slope)
-
-    def should_continue(state: tuple[Array, Array, int]) -> Array:
-        _, slope, n = state
-        return (n < REWEIGHTINGS) & (jnp.linalg.norm(slope) > least)
-
-    def reweight(state: tuple[Array, Array, int]) -> tuple[Array, Array, int]:
-        u, slope, n = state
-        weights = _weights(u, equations, params)
-        product = _product(weights, equations, params.leak)
-        u = u - _solve_linear(product, slope, _diagonal(weights, equations, params.leak))
-        return u, _slope(u, equations, params), n + 1
-
-    first = (start, _slope(start, equations, params), 0)
-    return jax.lax.while_loop(should_continue, reweight, first)[0]
-
-
-@jax.jit
-def measure_slope(equations: WindowEquations, params: Params) -> WindowEquations:
-    """Measure how far the host's solutions are from the minimum of the energy.
-
-    Args:
-        equations: Equations of windows, stacked.
-        params: Parameters that they were solved with.
-
-    Returns:
-        The equations with `slope`.
-    """
-    size = jax.lax.map(lambda one: jnp.linalg.norm(_slope(one.start, one, params)), equations)
-    return equations._replace(slope=1.001 * size)
 
 
 def _slope(u: Array, equations: WindowEquations, params: Params) -> Array:
@@ -322,11 +318,8 @@ def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
     def times(du: Array) -> Array:
         return jax.jvp(lambda v: _slope(v, equations, params), (u,), (du,))[1]
 
-    weights = _weights(u, equations, params)
-    diagonal = _diagonal(weights, equations, params.leak)
-
     def solve(product: Callable[[Array], Array], right: Array) -> Array:
-        return _solve_linear(product, right, diagonal)
+        return _call_solver(functools.partial(_solve_linear, True), equations, params, u, right)
 
     _, right = jax.jvp(lambda numbers: _slope(u, equations, numbers), (params,), (changes[2],))
     return u, -jax.lax.custom_linear_solve(times, right, solve, symmetric=True)
@@ -369,7 +362,12 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
     """
     weights = _weights(u, equations, params)
     product = _product(weights, equations, params.leak)
-    diagonal = jax.lax.stop_gradient(_diagonal(weights, equations, params.leak))
+
+    def solve(product: Callable[[Array], Array], right: Array) -> Array:
+        image = jax.lax.stop_gradient(u)
+        return _call_solver(
+            functools.partial(_solve_linear, False), equations, params, image, right
+        )
 
     def sample(noise: Perturbation) -> Array:
         def spread(v: Array) -> Array:
@@ -381,7 +379,8 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
             total += (_gradient(v) * noise.pull).sum()
             return total + jnp.sqrt(params.leak) * (n[2] * v).sum()
 
-        z = _solve_linear(product, jax.grad(spread)(jnp.zeros_like(u)), diagonal)
+        right = jax.grad(spread)(jnp.zeros_like(u))
+        z = jax.lax.custom_linear_solve(product, right, solve, symmetric=True)
         return (z - z.mean()) ** 2
 
     squares = jax.lax.map(sample, equations.noise).mean(0)

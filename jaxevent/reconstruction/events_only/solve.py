@@ -22,13 +22,18 @@ large regions, which only their edges tie together, move as a whole. A hat is wi
 displacement d, so that on the grid of 2^l pixels the diagonal is 4^-l of the sum of r_k |d|^2 and
 of the weights of differences around it.
 
-At the solution dE/du = A u - b = 0 with the weights of u itself.
+At the solution dE/du = A u - b = 0 with the weights of u itself. Its derivatives by parameters need
+the second derivative of E, which has, in place of r_k and beside s,
+
+    w_k (1 - e_k^2 / (2 tail^2)) / (1 + e_k^2 / (2 tail^2))^2
+
+and for the products of each cell's four differences phi''(q) = -gradient / (2 (q + edge^2)^2).
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt32
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
@@ -36,8 +41,10 @@ from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParam
 from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 
 REWEIGHTINGS = 40  # at most
+MAX_REWEIGHTINGS = 2000  # where the image shall be as near to the minimum as numbers allow
 STEPS = 3  # of conjugate gradients with the same weights
 LEAST_CHANGE = 0.002  # of the image by a reweighting, root mean square in thresholds, to go on
+MAX_STEPS = 400  # of conjugate gradients towards the solution of one linear problem
 UPDATE_EVERY = 4  # so many reweightings the preconditioner takes the weights; each of the first
 SAMPLES = 4  # perturbed solutions that the variance is the mean of
 SAMPLE_STEPS = 25  # of conjugate gradients for each
@@ -60,24 +67,38 @@ class Solution(NamedTuple):
     iterations: int  # of conjugate gradients, all together
 
 
+class Energy(NamedTuple):
+    """The energy (3) of one window in thresholds; rows that look up near pixels lie together."""
+
+    corner: UInt32[np.ndarray, "rows 2"]
+    fraction: Float[np.ndarray, "rows 2 2"]
+    weight: Float[np.ndarray, " rows"]  # w_k
+    change: Float[np.ndarray, " rows"]  # d_k
+    information: Float[np.ndarray, "3 rows_or_0 width"]  # Lambda: xx, xy, yy
+    pull: Float[np.ndarray, "height width"]  # the transposed of the gradient times Lambda g
+    params: SolverParams
+
+
 class _System(NamedTuple):
-    """The matrix A of a reweighted problem."""
+    """The matrix A of a reweighted problem, or the second derivative of the energy."""
 
     corner: NDArray[np.uint32]
-    fraction: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    across: NDArray[np.float32]  # (height, width) weights of differences with the pixel right
-    down: NDArray[np.float32]  # and with the pixel below
-    information: NDArray[np.float32]  # (3, height, width) xx, xy, yy, or without rows if none
-    flux: NDArray[np.float32]  # (2, width), to work in
-    leak: np.float32
+    fraction: NDArray[np.floating]
+    weight: NDArray[np.floating]
+    across: NDArray[np.floating]  # (height, width) weights of differences with the pixel right
+    down: NDArray[np.floating]  # and with the pixel below
+    information: NDArray[np.floating]  # (3, height, width) xx, xy, yy, or without rows if none
+    curvature: NDArray[np.floating]  # (height - 1, width - 1) phi'' of cells, or without rows
+    image: NDArray[np.floating]  # (height, width) at which it is taken
+    flux: NDArray[np.floating]  # (2, width), to work in
+    leak: np.floating
 
 
 class _ScratchArrays(NamedTuple):
-    images: NDArray[np.float32]  # (6, height, width): reciprocal diagonal, r, that before, p, Ap, z
-    reciprocal: NDArray[np.float32]  # of the diagonals of P' A P, from grid to coarser grid
-    grids: NDArray[np.float32]  # values there
-    line: NDArray[np.float32]  # a row of a grid
+    images: NDArray[np.floating]  # (6, height, width): 1 / diagonal, r, that before, p, Ap, z
+    reciprocal: NDArray[np.floating]  # of the diagonals of P' A P, from grid to coarser grid
+    grids: NDArray[np.floating]  # values there
+    line: NDArray[np.floating]  # a row of a grid
 
 
 class _Preconditioner:
@@ -89,11 +110,10 @@ class _Preconditioner:
         while max(shape) > 1:
             shape = (shape[0] + 1) // 2, (shape[1] + 1) // 2
             count += shape[0] * shape[1]
-        images = np.zeros((6, height, width), np.float32)
-        self.arrays = _ScratchArrays(
-            images, *np.zeros((2, count), np.float32), np.zeros(width, np.float32)
-        )
-        self.of_rows, self.bend = np.zeros((2, height, width), np.float32)
+        dtype = system.weight.dtype
+        images = np.zeros((6, height, width), dtype)
+        self.arrays = _ScratchArrays(images, *np.zeros((2, count), dtype), np.zeros(width, dtype))
+        self.of_rows, self.bend = np.zeros((2, height, width), dtype)
         _add_row_diagonal(system, self.of_rows.reshape(-1), self.bend.reshape(-1))
 
     def update(self, system: _System) -> None:
@@ -104,7 +124,7 @@ class _Preconditioner:
         np.divide(1, diagonal, out=diagonal, where=diagonal > 0)
         if system.information.shape[1]:
             bend += system.information[0] + system.information[2]
-        scale, begin = np.float32(1), 0
+        scale, begin = bend.dtype.type(1), 0
         while max(bend.shape) > 1:
             for axis in range(2):
                 bend = np.add.reduceat(bend, np.arange(0, bend.shape[axis], 2), axis)
@@ -136,45 +156,28 @@ def solve(
         The image and its variance.
     """
     params = params or SolverParams()
-    height, width = rows.shape
     c = np.float32(rows.threshold)
     u = np.zeros(rows.shape, np.float32) if start is None else (start / c).astype(np.float32)
     # Rows that look up the same pixels lie together in memory.
     order = np.argsort(rows.corner[:, 0], kind="stable")
     base = np.where(rows.kind == EVENT, 1, params.silence).astype(np.float32) * rows.weight
-    base, change = base[order], rows.change[order]
-    information = np.zeros((3, 0, width), np.float32)
+    information = np.zeros((3, 0, rows.shape[1]), np.float32)
     pull = np.zeros(rows.shape, np.float32)
     if prior is not None:
         L = (prior.information * c**2).astype(np.float32)
         information = np.stack([L[..., 0, 0], L[..., 0, 1], L[..., 1, 1]])
         g = np.einsum("hwij,hwj->hwi", L, prior.gradient / c).astype(np.float32)
         _add_gradient_transposed(g, pull)
-    system = _System(
+    energy = Energy(
         rows.corner[order],
         rows.fraction[order],
-        base,
-        *np.zeros((2, height, width), np.float32),
+        base[order],
+        rows.change[order],
         information,
-        np.zeros((2, width), np.float32),
-        np.float32(params.leak),
+        pull,
+        params,
     )
-    preconditioner = _Preconditioner(system)
-    system = system._replace(weight=np.empty_like(base))
-    residual, b, before = np.empty_like(base), np.empty_like(u), np.empty_like(u)
-    numbers = tuple(np.float32(v) for v in (params.tail, params.gradient, params.edge))
-    iterations, rho = 0, 0.0
-    for n in range(REWEIGHTINGS):
-        _reweight(system, u, (change, base), numbers, residual)
-        if n < 3 or n % UPDATE_EVERY == 0:
-            preconditioner.update(system)
-        b[:], before[:] = pull, u
-        _add_transposed(system, change * system.weight, b)
-        rho = _conjugate_gradients(system, b, u, preconditioner.arrays, (rho, STEPS))
-        iterations += STEPS
-        if np.sqrt(np.mean((u - before) ** 2)) < LEAST_CHANGE:
-            break
-    _reweight(system, u, (change, base), numbers, residual)
+    system, preconditioner, residual, iterations = _minimise(energy, u)
     V = np.full(rows.shape, np.inf, np.float32)
     unseen = _unseen_variance(system, preconditioner.of_rows) * c**2
     if variance:
@@ -182,6 +185,119 @@ def solve(
         V = VARIANCE_FACTOR * c**2 * samples + unseen
     place = np.argsort(order, kind="stable")
     return Solution(u * c, V, unseen, residual[place], system.weight[place], iterations)
+
+
+class _Minimum(NamedTuple):
+    """The reweighted problem at the image of least energy."""
+
+    system: _System
+    preconditioner: _Preconditioner
+    residual: NDArray[np.floating]  # of rows, in their order
+    iterations: int
+
+
+def _minimise(
+    energy: Energy, u: NDArray, least_change: float = LEAST_CHANGE, most: int = REWEIGHTINGS
+) -> _Minimum:
+    """Go from the image u to that of least energy, in place."""
+    system = _set_up(energy)
+    preconditioner = _Preconditioner(system)
+    system = system._replace(weight=np.empty_like(energy.weight))
+    residual, b, before = np.empty_like(energy.weight), np.empty_like(u), np.empty_like(u)
+    data, numbers = (energy.change, energy.weight), _numbers(energy)
+    iterations, rho = 0, 0.0
+    for n in range(most):
+        _reweight(system, u, data, numbers, residual)
+        if n < 3 or n % UPDATE_EVERY == 0:
+            preconditioner.update(system)
+        b[:], before[:] = energy.pull, u
+        _add_transposed(system, energy.change * system.weight, b)
+        rho = _conjugate_gradients(system, b, u, preconditioner.arrays, (rho, STEPS))
+        iterations += STEPS
+        if np.sqrt(np.mean((u - before) ** 2)) < least_change:
+            break
+    _reweight(system, u, data, numbers, residual)
+    return _Minimum(system, preconditioner, residual, iterations)
+
+
+def _set_up(energy: Energy) -> _System:
+    """Set up the matrix with the weights of rows w_k and none of differences."""
+    height, width = energy.pull.shape
+    dtype = energy.weight.dtype
+    return _System(
+        energy.corner,
+        energy.fraction,
+        energy.weight,
+        *np.zeros((2, height, width), dtype),
+        energy.information,
+        np.zeros((0, width), dtype),
+        np.zeros((0, width), dtype),
+        np.zeros((2, width), dtype),
+        dtype.type(energy.params.leak),
+    )
+
+
+def _numbers(energy: Energy) -> tuple:
+    params, convert = energy.params, energy.weight.dtype.type
+    return convert(params.tail), convert(params.gradient), convert(params.edge)
+
+
+def find_minimum(energy: Energy, start: NDArray, least_change: float) -> NDArray:
+    """Find the image of least energy.
+
+    Args:
+        energy: Energy of a window.
+        start: (height, width) image to begin with, thresholds.
+        least_change: Root mean square change by a reweighting, in thresholds, at which it is found.
+
+    Returns:
+        (height, width) image, thresholds.
+    """
+    u = np.array(start, energy.weight.dtype)
+    _minimise(energy, u, least_change, MAX_REWEIGHTINGS)
+    return u
+
+
+def solve_linear(
+    energy: Energy, u: NDArray, right: NDArray, tolerance: float, *, exact: bool
+) -> NDArray:
+    """Solve a linear problem with the second derivative of the energy at an image.
+
+    Args:
+        energy: Energy of a window.
+        u: (height, width) image, thresholds.
+        right: (height, width) right side.
+        tolerance: Norm of the residual to stop at, relative to that of the right side.
+        exact: Whether the second derivative is exact; else it is the matrix A of the reweighted
+            problem.
+
+    Returns:
+        (height, width) solution.
+    """
+    system = _set_up(energy)
+    preconditioner = _Preconditioner(system)
+    system = system._replace(weight=np.empty_like(energy.weight))
+    residual = np.empty_like(energy.weight)
+    _reweight(system, u, (energy.change, energy.weight), _numbers(energy), residual)
+    preconditioner.update(system)
+    if exact:
+        share = residual**2 / (2 * energy.params.tail**2)
+        system.weight[:] = energy.weight * (1 - share) / (1 + share) ** 2
+        system = system._replace(curvature=_bend_cells(u, energy.params), image=u)
+    z, rho = np.zeros_like(right), 0.0
+    least = tolerance * np.linalg.norm(right)
+    for _ in range(MAX_STEPS // SAMPLE_STEPS):
+        rho = _conjugate_gradients(system, right, z, preconditioner.arrays, (rho, SAMPLE_STEPS))
+        if not rho > 0 or np.linalg.norm(preconditioner.arrays.images[1]) <= least:
+            break
+    return z
+
+
+def _bend_cells(u: NDArray, params: SolverParams) -> NDArray:
+    """Return phi''(q) of the cells of an image."""
+    across, down = np.diff(u, axis=1) ** 2, np.diff(u, axis=0) ** 2
+    q = (across[:-1] + across[1:] + down[:, :-1] + down[:, 1:]) / 2
+    return -params.gradient / (2 * (q + params.edge**2) ** 2)
 
 
 def _unseen_variance(system, of_rows):
@@ -323,6 +439,25 @@ def _add_gradient_transposed(g, out):
             out[above, x] -= sy * g[y, x, 1]
 
 
+@njit_fastmath_inlined
+def _differences_of_cell(u, y, x):
+    """Return the differences across, above and below, and down, left and right."""
+    upper, lower = u[y, x + 1] - u[y, x], u[y + 1, x + 1] - u[y + 1, x]
+    return upper, lower, u[y + 1, x] - u[y, x], u[y + 1, x + 1] - u[y, x + 1]
+
+
+@njit_fastmath_inlined
+def _add_cell(image, curvature, u, y, x, out):
+    """Add the part of the second derivative that couples the differences of a cell, times u."""
+    a, b, c, d = _differences_of_cell(image, y, x)
+    ua, ub, uc, ud = _differences_of_cell(u, y, x)
+    value = curvature * (a * ua + b * ub + c * uc + d * ud)
+    out[y, x] -= value * (a + c)
+    out[y, x + 1] += value * (a - d)
+    out[y + 1, x] += value * (c - b)
+    out[y + 1, x + 1] += value * (b + d)
+
+
 @njit_fastmath
 def _apply(system, u, out):
     """Write A u to `out`."""
@@ -364,6 +499,9 @@ def _apply(system, u, out):
             left, right, sx = _neighbours(x, width)
             out[y, right] += sx * along[x]
             out[y, left] -= sx * along[x]
+    for y in range(system.curvature.shape[0]):
+        for x in range(width - 1):
+            _add_cell(system.image, system.curvature[y, x], u, y, x, out)
     flat, image = out.reshape(-1), u.reshape(-1)
     for k in range(len(system.weight)):
         pixels, a = _row(system, k)
@@ -524,8 +662,7 @@ def _reweight(system, u, data, numbers, residual):
             system.down[y, x] = 0
     for y in range(height - 1):
         for x in range(width - 1):
-            a, b = u[y, x + 1] - u[y, x], u[y + 1, x + 1] - u[y + 1, x]
-            c, d = u[y + 1, x] - u[y, x], u[y + 1, x + 1] - u[y, x + 1]
+            a, b, c, d = _differences_of_cell(u, y, x)
             q = (a * a + b * b + c * c + d * d) / 2
             s = gradient / (2 * (q + edge * edge))
             system.across[y, x] += s
@@ -553,16 +690,19 @@ def _turn(r, before, z, rho, p):
 
 @njit_fastmath
 def _advance(p, Ap, u, r, before):
-    """Go along the direction p to the minimum there."""
+    """Go along the direction p to the minimum there; return whether there is one."""
     along, curvature = np.float32(0), np.float32(0)
     for k in range(len(p)):
         along += r[k] * p[k]
         curvature += p[k] * Ap[k]
+    if curvature <= 0:
+        return False
     alpha = along / curvature
     for k in range(len(p)):
         before[k] = r[k]
         u[k] += alpha * p[k]
         r[k] -= alpha * Ap[k]
+    return True
 
 
 def _conjugate_gradients(system, b, u, scratch, stage):
@@ -570,16 +710,18 @@ def _conjugate_gradients(system, b, u, scratch, stage):
 
     Weights may have changed since. `stage` has what that call returned, or 0, and how many steps.
     """
-    rho, steps = np.float32(stage[0]), stage[1]
+    convert = u.dtype.type
+    rho, steps = convert(stage[0]), stage[1]
     _, residual, _, direction, product, preconditioned = scratch.images
     r, before, p, Ap, z = scratch.images[1:].reshape(5, -1)
     _apply(system, u, product)
     np.subtract(b, product, out=residual)
     for _ in range(steps):
         _precondition(scratch, residual, preconditioned)
-        rho = np.float32(_turn(r, before, z, rho, p))
+        rho = convert(_turn(r, before, z, rho, p))
         if rho <= 0:
             break
         _apply(system, direction, product)
-        _advance(p, Ap, u.reshape(-1), r, before)
+        if not _advance(p, Ap, u.reshape(-1), r, before):
+            return convert(0)
     return rho
