@@ -307,7 +307,14 @@ class PatchEvents(NamedTuple):
 
 @njit_noalloc
 def _accumulate_energy(events, displacements, scratch, energy):
-    """Sum the squares of patches' signed images for every displacement."""
+    """Compute the sum of squares of patches' signed images for every displacement.
+
+    Args:
+        events: Positions, times, signs, patches and halves of events.
+        displacements: (n,) displacements along x and along y that are tried, px in the window.
+        scratch: (2, patches, side, side) images.
+        energy: (2, patches, n, n) output, by half, patch, and displacement along y and x.
+    """
     at, since, sign, patch, half = events
     side = scratch.shape[3]
     for row in range(len(displacements)):
@@ -356,7 +363,7 @@ def is_camera_known_to_move(recording: Recording, camera: PinholeCamera | None =
         camera: The camera; by default the recording's.
 
     Returns:
-        A boolean; false where nothing tells.
+        A boolean; false where it is not known.
     """
     if recording.imu is not None and gyro_speed(recording.imu) > MIN_GYRO_SPEED_RAD_S:
         return True
