@@ -62,7 +62,7 @@ GLOSSARY = {
     "Nothing": "NoFrames", "belief": "effective_certainty", "believed_rate": "frame_information",
     "Growth": "DeadTimeDerivative", "Passage": "SmoothedWindow", "Link": "MessageMap",
     "Measured": "FrameMeasurements", "Sided": "CensoredPixels", "held_by_pixel": "pixel_state_spec",
-    "through": "apply_link", "of_pixel": "pixel_functions", "shared": "redistribute_events",
+    "through": "apply_link", "of_pixel": "pixel_functions", "shared": "redistribute_pixel_count",
     "Follower": "TrajectoryEstimator", "Followed": "TrajectoryEstimate",
     "Shutter": "FrameExposures", "Taken": "AdjacentExposures", "Shots": "AdjacentFrames",
     "Along": "WarpedImages", "spread_purely": "interpolate_paths_jax",
