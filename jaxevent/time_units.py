@@ -68,12 +68,8 @@ _UNIT_PATTERNS = {
 # Log-probabilities of a unit before any number but the kind is known.
 _WHOLE_NUMBER_NATS = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
 _DECIMAL_NUMBER_NATS = {"s": 0.0, "ms": -3.5, "us": -4.0, "ns": -8.0}
-_ROUNDED_NUMBER_NATS = {
-    "s": 0.0,
-    "us": -0.5,
-    "ms": -3.0,
-    "ns": -3.0,
-}  # whole, since their type is coarse
+# Numbers that are whole since their type is coarse, as float32 is.
+_ROUNDED_NUMBER_NATS = {"s": 0.0, "us": -0.5, "ms": -3.0, "ns": -3.0}
 _UNUSUAL_UNIT_NATS = -4.0  # of units other than the usual one of a layout
 
 

@@ -30,9 +30,8 @@ MAX_ADAPTING_VARIANCE_PX2 = (
     3.0  # px^2; the radius follows the size where the position's variances are below
 )
 PENDING_EVENTS_PER_BLOCK = 8  # pending events that are applied together
-MAX_PENDING_EVENTS = (
-    8 * PENDING_EVENTS_PER_BLOCK
-)  # pending events of a target; further ones are left out
+# Pending events of a target; further ones are left out.
+MAX_PENDING_EVENTS = 8 * PENDING_EVENTS_PER_BLOCK
 
 
 class ReferenceState(eqx.Module):

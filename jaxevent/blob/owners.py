@@ -36,7 +36,7 @@ class PathTable(NamedTuple):
         return self.t[self.first[1:] - 1] + self.window // 2
 
 
-class _EventOwners(NamedTuple):
+class _Owners(NamedTuple):
     """Columns of events, and the likeliest paths of each, for kernels."""
 
     t: NDArray[np.int64]
@@ -63,9 +63,7 @@ def owner_candidates(events: Events, table: PathTable, sigmas: float | int) -> N
     """
     t, single = events.t, len(table.window) == 1
     owner = np.full((len(events), 2), NO_OWNER_INDEX, np.int32)
-    near = _EventOwners(
-        t, events.x, events.y, events.p, owner, np.empty((0 if single else len(t), 2))
-    )
+    near = _Owners(t, events.x, events.y, events.p, owner, np.empty((0 if single else len(t), 2)))
     rows = np.stack([np.searchsorted(t, us) for us in (table.begins, table.ends)])
     _find_owners(near, table, rows, float(sigmas) ** 2)
     return owner
@@ -76,7 +74,7 @@ def _find_owners(near: Any, table: Any, rows: Any, limit: float | int) -> None:
     """Find the paths that may own each event.
 
     Args:
-        near: `_EventOwners`, the events; owners and costs are output.
+        near: `_Owners`, the events; owners and costs are output.
         table: `PathTable` of all paths.
         rows: (2, paths) first event of each path's life, and the one after its last.
         limit: Largest squared Mahalanobis distance of an owner.
@@ -98,7 +96,7 @@ def _find_owners_between(near: Any, table: Any, place: Any, events: Any, limit: 
     """Find the events between two rows of a path that it may own.
 
     Args:
-        near: `_EventOwners`, the events; owners and costs are output.
+        near: `_Owners`, the events; owners and costs are output.
         table: `PathTable` of all paths.
         place: Number of the path, and both rows of the table.
         events: First event, and the one after the last.

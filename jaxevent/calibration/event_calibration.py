@@ -105,12 +105,10 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
     hot_share = float(counts[hot].sum() / max(counts.sum(), 1))
-    return EventCalibration(
-        thresholds, ratio, spread, hot, _find_region_of_interest(counts), hot_share
-    )
+    return EventCalibration(thresholds, ratio, spread, hot, _find_read_region(counts), hot_share)
 
 
-def _find_region_of_interest(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+def _find_read_region(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Find the region of interest: rows and columns between the first and the last with events."""
     inside = np.ones(counts.shape, bool)
     for axis in (0, 1):

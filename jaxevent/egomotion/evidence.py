@@ -303,10 +303,8 @@ class LockDetector:
             return
         self._history.append((t, mean))
         is_large = self._blocks > MIN_BLOCKS or self._camera_moves
-        is_convincing = (
-            found.is_supported and is_large and self._is_steady(covariance, found.length)
-        )
-        self._supporting = self._supporting + 1 if is_convincing else 0
+        is_sure = found.is_supported and is_large and self._is_steady(covariance, found.length)
+        self._supporting = self._supporting + 1 if is_sure else 0
         if self._supporting >= N_SUPPORTING_WINDOWS:
             self._is_settled, self._history = True, []
 

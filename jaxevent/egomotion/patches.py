@@ -62,9 +62,8 @@ MAX_STATIC_EDGE_FRACTION = 0.3  # fraction of edges with events, below which the
 N_FIT_TIMES = 4  # at which patches are evaluated for fits
 MAX_FIT_DISPLACEMENT_PX = 10  # of their grid, in x and y
 FIT_WINDOW_DISPLACEMENT_PX = 5.0  # median displacement of the image in a window of a fit
-HALF_LINE_POSITIONS_PX = np.linspace(
-    0, 1.4 * MAX_FIT_DISPLACEMENT_PX, 29
-)  # positions along a half-line
+# Positions along a half-line.
+HALF_LINE_POSITIONS_PX = np.linspace(0, 1.4 * MAX_FIT_DISPLACEMENT_PX, 29)
 N_REFINED_HEADINGS = 6  # from which a general motion is refined
 MIN_INCONSISTENCY_Z = 3.0  # from which parts of the image move apart
 # Of the model's displacement; a roll moves half of the patches backwards.

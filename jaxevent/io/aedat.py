@@ -90,10 +90,8 @@ _DVS128_CHIPS = {"dvs128", "tmpdiff128", "dvs128phidget", "arctds_dvs128"}
 _RESET, _SIGNAL, _IMU = 0, 1, 3
 
 
-_COMPRESSION_MAGIC = (
-    b"\x04\x22\x4d\x18",
-    b"\x28\xb5\x2f\xfd",
-)  # the first bytes of LZ4 and Zstandard
+# The first bytes of LZ4 and Zstandard.
+_COMPRESSION_MAGIC = (b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -143,9 +143,8 @@ class Disorder:
                 f"event {self.first.row} is at {self.first.after} us, earlier than the one before "
                 f"it at {self.first.before} us: "
             )
-        if self.events <= 2 * _MAX_EDGE_OUTLIERS and (
-            self.resets or self.outliers
-        ):  # too few to distinguish
+        # With so few events, a reset of the clock and outliers at an edge look alike.
+        if self.events <= 2 * _MAX_EDGE_OUTLIERS and (self.resets or self.outliers):
             return OrderError(f"{where.rstrip(': ')}; sort the events by time (stable)")
         return OrderError(
             f"{where}{'; '.join(faults)}; mend this with repair={repairs!r} or jaxevent convert "

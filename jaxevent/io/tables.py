@@ -76,15 +76,10 @@ if TYPE_CHECKING:
 NUMPY_MAGIC = b"\x93NUMPY"
 _TEXT_BLOCK_BYTES = 1 << 24  # of text parsed together: about a million events
 _MAX_LINE_BYTES = 1 << 12
-_TEXT_SAMPLE_BYTES = (
-    16 * SAMPLE_EVENTS
-)  # bytes of text from which order, unit and signs are inferred
-_OTHER_TIME_ARRAYS = (
-    "frame_t",
-    "exp_start",
-    "exp_end",
-    "imu_t",
-)  # of an archive, beside the events
+# Bytes of text from which order, unit and signs are inferred.
+_TEXT_SAMPLE_BYTES = 16 * SAMPLE_EVENTS
+# Arrays of an archive that hold other times than those of the events.
+_OTHER_TIME_ARRAYS = ("frame_t", "exp_start", "exp_end", "imu_t")
 _NO_SIZE = "the table does not state the sensor's size"
 
 

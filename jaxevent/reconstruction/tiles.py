@@ -32,10 +32,8 @@ from jaxevent.reconstruction.stream import (
     event_weight,
 )
 
-MIN_KIND_EVENTS = (
-    128,
-    1024,
-)  # events at a pixel from which the next, narrower kind of tile serves it
+# Events at a pixel from which the next, narrower kind of tile serves it.
+MIN_KIND_EVENTS = (128, 1024)
 N_TILE_THREADS = min(4, os.cpu_count() or 1)
 
 

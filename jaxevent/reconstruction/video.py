@@ -463,10 +463,8 @@ class Video(ImageSequence[P]):
         )
         self._starts = [WindowStart(None, self._windows.initial(), None)]
         self._current: FilteredWindow | None = None
-        self._pending: tuple[object, Any] = (
-            None,
-            None,
-        )  # the last reading and its images
+        # The last reading and its images.
+        self._pending: tuple[object, Any] = (None, None)
         self._future: dict[int | None, Any] | None = None  # by the start of the window
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -84,15 +84,8 @@ TARGET_SETTINGS: Mapping[str, Check] = {
 }
 
 
-OPTIONAL_COLUMNS = (
-    "vx",
-    "vy",
-    "lambda1",
-    "lambda2",
-    "theta",
-    "inverse_ttc",
-    "range",
-)  # columns beside x, y
+# Columns beside x, y.
+OPTIONAL_COLUMNS = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "range")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -340,12 +333,13 @@ class TrackProtocol(Protocol):
         seconds = time.perf_counter() - clock
         matched = score_tracks(known.xi, mean[..., :2], options.get("reach", MATCH_DISTANCE_PX))
         own = matched.match
-        if begin == "positions" and not isinstance(
-            method, MethodFunction
-        ):  # whose a track is needs no matching
+        # A tracker that starts at the true positions keeps their order: track k is of target k.
+        if begin == "positions" and not isinstance(method, MethodFunction):
             own = np.where(np.isfinite(mean[..., 0]), np.arange(mean.shape[1]), -1)
         given = np.isfinite(known.xi).all(2)
-        distance = np.linalg.norm(_select_matches(mean, own)[..., :2] - known.xi, axis=2)[given]
+        mean, covariance = _select_matches(mean, own), _select_matches(covariance, own)
+        xi = mean[..., :2]
+        distance = np.linalg.norm(xi - known.xi, axis=2)[given]
         alive = np.isfinite(distance)
         names = ("tracks", "missed", "false", "switches", "mota", "idf1", "hota")
         return {
@@ -353,18 +347,8 @@ class TrackProtocol(Protocol):
             "median": float(np.median(distance[alive])) if alive.any() else None,
             "covered": float(alive.mean()),
             **{name: getattr(matched, name) for name in names},
-            **_errors(
-                known,
-                _select_matches(mean, own),
-                _select_matches(covariance, own),
-                options,
-                noise=noise,
-                recording=recording.name,
-            ),
-            **{
-                m.name: m(_select_matches(mean, own)[..., :2], known.xi, recording.name)
-                for m in metrics
-            },
+            **_errors(known, mean, covariance, options, noise=noise, recording=recording.name),
+            **{m.name: m(xi, known.xi, recording.name) for m in metrics},
             **own_names(metrics),
             "times": len(distance),
             "events": len(recording.events),

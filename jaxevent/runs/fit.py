@@ -250,13 +250,8 @@ def _fit_objects(
     return _fit(plan, Path(out), resume, progress, replace)
 
 
-METHOD_SETTINGS = (
-    "fit",
-    "search",
-    "params",
-    "label",
-    "prior",
-)  # settings of a method, not of the file
+# Settings of a method, not of the file.
+METHOD_SETTINGS = ("fit", "search", "params", "label", "prior")
 
 
 def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
@@ -264,9 +259,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
     progress = progress if devices.is_process_zero() else False
     with contextlib.ExitStack() as held:
         if out is not None:
-            rows = devices.on_process_zero(
-                lambda: _rows_of_ended_run(out, plan, resume, replace, held)
-            )
+            rows = devices.on_process_zero(lambda: _ended_rows(out, plan, resume, replace, held))
             if rows is not None:
                 return _read_finished(rows, out, plan)
         data = devices.on_all_processes(lambda: _load_all(plan, progress))
@@ -333,7 +326,7 @@ def _read_finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
     return Fits(rows, params, found, gained, _format_report(plan.tasks, rows, found, gained))
 
 
-def _rows_of_ended_run(
+def _ended_rows(
     out: Path, plan: Plan, resume: bool, replace: bool, held: contextlib.ExitStack
 ) -> list[dict[str, Any]] | None:
     """Return the rows of a run that had ended and is to go on; None if it is to be computed.

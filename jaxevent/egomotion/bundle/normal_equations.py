@@ -29,9 +29,8 @@ from jaxevent.egomotion.bundle.residuals import (
     subtract_mean,
 )
 
-N_PATH_UNKNOWNS = (
-    6 * warp.N_COEFFICIENT_ROWS
-)  # numbers of a path's rows; after them come the skew and the plane's normal
+# Numbers of a path's rows; after them come the skew and the plane's normal.
+N_PATH_UNKNOWNS = 6 * warp.N_COEFFICIENT_ROWS
 NODE_EDGE_LOG_DEPTH = 0.1  # a larger difference of log depth between nodes is an edge
 # Less accurate solutions save a sixth of the time and lose 0.3 degrees of heading on slider_depth.
 MAX_CG_STEPS, CG_TOLERANCE = 40, 0.01

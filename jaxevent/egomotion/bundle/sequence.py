@@ -16,10 +16,8 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.progress import bar
 
-WINDOW_DISPLACEMENT_RANGE_PX = (
-    24.0,
-    150.0,
-)  # motion of the image in a window, with which the default length stays
+# Motion of the image in a window, with which the default length stays.
+WINDOW_DISPLACEMENT_RANGE_PX = (24.0, 150.0)
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.02, 2.0
 # Uncertainty of the motion at the end of a window without neighbour, by its difference from that at
 # the middle. Squared errors of Omega 0.1 s from the middle are then 0.1 to 2 times the variance.

@@ -40,9 +40,8 @@ MIN_NODES_PER_COMPONENT, MAX_NODES_PER_COMPONENT = 3, 7  # of a component
 MAX_SCORED_FRACTION = 0.6  # of the particles, number of nodes and checks
 N_BATCHES_WITHOUT_NODES = 64  # after the most nodes per component were too few
 REDUCING_ERROR_RATIO = 0.05  # of the bound, error at which there may be fewer nodes
-NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(
-    4
-)  # in `Interpolation.counters`
+# Places in `Interpolation.counters`.
+NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(4)
 
 
 class ModelFunctions(NamedTuple):

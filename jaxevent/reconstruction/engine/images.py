@@ -162,9 +162,8 @@ class FilterVideo(ImageSequence[P]):
         begin = WindowStart(window.stop, window.context, self._passes.copy_states())
         if all(b.start != window.stop for b in self._begins):
             self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
-            if (
-                len(self._begins) > MAX_WINDOW_STARTS
-            ):  # the first one, the last one, and half of the others
+            # Keep the first one, the last one, and half of the others.
+            if len(self._begins) > MAX_WINDOW_STARTS:
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
         return begin
 
