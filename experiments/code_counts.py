@@ -62,7 +62,7 @@ GLOSSARY = {
     "Nothing": "NoFrames", "belief": "effective_certainty", "believed_rate": "frame_information",
     "Growth": "DeadTimeDerivative", "Passage": "SmoothedWindow", "Link": "MessageMap",
     "Measured": "FrameMeasurements", "Sided": "CensoredPixels", "held_by_pixel": "pixel_state_spec",
-    "through": "apply_link", "of_pixel": "pixel_functions", "shared": "redistribute_events",
+    "through": "apply_link", "of_pixel": "pixel_functions", "shared": "redistribute_pixel_count",
     "Follower": "TrajectoryEstimator", "Followed": "TrajectoryEstimate",
     "Shutter": "FrameExposures", "Taken": "AdjacentExposures", "Shots": "AdjacentFrames",
     "Along": "WarpedImages", "spread_purely": "interpolate_paths_jax",
@@ -91,6 +91,9 @@ GLOSSARY = {
     "again": "evaluate", "Known": "Constant", "OfParameters": "ParameterValue", "kept": "cache",
     "Opened": "RecordingCache", "Contents": "FileHashes",
 }  # fmt: skip
+
+# Names in capitals, in text, of other programs and of file formats.
+FOREIGN_NAMES = {"XLA_FLAGS", "TIME_HIGH", "CD_ON", "CD_OFF"}
 
 # Words of that column that stay, and why.
 KEPT_WORDS: dict[str, str] = {
@@ -279,6 +282,31 @@ def is_no_noun(name: str) -> bool:
     return words[-1] in NOT_NOUNS or words[-1].endswith("ed") or (words[-1].endswith("ing"))
 
 
+def split_text(path: Path) -> tuple[set[str], list[tuple[int, str]]]:
+    """Return the words of a file's code, and its comments and docstrings with their lines."""
+    words, texts, begins = set[str](), list[tuple[int, str]](), True
+    for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
+        if token.type == tokenize.COMMENT or (begins and token.type == tokenize.STRING):
+            texts.append((token.start[0], token.string))
+        else:
+            words.update(re.findall(r"\w+", token.string))
+        if token.type not in (tokenize.COMMENT, tokenize.NL):
+            begins = token.type in (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+    return words, texts
+
+
+def unknown_constants(paths: list[Path]) -> list[str]:
+    """List the constants that comments and docstrings of some files name, and no file defines."""
+    known = FOREIGN_NAMES.union(*(split_text(path)[0] for path in files_of("jaxevent")))
+    return [
+        f"{path.relative_to(ROOT)}:{line} {name}"
+        for path in paths
+        for line, text in split_text(path)[1]
+        for name in re.findall(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b", text)
+        if name not in known
+    ]
+
+
 def broken_rules(paths: list[Path]) -> dict[str, list[str]]:
     """List the places in some files of the package that break a rule of its language.
 
@@ -294,6 +322,7 @@ def broken_rules(paths: list[Path]) -> dict[str, list[str]]:
         "docstring begins badly": [], "public surface without docstring": [],
         "public surface without Args or Returns": [], "more than six positional arguments": [],
         "class is no noun": [], "word of the old glossary": [],
+        "text names an unknown constant": unknown_constants(paths),
     }  # fmt: skip
     for path in paths:
         text = path.read_text()

@@ -106,7 +106,7 @@ def secret_key(folder: Path) -> bytes | None:
 
 
 def _read_key(path: Path) -> bytes | None:
-    """The content of a key's file; None where there is none, or not the user's alone."""
+    """Return the content of a key's file; None where there is none, or others may read it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | _OPEN)
     except OSError:
@@ -200,7 +200,7 @@ def _user_folder(kind: str) -> Path:
 
 @functools.cache
 def _processor() -> str:
-    """A name of the instructions that this processor has."""
+    """Return a name of the instructions that this processor has."""
     about = platform.machine()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -338,7 +338,7 @@ def estimate_response(
         )
     level = np.arange(256)
     hat = np.maximum(np.minimum(level, 255 - level) - margin, 0) / (127 - margin)
-    z = _drawn(stack.reshape(len(stack), -1), hat > 0, samples, np.random.default_rng(seed))
+    z = _draw_pixels(stack.reshape(len(stack), -1), hat > 0, samples, np.random.default_rng(seed))
     shown = (np.bincount(z.ravel(), minlength=256) > 0) & (hat > 0)
     surplus = int((hat[z] > 0).sum()) - z.shape[1]
     if surplus < 256 or not shown[:48].any() or not shown[208:].any():
@@ -370,8 +370,18 @@ def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.f
     return stack, times
 
 
-def _drawn(z: NDArray, usable: NDArray, samples: int, rng: np.random.Generator) -> NDArray:
-    """Draw grey levels (images, drawn) of pixels that are usable twice, spread over the levels."""
+def _draw_pixels(z: NDArray, usable: NDArray, samples: int, rng: np.random.Generator) -> NDArray:
+    """Draw pixels that are usable twice, spread over the grey levels.
+
+    Args:
+        z: (images, pixels) grey levels.
+        usable: (256,) whether a level is usable.
+        samples: Pixels of each level that are drawn in each image.
+        rng: Generator.
+
+    Returns:
+        (images, drawn) grey levels.
+    """
     z = z[:, usable[z].sum(0) >= 2]
     z = z[:, rng.permutation(z.shape[1])]
     drawn = np.zeros(z.shape[1], bool)
@@ -386,11 +396,20 @@ def _drawn(z: NDArray, usable: NDArray, samples: int, rng: np.random.Generator) 
 def _debevec(
     z: NDArray, log_exposure: NDArray, hat: NDArray, smoothness: float | int
 ) -> NDArray[np.float64]:
-    """Fit the intensity of every grey level to the levels z of pixels (images, pixels).
+    """Fit the intensity of every grey level.
 
     Pixel i contributes sum_j h_j (g(z_j) - ln t_j - ln E_i)^2, h_j = hat(z_j)^2. Its best ln E_i is
     the mean of g(z_j) - ln t_j under h. Put in, normal equations of the 256 values of g remain:
     their matrix is the sum over pixels of diag(v) - v v' / sum v, v = sum_j h_j e_zj.
+
+    Args:
+        z: (images, pixels) grey levels, 0 to 255.
+        log_exposure: (images,) logarithms of the exposure times t.
+        hat: (256,) weights of grey levels.
+        smoothness: Weight of the second differences of g.
+
+    Returns:
+        (256,) intensities; that of the highest level is 1.
     """
     import scipy.linalg
     import scipy.optimize

@@ -182,7 +182,18 @@ def _parts(loss: Any, params: Any, batch: Any) -> tuple[Array, Array]:
 def _directional_derivatives(
     loss: Any, params: Any, raw: dict[str, Array], way: dict[str, Array], batch: Any
 ):
-    """Compute the derivative of every part along a direction, (parts,)."""
+    """Compute the derivative of every part of a loss along a direction.
+
+    Args:
+        loss: The loss.
+        params: Parameters.
+        raw: Unconstrained numbers by name.
+        way: The direction, in the shape of `raw`.
+        batch: One batch.
+
+    Returns:
+        (parts,).
+    """
 
     def value(one: dict[str, Array]) -> Array:
         return loss.parts(params.with_raw(one), batch)[0]
@@ -344,7 +355,14 @@ def _rises_otherwise(
     width: float,
     curvature: float,
 ) -> bool:
-    """Return true if the loss at the ends of an interval is not what the curvature predicts."""
+    """Return true if the loss at the ends of an interval is not what the curvature predicts.
+
+    Args:
+        sample: The loss of all parts.
+        objective: Function of a step that returns the losses (parts,), None outside the bounds.
+        width: Half width of the interval, unit steps.
+        curvature: Second derivative of the loss by the step.
+    """
     found = [objective(sign * width) for sign in (-1.0, 1.0)]
     rises = [sample.shares @ (values - sample.values) for values in found if values is not None]
     if len(rises) < 2 or not np.isfinite(rises).all():
@@ -354,7 +372,14 @@ def _rises_otherwise(
 
 
 def _has_no_skill(sample: _Sample, k: int, scale: float, ends: Sequence[float | None]) -> bool:
-    """Return true if the slope does not predict the changes of the loss inside an interval."""
+    """Return true if the slope does not predict the changes of the loss inside an interval.
+
+    Args:
+        sample: The loss of all parts.
+        k: Which of the numbers.
+        scale: Its unit step.
+        ends: Ends of the interval, unit steps; None: open.
+    """
     if not all(end is not None and math.isfinite(end) for end in ends):
         return False
     low, high = (0.99 * float(end) for end in ends if end is not None)
@@ -371,9 +396,17 @@ def _has_no_skill(sample: _Sample, k: int, scale: float, ends: Sequence[float | 
 def _smoothed_ends(
     sample: _Sample, objective: Callable[[float], NDArray[np.float64] | None]
 ) -> list[float | None] | None:
-    """Find the ends of the interval of a smoothed loss; None if it has no minimum near.
+    """Find the ends of the interval of a smoothed loss.
 
-    The line is the shortest that holds the interval and tells the curvature to a quarter.
+    The loss is smoothed by a parabola over the shortest line that holds the interval and determines
+    the curvature to a quarter.
+
+    Args:
+        sample: The loss of all parts.
+        objective: Function of a step that returns the losses (parts,), None outside the bounds.
+
+    Returns:
+        The ends, unit steps; None if the loss has no minimum near.
     """
     if sample.count < 3:
         return None
@@ -440,7 +473,17 @@ def _widths(sample: _Sample, scales: NDArray[np.float64]) -> tuple[NDArray[np.fl
 def _losses_at_step(
     sample: _Sample, k: int, scale: float, step: float
 ) -> NDArray[np.float64] | None:
-    """Compute the losses of all parts with one number moved; None outside its bounds."""
+    """Compute the losses of all parts with one number moved.
+
+    Args:
+        sample: The loss of all parts.
+        k: Which of the numbers.
+        scale: Its unit step.
+        step: Number of unit steps.
+
+    Returns:
+        (parts,); None outside the number's bounds.
+    """
     at = sample.at.copy()
     at[k] += step * scale
     params = sample.found.with_raw(sample.raw(at))
@@ -455,7 +498,13 @@ def _find_interval_end(
 ) -> float | None:
     """Find the distance at which the loss has risen enough.
 
-    None if not found, NaN if undetermined.
+    Args:
+        sample: The loss of all parts.
+        objective: Function of a step that returns the losses (parts,), None outside the bounds.
+        sign: 1 to search upwards, -1 downwards.
+
+    Returns:
+        The end, unit steps; None if not found, NaN if undetermined.
     """
     inside, step = 0.0, FIRST_SEARCH_STEP
     for _ in range(MAX_DOUBLINGS + 1):
@@ -483,7 +532,18 @@ def _find_interval_end(
 def _remark(
     sample: _Sample, k: int, moved: float, ends: Sequence[float | None], scale: float
 ) -> str:
-    """Describe a number that ran to a bound or away, given its move in unit steps."""
+    """Describe a number that ran to a bound or away.
+
+    Args:
+        sample: The loss of all parts.
+        k: Which of the numbers.
+        moved: Its move in the fit, unit steps.
+        ends: Ends of its interval, unit steps; None: open.
+        scale: Its unit step.
+
+    Returns:
+        The remark; empty if there is none.
+    """
     number = sample.found.numbers[sample.places[k][0]]
     for bound in (number.least, number.most):
         if abs(bound) >= MAX_VALUE or (bound == 0 and isinstance(number, Positive)):
@@ -507,7 +567,19 @@ def _interval_of_searched(
     interval: Interval,
     prepared: Callable[[Any], Batches],
 ) -> ParameterInterval:
-    """Find the interval of a number that was searched, for which every batch is prepared again."""
+    """Find the interval of a number that was searched; every value prepares the batches again.
+
+    Args:
+        loss: The loss.
+        start: Parameters at the start of the fit.
+        found: Parameters at its end.
+        name: Name of the number.
+        interval: Low and high end, and number of values that were tried.
+        prepared: Function that prepares the batches for parameters.
+
+    Returns:
+        The interval.
+    """
     low, high, count = interval
     value, scale = float(getattr(found, name)), (high - low) / (count - 1)
     number = found.numbers[name]

@@ -1,4 +1,4 @@
-"""The errors that are the user's to mend: bad input, said in a sentence."""
+"""The errors that are the user's to mend: bad input, described in a sentence."""
 
 import importlib
 import json
@@ -47,14 +47,14 @@ def require(module: str, extra: str) -> ModuleType:
 
 
 def install_command(extra: str) -> str:
-    """The command that installs an extra from where jaxevent itself came: `pip install ...`.
+    """Return the command that installs an extra from where jaxevent itself came: `pip install ...`.
 
     A package that was installed from a folder or a repository names it in direct_url.json
     (packaging.python.org, "Recording the Direct URL Origin of installed distributions").
     """
     try:
-        told = metadata.distribution("jaxevent").read_text("direct_url.json")
-        origin: dict[str, Any] = json.loads(told or "{}")
+        record = metadata.distribution("jaxevent").read_text("direct_url.json")
+        origin: dict[str, Any] = json.loads(record or "{}")
     except metadata.PackageNotFoundError:
         # Not installed: Python finds a checkout on its path.
         checkout = Path(__file__).resolve().parents[1]
@@ -64,8 +64,8 @@ def install_command(extra: str) -> str:
     url = origin.get("url", "")
     if "vcs_info" in origin:
         vcs = origin["vcs_info"]
-        asked = f"@{vcs['requested_revision']}" if vcs.get("requested_revision") else ""
-        return f"pip install 'jaxevent[{extra}] @ {vcs['vcs']}+{url}{asked}'"
+        revision = f"@{vcs['requested_revision']}" if vcs.get("requested_revision") else ""
+        return f"pip install 'jaxevent[{extra}] @ {vcs['vcs']}+{url}{revision}'"
     if "archive_info" in origin and urlsplit(url).scheme != "file":
         return f"pip install 'jaxevent[{extra}] @ {url}'"
     if "dir_info" not in origin and "archive_info" not in origin:

@@ -78,7 +78,7 @@ MEASURE_MEANINGS = {
     "range": "root mean square error of the range, of its size",
     "nll": "mean negative log-likelihood of an event, nats; less is better",
     "times": "times that were compared",
-    "windows": "stretches of the recordings that were compared",
+    "windows": "segments of the recordings that were compared",
     "events": "events in them",
     "seconds": "seconds of computing, compilation included",
 }

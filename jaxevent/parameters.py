@@ -608,9 +608,8 @@ def _elementwise(name: str, values: Array) -> Array:
     known_by, traced_by = _FUNCTIONS[name]
     if isinstance(values, Tracer):
         return traced_by(values)
-    with np.errstate(
-        divide="ignore", over="ignore"
-    ):  # the logarithm of 0, and what is stored of it
+    # NumPy would warn of the logarithm of 0, and of an exponential that overflows.
+    with np.errstate(divide="ignore", over="ignore"):
         known = np.asarray(known_by(np.asarray(values)))
     # Without the type JAX compiles a copy.
     return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))

@@ -34,7 +34,7 @@ class TurnLock:
     """
 
     def __init__(self, owner: str):
-        """`owner` names the object, for the message."""
+        """Make a lock of an object, whose name is for the message."""
         self._owner, self._lock, self._was_locked = owner, threading.RLock(), False
         _locks.add(self)
 

@@ -68,12 +68,8 @@ _UNIT_PATTERNS = {
 # Log-probabilities of a unit before any number but the kind is known.
 _WHOLE_NUMBER_NATS = {"us": 0.0, "ns": -3.0, "ms": -3.5, "s": -10.0}
 _DECIMAL_NUMBER_NATS = {"s": 0.0, "ms": -3.5, "us": -4.0, "ns": -8.0}
-_ROUNDED_NUMBER_NATS = {
-    "s": 0.0,
-    "us": -0.5,
-    "ms": -3.0,
-    "ns": -3.0,
-}  # whole, since their type is coarse
+# Numbers that are whole since their type is coarse, as float32 is.
+_ROUNDED_NUMBER_NATS = {"s": 0.0, "us": -0.5, "ms": -3.0, "ns": -3.0}
 _UNUSUAL_UNIT_NATS = -4.0  # of units other than the usual one of a layout
 
 
@@ -254,14 +250,24 @@ class _Contradiction(NamedTuple):
 def _contradiction(
     numbers: "_Numbers", unit: str, least: float, usual: str | None = None
 ) -> _Contradiction | None:
-    """Return another unit that exceeds the one stated by `least` nats; None where none does."""
+    """Find a unit that fits far better than the one stated.
+
+    Args:
+        numbers: Statistics of the times.
+        unit: The stated unit.
+        least: Log likelihood ratio from which another unit counts, nats.
+        usual: Usual unit of the layout.
+
+    Returns:
+        The unit and the comparison in words; None if no other unit fits so well.
+    """
     scores = {other: numbers.score(other, usual) for other in US_PER_UNIT}
     best = max(scores, key=lambda other: scores[other])
     known = numbers.count >= MIN_EVENTS and numbers.span > 0
     if not known or scores[best] <= scores[unit] + least:
         return None
-    told = f"{numbers.describe(unit)}; as {UNIT_NAMES[best]} {numbers.describe(best)}"
-    return _Contradiction(best, told)
+    text = f"{numbers.describe(unit)}; as {UNIT_NAMES[best]} {numbers.describe(best)}"
+    return _Contradiction(best, text)
 
 
 def _warn(text: str) -> None:
@@ -413,7 +419,16 @@ def _convention(numbers: _Numbers) -> str:
 
 
 def _repetition(t: NDArray, x: NDArray, y: NDArray) -> float | None:
-    """Return the 5 % quantile of intervals between events of one pixel, None of too few."""
+    """Return the 5 % quantile of intervals between events of one pixel.
+
+    Args:
+        t: (n,) times.
+        x: (n,) columns.
+        y: (n,) rows.
+
+    Returns:
+        The quantile, in units of `t`; None of too few intervals.
+    """
     order = np.lexsort((x[:-1], y[:-1]))  # the last event is not next to the others
     x, y, t = x[order], y[order], t[order]
     same = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (t[1:] > t[:-1])

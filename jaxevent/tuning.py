@@ -404,7 +404,17 @@ def gradient_skill(steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike) -> fl
 def _prediction_errors(
     steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the errors of predicted changes, 0 where negligible, and the predictions."""
+    """Compare changes of a loss with those that its slope predicts.
+
+    Args:
+        steps: (n,) steps.
+        losses: (n,) losses.
+        slopes: (n,) derivatives of the loss by the step.
+
+    Returns:
+        Errors of the predicted changes, 0 where negligible, and the predicted changes, (n - 1,)
+            each.
+    """
     table = np.array([steps, losses, slopes], float)
     at, loss, slope = table[:, np.isfinite(table).all(0)]
     predicted = np.diff(at) * (slope[1:] + slope[:-1]) / 2
@@ -505,9 +515,18 @@ def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> P
 def _update_best(
     position: Position, seen: Array, i: int | Array, patience: int | Array
 ) -> tuple[Position, Array]:
-    """Keep the best of each start at iteration i, and return whether any start goes on.
+    """Keep the best parameters of each start.
 
     A start that has stopped keeps its best, however long the others go on.
+
+    Args:
+        position: State of the fit.
+        seen: (starts,) losses that count.
+        i: Number of the iteration.
+        patience: Iterations without improvement after which a start stops.
+
+    Returns:
+        The state, and whether any start goes on.
     """
     first = i == 0
     going = first | (i - position.best_at < patience)
@@ -542,8 +561,9 @@ def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[
     own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.REMOTE_BATCH)
     mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
     said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
-    told = {k: v for some in devices.allgather(said) for k, v in some.items()}
-    return [(told[k][0], jax.tree.map(jnp.asarray, told[k][1])) for k in range(len(batches))]
+    gathered = {k: v for some in devices.allgather(said) for k, v in some.items()}
+    values = (gathered[k] for k in range(len(batches)))
+    return [(weight, jax.tree.map(jnp.asarray, value)) for weight, value in values]
 
 
 def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
@@ -633,7 +653,7 @@ class _Loop:
         )
 
     def leader(self) -> Any:
-        """The parameters of the best start."""
+        """Return the parameters of the best start."""
         position = self.run.position
         best = int(jnp.argmin(position.best_loss))
         raw = {name: leaf[best] for name, leaf in position.raw.items()}

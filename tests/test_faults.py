@@ -197,14 +197,14 @@ def test_events_that_a_sample_leaves_out_are_known(sound, most, monkeypatch):
     place = events.y.astype(int) * sound.width + events.x
     sampled = np.concatenate([[0], np.cumsum(np.isin(place, sample.places))])
     assert 0 < len(sample.places) < sound.width * sound.height
-    for stretch in sample.stretches:
-        first, last = stretch.span
-        offsets = (0, first - int(stretch.frame_t[0]), last + 1 - int(stretch.frame_t[-1]))
+    for segment in sample.segments:
+        first, last = segment.span
+        offsets = (0, first - int(segment.frame_t[0]), last + 1 - int(segment.frame_t[-1]))
         for offset, covered in zip(offsets, (True, True, False), strict=True):
-            known = stretch.is_covered(offset)
+            known = segment.is_covered(offset)
             assert known[:-1].all() and known[-1] == covered
-            counted = count_between(stretch, offset).sum((1, 2))
-            edges = np.searchsorted(events.t, stretch.frame_t + offset)
+            counted = count_between(segment, offset).sum((1, 2))
+            edges = np.searchsorted(events.t, segment.frame_t + offset)
             np.testing.assert_array_equal(counted[known], np.diff(sampled[edges])[known])
 
 

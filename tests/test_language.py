@@ -25,6 +25,7 @@ def broken():
         "public surface without Args or Returns",
         "class is no noun",
         "word of the old glossary",
+        "text names an unknown constant",
     ],
 )
 def test_no_place_breaks_a_rule(broken, rule):

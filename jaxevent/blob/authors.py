@@ -29,10 +29,9 @@ DISPLAY_PERIOD_US = 25_000  # between displayed images
 MAX_ADAPTING_VARIANCE_PX2 = (
     3.0  # px^2; the radius follows the size where the position's variances are below
 )
-EVENTS_PER_REAPPLIED_BLOCK = 8  # pending events that are applied together
-MAX_PENDING_EVENTS = (
-    8 * EVENTS_PER_REAPPLIED_BLOCK
-)  # pending events of a target; further ones are left out
+PENDING_EVENTS_PER_BLOCK = 8  # pending events that are applied together
+# Pending events of a target; further ones are left out.
+MAX_PENDING_EVENTS = 8 * PENDING_EVENTS_PER_BLOCK
 
 
 class ReferenceState(eqx.Module):
@@ -47,7 +46,15 @@ class ReferenceState(eqx.Module):
 
     @classmethod
     def init(cls, time: Int[Array, " targets"], dtype: Any) -> "ReferenceState":
-        """Initialise targets that begin at some times."""
+        """Initialise the association state of targets.
+
+        Args:
+            time: (targets,) times at which the targets begin, us since the chunk's start.
+            dtype: Type of positions.
+
+        Returns:
+            The state, without pending events.
+        """
         pending = jnp.zeros((*time.shape, MAX_PENDING_EVENTS, 2), dtype)
         zero = jnp.zeros_like(time)
         return cls(time - 1, time, time + DISPLAY_PERIOD_US, zero > 0, pending, zero)
@@ -94,6 +101,9 @@ def reference_step(
         radius: Radius of the gate, px.
         reference: Association state of the target.
         event: The event.
+
+    Returns:
+        The target after the event.
     """
     time, batch = event.time, event.batch
     fixed, now = lax.stop_gradient((params, filter.predicted_measurement(params, state)))
@@ -109,7 +119,7 @@ def reference_step(
         return filter.update(params, state, batch, jnp.ones(1))
 
     def apply(state: Any) -> Any:
-        of_queue = lambda s: reapply_pending(filter, params, s, reference, event)  # noqa: E731
+        of_queue = lambda s: apply_pending(filter, params, s, reference, event)  # noqa: E731
         return lax.cond(reference.n_pending > 0, of_queue, apply_event, state)
 
     state = lax.cond(updated, apply, lambda s: s, state)
@@ -124,7 +134,7 @@ def reference_step(
     return ReferenceStepResult(state, radius, reference, accepted, updated)
 
 
-def reapply_pending(
+def apply_pending(
     filter: Filter,
     params: TrackerParams,
     state: Any,
@@ -134,6 +144,16 @@ def reapply_pending(
     """Update a state with the pending events, which take the place of an accepted event.
 
     They come at even distances of time between the last event, of any target, and this one.
+
+    Args:
+        filter: Filter of the target.
+        params: Parameters of the target.
+        state: State of the filter, at the last update.
+        reference: Association state, which holds the positions of the pending events.
+        event: The accepted event; its position does not count.
+
+    Returns:
+        The state at the event's time.
     """
     batch, since = event.batch, event.since
     whole = (event.time - reference.last_event).astype(since.dtype) * 1e-6
@@ -151,20 +171,31 @@ def reapply_pending(
         return lax.cond(some, lambda s: lax.scan(one, s, part)[0], lambda s: s, state), None
 
     blocks = (
-        reference.pending.reshape(-1, EVENTS_PER_REAPPLIED_BLOCK, 2),
-        jnp.arange(MAX_PENDING_EVENTS).reshape(-1, EVENTS_PER_REAPPLIED_BLOCK),
+        reference.pending.reshape(-1, PENDING_EVENTS_PER_BLOCK, 2),
+        jnp.arange(MAX_PENDING_EVENTS).reshape(-1, PENDING_EVENTS_PER_BLOCK),
     )
     return lax.scan(block, state, blocks)[0]
 
 
-def update_reference(
+def update_reference_state(
     filter: Filter,
     params: TrackerParams,
     state: Any,
     reference: ReferenceState,
     time: Int[Array, ""],
 ) -> ReferenceState:
-    """Update the association state of any target after an event, of this target or not."""
+    """Update the association state of any target after an event, of this target or not.
+
+    Args:
+        filter: Filter of the target.
+        params: Parameters of the target.
+        state: State of the filter, at the last update.
+        reference: Association state of the target.
+        time: Time of the event, us since the chunk's start.
+
+    Returns:
+        The association state after the event.
+    """
     predicted = filter.predicted_measurement(params, state)
     variances = jnp.diagonal(lax.stop_gradient(predicted).P_p)
     due = time >= reference.next_display

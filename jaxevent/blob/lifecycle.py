@@ -93,7 +93,7 @@ def init_state(filter: Filter, params: TrackerParams, features: Features) -> Tra
 
 
 def shift_state(state: TrackerState, elapsed: Array) -> TrackerState:
-    """Count times from a moment `elapsed` us later; those that would not fit stay at the least."""
+    """Count times from a moment `elapsed` us later; times that would not fit are limited."""
     grid = state.grid
     if grid is not None:
         grid = ClutterGrid(grid.sums, jnp.maximum(grid.time - elapsed, -2 * MAX_CHUNK_US))
@@ -103,7 +103,18 @@ def shift_state(state: TrackerState, elapsed: Array) -> TrackerState:
 def spawn_seeded_tracks(
     filter: Filter, params: TrackerParams, features: Features, due: Array, tracks: TrackBuffer
 ) -> TrackBuffer:
-    """Start a confirmed track at each seed that is `due` (seeds,); seed k uses buffer entry k."""
+    """Start a confirmed track at each seed that is due; seed k uses buffer entry k.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: Seeds of the segment.
+        due: (seeds,) whether a seed starts now.
+        tracks: Tracks so far.
+
+    Returns:
+        The tracks.
+    """
     seeds, number = len(features.seed), len(tracks.id)
     if seeds == 0:
         return tracks
@@ -161,9 +172,20 @@ def _sum_3x3(counts: Float[Array, "rows columns"]) -> Float[Array, "rows columns
 def _find_births(
     params: TrackerParams, sums: Array, free: Array, next_id: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Find where tracks are born: entries of the buffer, positions, numbers, and the grid's rest.
+    """Find where tracks are born.
 
     The cell whose 3x3 sum is largest comes first; the 5x5 cells around it are emptied.
+
+    Args:
+        params: `n_birth`.
+        sums: (3, rows, columns) sums of the weights of unassociated events, and of weight times x
+            and y (px), in each cell.
+        free: (entries,) whether an entry of the buffer is free.
+        next_id: Number of the first new track.
+
+    Returns:
+        For each entry whether a track begins in it, its position (entries, 2) in px and its number,
+        and what remains of the sums.
     """
     number, (_, rows, columns) = len(free), sums.shape
 
@@ -196,7 +218,17 @@ def _find_births(
 def predict_measurement(
     filter: Filter, params: TrackerParams, track: TrackBuffer, stop: Array
 ) -> PredictedMeasurement:
-    """Predict the events of one track at a chunk's end (us)."""
+    """Predict the events of one track at a chunk's end.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        track: One track of the buffer, at its last update.
+        stop: End of the chunk, us since its start.
+
+    Returns:
+        The prediction; for an empty entry that of its state as it is.
+    """
     params = track_params(params, track.overrides)
     dt = to_seconds(jnp.maximum(stop - track.last_update, 0), track.gate)
     dt = jnp.where(track.id >= 0, dt, 0)
@@ -217,6 +249,9 @@ def decide_track(
         track: The track.
         evidence: Predicted events, and relation to other tracks.
         stop: End of the chunk, us.
+
+    Returns:
+        The decision; its reason is an index of `END_REASONS`, 0 for a track that goes on.
     """
     predicted, merging = evidence.predicted, evidence.merging
     alive = track.id >= 0
@@ -277,7 +312,18 @@ def _decide_tracks(
 def manage_tracks(
     filter: Filter, params: TrackerParams, features: Features, stop: Array, state: TrackerState
 ) -> tuple[TrackerState, LifecycleLog]:
-    """Confirm, delete, merge and begin tracks at a chunk's end (us)."""
+    """Confirm, delete, merge and begin tracks at a chunk's end.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: Seeds and sensor of the segment.
+        stop: End of the chunk, us since its start.
+        state: Tracks and grid at the chunk's end.
+
+    Returns:
+        The state after births and deaths, and the changes.
+    """
     fixed = lax.stop_gradient(params)
     decision = _decide_tracks(filter, fixed, features, stop, state.tracks)
     id_before, dead = state.tracks.id, decision.end_reason > 0

@@ -36,7 +36,7 @@ class PathTable(NamedTuple):
         return self.t[self.first[1:] - 1] + self.window // 2
 
 
-class _Near(NamedTuple):
+class _Owners(NamedTuple):
     """Columns of events, and the likeliest paths of each, for kernels."""
 
     t: NDArray[np.int64]
@@ -63,7 +63,7 @@ def owner_candidates(events: Events, table: PathTable, sigmas: float | int) -> N
     """
     t, single = events.t, len(table.window) == 1
     owner = np.full((len(events), 2), NO_OWNER_INDEX, np.int32)
-    near = _Near(t, events.x, events.y, events.p, owner, np.empty((0 if single else len(t), 2)))
+    near = _Owners(t, events.x, events.y, events.p, owner, np.empty((0 if single else len(t), 2)))
     rows = np.stack([np.searchsorted(t, us) for us in (table.begins, table.ends)])
     _find_owners(near, table, rows, float(sigmas) ** 2)
     return owner
@@ -71,7 +71,14 @@ def owner_candidates(events: Events, table: PathTable, sigmas: float | int) -> N
 
 @njit_noalloc
 def _find_owners(near: Any, table: Any, rows: Any, limit: float | int) -> None:
-    """Fill in the owners of events; `rows` (2, paths) are the events of each path's life."""
+    """Find the paths that may own each event.
+
+    Args:
+        near: `_Owners`, the events; owners and costs are output.
+        table: `PathTable` of all paths.
+        rows: (2, paths) first event of each path's life, and the one after its last.
+        limit: Largest squared Mahalanobis distance of an owner.
+    """
     for k in range(len(table.window)):
         row, last, i, end = table.first[k], table.first[k + 1] - 1, rows[0, k], rows[1, k]
         while i < end:
@@ -86,7 +93,15 @@ def _find_owners(near: Any, table: Any, rows: Any, limit: float | int) -> None:
 
 @njit_noalloc_inlined
 def _find_owners_between(near: Any, table: Any, place: Any, events: Any, limit: float | int):
-    """Fill in the owners of events (first, end) between two rows of a path: (path, row, row)."""
+    """Find the events between two rows of a path that it may own.
+
+    Args:
+        near: `_Owners`, the events; owners and costs are output.
+        table: `PathTable` of all paths.
+        place: Number of the path, and both rows of the table.
+        events: First event, and the one after the last.
+        limit: Largest squared Mahalanobis distance of an owner.
+    """
     (k, row, following), w, polarity = place, table.window[place[0]], table.polarity[place[0]]
     x, y, p, S = near.x, near.y, table.p, table.S
     wide = np.sqrt(limit * max(S[row, 0], S[following, 0]))
@@ -123,7 +138,14 @@ def _find_owners_between(near: Any, table: Any, place: Any, events: Any, limit: 
 
 @njit_noalloc_inlined
 def _insert_owner(owner: Any, cost: Any, k: int, new: float) -> None:
-    """Insert a path among the likeliest two of an event."""
+    """Insert a path among the two likeliest owners of an event.
+
+    Args:
+        owner: (2,) numbers of the paths, -1 for none.
+        cost: (2,) -2 ln p of the event for these, but for a constant.
+        k: Number of the path.
+        new: Its cost.
+    """
     if owner[0] < 0 or new < cost[0]:
         owner[1], cost[1] = owner[0], cost[0]
         owner[0], cost[0] = k, new

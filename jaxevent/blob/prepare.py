@@ -273,7 +273,15 @@ class ChunkPacker:
         return dataclasses.replace(segments[0].features, seed=seed.astype(np.int32), **fields)
 
     def locate_times(self, features: Features, us: NDArray[np.int64]) -> ReadoutTimes:
-        """Find times (us) in all chunks, `features`."""
+        """Find the chunks and steps of some times.
+
+        Args:
+            features: All chunks of the recording.
+            us: (n,) times, us.
+
+        Returns:
+            The place of each time, and whether it is inside the tracked span.
+        """
         inside = (self.start <= us) & (us < self.stop)
         us = np.where(inside, us, self.start)
         n_chunks = int(np.flatnonzero(features.cycle)[-1]) + 1  # the others are padding
@@ -397,10 +405,15 @@ def _discard_open_chunk(state: _PackingState, out: _ChunkArrays) -> _PackingStat
 
 @njit_noalloc
 def _spread_ties(t: Any, max_ties: int, order: Any) -> None:
-    """Spread runs of more than so many equal times in an order.
+    """Spread long runs of equal times in an order of events.
 
-    A run of n is traversed in steps of about .618 n, so that a few consecutive events come from
-    all parts of the run.
+    A run of n is traversed in steps of about .618 n, so that a few consecutive events come from all
+    parts of the run.
+
+    Args:
+        t: (n,) sorted times, us.
+        max_ties: Number of equal times that stay in order.
+        order: (n,) indices of the events, changed in place.
     """
     begin = 0
     for end in range(1, len(t) + 1):
@@ -418,9 +431,18 @@ def _spread_ties(t: Any, max_ties: int, order: Any) -> None:
 
 @njit_noalloc
 def _pack(rows, first_row, final, limits, state, out):
-    """Fill chunks until they are full or events end: (full or ended, events used, state).
+    """Fill chunks until they are full or the events end.
 
-    With `final`, the end of the time closes what is open.
+    Args:
+        rows: `_EventRows` to be packed.
+        first_row: Row of the first of them in the recording.
+        final: Whether these are the last events; then the end of the time closes the open chunk.
+        limits: `_ChunkLimits`.
+        state: `_PackingState` before.
+        out: `_ChunkArrays`, output.
+
+    Returns:
+        Whether the chunks are full or time is over, the number of events used, and the state after.
     """
     chunk, opened, fill, row, previous, begin, end, following = state
     seed_t, finish = limits.seed_t, limits.stop

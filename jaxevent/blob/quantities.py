@@ -185,7 +185,19 @@ def _relative_noise(
     times: Array, relative: Array, covariance: Array, valid: Array, Q_lambda: Number | None,
     smoothed: bool,
 ) -> Float[Array, " times"]:  # fmt: skip
-    """Return the variances of log sizes for independent errors; see `growth`."""
+    """Return the variances of log sizes that make a filter's errors count like independent ones.
+
+    Args:
+        times: (times,) s.
+        relative: (times,) variances of log sizes by the states' covariance.
+        covariance: (times, 8, 8) of the states.
+        valid: (times,) whether the track is alive.
+        Q_lambda: Process noise of sizes, px^2/s; None: errors are independent already.
+        smoothed: Whether states are smoothed.
+
+    Returns:
+        (times,) variances.
+    """
     # Sizes known exactly would make the covariances singular.
     R = jnp.maximum(relative, 1e-10)
     if Q_lambda is None:
@@ -212,10 +224,19 @@ def _size_variance(covariance: Array) -> Float[Array, " times"]:
 def _lag(
     times: Array, covariance: Array, valid: Array, Q_lambda: Number | None
 ) -> Float[Array, " times"]:
-    """Return by how much the sizes of a filter lag, s.
+    """Return the time by which the sizes of a filter lag.
 
     A settled filter forgets over P / Q. One that has not settled holds the mean since its start,
     which lags by half of the time since then.
+
+    Args:
+        times: (times,) s.
+        covariance: (times, 8, 8) of the states.
+        valid: (times,) whether the track is alive.
+        Q_lambda: Process noise of sizes, px^2/s; None: no lag.
+
+    Returns:
+        (times,) s.
     """
     if Q_lambda is None:
         return jnp.zeros_like(times)

@@ -285,7 +285,17 @@ class XlaRunner:
         following: Sequence[NextChunk] | None,
         chunk: int,
     ) -> Any:
-        """Make the function that reads out a chunk at steps, times and entries of the buffer."""
+        """Make the function that reads out a chunk.
+
+        Args:
+            features: Chunks of the segment.
+            starts: Tracks at the chunks' starts.
+            following: Backward information after each chunk; None: states are filtered.
+            chunk: Number of the chunk.
+
+        Returns:
+            A function of steps, times and entries of the buffer, see `_read_filtered`.
+        """
         if following is None:
             path = _replay_chunk(*self._parts, features, starts, np.int32(chunk))
             return functools.partial(_read_filtered, *self._parts, path)
@@ -305,7 +315,19 @@ def count_numbers(tree: Any) -> int:
 def _read_filtered(
     filter: Filter, params: TrackerParams, path: TrackBuffer, step: Array, time: Array, entry: Array
 ) -> tuple[Array, Array, Array]:
-    """Read out entries of the buffer at times (us) after steps of a chunk."""
+    """Read out filtered states of a chunk.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        path: Tracks at the chunk's start and after each step.
+        step: (times,) steps of the chunk done by each time.
+        time: (times,) us since the chunk's start.
+        entry: (tracks,) entries of the buffer.
+
+    Returns:
+        Mean (times, tracks, 8), covariance, and s since the last event.
+    """
     tracks = jax.tree.map(lambda a: a[step[:, None], entry], path)
     read = functools.partial(readout, filter, params)
     return jax.vmap(jax.vmap(read, (0, None)))(tracks, time)

@@ -131,9 +131,17 @@ def score_tracks(
 def _match(
     pairs: NDArray[np.bool_], distance: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Match tracks to targets at each time by the rules of CLEAR; count changes.
+    """Match tracks to targets at each time by the rules of CLEAR.
 
     A matched pair stays matched while it may; the others are matched at the least distance.
+
+    Args:
+        pairs: (times, targets, tracks) whether a track is near enough to a target.
+        distance: (times, targets, tracks) px.
+
+    Returns:
+        (times, targets) track of each target, -1 for none, and the number of switches between
+            tracks.
     """
     times, targets, tracks = pairs.shape
     match, last, switches = np.full((times, targets), -1), np.full(targets, -1), 0
@@ -163,7 +171,18 @@ def _hota(
     there: NDArray[np.bool_],
     alive: NDArray[np.bool_],
 ) -> tuple[float, float, float]:
-    """Compute detection, association and HOTA, means over `HOTA_THRESHOLDS`."""
+    """Compute HOTA (Luiten et al. 2021), means over `HOTA_THRESHOLDS`.
+
+    Args:
+        distance: (times, targets, tracks) px, infinite where a target is not there.
+        reach: (times, targets, 1) distance at which the similarity of a track and a target is 1/2,
+            px.
+        there: (times, targets) whether a target is there.
+        alive: (times, tracks) whether a track is alive.
+
+    Returns:
+        Detection, association and HOTA, 0 to 1.
+    """
     similar = np.maximum(1 - np.where(alive[:, None], distance, np.inf) / (2 * reach), 0)
     if not there.any() and not alive.any():
         return 1.0, 1.0, 1.0

@@ -99,9 +99,9 @@ def tracking_span(
     begin = first if start is None else int(microseconds(start, "the start"))
     end = last if stop is None else int(microseconds(stop, "the stop"))
     if end <= begin:
-        asked = [f"from {begin} us"] * (start is not None) + [f"to {end} us"] * (stop is not None)
+        limits = [f"from {begin} us"] * (start is not None) + [f"to {end} us"] * (stop is not None)
         raise InputError(
-            f"{recording.name}: nothing to track {' '.join(asked)}; the events reach "
+            f"{recording.name}: nothing to track {' '.join(limits)}; the events reach "
             f"from {first} to {last - 1} us, integers are microseconds, floats seconds"
         )
     return begin, end

@@ -1,4 +1,4 @@
-"""Uncertainty of a position that a change of the target's shape tells of.
+"""Uncertainty of a position where the target's shape changes.
 
 The filter takes events for independent ones of an ellipse, so that their mean is the target's
 middle. Where another target's events are among them, or a part of the target is not seen, the mean

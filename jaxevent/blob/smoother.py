@@ -194,7 +194,19 @@ def _describe_update(
     time: Array,
     now: tuple[Array, Array],
 ) -> _TrackUpdate:
-    """Describe a track's update at a time, from the states read out before and after it."""
+    """Describe a track's update at a time, for the backward pass.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        before: The track before the time.
+        then: Mean (8,) and covariance (8, 8) of `before`, not predicted.
+        time: Time of the update, us since the chunk's start.
+        now: Mean and covariance after the update.
+
+    Returns:
+        The update.
+    """
     params = track_params(params, before.overrides)
     dt = to_seconds(time - before.last_update, before.gate)
     static = is_static(params, dt)

@@ -21,7 +21,7 @@ from jaxevent.blob.authors import (
     ReferenceState,
     nearest_target,
     reference_step,
-    update_reference,
+    update_reference_state,
 )
 from jaxevent.blob.filter import EventBatch, Filter, gate_radius, where_tree
 from jaxevent.blob.params import TrackerParams
@@ -124,7 +124,12 @@ def wrap_angle(theta: Array) -> Array:
 
 
 def track_params(params: P, overrides: dict[str, Array]) -> P:
-    """Return the parameters of one track: the common ones with its own values in place of some."""
+    """Return the parameters of one track: the common ones, with its own values in place of some.
+
+    Args:
+        params: Parameters of the tracker.
+        overrides: The track's own values by name, in unconstrained form.
+    """
     if not overrides:
         return params
     return eqx.tree_at(lambda one: one.raw, params, {**params.raw, **overrides})
@@ -147,6 +152,9 @@ def init_tracks(
         new: Tracks to start.
         time: Start of the tracks, us since the chunk's start.
         confirmed: Whether they are confirmed at once.
+
+    Returns:
+        The tracks.
     """
     state = init_states(filter, params, tracks.overrides, new.xi, new.size)
     gate = initial_gate(params, new.size).astype(new.xi.dtype)
@@ -174,7 +182,18 @@ def init_reference(params: TrackerParams, time: Array, dtype: Any) -> ReferenceS
 def init_states(
     filter: Filter, params: TrackerParams, overrides: dict[str, Array], xi: Array, size: Array
 ) -> Any:
-    """Return filter states (targets, ...) at rest at positions (targets, 2) and sizes in px."""
+    """Make filter states of targets at rest.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        overrides: Own values of the targets, (targets,) by name.
+        xi: (targets, 2) positions, px.
+        size: (targets,) sizes, px.
+
+    Returns:
+        The states, with the axis of targets first.
+    """
 
     def init(overrides: dict[str, Array], xi: Array, size: Array) -> Any:
         return filter.init(track_params(params, overrides), xi, size)
@@ -230,6 +249,9 @@ def predict(
         state: State at the last update.
         dt: Time since then, s.
         static: Whether the target stands still; None: decided by `dt`.
+
+    Returns:
+        The predicted state.
     """
     static = is_static(params, dt) if static is None else static
     state = where_tree(static, filter.zero_velocity(params, state, True), state)
@@ -262,6 +284,9 @@ def predict_and_gate(
         track: One track of the buffer, at its last update.
         limit: Longest time without events before the track ends, us.
         events: The M events of the step.
+
+    Returns:
+        The predicted state, the gate, and for each event whether it is inside and its likelihood.
     """
     params = track_params(params, track.overrides)
     time, batch = events.time, events.batch
@@ -292,7 +317,19 @@ def update_track(
     events: StepEvents,
     weight: Array,
 ) -> TrackBuffer:
-    """Update one track with the step's events, each with a weight (M,) in [0, 1]."""
+    """Update one track with the step's events.
+
+    Args:
+        filter: Filter of the target.
+        params: Parameters of the tracker.
+        track: The track at its last update.
+        prediction: Its prediction at the step's time.
+        events: The M events of the step.
+        weight: (M,) weights of the events for this track, 0 to 1.
+
+    Returns:
+        The track; unchanged if all weights are 0.
+    """
     params = track_params(params, track.overrides)
     touched = (weight > 0).any()
     number = lax.stop_gradient(weight).sum()
@@ -339,7 +376,7 @@ def _update_nearest_track(
     def update(track: TrackBuffer) -> ReferenceState:
         assert track.reference is not None
         own = track_params(params, track.overrides)
-        return update_reference(filter, own, track.state, track.reference, time)
+        return update_reference_state(filter, own, track.state, track.reference, time)
 
     reference = where_tree(valid[0], jax.vmap(update)(after), after.reference)
     inside = (hit & result.accepted)[:, None]
@@ -366,7 +403,18 @@ def _update_tracks(
 def _loss(
     params: TrackerParams, output: str, frame: Any, prediction: TrackPrediction, valid: Array
 ) -> tuple[Array, Array]:
-    """Return the sum of -ln p over the events that count, see `losses`, and their number."""
+    """Add up the negative log likelihood of a step's events.
+
+    Args:
+        params: `outliers`, the fraction of events that belong to no target.
+        output: "associated": events inside a gate count; "all": every event.
+        frame: Width and height of the sensor, px.
+        prediction: Prediction of all tracks.
+        valid: (M,) whether an event is real rather than padding.
+
+    Returns:
+        The sum of -ln p, and the number of events that count.
+    """
     log_p = prediction.log_likelihood - math.log(2 * math.pi)
     alive = prediction.alive[:, None] & valid
     if output == "associated":

@@ -124,7 +124,13 @@ def _concatenate_states(parts: Sequence[TrackStates]) -> TrackStates:
 def _add_shape_covariance(
     states: TrackStates, times: NDArray[np.int64], usual: list[UsualSizes | None]
 ) -> None:
-    """Add what changes of shape tell of positions to the covariance of states, in place."""
+    """Add the uncertainty of positions by changes of shape to the covariance of states, in place.
+
+    Args:
+        states: States of tracks, (times, tracks).
+        times: (times,) us.
+        usual: Usual sizes of each track; None where they are unknown.
+    """
     for k, sizes in enumerate(usual):
         alive = states.valid[:, k]
         if sizes is not None and alive.any():
@@ -428,9 +434,17 @@ class Tracks(HtmlRepr):
         times: NDArray[np.int64],
         chosen: NDArray[np.int64],
     ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
-        """Read out some tracks at times of a segment, in batches, by its record and backward pass.
+        """Read out some tracks at times of a segment, in batches.
 
-        Without the result of the backward pass, `infos`, states are filtered.
+        Args:
+            segment: The segment.
+            record: Its record.
+            infos: Result of its backward pass; None: states are filtered.
+            times: (times,) us.
+            chosen: (tracks,) indices of the tracks.
+
+        Yields:
+            Times of a batch, and the states at these.
         """
         at_once = max(MAX_STATES_PER_READOUT // max(len(chosen), 1), 1)
         for first in range(0, len(times), at_once):

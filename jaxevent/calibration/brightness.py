@@ -19,7 +19,7 @@ MAX_WEIGHT = 3.0  # events that one stands for after a dead time
 
 
 class PixelEvents(NamedTuple):
-    """Events of the pixels of a stretch that fire often enough, pixel by pixel."""
+    """Events of the pixels of a segment that fire often enough, pixel by pixel."""
 
     t: NDArray[np.int64]  # us
     p: NDArray[np.bool_]
@@ -63,32 +63,43 @@ class Positions(NamedTuple):
     spread: NDArray[np.float32]  # of errors of events, see `_spread`
 
 
-def sort_by_pixel(stretch: SampledSegment, clear: NDArray[np.bool_]) -> PixelEvents:
-    """Sort the events of a stretch by pixel.
+def sort_by_pixel(segment: SampledSegment, clear: NDArray[np.bool_]) -> PixelEvents:
+    """Sort the events of a segment by pixel.
 
     Args:
-        stretch: The stretch.
+        segment: The segment.
         clear: (frames, pixels) where frames can be used.
 
     Returns:
         The events.
     """
-    number = np.bincount(stretch.pixel, minlength=clear.shape[1])
+    number = np.bincount(segment.pixel, minlength=clear.shape[1])
     active = np.flatnonzero((number >= MIN_EVENTS_PER_PIXEL) & (clear.sum(0) > 1))
     index = np.full(len(number), -1)
     index[active] = np.arange(len(active))
-    index = index[stretch.pixel]
+    index = index[segment.pixel]
     rows = np.flatnonzero(index >= 0)
     rows = rows[np.argsort(index[rows], kind="stable")]
     first = np.concatenate([[0], np.cumsum(number[active])])
     return PixelEvents(
-        stretch.t[rows], stretch.p[rows], first, active, np.ascontiguousarray(clear[:, active].T)
+        segment.t[rows], segment.p[rows], first, active, np.ascontiguousarray(clear[:, active].T)
     )
 
 
 @njit_noalloc
 def _interpolate(t, p, first, rho, counts, bend, integral):
-    """Fill counts, bends and integrals, pixel by pixel."""
+    """Interpolate the counts of events between events, pixel by pixel.
+
+    Args:
+        t: (n,) times of events, us, pixel by pixel.
+        p: (n,) polarities.
+        first: (pixels + 1,) first event of each pixel, and n.
+        rho: Dead time, us.
+        counts: (n, 4) output: ON and OFF counts up to and with the event, and their derivatives by
+            the dead time, 1/s.
+        bend: (n, 4) output, second derivatives of the counts in the gap before the event, 1/us^2.
+        integral: (n, 4) output, integrals of the counts from the pixel's first event on, us.
+    """
     for i in range(len(first) - 1):
         low, high = first[i], first[i + 1]
         for k in range(low, high):
@@ -153,14 +164,33 @@ def interpolate(events: PixelEvents, rho_us: float) -> Interpolation:
 
 @njit_noalloc_inlined
 def _level(counts, bend, k, channel, gap, u):
-    """Return the count at the part `u` of the gap before event k."""
+    """Return a pixel's count between two of its events.
+
+    Args:
+        counts: (n, 4) counts at events.
+        bend: (n, 4) second derivatives in the gaps before events.
+        k: Number of the event after the time.
+        channel: Number of the count, 0 to 3.
+        gap: Length of the gap before event k, us.
+        u: Part of the gap that is over, 0 to 1.
+    """
     step = counts[k, channel] - counts[k - 1, channel]
     return counts[k - 1, channel] + u * step - bend[k, channel] * gap * gap * u * (1 - u) / 2
 
 
 @njit_noalloc_inlined
 def _area(counts, bend, integral, k, channel, gap, u):
-    """Return the integral of the count until the part `u` of the gap before event k."""
+    """Return the integral of a pixel's count from its first event to a time between two events.
+
+    Args:
+        counts: (n, 4) counts at events.
+        bend: (n, 4) second derivatives in the gaps before events.
+        integral: (n, 4) integrals up to events, us.
+        k: Number of the event after the time.
+        channel: Number of the count, 0 to 3.
+        gap: Length of the gap before event k, us.
+        u: Part of the gap that is over, 0 to 1.
+    """
     step = counts[k, channel] - counts[k - 1, channel]
     line = u * gap * (counts[k - 1, channel] + u * step / 2)
     curve = bend[k, channel] * gap * gap * gap * u * u * (1 / 4 - u / 6)
@@ -169,12 +199,23 @@ def _area(counts, bend, integral, k, channel, gap, u):
 
 @njit_noalloc_inlined
 def _spread(t, k, m, u, v, length):
-    """Return how errors of events remain in the mean over an exposure of events k to m - 1.
+    """Return the share of events' errors that remains in the mean over an exposure.
 
     An error of one event stands on the lines to its neighbours. So the mean has weights w of the
-    events k - 1 to m, and the mean of both ends has weights e. Returned are the sums over events of
-    w^2 and of w (e - w), and the same of errors that add up from event to event: of C (E - C), C
-    and E the sums of w and e from an event on, and of those before it.
+    events k - 1 to m, and the mean of both ends has weights e.
+
+    Args:
+        t: (n,) times of events, us.
+        k: First event not before the exposure's begin.
+        m: First event not before its end.
+        u: Part of the gap before event k that is over at the begin, 0 to 1.
+        v: Part of the gap before event m that is over at the end.
+        length: Length of the exposure, us.
+
+    Returns:
+        The sums over events of w^2 and of w (e - w), and the same of errors that add up from event
+            to
+        event: of C (E - C), C and E the sums of w and e from an event on, and of those before it.
     """
     squares = products = late = early = carried = before = ends_before = 0.0
     for j in range(k, m + 2):
@@ -254,7 +295,7 @@ def read_positions(
     are of equal polarity, as are those around its end, and near in time.
 
     Args:
-        events: Events of a stretch.
+        events: Events of a segment.
         path: Their interpolation.
         middle_us: (frames,) sorted middles of exposures, us since the path's origin.
         length_us: (frames,) their lengths, us, positive.

@@ -87,19 +87,24 @@ class _Sums(NamedTuple):
 
 
 def _lag_counts(
-    stretch: SampledSegment, row: int, lags: NDArray[np.int64]
+    segment: SampledSegment, row: int, lags: NDArray[np.int64]
 ) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.floating]]:
     """Count the events between two frames at lags.
+
+    Args:
+        segment: The segment.
+        row: Number of the first of the frames.
+        lags: (m,) times added to the frames' stamps, us.
 
     Returns:
         (active,) pixels with events, and net and total counts (m, active).
     """
-    first, last = (np.searchsorted(stretch.t, stretch.frame_t[row + k] + lags) for k in (0, 1))
+    first, last = (np.searchsorted(segment.t, segment.frame_t[row + k] + lags) for k in (0, 1))
     part = slice(first[0], last[-1])
-    counts = np.bincount(stretch.pixel[part])
+    counts = np.bincount(segment.pixel[part])
     active, rank = np.flatnonzero(counts), np.cumsum(counts > 0) - 1
-    place = rank[stretch.pixel[part]]
-    sign = np.where(stretch.p[part], np.float32(1), np.float32(-1))
+    place = rank[segment.pixel[part]]
+    sign = np.where(segment.p[part], np.float32(1), np.float32(-1))
     counted = np.zeros((2, len(lags), len(active)), np.float32)
     _count_in_windows(place, sign, first - first[0], last - first[0], counted)
     return active, counted[0], counted[1]
@@ -107,7 +112,15 @@ def _lag_counts(
 
 @njit_noalloc
 def _count_in_windows(place, sign, first, last, out):
-    """Write net and total counts (2, windows, n) of events first <= i < last, both ascending."""
+    """Count the events of each pixel in windows of rows.
+
+    Args:
+        place: (events,) number of the pixel.
+        sign: (events,) 1 or -1.
+        first: (windows,) first row of each window, ascending.
+        last: (windows,) row after its last, ascending.
+        out: (2, windows, n) output, sums of signs and numbers of events.
+    """
     begin = end = 0
     for k in range(len(first)):
         if k > 0:
@@ -126,7 +139,16 @@ def _count_in_windows(place, sign, first, last, out):
 def _sum_by_tile(
     counts: NDArray[np.floating], weights: NDArray[np.floating], tile: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """Return sums (lags, tiles, kinds) of counts (lags, n) times weights (kinds, n)."""
+    """Sum weighted counts over the pixels of each tile.
+
+    Args:
+        counts: (lags, n) counts of pixels.
+        weights: (kinds, n) weights of pixels.
+        tile: (n,) number of each pixel's tile.
+
+    Returns:
+        (lags, tiles, kinds).
+    """
     out = np.zeros((len(counts), tile.max() + 1, len(weights)))
     _add_by_tile(counts, np.ascontiguousarray(weights.T), tile, out)
     return out
@@ -149,7 +171,7 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
     Returns:
         The correspondence; None where no clear pixels of two frames are within the events' time.
     """
-    pairs = [(s, row) for s in sample.stretches for row in range(len(s.frame_t) - 1) if len(s.t)]
+    pairs = [(s, row) for s in sample.segments for row in range(len(s.frame_t) - 1) if len(s.t)]
     if not pairs:
         return None
     interval = int(np.median([s.frame_t[row + 1] - s.frame_t[row] for s, row in pairs]))
@@ -162,12 +184,12 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
     S2, d2, used = np.zeros((n, m)), np.zeros((n, m)), np.zeros(m)
     sums, busy, tiles = [], 0, 0
     chosen = np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).round().astype(int))
-    for stretch, row in (pairs[i] for i in chosen):
-        changes, clears = log_changes(_pair(stretch, row), I0)
+    for segment, row in (pairs[i] for i in chosen):
+        changes, clears = log_changes(_pair(segment, row), I0)
         d, clear = changes[0], clears[0]
-        begin = max(stretch.span[0], int(stretch.t[0]))
-        end = min(stretch.span[1], int(stretch.t[-1])) + 1
-        inside = (stretch.frame_t[row] + lags >= begin) & (stretch.frame_t[row + 1] + lags <= end)
+        begin = max(segment.span[0], int(segment.t[0]))
+        end = min(segment.span[1], int(segment.t[-1])) + 1
+        inside = (segment.frame_t[row] + lags >= begin) & (segment.frame_t[row + 1] + lags <= end)
         if clear.sum() < MIN_PIXELS or not inside.any():
             continue
         # The median change is the frames' own brightness, which is judged apart.
@@ -180,7 +202,7 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
             for image in full
         )
         moved, seen = moved[:, sample.places], seen[:, sample.places]
-        active, S, N = _lag_counts(stretch, row, lags)
+        active, S, N = _lag_counts(segment, row, lags)
         S, N = S * inside[:, None], N * inside[:, None]
         tile = sample.tile[active]
         products = _sum_by_tile(S, moved[:, active], tile)
@@ -228,21 +250,29 @@ def turn_events(sample: Sample, name: str, inverted: bool) -> Sample:
     place = np.arange(width * height).reshape(height, width)
     to = index[TRANSFORMS[name](place).ravel()[sample.places]]
     turned = []
-    for one in sample.stretches:
+    for one in sample.segments:
         pixel = to[one.pixel]
         keep = pixel >= 0
         turned.append(one._replace(t=one.t[keep], pixel=pixel[keep], p=one.p[keep] ^ inverted))
-    return sample._replace(stretches=tuple(turned))
+    return sample._replace(segments=tuple(turned))
 
 
-def _pair(stretch: SampledSegment, row: int) -> SampledSegment:
-    """Return a stretch with two frames."""
+def _pair(segment: SampledSegment, row: int) -> SampledSegment:
+    """Return a segment with two frames."""
     two = slice(row, row + 2)
-    return stretch._replace(intensity=stretch.intensity[two], clear=stretch.clear[two])
+    return segment._replace(intensity=segment.intensity[two], clear=segment.clear[two])
 
 
 def _contrast(curve: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return curves (lags, n) above the mean of lags at which events belong to other frames."""
+    """Return the height of curves above the mean of lags at which events belong to other frames.
+
+    Args:
+        curve: (lags, n).
+        inside: (lags,) whether all events are known.
+
+    Returns:
+        (lags, n), 0 where the mean is not known.
+    """
     out = np.zeros(curve.shape)
     near = np.arange(FAR_STEPS, len(curve) - FAR_STEPS)
     known = inside[near] & inside[near - FAR_STEPS] & inside[near + FAR_STEPS]
@@ -254,7 +284,14 @@ def _contrast(curve: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _fit_windows(
     sums: list[_Sums], first: NDArray[np.integer], stop: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit d to S averaged over windows of lags, of which half of the pairs know all events.
+    """Fit the frames' changes to events averaged over windows of lags.
+
+    A window counts if all events are known for half of the pairs.
+
+    Args:
+        sums: Sums of each pair of frames.
+        first: (windows,) first lag of each window.
+        stop: (windows,) lag after its last.
 
     Returns:
         The correlations, minus infinity where they are not known, and the changes per event.
@@ -278,7 +315,15 @@ def _fit_windows(
 
 
 def _find_offset(sums: list[_Sums], step: int) -> float:
-    """Find the lag of the highest correlation (us), by a parabola through three."""
+    """Find the lag of the highest correlation, by a parabola through three.
+
+    Args:
+        sums: Sums of each pair of frames.
+        step: Distance of lags, us.
+
+    Returns:
+        The lag, us; NaN if no correlation is known.
+    """
     lags = np.arange(2 * N_STEPS + 1)
     curve, _ = _fit_windows(sums, lags, lags + 1)
     if not np.isfinite(curve).any():
@@ -291,7 +336,16 @@ def _find_offset(sums: list[_Sums], step: int) -> float:
 
 
 def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float]:
-    """Find exposure (us) and dilution, see `Correspondence`."""
+    """Find the exposure of the highest correlation.
+
+    Args:
+        sums: Sums of each pair of frames.
+        step: Distance of lags, us.
+        interval: Time between frames, us.
+
+    Returns:
+        Exposure, us, and dilution, see `Correspondence`.
+    """
     half, middle = np.mgrid[: N_STEPS - 1, : 2 * N_STEPS + 1].reshape(2, -1)
     whole = (middle >= half) & (middle + half <= 2 * N_STEPS)
     half, middle = half[whole], middle[whole]

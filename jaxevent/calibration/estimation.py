@@ -99,7 +99,7 @@ def find_offset(sample: Sample, I0: float) -> Clock:
     if not known.any():
         return Clock(tried * 1e-6, found, math.nan, "no events between frames")
     top = int(np.nanargmax(found))
-    interval = np.median(np.concatenate([np.diff(s.frame_t) for s in sample.stretches]))
+    interval = np.median(np.concatenate([np.diff(s.frame_t) for s in sample.segments]))
     far = found[known & (np.abs(tried - tried[top]) > 2 * max(interval, OFFSET_STEP_US))]
     others = float(np.quantile(np.abs(far), 0.9)) if len(far) else 0.0
     why = ""
@@ -195,7 +195,7 @@ def calibrate(recording: Recording, I0: float = 1.0, sample: Sample | None = Non
     grey = np.linspace(0, 1, 1025)
     table = np.asarray(recording.response.intensity(grey), np.float64)
     slope = np.stack([grey, np.maximum(np.gradient(table, grey), 1e-6)])
-    is_unknown = any((s.exposure == 0).any() for s in sample.stretches)
+    is_unknown = any((s.exposure == 0).any() for s in sample.segments)
     found = _fit_sensor(sample, slope, clock, is_unknown)
     if found is None:
         return _by_whole_events(sample, I0, ratio, dead, clock)
@@ -239,10 +239,10 @@ def _by_whole_events(
     rest = _without_fit(sample, ratio, dead, why, clock)
     late = clock.best
     sums = np.zeros((2, 2))  # of changes and of events, brighter and darker
-    for stretch in sample.stretches:
-        counts = count_between(stretch, round(1e6 * late)).astype(np.float64)
-        change, used = log_changes(stretch, I0)
-        used = used & stretch.is_covered(round(1e6 * late))[:, None]
+    for segment in sample.segments:
+        counts = count_between(segment, round(1e6 * late)).astype(np.float64)
+        change, used = log_changes(segment, I0)
+        used = used & segment.is_covered(round(1e6 * late))[:, None]
         for row, sign in ((0, 1), (1, -1)):
             net = sign * (counts[:, 0] - counts[:, 1])
             rising = used & (net > 0) & (sign * change > 0)
@@ -321,7 +321,7 @@ def _gap(fit: Fit, column: int, power: int) -> float:
 
 
 def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
-    known = np.concatenate([s.exposure for s in sample.stretches])
+    known = np.concatenate([s.exposure for s in sample.segments])
     if (known > 0).all():
         length = float(np.median(known)) * 1e-6
         return CalibrationValue(length, length, length, "s", "as the recording says")
@@ -387,15 +387,15 @@ def _noises(fit: Fit) -> tuple[CalibrationValue, CalibrationValue]:
 
 
 def _drift(sample: Sample, fit: Fit) -> CalibrationValue:
-    """Return the growth of the clock offset from stretch to stretch."""
+    """Return the growth of the clock offset from segment to segment."""
     changes, J = fit.changes, fit.terms.J[:, 2]
-    middle = np.array([s.frame_t.mean() for s in sample.stretches]) * 1e-6
-    rows = np.unique(changes.stretch)
+    middle = np.array([s.frame_t.mean() for s in sample.segments]) * 1e-6
+    rows = np.unique(changes.segment)
     if len(rows) < 3 or np.ptp(middle[rows]) < MIN_DRIFT_SPAN_S:
         return not_identifiable("s/s", f"the recording is shorter than {MIN_DRIFT_SPAN_S:g} s")
     offset, information = np.zeros(len(rows)), np.zeros(len(rows))
     for k, row in enumerate(rows):
-        own = changes.stretch == row
+        own = changes.segment == row
         score = (fit.weight * fit.terms.residual * J)[own]
         H = (fit.weight * J**2)[own].sum() * CURVATURE
         _, index = np.unique(changes.interval[own], return_inverse=True)

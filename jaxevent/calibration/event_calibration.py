@@ -106,7 +106,7 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
     s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
-    return EventCalibration(thresholds, ratio, spread, hot, _find_read_out(counts), hot_share)
+    return EventCalibration(thresholds, ratio, spread, hot, _find_read_region(counts), hot_share)
 
 
 def _find_hot(parts: NDArray[np.integer]) -> tuple[NDArray[np.bool_], float]:
@@ -138,7 +138,7 @@ def remove_many_hot_events(
     return remove_hot_pixels(recording, hot) if MAX_EVENTS_SHARE < share < 1 else recording
 
 
-def _find_read_out(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+def _find_read_region(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Find the region of interest: rows and columns between the first and the last with events."""
     inside = np.ones(counts.shape, bool)
     for axis in (0, 1):
@@ -153,7 +153,15 @@ def _find_read_out(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 def _differences(
     counts: NDArray[np.integer], hot: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return differences of ON and of OFF counts between pixels `DISTANCES_PX` apart."""
+    """Return differences of counts between pixels `DISTANCES_PX` apart, without hot ones.
+
+    Args:
+        counts: (2, height, width) ON and OFF events.
+        hot: (height, width) hot pixels.
+
+    Returns:
+        (n,) differences of ON and of OFF counts.
+    """
     found = []
     for distance in DISTANCES_PX:
         for near, far in (
@@ -187,7 +195,15 @@ def _estimate_ratio(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> Cali
 
 
 def _compare_neighbours(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return ln(c_on / c_off) from differences between pixels, and its standard deviation."""
+    """Estimate ln(c_on / c_off) by differences between pixels.
+
+    Args:
+        counts: (2, height, width) ON and OFF events.
+        hot: (height, width) hot pixels.
+
+    Returns:
+        The estimate and its standard deviation.
+    """
     U, D = _differences(counts, hot)
     root, rho = 1.0, 0.0
     for _ in range(N_STEPS):
@@ -223,7 +239,7 @@ def _estimate_deviations(
     """
     from scipy.ndimage import median_filter
 
-    change = np.where(is_used, change, 0)  # a hot pixel tells nothing of its neighbours, either
+    change = np.where(is_used, change, 0)  # nor does a hot pixel count in its neighbours' sums
     own = change - median_filter(change, (1, 5, 5), mode="reflect")
     own, gain = own[:, is_used], gain[:, is_used]
     products, moments = np.zeros((2, own.shape[1]))

@@ -24,9 +24,9 @@ def gaps_of_pixels(sample: Sample, of_one_sign: bool = False) -> NDArray[np.int6
         (gaps,) us.
     """
     parts = [np.empty(0, np.int64)]
-    for stretch in sample.stretches:
-        order = np.argsort(stretch.pixel, kind="stable")
-        t, pixel, p = stretch.t[order], stretch.pixel[order], stretch.p[order]
+    for segment in sample.segments:
+        order = np.argsort(segment.pixel, kind="stable")
+        t, pixel, p = segment.t[order], segment.pixel[order], segment.p[order]
         kept = pixel[1:] == pixel[:-1]
         if of_one_sign:
             kept &= p[1:] == p[:-1]

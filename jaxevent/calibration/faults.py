@@ -47,7 +47,7 @@ MAX_UNDONE_SHARE = 0.5  # of the events
 MAX_REPEATED_SHARE, MIN_NET_EVENTS, MIN_CHANGING = 0.05, 2, 50
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
-# Faults of the events alone, whether frames told them or not.
+# Faults of the events alone, whether frames revealed them or not.
 EVENT_FAULTS = (
     *("hot pixels", "missing events", "event bursts"),
     *("lost polarity", "inverted polarity", "flipped or swapped axes"),
@@ -128,10 +128,10 @@ def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
 
 
 def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:
-    """Return times of events without hot pixels: of all in memory, else of the stretches."""
+    """Return times of events without hot pixels: of all in memory, else of the segments."""
     events = recording.events
     if not isinstance(events, Events):
-        return [stretch.t for stretch in sample.stretches]
+        return [segment.t for segment in sample.segments]
     return [events.t[~sample.hot[events.y, events.x]] if sample.hot.any() else events.t]
 
 
@@ -294,12 +294,21 @@ def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
 
 
 def _check_brightness(sample: Sample, offset: float, has_polarity: bool) -> Iterator[Fault]:
-    """Check that frames change brightness as events do, and, where these have polarity, often."""
+    """Check the brightness of frames: repeated frames, flicker, and changes undone between frames.
+
+    Args:
+        sample: Sample of the recording.
+        offset: Time added to the frames' stamps, us; NaN: none.
+        has_polarity: Whether the polarity of events can be used.
+
+    Yields:
+        The faults, with their statistics.
+    """
     steps, net, total, repeated, intervals = [], 0, 0, 0, 0
-    for stretch in sample.stretches:
-        changes, clear = log_changes(stretch, I0)
+    for segment in sample.segments:
+        changes, clear = log_changes(segment, I0)
         offset_us = 0 if np.isnan(offset) else int(offset)
-        counts, covered = count_between(stretch, offset_us), stretch.is_covered(offset_us)
+        counts, covered = count_between(segment, offset_us), segment.is_covered(offset_us)
         known = (part[covered] for part in (changes, clear, counts))
         for d, used, (on, off) in zip(*known, strict=True):
             quiet = used & (on + off == 0)

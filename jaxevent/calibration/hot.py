@@ -1,4 +1,4 @@
-"""Hot pixels, told from others by events in every part of a recording."""
+"""Hot pixels, recognised by events in every part of a recording."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -76,7 +76,7 @@ class Changes(NamedTuple):
     gap: NDArray[np.float64]  # (n,) that time's mean of both frames, s
     tile: NDArray[np.intp]  # (n,)
     interval: NDArray[np.intp]  # (n,) number of the pair of frames
-    stretch: NDArray[np.intp]  # (n,)
+    segment: NDArray[np.intp]  # (n,)
     pixel: NDArray[np.intp]  # (n,)
 
 
@@ -145,16 +145,16 @@ class Model:
         self.sample, self.I0, self.grey_noise, self.slope = sample, I0, grey_noise, slope
         self._rho: float | None = None
         self._paths: list[Interpolation] = []
-        self._events = [sort_by_pixel(stretch, stretch.clear) for stretch in sample.stretches]
+        self._events = [sort_by_pixel(segment, segment.clear) for segment in sample.segments]
         self._choose_clear()
 
     def _choose_clear(self) -> None:
         """Choose the pixels at whose brightness noise changes the logarithm little."""
-        for row, stretch in enumerate(self.sample.stretches):
+        for row, segment in enumerate(self.sample.segments):
             active = self._events[row].active
-            level = np.maximum(stretch.intensity[:, active], 0) + self.I0
-            noise = self.grey_noise * np.interp(stretch.grey[:, active], *self.slope)
-            clear = stretch.clear[:, active] & (noise < MAX_RELATIVE_NOISE * level)
+            level = np.maximum(segment.intensity[:, active], 0) + self.I0
+            noise = self.grey_noise * np.interp(segment.grey[:, active], *self.slope)
+            clear = segment.clear[:, active] & (noise < MAX_RELATIVE_NOISE * level)
             self._events[row] = self._events[row]._replace(clear=np.ascontiguousarray(clear.T))
 
     def with_offset(self, I0: float) -> "Model":
@@ -165,7 +165,7 @@ class Model:
         return other
 
     def thinned(self, most: int) -> "Model":
-        """Return the likelihood of at most about `most` pixels of each stretch, evenly chosen."""
+        """Return the likelihood of at most about `most` pixels of each segment, evenly chosen."""
         other = copy.copy(self)
         other._rho = None
         other._events = [
@@ -176,13 +176,13 @@ class Model:
     @functools.cached_property
     def interval_s(self) -> float:
         """Median time between frames, s."""
-        steps = [np.diff(s.frame_t) for s in self.sample.stretches]
+        steps = [np.diff(s.frame_t) for s in self.sample.segments]
         return float(np.median(np.concatenate(steps))) * 1e-6
 
-    def _lengths(self, stretch: SampledSegment, theta: NDArray) -> NDArray[np.float64]:
+    def _lengths(self, segment: SampledSegment, theta: NDArray) -> NDArray[np.float64]:
         """Return the lengths of exposures, us."""
         unknown = 1e6 * np.sqrt(max(theta[4], 0))
-        return np.maximum(np.where(stretch.exposure > 0, stretch.exposure, unknown), SHORTEST_US)
+        return np.maximum(np.where(segment.exposure > 0, segment.exposure, unknown), SHORTEST_US)
 
     def _positions(self, theta: NDArray[np.float64]) -> list[Positions]:
         if self._rho != theta[3]:
@@ -192,23 +192,23 @@ class Model:
             read_positions(
                 events,
                 path,
-                (stretch.frame_t - path.origin) + 1e6 * theta[2],
-                self._lengths(stretch, theta),
+                (segment.frame_t - path.origin) + 1e6 * theta[2],
+                self._lengths(segment, theta),
                 self.interval_s,
             )
-            for stretch, events, path in zip(
-                self.sample.stretches, self._events, self._paths, strict=True
+            for segment, events, path in zip(
+                self.sample.segments, self._events, self._paths, strict=True
             )
         ]
 
     def changes(self, theta: NDArray[np.float64]) -> Changes:
         """Return the changes that count at some parameters."""
         parts, interval = [], 0
-        for number, (stretch, events, at) in enumerate(
-            zip(self.sample.stretches, self._events, self._positions(theta), strict=True)
+        for number, (segment, events, at) in enumerate(
+            zip(self.sample.segments, self._events, self._positions(theta), strict=True)
         ):
             row, pair = np.nonzero(at.good[:, 1:] & at.good[:, :-1])
-            length = 1e-6 * self._lengths(stretch, theta)
+            length = 1e-6 * self._lengths(segment, theta)
             pixel, ends = events.active[row], (pair, pair + 1)
             mean, edges, travel = (
                 [values[row, f].astype(np.float64).T for f in ends]
@@ -225,8 +225,8 @@ class Model:
             spread = [at.spread[row, f].astype(np.float64).T for f in ends]
             parts.append(
                 Changes(
-                    np.stack([stretch.intensity[f, pixel] for f in ends]),
-                    np.stack([np.interp(stretch.grey[f, pixel], *self.slope) for f in ends]),
+                    np.stack([segment.intensity[f, pixel] for f in ends]),
+                    np.stack([np.interp(segment.grey[f, pixel], *self.slope) for f in ends]),
                     mean[1] - mean[0],
                     slope[1] - slope[0],
                     square[1] - square[0],
@@ -244,7 +244,7 @@ class Model:
                     pixel,
                 )
             )
-            interval += len(stretch.frame_t)
+            interval += len(segment.frame_t)
         columns: list[Any] = [np.concatenate(one, -1) for one in zip(*parts, strict=True)]
         joined = Changes(*columns)
         if len(joined.n[0]) > MAX_CHANGES:
@@ -324,13 +324,21 @@ class Model:
 
 
 def losses_of(residual: NDArray, variance: NDArray) -> NDArray[np.float64]:
-    """Return the negative log likelihood of each change, but for a constant."""
+    """Return the negative log likelihood of each change under Student's t, but for a constant."""
     nu = DEGREES_OF_FREEDOM
     return np.log(variance) / 2 + (nu + 1) / 2 * np.log1p(residual**2 / variance / nu)
 
 
 def reweight(V: NDArray[np.float64], terms: Terms) -> tuple[NDArray, NDArray]:
-    """Return better variances, and the weights of changes by them."""
+    """Improve variances, and weigh changes by them.
+
+    Args:
+        V: (3,) variances of the sources of errors.
+        terms: Terms of the likelihood.
+
+    Returns:
+        The variances, and the weights of changes (n,).
+    """
     nu, X, square = DEGREES_OF_FREEDOM, terms.X, terms.residual**2
     for _ in range(5):
         v = V @ X

@@ -1,9 +1,9 @@
-"""Samples of a recording: a few stretches of consecutive frames, with the events around them.
+"""Samples of a recording: a few segments of consecutive frames, with the events around them.
 
 A calibration needs some ten thousand changes of brightness, and not more as recordings grow. So a
 sample has at most `MAX_EVENTS` events, `MAX_INTERVALS` intervals between frames and `MAX_PIXELS`
-pixels, in stretches that are spread over the recording. Short recordings are taken whole. Where
-events are dense, a stretch is two frames with an interval between frames before and after, and the
+pixels, in segments that are spread over the recording. Short recordings are taken whole. Where
+events are dense, a segment is two frames with an interval between frames before and after, and the
 sample has fewer pixels: with a part of an interval's events it would miss the change between them.
 """
 
@@ -21,8 +21,8 @@ MAX_EVENTS = 3_000_000
 MAX_READ_EVENTS = 24_000_000  # of all pixels, where events are dense
 MAX_INTERVALS = 48
 MAX_PIXELS = 100_000
-N_STRETCHES = 8
-N_CANDIDATES = 32  # places of stretches, of which the busiest are taken
+N_SEGMENTS = 8
+N_CANDIDATES = 32  # places of segments, of which the busiest are taken
 SEARCH_US = 500_000  # largest offset of the clocks that is sought
 TILE_PX = 16
 MARGIN_LEVELS = 2.5  # of 255, from either end, within which a pixel counts as clipped
@@ -44,19 +44,19 @@ class SampledSegment(NamedTuple):
     clear: NDArray[np.bool_]  # (frames, pixels), not clipped
 
     def without(self, pixels: NDArray[np.bool_]) -> "SampledSegment":
-        """Return the stretch without the events of some of the sampled pixels."""
+        """Return the segment without the events of some of the sampled pixels."""
         keep = ~pixels[self.pixel]
         clear = self.clear & ~pixels
         return self._replace(t=self.t[keep], pixel=self.pixel[keep], p=self.p[keep], clear=clear)
 
     def is_covered(self, offset_us: int = 0) -> NDArray[np.bool_]:
-        """Return between which consecutive frames (frames - 1,) the stretch has all events."""
+        """Return between which consecutive frames (frames - 1,) the segment has all events."""
         times = self.frame_t + offset_us
         return (times[:-1] >= self.span[0]) & (times[1:] <= self.span[1])
 
 
 class SegmentPlace(NamedTuple):
-    """Place of a stretch in a recording."""
+    """Place of a segment in a recording."""
 
     rows: NDArray[np.intp]  # (frames,)
     span: tuple[int, int]  # us, first and last time of which all events are in it
@@ -67,12 +67,12 @@ class SegmentPlace(NamedTuple):
 class Sample(NamedTuple):
     """Stretches of a recording, without its hot pixels."""
 
-    stretches: tuple[SampledSegment, ...]
+    segments: tuple[SampledSegment, ...]
     places: NDArray[np.intp]  # (pixels,) y width + x of the sampled pixels
     tile: NDArray[np.intp]  # (pixels,) number of the pixel's tile
     size: tuple[int, int]  # width, height
     hot: NDArray[np.bool_]  # (height, width)
-    counts: NDArray[np.int64]  # (2, height, width) ON and OFF events of all pixels and stretches
+    counts: NDArray[np.int64]  # (2, height, width) ON and OFF events of all pixels and segments
 
 
 def choose_pixels(
@@ -101,28 +101,36 @@ def choose_pixels(
 
 
 def _choose_rows(recording: Recording) -> list[NDArray[np.intp]]:
-    """Choose the frames of each stretch."""
+    """Choose the frames of each segment."""
     frames, source = recording.frames, recording.events
     assert frames is not None
     intervals = len(frames) - 1
     if intervals <= MAX_INTERVALS and len(source) <= MAX_EVENTS:
         return [np.arange(len(frames))]
-    each = max(1, min(MAX_INTERVALS // N_STRETCHES, intervals // N_STRETCHES))
+    each = max(1, min(MAX_INTERVALS // N_SEGMENTS, intervals // N_SEGMENTS))
     begins = np.unique(np.linspace(0, intervals - each, N_CANDIDATES).astype(np.intp))
-    # The busiest of each eighth, so that stretches are spread over the recording.
+    # The busiest of each eighth, so that segments are spread over the recording.
     busy = [
         source.index(int(frames.t[k + each])) - source.index(int(frames.t[k]))
         for k in begins.tolist()
     ]
-    parts = np.array_split(np.arange(len(begins)), min(N_STRETCHES, len(begins)))
+    parts = np.array_split(np.arange(len(begins)), min(N_SEGMENTS, len(begins)))
     best = [part[np.argmax(np.array(busy)[part])] for part in parts]
     return [begins[k] + np.arange(each + 1) for k in best]
 
 
-def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> SegmentPlace:
-    """Shrink a stretch until it has at most `most` events: first the search, then the frames.
+def _bound_segment(recording: Recording, rows: NDArray[np.intp], most: int) -> SegmentPlace:
+    """Shrink a segment until it has few enough events: first the search, then the frames.
 
-    What remains is at least two frames, with at least half of an interval before and after.
+    At least two frames remain, with at least half of an interval before and after.
+
+    Args:
+        recording: Events and frames.
+        rows: Rows of the frames.
+        most: Most events.
+
+    Returns:
+        The place of the segment.
     """
     source, frames = recording.events, recording.frames
     assert frames is not None
@@ -138,28 +146,28 @@ def _bound_stretch(recording: Recording, rows: NDArray[np.intp], most: int) -> S
             return SegmentPlace(rows, span, first, last)
 
 
-def _cut_stretch(source: EventSource, stretch: SegmentPlace) -> SegmentPlace:
-    """End a stretch after `MAX_READ_EVENTS`, as where minutes pass between two frames."""
-    last = stretch.first + MAX_READ_EVENTS
-    if last >= stretch.last:
-        return stretch
+def _cut_segment(source: EventSource, segment: SegmentPlace) -> SegmentPlace:
+    """End a segment after `MAX_READ_EVENTS`, as where minutes pass between two frames."""
+    last = segment.first + MAX_READ_EVENTS
+    if last >= segment.last:
+        return segment
     end = int(source[last : last + 1].t[0])
-    return stretch._replace(span=(stretch.span[0], end - 1), last=source.index(end))
+    return segment._replace(span=(segment.span[0], end - 1), last=source.index(end))
 
 
-def _choose_stretches(recording: Recording) -> list[SegmentPlace]:
-    """Choose the stretches, of whose frames there may be none."""
+def _choose_segments(recording: Recording) -> list[SegmentPlace]:
+    """Choose the segments; without frames they are ranges of events."""
     frames, source = recording.frames, recording.events
     if frames is not None and len(frames) > 1:
         chosen = _choose_rows(recording)
-        found = [_bound_stretch(recording, rows, MAX_EVENTS // len(chosen)) for rows in chosen]
+        found = [_bound_segment(recording, rows, MAX_EVENTS // len(chosen)) for rows in chosen]
         number = MAX_READ_EVENTS // max(1, *(one.last - one.first for one in found))
         if number < len(found):
             some = np.linspace(0, len(found) - 1, max(number, 1)).round().astype(int)
-            found = [_cut_stretch(source, found[k]) for k in some.tolist()]
+            found = [_cut_segment(source, found[k]) for k in some.tolist()]
         return found
     rows = np.arange(len(frames) if frames is not None else 0)
-    count = N_STRETCHES if len(source) > MAX_EVENTS else 1
+    count = N_SEGMENTS if len(source) > MAX_EVENTS else 1
     most, found = MAX_EVENTS // count, []
     for first in np.linspace(0, max(len(source) - most, 0), count).astype(int).tolist():
         last = min(first + most, len(source))
@@ -171,7 +179,16 @@ def _choose_stretches(recording: Recording) -> list[SegmentPlace]:
 def _read_frames(
     recording: Recording, rows: NDArray[np.intp], places: NDArray[np.intp]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return grey values and intensities (rows, pixels) of frames."""
+    """Read frames at sampled pixels.
+
+    Args:
+        recording: Events and frames.
+        rows: Rows of the frames.
+        places: (pixels,) numbers of the pixels, row by row.
+
+    Returns:
+        Grey values and intensities, (rows, pixels) each.
+    """
     grey = np.empty((len(rows), len(places)), np.float32)
     intensity, frames = np.empty_like(grey), recording.frames
     if frames is None:
@@ -185,13 +202,13 @@ def _read_frames(
 
 
 def _read_events(
-    recording: Recording, stretch: SegmentPlace, index: NDArray[np.int32], parts: int
+    recording: Recording, segment: SegmentPlace, index: NDArray[np.int32], parts: int
 ) -> tuple[list[NDArray], NDArray[np.int32]]:
-    """Read the events of a stretch.
+    """Read the events of a segment.
 
     Args:
         recording: The recording.
-        stretch: The stretch.
+        segment: The segment.
         index: (pixels of the sensor,) index among the sampled pixels, -1 outside of these.
         parts: Number of parts of equal length in time.
 
@@ -199,7 +216,7 @@ def _read_events(
         Times, pixels and polarity of the events at sampled pixels, and numbers (2, parts, pixels of
         the sensor) of ON and OFF events at all.
     """
-    source, first, last = recording.events, stretch.first, stretch.last
+    source, first, last = recording.events, segment.first, segment.last
     counts, kept = np.zeros((2, parts, len(index)), np.int32), []
     cuts = np.empty(0)
     if parts > 1 and last > first:
@@ -231,24 +248,24 @@ def take_sample(recording: Recording) -> Sample:
         The sample, without events of hot pixels.
     """
     width, height, frames = recording.width, recording.height, recording.frames
-    chosen = _choose_stretches(recording)
-    most = max(stretch.last - stretch.first for stretch in chosen) * len(chosen)
+    chosen = _choose_segments(recording)
+    most = max(segment.last - segment.first for segment in chosen) * len(chosen)
     places, tile = choose_pixels(width, height, MAX_EVENTS / max(most, MAX_EVENTS))
     index = np.full(width * height, -1, np.int32)
     index[places] = np.arange(len(places))
     found, by_part = [], []
-    parts = N_STRETCHES if len(chosen) == 1 else 1
-    for stretch in chosen:
-        columns, counts = _read_events(recording, stretch, index, parts)
+    parts = N_SEGMENTS if len(chosen) == 1 else 1
+    for segment in chosen:
+        columns, counts = _read_events(recording, segment, index, parts)
         by_part.append(counts)
-        rows = stretch.rows
+        rows = segment.rows
         grey, intensity = _read_frames(recording, rows, places)
         stamps = frames.t[rows] if frames is not None else np.empty(0, np.int64)
         exposure = frames.exposure[rows] if frames is not None else np.empty(0, np.int64)
         # Before the first and after the last event nothing is known to be missing.
         found.append(
             SampledSegment(
-                *columns, stretch.span, rows, stamps, exposure, grey, intensity,
+                *columns, segment.span, rows, stamps, exposure, grey, intensity,
                 np.zeros(grey.shape, bool),
             )
         )  # fmt: skip
@@ -257,53 +274,64 @@ def take_sample(recording: Recording) -> Sample:
     dark, bright = MARGIN_LEVELS / 255, min(white, 1 - MARGIN_LEVELS / 255)
     hot = find_hot_pixels(counts.sum(0))
     is_out = hot.ravel()[places]
-    stretches = tuple(
+    segments = tuple(
         s._replace(clear=(s.grey > dark) & (s.grey < bright)).without(is_out) for s in found
     )
     return Sample(
-        stretches, places, tile, (width, height), hot, counts.sum(1, dtype=np.int64)
+        segments, places, tile, (width, height), hot, counts.sum(1, dtype=np.int64)
     )  # fmt: skip
 
 
-def count_between(stretch: SampledSegment, offset_us: int = 0) -> NDArray[np.int32]:
+def count_between(segment: SampledSegment, offset_us: int = 0) -> NDArray[np.int32]:
     """Count the events between consecutive frames.
 
     Args:
-        stretch: The stretch.
+        segment: The segment.
         offset_us: Time added to the frames' stamps, us.
 
     Returns:
         (frames - 1, 2, pixels) ON and OFF events.
     """
-    pixels = stretch.clear.shape[1]
-    out = np.zeros((max(len(stretch.frame_t) - 1, 0), 2, pixels), np.int32)
-    edges = np.searchsorted(stretch.t, stretch.frame_t + offset_us)
+    pixels = segment.clear.shape[1]
+    out = np.zeros((max(len(segment.frame_t) - 1, 0), 2, pixels), np.int32)
+    edges = np.searchsorted(segment.t, segment.frame_t + offset_us)
     for k in range(len(out)):
         part = slice(edges[k], edges[k + 1])
-        p, pixel = stretch.p[part], stretch.pixel[part]
+        p, pixel = segment.p[part], segment.pixel[part]
         out[k] = [np.bincount(pixel[of], minlength=pixels) for of in (p, ~p)]
     return out
 
 
 def log_changes(
-    stretch: SampledSegment, I0: float
+    segment: SampledSegment, I0: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the changes of ln(I + I0) from each frame to the next.
 
     Args:
-        stretch: The stretch.
+        segment: The segment.
         I0: Offset inside the logarithm.
 
     Returns:
         (frames - 1, pixels) changes, and where both frames are not clipped.
     """
-    L = np.log(np.maximum(stretch.intensity, 0) + np.float32(I0))
-    return np.diff(L, axis=0), stretch.clear[1:] & stretch.clear[:-1]
+    L = np.log(np.maximum(segment.intensity, 0) + np.float32(I0))
+    return np.diff(L, axis=0), segment.clear[1:] & segment.clear[:-1]
 
 
 @njit_noalloc
 def _add_moments(t, pixel, sign, change, used, edges, count, out):
-    """Add S^2, S d and S of all used pixels at each offset, S the sum of signs in the window."""
+    """Add up moments of event counts S and changes d of all used pixels, in windows at offsets.
+
+    Args:
+        t: (events,) times, us.
+        pixel: (events,) numbers of the pixels.
+        sign: (events,) 1 or -1; S is its sum in the window.
+        change: (pixels,) changes d of log intensity.
+        used: (pixels,) whether a pixel counts.
+        edges: (offsets, 2) begin and end of the window at each offset, us, ascending.
+        count: (pixels,) zeros, scratch.
+        out: (offsets, 3), changed in place: sums of S^2, S d and S.
+    """
     low = high = 0
     S2 = Sd = S = 0.0
     for j in range(len(edges)):
@@ -351,20 +379,20 @@ def correlate(
     sums = np.zeros((len(offsets_us), 6))  # S^2, S d, S, n, d^2, d
     intervals = np.zeros(len(offsets_us))
     total = 0
-    for stretch in sample.stretches:
-        change, used = log_changes(stretch, I0)
-        sign = np.where(stretch.p, 1.0, -1.0)
+    for segment in sample.segments:
+        change, used = log_changes(segment, I0)
+        sign = np.where(segment.p, 1.0, -1.0)
         count = np.zeros(change.shape[1])
-        begin, end = stretch.span
-        if len(stretch.t):
-            begin, end = max(begin, int(stretch.t[0])), min(end, int(stretch.t[-1]))
+        begin, end = segment.span
+        if len(segment.t):
+            begin, end = max(begin, int(segment.t[0])), min(end, int(segment.t[-1]))
         for k in range(len(change)):
-            edges = stretch.frame_t[k : k + 2] + offsets_us[:, None]
+            edges = segment.frame_t[k : k + 2] + offsets_us[:, None]
             inside = (edges[:, 0] >= begin) & (edges[:, 1] <= end + 1)
             out = np.zeros((len(edges), 3))
-            first = int(np.searchsorted(stretch.t, edges[0, 0]))
+            first = int(np.searchsorted(segment.t, edges[0, 0]))
             _add_moments(
-                stretch.t[first:], stretch.pixel[first:], sign[first:], change[k], used[k],
+                segment.t[first:], segment.pixel[first:], sign[first:], change[k], used[k],
                 edges, count, out,
             )  # fmt: skip
             d = change[k][used[k]].astype(np.float64)

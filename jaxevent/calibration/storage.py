@@ -81,7 +81,14 @@ def _recall(
     to_bytes: Callable[[Any], bytes],
     of_bytes: Callable[[bytes], Any],
 ) -> Any:
-    """Return what is kept under a key; computed, and kept, if there is none."""
+    """Return the value of a key: from memory, from the folder, or computed and kept in both.
+
+    Args:
+        key: The key.
+        compute: Function that computes the value.
+        to_bytes: Function that encodes it.
+        of_bytes: Function that decodes it.
+    """
     found = _memory.get(key)
     if found is None:
         found = _read(key, of_bytes)

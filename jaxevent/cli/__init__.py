@@ -122,13 +122,13 @@ def _shown(words: Sequence[str]) -> Iterator[None]:
 def _plain_warnings() -> Iterator[None]:
     """Print each warning about input as one line, once, without the line of code that raised it."""
     with warnings.catch_warnings():
-        usual, said = warnings.showwarning, set()
+        usual, printed = warnings.showwarning, set()
 
         def show(message: Any, category: Any, *rest: Any, **more: Any) -> None:
             if issubclass(category, InputWarning):
-                if str(message) not in said:
+                if str(message) not in printed:
                     _say(f"warning: {message}")
-                said.add(str(message))
+                printed.add(str(message))
             else:
                 usual(message, category, *rest, **more)
 
@@ -181,7 +181,7 @@ def _terminable() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    told = sys.unraisablehook
+    previous_hook = sys.unraisablehook
     came: list[int] = []
 
     def leave(number: int, frame: Any) -> None:
@@ -201,7 +201,7 @@ def _terminable() -> Iterator[None]:
 
     def drop(dropped: Any) -> None:
         if not isinstance(dropped.exc_value, _Signal):
-            told(dropped)
+            previous_hook(dropped)
 
     before: dict[int, Any] = {}
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
@@ -222,7 +222,7 @@ def _terminable() -> Iterator[None]:
     finally:
         if hasattr(signal, "setitimer") and came:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        sys.unraisablehook = told
+        sys.unraisablehook = previous_hook
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -265,7 +265,7 @@ def _mend_streams() -> None:
 
 
 def _say(sentence: str) -> None:
-    """Say on stderr why the command ends; silently where nobody can be told."""
+    """Print on stderr why the command ends; do nothing if stderr cannot be written."""
     try:
         print(f"jaxevent: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
     except OSError:

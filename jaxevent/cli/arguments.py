@@ -152,7 +152,7 @@ def refuse_with_live(given: Mapping[str, bool]) -> None:
 
 
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
-    """Open what --live reads: a recording that tells sensor and camera, and chunks of events."""
+    """Open what --live reads: a recording that describes the sensor, and chunks of events."""
     from jaxevent.events import live
 
     if str(path) != "-":
@@ -228,7 +228,7 @@ def warn_of_faults(recording: Any, sample: Any = None, *, frames: bool = True) -
     Args:
         recording: The recording.
         sample: A sample of it, if there is one.
-        frames: Whether faults of frames and clocks are told, too.
+        frames: Whether to warn of faults of frames and clocks, too.
     """
     from jaxevent.calibration import check_consistency
     from jaxevent.calibration.faults import EVENT_FAULTS

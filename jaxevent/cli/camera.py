@@ -183,9 +183,9 @@ def attach(path: Path, response: Path, reading: dict[str, Any], out: Path) -> No
             f"{path}: holds no frames, of whose camera a response could be{missing}; give a "
             "recording with frames"
         )
-    told = {"response": np.asarray(camera.levels), "certainty": np.asarray(camera.weights)}
+    fitted = {"response": np.asarray(camera.levels), "certainty": np.asarray(camera.weights)}
     kept = {name: values for name, values in recording.extra.items() if name != "f_Q"}
-    recording = dataclasses.replace(recording, extra={**kept, **told})
+    recording = dataclasses.replace(recording, extra={**kept, **fitted})
     save(recording, out, progress=show_progress())
     print_stored(recording, out)
 

@@ -61,7 +61,7 @@ def add(commands: Any) -> None:
 
 
 def _calibrated_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines about what the recordings determined, one for methods that it is the same for."""
+    """Describe what the recordings determined, in one line for all methods with the same values."""
     from jaxevent.calibration.result import format_calibrated
 
     methods: dict[tuple[str, str], list[str]] = {}

@@ -112,16 +112,16 @@ def run(
             f"{source}: nothing was asked to be left out; name a step, for example --hot-pixels, "
             "or use jaxevent convert"
         )
-    told = [("events", len(recording.events))]
+    counts = [("events", len(recording.events))]
     for title, step in steps:
         recording = step(recording)
-        told.append((title, len(recording.events)))
+        counts.append((title, len(recording.events)))
     if not len(recording.events):
         raise InputError(f"{source}: no event is left; take less away")
     save(dataclasses.replace(recording, name=name), target, compression, progress=show_progress())
-    width = max(len(f"{count:,}") for _, count in told)
-    for title, count in told:
-        share = 100 * count / max(told[0][1], 1)
+    width = max(len(f"{count:,}") for _, count in counts)
+    for title, count in counts:
+        share = 100 * count / max(counts[0][1], 1)
         print(f"{title:12} {count:>{width},}  {share:5.1f} %")
     print_stored(recording, target)
 

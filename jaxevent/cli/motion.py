@@ -169,10 +169,10 @@ def _write(options: Options, kind: Any) -> None:
     whole = _open(options)
     arguments.warn_of_faults(whole, frames=False)
     bias = _gyro_bias(options, whole)
-    recording = _stretch(whole, options.start, options.stop)
+    recording = _crop_events(whole, options.start, options.stop)
     choice = None
     if kind is None:
-        kind, recording, choice = _choose(recording)
+        kind, recording, choice = _select_model(recording)
     estimator = find_estimator(options.method or kind.best_method)
     _check(estimator, kind, options)
     _need_camera(recording, kind)
@@ -184,18 +184,18 @@ def _write(options: Options, kind: Any) -> None:
     elif "smooth" in estimator.options:
         settings["smooth"] = options.smooth or not options.centred
     is_default = not (options.method or options.params or options.causal or options.smooth)
-    estimator, told, values = estimated(
+    estimator, motion, values = estimate_or_fall_back(
         estimator, recording, options.params, settings, (options.imu, bias, turned), is_default
     )
-    told = _with_doubt(told, recording, choice, options.focal)
+    motion = _include_doubts(motion, recording, choice, options.focal)
     seconds = time.perf_counter() - clock
     about = {
         "seed": options.seed, "smooth": settings.get("smooth", False), "gyro": options.imu,
         "causal": options.causal,
     }  # fmt: skip
     made = {"method": estimator.name, "params": values}
-    written = output.write(recording, told, about, true, progress=show_progress(), **made)
-    hint = _truth_there(whole, kind) if options.truth is None else []
+    written = output.write(recording, motion, about, true, progress=show_progress(), **made)
+    hint = _truth_hint(whole, kind) if options.truth is None else []
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)
     print(
@@ -218,7 +218,7 @@ def _check_options(options: Options, kind: Any) -> None:
 
 
 def _open(options: Options) -> Any:
-    """The recording, with its camera; it must hold events, and the IMU that options need."""
+    """Open the recording with its camera; it must hold events, and the IMU that options need."""
     path = options.path
     recording, _ = arguments.open_named(path, options.reading)
     recording = _with_camera(recording, options.focal)
@@ -233,7 +233,7 @@ def _open(options: Options) -> Any:
 
 
 def _gyro_bias(options: Options, recording: Any) -> Any:
-    """The gyro's rates while the camera is still, or None."""
+    """Return the gyro's rates (3,), rad/s, while the camera is still; None without --still."""
     from jaxevent.egomotion.truth import gyro_bias
 
     if recording.imu is None or options.still is None:
@@ -241,8 +241,8 @@ def _gyro_bias(options: Options, recording: Any) -> Any:
     return gyro_bias(recording.imu, *options.still)
 
 
-def _choose(recording: Any) -> tuple[Any, Any, Any]:
-    """The model that the recording suggests, the recording with the lens found, the choice."""
+def _select_model(recording: Any) -> tuple[Any, Any, Any]:
+    """Select a model by the recording; return it, the recording with its lens, and the test."""
     from jaxevent.egomotion.model_selection import select_model
 
     choice = select_model(recording)
@@ -252,16 +252,16 @@ def _choose(recording: Any) -> tuple[Any, Any, Any]:
     return choice.model, recording, choice
 
 
-def _with_doubt(told: Any, recording: Any, choice: Any, focal: float | None) -> Any:
-    """The motion with the doubt of the model, the focal length and parts of the image."""
+def _include_doubts(motion: Any, recording: Any, choice: Any, focal: float | None) -> Any:
+    """Add the uncertainty of model, focal length and parts of the image to a motion."""
     if choice is not None:
-        told = choice.include_doubt(told)
+        motion = choice.include_doubt(motion)
     if focal is not None:
-        told = told.with_focal_error()
-    told, warning = told.with_flow_consistency(recording)
+        motion = motion.with_focal_error()
+    motion, warning = motion.with_flow_consistency(recording)
     if warning:
         print(warning)
-    return told
+    return motion
 
 
 def _print_live(options: Options, kind: Any) -> None:
@@ -307,8 +307,8 @@ def _check(estimator: Any, kind: Any, options: Options) -> None:
             )
 
 
-def _stretch(recording: Any, start: float | int | None, stop: float | int | None) -> Any:
-    """The events of some time, with the poses and the IMU of all."""
+def _crop_events(recording: Any, start: float | int | None, stop: float | int | None) -> Any:
+    """Return a recording's events from start to stop (s), with the poses and the IMU of all."""
     if start is None and stop is None:
         return recording
     kept = {"poses": recording.poses, "imu": recording.imu}
@@ -321,7 +321,7 @@ def _stretch(recording: Any, start: float | int | None, stop: float | int | None
 
 
 def _with_camera(recording: Any, focal: float | int | None) -> Any:
-    """The recording, with a camera of a focal length that was given."""
+    """Return the recording with a camera of the focal length (px) that was given, if any was."""
     from jaxevent.camera import PinholeCamera
 
     if focal is None:
@@ -334,12 +334,12 @@ def _with_camera(recording: Any, focal: float | int | None) -> Any:
     return dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
 
 
-def _truth_there(recording: Any, kind: Any) -> list[str]:
-    """A line that says that the recording itself tells its motion, if it does."""
+def _truth_hint(recording: Any, kind: Any) -> list[str]:
+    """Return a line that recommends --truth if the recording holds its true motion, else none."""
     has = {"poses": recording.poses, "gyro": recording.imu}
     sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.truth_sources
     known = [name for name in sources if has[name] is not None and len(has[name])]
-    return [f"the recording's {known[0]} can tell errors: add --truth"] if known else []
+    return [f"the recording's {known[0]} can show errors: add --truth"] if known else []
 
 
 def _need_camera(recording: Any, kind: Any) -> None:
@@ -355,7 +355,7 @@ def _need_camera(recording: Any, kind: Any) -> None:
 
 
 def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[str]]:
-    """The parameters, and the names of those that a file gives."""
+    """Return the parameters, and the names of those that a file gives."""
     from jaxevent.parameters import read_toml
 
     if path is None:
@@ -365,7 +365,7 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
     return values, {*table, *table.get(estimator.name, {})}
 
 
-def estimated(
+def estimate_or_fall_back(
     estimator: Any,
     recording: Any,
     params: Path | None,
@@ -373,7 +373,7 @@ def estimated(
     gyro: Any,
     other: bool,
 ) -> tuple[Any, Any, Any]:
-    """Estimate the motion, by the model's other method where one finds nothing until the middle.
+    """Estimate the motion; try the model's other method if the first half has no estimate.
 
     Args:
         estimator: The method.
@@ -393,12 +393,12 @@ def estimated(
     suited = estimator.adapt_params(recording, values, given=given)
     if suited.message:
         print(suited.message)
-    told = _told(estimator, recording, suited.params, settings, gyro)
-    first, usual = told.t[told.valid][:1], (estimator, told, suited.params)
-    soon = len(first) and first[0] - recording.start <= (recording.stop - recording.start) / 2
-    is_refuted = not len(first) and told.warning
-    if soon or is_refuted or not other or not kind.fallback_method:
-        return usual
+    motion = _estimate(estimator, recording, suited.params, settings, gyro)
+    first, result = motion.t[motion.valid][:1], (estimator, motion, suited.params)
+    is_early = len(first) and first[0] - recording.start <= (recording.stop - recording.start) / 2
+    is_refuted = not len(first) and motion.warning
+    if is_early or is_refuted or not other or not kind.fallback_method:
+        return result
     late = " before the recording's middle" if len(first) else ""
     print(f"{estimator.name} found no motion{late}, so {kind.fallback_method} is tried")
     estimator = find_estimator(kind.fallback_method)
@@ -406,20 +406,33 @@ def estimated(
     if suited.params_message:
         print(f"{estimator.name}: {suited.params_message}")
     settings = {k: v for k, v in settings.items() if k not in ("causal", "smooth")}
-    told = _told(estimator, recording, suited.params, settings, gyro)
-    if len(first) and not told.valid.any():
-        return usual
-    return estimator, told, suited.params
+    motion = _estimate(estimator, recording, suited.params, settings, gyro)
+    if len(first) and not motion.valid.any():
+        return result
+    return estimator, motion, suited.params
 
 
-def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any) -> Any:
-    """The motion by a method; `gyro` tells whether the IMU helps, its bias and its axes."""
+def _estimate(
+    estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any
+) -> Any:
+    """Estimate the motion by a method.
+
+    Args:
+        estimator: The method.
+        recording: The recording.
+        values: Parameters.
+        settings: Options of `estimate`.
+        gyro: Whether the IMU helps, its bias (3,) in rad/s or None, and its axes.
+
+    Returns:
+        The motion.
+    """
     from jaxevent.egomotion.estimator import InconsistentMotionWarning, LostMotionWarning
 
     more = {"cloud": N_PLOTTED_PARTICLES} if "cloud" in estimator.options else {}
     helps, bias, turned = gyro
     with warnings.catch_warnings():
-        # The summary of the command tells them.
+        # The summary of the command shows them.
         warnings.simplefilter("ignore", LostMotionWarning)
         warnings.simplefilter("ignore", InconsistentMotionWarning)
         if helps:
@@ -430,7 +443,7 @@ def _told(estimator: Any, recording: Any, values: Any, settings: dict[str, Any],
 def _gyro(
     estimator: Any, recording: Any, values: Any, settings: Any, bias: Any, turned: Any
 ) -> Any:
-    """Return the gyro's rates without bias; an unknown bias is taken from a first estimate."""
+    """Return the gyro's rates without bias; an unknown bias is found by a first estimate."""
     import numpy as np
 
     from jaxevent.egomotion import from_gyro
@@ -440,11 +453,11 @@ def _gyro(
     measured = from_gyro(recording.imu, zero, turned)
     if bias is not None:
         return measured
-    told = estimator.estimate(recording, values, **settings)
-    at = told.t[told.valid & (told.t >= measured.start) & (told.t <= measured.stop)]
+    motion = estimator.estimate(recording, values, **settings)
+    at = motion.t[motion.valid & (motion.t >= measured.start) & (motion.t <= measured.stop)]
     if not len(at):
         return measured
-    rows = next(part.rows for part in told.model.parts if part.figure == "Omega")
-    off = fit_gyro_bias(told(at).mean[:, rows], measured(at)[1])
+    rows = next(part.rows for part in motion.model.parts if part.figure == "Omega")
+    off = fit_gyro_bias(motion(at).mean[:, rows], measured(at)[1])
     print(f"the gyro's bias, from a first estimate: {', '.join(f'{v:+.3f}' for v in off)} rad/s")
     return dataclasses.replace(measured, Omega=measured.Omega - off)

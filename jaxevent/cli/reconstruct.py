@@ -91,8 +91,17 @@ _EVENTS_ONLY_SECONDS_PER_PIXEL = 10e-6  # s, of `events-only`: 0.4 for 240x180
 _MAX_SECONDS = 600.0  # s
 
 
-def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
-    """The method where none is named, for images of so many pixels in all; says why it is that."""
+def _choose_method(has_frames: bool, pixels: int, missing: str = "") -> str:
+    """Choose the method where none is named, and print the reason.
+
+    Args:
+        has_frames: Whether the recording has frames.
+        pixels: Number of pixels of all images together.
+        missing: Words for the reason why frames are missing.
+
+    Returns:
+        The method's name.
+    """
     each = _MC_SECONDS_PER_PIXEL if has_frames else _EVENTS_ONLY_SECONDS_PER_PIXEL
     seconds = each * pixels
     late = f"would take {seconds / 60:.0f} minutes of a core"
@@ -109,7 +118,7 @@ def _usual(has_frames: bool, pixels: int, missing: str = "") -> str:
 
 
 def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict[str, Any]:
-    """The settings of --params; without a method they need a calibration."""
+    """Read the settings of --params; without a method the file must be a calibration."""
     from jaxevent.parameters import CALIBRATION_TABLE, read_toml
 
     if params is None:
@@ -122,7 +131,7 @@ def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict
 def _default_times(
     recording: Any, estimator: Any, values: Any, rate: float | int | None, start: float | int | None
 ) -> Any:
-    """The times of images where no file gives them, us."""
+    """Return the times (us) of images where no file gives them."""
     from jaxevent.events.clocks import check_clocks, compare_clocks
     from jaxevent.runs.protocols import frame_times
     from jaxevent.show.export import image_times
@@ -168,13 +177,13 @@ def run(
     estimator = find(method or "mc", "reconstruction")
     table = _read_table(params, estimator, method)
     recording, name = arguments.open_named(path, reading)
-    asked = None if times is None else read_times(times, (recording.start, recording.stop))
+    file_times = None if times is None else read_times(times, (recording.start, recording.stop))
     if at == "frames" and recording.frames is None:
         missing = recording.describe_left_out("frames")
         raise InputError(f"{path}: holds no frames{missing}; give --rate instead of --at frames")
 
     def choose_times(values: Any) -> Any:
-        wanted = asked
+        wanted = file_times
         if wanted is None:
             wanted = _default_times(recording, estimator, values, rate, start)
         return within(wanted, start, stop, str(path))
@@ -184,9 +193,9 @@ def run(
     if method is None:
         pixels = len(chosen) * recording.width * recording.height
         missing = recording.describe_left_out("frames")
-        usual = _usual(recording.frames is not None, pixels, missing)
-        estimator = find(usual, "reconstruction")
-        table = _read_table(params, estimator, usual)
+        chosen_method = _choose_method(recording.frames is not None, pixels, missing)
+        estimator = find(chosen_method, "reconstruction")
+        table = _read_table(params, estimator, chosen_method)
         values = estimator.Params.of(table)
     names = estimator.names_left_open(table) if calibrate else ()
     if names:

@@ -180,7 +180,7 @@ def run(
         far = {} if depth is None else {"depth": rig.read_depth(depth, seen)}
         grid = known.grid(seen, (other.width, other.height), plane=plane, **far)
     H = None if homography is None else rig.read_homography(homography)
-    # Opened first, so that a place that cannot be written is told before the work.
+    # Opened first, so that a place that cannot be written is reported before the work.
     with complete(out) as partial:
         found = rig.estimate(
             recording, other, grid, homography=H, offset=offset, search=search,

@@ -193,7 +193,7 @@ def _simulate_video(
             f"--speed {speed} is for a scene; give a video a number, such as 0.5"
         ) from None
     stop = None if duration is None else given.get("start", 0.0) + duration
-    # Opened first, so that a place that cannot be written is told before the work.
+    # Opened first, so that a place that cannot be written is reported before the work.
     with complete(out) as partial:
         recording = sim.from_video(video, sensor, speed=factor, stop=stop, seed=seed, **given)
         save(recording, partial)
@@ -210,7 +210,7 @@ def _simulate_frames(
     duration: float | int | None,
     size: tuple[int, int] | None,
 ) -> None:
-    """A camera over a scene, or without one moving objects."""
+    """Simulate a camera over a scene; without a scene, moving objects."""
     from jaxevent import simulate as sim
     from jaxevent.io import save
     from jaxevent.io.output import complete
@@ -257,7 +257,7 @@ def _simulate_blobs(
 
 
 def _pace(speed: str | None, example: str) -> float | None:
-    """The number that --speed gives; raises `InputError` for what is none above 0."""
+    """Return the number that --speed gives; raise `InputError` unless it is above 0."""
     try:
         pace = None if speed is None else float(speed)
     except ValueError:

@@ -143,7 +143,7 @@ def run(
     from jaxevent.show.tracks import Output
 
     tracker = methods.find(method, "blob")
-    given = None if params is None else tracker.Params.load(params, method)  # told before the work
+    given = None if params is None else tracker.Params.load(params, method)  # read before the work
     if live:
         options = {
             "--accuracy": accuracy, "--at": at, "--start": start, "--stop": stop, "--pair": pairs,

@@ -138,9 +138,14 @@ def _workers() -> ThreadPoolExecutor:
 
 
 def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
-    """Call `kernel(begin, end, *args)` for parts of the rows, each on a thread of its own.
+    """Run a kernel on parts of the rows, each on a thread of its own.
 
     Kernels release the interpreter's lock. What they compute must not depend on the parts.
+
+    Args:
+        kernel: Function of the first row, the one after the last, and `args`.
+        n_rows: Number of rows.
+        *args: Further arguments.
     """
     parts = min(N_THREADS, n_rows)
     if parts <= 1:

@@ -45,7 +45,15 @@ class DerivativeDirections(NamedTuple):
         return jax.tree.unflatten(tree, seeds)
 
     def inputs(self, params: Any, fixed: Any) -> tuple[Any, ...]:
-        """Return the numbers that a traced program begins with: the first argument of its steps."""
+        """Return the numbers that a traced program begins with: the first argument of its steps.
+
+        Args:
+            params: Parameters.
+            fixed: Further numbers that are known with them.
+
+        Returns:
+            Both, and the directions if there are any.
+        """
         return (params, fixed, self.seeds(params)) if self.numbers else (params, fixed)
 
     def shapes(self, tree: Any) -> Any:
@@ -178,7 +186,9 @@ def make_vector_sums(n_lanes: int, sums: tuple[Sum, ...]) -> Any:
     @make_intrinsic
     def function(context: Any, out: Any, to: Any, cells: Any, at: Any, numbers: Any, factors: Any):
         def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            lines = _Vectors(builder, context.get_value_type(signature.args[0].dtype), n_lanes)
+            lines = _VectorInstructions(
+                builder, context.get_value_type(signature.args[0].dtype), n_lanes
+            )
             out, to, cells, at, numbers, factors = arguments
             totals = []
             for _, terms in sums:
@@ -198,7 +208,7 @@ def make_vector_sums(n_lanes: int, sums: tuple[Sum, ...]) -> Any:
     return function
 
 
-class _Vectors:
+class _VectorInstructions:
     """Instructions of LLVM on vectors."""
 
     def __init__(self, builder: Any, real: Any, lanes: int):
@@ -267,6 +277,9 @@ def collect_derivatives(
         moving: Changes of numbers of the parameters.
         graph: Graph of the nodes.
 
+    Returns:
+        The derivatives, as sums of factors times vectors of changes.
+
     Raises:
         TranslationError: They are no such sums.
     """
@@ -306,7 +319,7 @@ def collect_derivatives(
     terms: dict[str, dict[int, Node]] = {name: {} for name in outs}
     for key in order:
         kind, state = key[:2]
-        change = ChangeVector(kind, state, _contents(kind, vectors[key], tables, graph))
+        change = ChangeVector(kind, state, _change_contents(kind, vectors[key], tables, graph))
         if change not in made:
             made.append(change)
         place = made.index(change)
@@ -320,7 +333,7 @@ def collect_derivatives(
     return Derivatives(made, sums)
 
 
-def _contents(
+def _change_contents(
     kind: str, changes: dict[int, list[Node]], tables: list[list[Node]], graph: Graph
 ) -> dict[int, list[Node]]:
     def total(nodes: list[Node]) -> Node:

@@ -55,7 +55,7 @@ def _as_bits(context: Any, x: Any):
 
 
 @make_intrinsic
-def _choose(context: Any, truth: Any, one: Any, other: Any):
+def _select(context: Any, truth: Any, one: Any, other: Any):
     """Select one number or another, without a branch.
 
     A wait at each costs more than both numbers.
@@ -73,8 +73,8 @@ def _choose(context: Any, truth: Any, one: Any, other: Any):
 @compile_function
 def exp32(x):
     n = np.floor(x * F(1.44269504) + F(0.5))
-    n = _choose(n > F(-126), n, F(-126))
-    n = _choose(n < F(127), n, F(127))
+    n = _select(n > F(-126), n, F(-126))
+    n = _select(n < F(127), n, F(127))
     r = x - n * F(0.693359375) + n * F(2.12194440e-4)
     p = F(1.9875691500e-4)
     p = p * r + F(1.3981999507e-3)
@@ -84,9 +84,9 @@ def exp32(x):
     p = p * r + F(5.0000001201e-1)
     p = p * r * r + r + F(1)
     p = p * _as_real((np.int32(n) + np.int32(127)) << np.int32(23))
-    p = _choose(x < F(88.37), p, INFINITE)
-    p = _choose(x > F(-87.33), p, F(0))
-    return _choose(x == x, p, x)
+    p = _select(x < F(88.37), p, INFINITE)
+    p = _select(x > F(-87.33), p, F(0))
+    return _select(x == x, p, x)
 
 
 @compile_function
@@ -107,16 +107,16 @@ def log32(x):
     p = p * y + F(3.3333331174e-1)
     p = y * z * p - F(2.12194440e-4) * e - F(0.5) * z
     p = y + p + F(0.693359375) * e
-    p = _choose(x < INFINITE, p, x)
-    p = _choose(x > F(0), p, -INFINITE)
-    return _choose(x >= F(0), p, NAN)
+    p = _select(x < INFINITE, p, x)
+    p = _select(x > F(0), p, -INFINITE)
+    return _select(x >= F(0), p, NAN)
 
 
 @compile_function
 def log1p32(x):
     y = F(1) + x
     lost = (x - (y - F(1))) / y
-    return log32(y) + _choose((y > F(0)) & (y < INFINITE), lost, F(0))
+    return log32(y) + _select((y > F(0)) & (y < INFINITE), lost, F(0))
 
 
 @compile_function
@@ -153,8 +153,8 @@ def sin32(x):
     if not abs(x) < F(8000):  # the reduction loses digits
         return np.sin(x)
     r, n = _reduced(x)
-    value = _choose((n & 1) != 0, _cosine(r), _sine(r))
-    return _choose((n & 2) != 0, -value, value)
+    value = _select((n & 1) != 0, _cosine(r), _sine(r))
+    return _select((n & 2) != 0, -value, value)
 
 
 @compile_function
@@ -162,8 +162,8 @@ def cos32(x):
     if not abs(x) < F(8000):
         return np.cos(x)
     r, n = _reduced(x)
-    value = _choose((n & 1) != 0, _sine(r), _cosine(r))
-    return _choose(((n + 1) & 2) != 0, -value, value)
+    value = _select((n & 1) != 0, _sine(r), _cosine(r))
+    return _select(((n + 1) & 2) != 0, -value, value)
 
 
 @compile_function

@@ -109,7 +109,14 @@ class Graph:
         self._known: dict[Any, Node] = {}
 
     def node(self, op: str, args: tuple[Any, ...], kind: str, level: Level) -> Node:
-        """Return the node of an operation, always the same object."""
+        """Return the node of an operation, always the same object.
+
+        Args:
+            op: Name of the operation.
+            args: Nodes, and plain values.
+            kind: Type of the result: "f", "i" or "b".
+            level: What the result depends on.
+        """
         key = (op, kind, level, *(a.number if isinstance(a, Node) else ("", a) for a in args))
         if key not in self._known:
             self._known[key] = Node(op, args, kind, level, len(self._known))
@@ -129,7 +136,16 @@ class Graph:
         return self.node("constant", (repr(text),), kind, Level.CONSTANT)
 
     def apply(self, op: str, args: tuple[Any, ...], kind: str) -> Node:
-        """Apply an operation to nodes and simplify it; further arguments are plain values."""
+        """Apply an operation to nodes, and simplify it.
+
+        Args:
+            op: Name of the operation.
+            args: Nodes, and plain values.
+            kind: Type of the result: "f", "i" or "b".
+
+        Returns:
+            The node of the result.
+        """
         simple = self._folded(op, args)
         if simple is not None:
             return simple
@@ -293,9 +309,14 @@ def called_jaxpr(eqn: Any) -> Any | None:
 
 
 def move_elements(eqn: Any, values: list[Any]) -> NDArray | None:
-    """Evaluate a primitive that only moves elements, of any kind; return None for other primitives.
+    """Evaluate a primitive that only moves elements, whatever their kind.
 
-    Indices are known numbers.
+    Args:
+        eqn: Equation of a jaxpr.
+        values: Its arguments: arrays of any kind, and indices that are known numbers.
+
+    Returns:
+        The result; None for other primitives.
     """
     name, p = eqn.primitive.name, eqn.params
     x = np.asarray(values[0]) if values else None
@@ -340,11 +361,24 @@ def move_elements(eqn: Any, values: list[Any]) -> NDArray | None:
         ]
         return x[tuple(slice(s, s + n) for s, n in zip(starts, p["slice_sizes"], strict=True))]
     if name == "gather":
-        return _reduce(eqn, x, np.asarray(values[1]))
+        return _gather(eqn, x, np.asarray(values[1]))
     return None
 
 
-def _reduce(eqn: Any, x: NDArray, indices: NDArray) -> NDArray:
+def _gather(eqn: Any, x: NDArray, indices: NDArray) -> NDArray:
+    """Evaluate the primitive gather, without batch dimensions.
+
+    Args:
+        eqn: Equation of a jaxpr.
+        x: Array of any kind.
+        indices: (..., axes) indices of the first elements of slices.
+
+    Returns:
+        The slices.
+
+    Raises:
+        TranslationError: There are batch dimensions.
+    """
     numbers, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
         raise TranslationError("a gather with batch dimensions")
@@ -365,7 +399,15 @@ def _reduce(eqn: Any, x: NDArray, indices: NDArray) -> NDArray:
 
 
 def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
-    """Evaluate an equation of a jaxpr for arrays."""
+    """Evaluate an equation of a jaxpr by NumPy, or by JAX where NumPy has no such function.
+
+    Args:
+        eqn: The equation.
+        values: Arrays for its arguments.
+
+    Returns:
+        Arrays for its results.
+    """
     name = eqn.primitive.name
     called = called_jaxpr(eqn)
     if called is not None:
@@ -393,7 +435,15 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
 
 
 def evaluate_jaxpr(closed_jaxpr: Any, values: list[NDArray]) -> list[NDArray]:
-    """Evaluate a closed jaxpr for arrays."""
+    """Evaluate a closed jaxpr equation by equation.
+
+    Args:
+        closed_jaxpr: The jaxpr.
+        values: Arrays for its arguments.
+
+    Returns:
+        Arrays for its results.
+    """
     known: dict[Any, NDArray] = dict(zip(closed_jaxpr.jaxpr.invars, values, strict=True))
     known |= dict(
         zip(closed_jaxpr.jaxpr.constvars, map(np.asarray, closed_jaxpr.consts), strict=True)
@@ -453,9 +503,14 @@ class ParameterProgram:
         return len(self.values) - 1
 
     def add(self, eqn: Any, arguments: list[Any]) -> list[int]:
-        """Add an equation, and return the numbers of its results; an equal one is not added again.
+        """Add an equation, unless an equal one was added before.
 
-        Arguments are numbers of values (int), or arrays.
+        Args:
+            eqn: Equation of a jaxpr.
+            arguments: Numbers of values (int), or arrays.
+
+        Returns:
+            The numbers of its results among the values.
         """
         what = eqn.primitive.name, str(eqn.params)
         key = (what, *(a if isinstance(a, int) else (a.tobytes(), a.shape) for a in arguments))

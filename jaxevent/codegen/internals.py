@@ -47,7 +47,7 @@ class _Library(JITCodeLibrary):
 
 
 class _NoEnvironment:
-    """A code generator that does not store what Python objects a function knows: it knows none."""
+    """A code generator that stores no Python objects: the functions refer to none."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -87,7 +87,8 @@ def _refuse(*_: Any, **named: Any) -> None:
 class SignatureCache:
     """A cache for a function's compiled signatures, as numba's dispatchers use one.
 
-    `files` has the methods `load(key)`, `save(key, data)` and `flush()`; see `kept.Files`.
+    `files` has the methods `load(key)`, `save(key, data)` and `flush()`; see
+    `cache.SignatureFiles`.
     """
 
     def __init__(self, function: Any, files: Any):

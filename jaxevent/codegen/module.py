@@ -42,7 +42,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def get_or_make(known: dict[Any, T], key: Any, make: Callable[[], T]) -> T:
-    """Return the value of a key; the first thread that asks makes it, while others wait."""
+    """Return the value of a key; one thread makes it, while others wait."""
     if key not in known:
         with _lock:
             if key not in known:
@@ -138,7 +138,15 @@ def count_nodes(program: Any) -> int:
 def _match(
     programs: list[tuple[Any, dict]], inputs: list[NDArray]
 ) -> tuple[Any, dict, list[NDArray]] | None:
-    """Find the program whose conditions on parameters hold for the inputs."""
+    """Find the program whose conditions on parameters hold.
+
+    Args:
+        programs: Programs, and their modules by layout.
+        inputs: Leaves of the parameters.
+
+    Returns:
+        The program, its modules, and the values of its `host`; None if there is none.
+    """
     for program, modules in list(programs):
         values = program.host.evaluate(inputs)
         if values is not None:

@@ -25,10 +25,8 @@ __all__ = [
     "types",
 ]
 
-TESTED_NUMBA_RELEASES = (
-    (0, 61),
-    (0, 68),
-)  # first and last release of numba whose private interfaces are used
+# First and last release of numba whose private interfaces are used.
+TESTED_NUMBA_RELEASES = ((0, 61), (0, 68))
 
 numba: Any = None
 types: Any = None  # numba's types

@@ -89,7 +89,18 @@ class JaxprTranslator:
         raise TranslationError("a look-up at a place")
 
     def run(self, closed: Any, values: list[Value]) -> list[Value]:
-        """Translate a closed jaxpr for values of its arguments."""
+        """Translate a closed jaxpr.
+
+        Args:
+            closed: The jaxpr.
+            values: Values of its arguments.
+
+        Returns:
+            Values of its results.
+
+        Raises:
+            TranslationError: An operation cannot be translated.
+        """
         jaxpr = closed.jaxpr
         known: dict[Any, Value] = dict(zip(jaxpr.invars, values, strict=True))
         for var, const in zip(jaxpr.constvars, closed.consts, strict=True):
@@ -225,7 +236,16 @@ class JaxprTranslator:
         return power
 
     def reduce_axes(self, op: str, array: NDArray, axes: list[int]) -> NDArray:
-        """Reduce axes of an array by an operation on two nodes."""
+        """Reduce axes of an array by an operation on two nodes.
+
+        Args:
+            op: Name of the operation, such as "add".
+            array: Array of nodes.
+            axes: The axes.
+
+        Returns:
+            Array of nodes, without these axes.
+        """
         for axis in sorted(axes, reverse=True):
             parts = np.moveaxis(array, axis, 0)
             total = parts[0]
@@ -264,7 +284,16 @@ class JaxprTranslator:
         return out
 
     def _dot(self, eqn: Any, left: NDArray, right: NDArray) -> NDArray:
-        """Multiply two arrays, and sum over the axes that both share."""
+        """Multiply two arrays, and sum over the axes that both share.
+
+        Args:
+            eqn: Equation of the primitive dot_general.
+            left: Array of nodes.
+            right: Array of nodes.
+
+        Returns:
+            Array of nodes: the free axes of `left`, then those of `right`.
+        """
         ((of_left, of_right), (batch_left, batch_right)) = eqn.params["dimension_numbers"]
         if batch_left or batch_right:
             raise TranslationError("a product of batches of matrices")
@@ -317,7 +346,16 @@ class JaxprTranslator:
         raise TranslationError("a look-up with an index of data")
 
     def _table_entries(self, table: ParameterArray, index: NDArray, kind: str) -> NDArray:
-        """Look up entries of a table of one axis by an index of data."""
+        """Look up entries of a table of one axis by an index of data.
+
+        Args:
+            table: The table.
+            index: Array of nodes.
+            kind: Type of the entries.
+
+        Returns:
+            Array of nodes, in the shape of `index`.
+        """
         out, array = np.empty(index.shape, object), self.host.values[table.number]
         if table.sparse or table.change:
             self.host.zeros[table.number] = array == 0
@@ -529,7 +567,13 @@ def named_leaves(name: str, tree: Any) -> dict[str, Any]:
 
 
 def number_names(name: str, leaf: Any, elements: bool = True) -> list[str]:
-    """Return the names of a leaf's single numbers; an axis of elements counts once."""
+    """Return the names of a leaf's single numbers.
+
+    Args:
+        name: Name of the leaf.
+        leaf: Array, or shape.
+        elements: Whether an axis of elements counts once.
+    """
     shape = [1 if size == ELEMENT_AXIS_LENGTH and elements else size for size in np.shape(leaf)]
     return [f"{name}.{k}" for k in range(int(np.prod(shape)))]
 

@@ -120,7 +120,16 @@ class ModuleWriter:
     def write_lines(
         self, nodes: list[Node], indent: int, known: set[Node] | None = None
     ) -> list[str]:
-        """Write lines after which nodes are known by their names, as `known` ones are before."""
+        """Write the lines that compute nodes.
+
+        Args:
+            nodes: The nodes, which are known by their names afterwards.
+            indent: Spaces before each line.
+            known: Nodes that are known by their names before.
+
+        Returns:
+            The lines.
+        """
         known = set() if known is None else known
         return self.write_assignments(
             [n for n in find_dependencies(nodes, known) if n not in known], nodes, indent
@@ -129,9 +138,18 @@ class ModuleWriter:
     def write_assignments(
         self, nodes: Iterable[Node], wanted: Iterable[Node], indent: int
     ) -> list[str]:
-        """Write lines that compute the nodes: all that the wanted ones depend on and is not known.
+        """Write the lines that compute some nodes.
 
-        What is no plain arithmetic, such as a logarithm, is a line of its own between two blocks.
+        An operation that is no plain arithmetic, such as a logarithm, is a line of its own between
+        two blocks.
+
+        Args:
+            nodes: All nodes that the wanted ones depend on and that are not known.
+            wanted: Nodes that are used afterwards.
+            indent: Spaces before each line.
+
+        Returns:
+            The lines.
         """
         order = sorted((n for n in nodes if n.op != "constant"), key=lambda n: n.number)
         wanted = set(wanted)
@@ -174,6 +192,9 @@ class ModuleWriter:
             store: Texts "target = {}" by the results' names.
             loop: How its loops over elements are written.
             indent: Spaces before each line.
+
+        Returns:
+            The lines.
         """
         wanted = {key: node for key, node in function.results.items() if key in store}
         phases = TracedFunction(wanted).phases()
@@ -383,13 +404,16 @@ BLOCK_OPERATIONS = {
 
 
 def arithmetic_block(real: Any, given: str, lines: str, results: str) -> Any:
-    """An operation for numba: `v7, v9 = operation((numbers, v1, v2))`; of one result, that alone.
+    """Make an operation for numba: `v7, v9 = operation((numbers, v1, v2))`.
 
     Args:
         real: numba's type of real numbers.
         given: Names of arguments with their kinds; `numbers:p` is a pointer.
         lines: What is computed, in order.
-        results: Names of what is returned.
+        results: Names of what is returned; a single one is returned by itself.
+
+    Returns:
+        The operation, which compiled functions call.
     """
     arguments = dict(argument.split(":") for argument in given.split())
     program = [line.split(" = ") for line in lines.strip().splitlines()]

@@ -310,7 +310,19 @@ class CandidateArrays(NamedTuple):
 
 @njit_noalloc
 def _fill_batches(stream, rules, recent, out, cursor, clock):
-    """Fill batches from events; return the number of events used, and whether all are full."""
+    """Fill batches from events.
+
+    Args:
+        stream: Times (us), columns, rows and polarities of events, and the row of the first.
+        rules: Limits and numbers of the sampler.
+        recent: `RecentEvents`, changed in place.
+        out: Arrays of the batches, output.
+        cursor: (4,) batch, events in it, its first time, and the last time (us); changed in place.
+        clock: (5,) state of the history, see `CandidateSampler`; changed in place.
+
+    Returns:
+        Number of events used, and whether all batches are full.
+    """
     # Names of their own: numba reads arrays out of tuples anew in every loop.
     t_in, x, y, p, row_in = stream
     limits, gate, margin, every, longest, span, radius, silence = rules

@@ -50,7 +50,7 @@ class TrainingSegment(NamedTuple):
     start: int
     stop: int
     known: KnownMotion
-    split: int  # index in `splits.SPLITS`
+    split: int  # index in `runs.family.SPLIT_NAMES`
 
     def crop(self) -> Recording:
         """Return the part of the recording."""

@@ -16,8 +16,9 @@ motions as fast in other directions, and motions beside the estimate. The parabo
 latter and at m has its maximum beside m by an offset, which an estimate must explain by its sigma.
 
 One object that moves before a camera at rest is explained by a motion of the camera as well. It
-covers a part of the image. So a motion of the camera is told only where many of `N_BLOCKS`^2 blocks
-of the image support it: with D_b against rest their effective number is (sum D_b)^2 / sum D_b^2.
+covers a part of the image. So a motion of the camera is reported only where many of `N_BLOCKS`^2
+blocks of the image support it: with D_b against rest their effective number is
+(sum D_b)^2 / sum D_b^2.
 """
 
 from collections.abc import Callable
@@ -42,15 +43,15 @@ MIN_RIVAL_Z = -0.5  # against the best rival
 MIN_CURVATURE_Z = 2.5  # against the motions on both sides along any axis
 MAX_OFFSET_RATIO = 0.15  # of the motion
 MIN_BLOCKS = 4.0  # effective number that support a motion of the camera
-# A motion that was told remains so until the evidence is clearly against it.
+# A motion that was reported remains so until the evidence is clearly against it.
 LOST_REST_Z = 1.5
 LOST_RIVAL_Z = -3.0
 LOST_BLOCKS = 3.0
-N_SUPPORTING_WINDOWS = 2  # in a row, from which on a motion is told
+N_SUPPORTING_WINDOWS = 2  # in a row, from which on a motion is reported
 BLOCKS_WEIGHT = 0.2  # of a window in the mean number of blocks
 MAX_DRIFT_SIGMAS = 2.0  # of a motion since it was found
 MAX_DRIFT_WINDOWS = 2.0  # over which the drift is measured
-DRIFT_RATIO = 2.0  # time for which a motion that is told drifts on, per time until it was told
+DRIFT_RATIO = 2.0  # time for which a reported motion drifts on, per time until it was reported
 MIN_DENSITY_RATIO = 0.35  # of events per px of the motion, relative to what they were
 DENSITY_DISPLACEMENTS = 2.0  # of a window, stretch of the motion over which they are averaged
 
@@ -173,8 +174,8 @@ class EvidenceTest:
         )  # fmt: skip
 
 
-class Lock:
-    """Decision, window by window, from when on the motion of a filter is told.
+class LockDetector:
+    """Decision, window by window, from when on the motion of a filter is reported.
 
     Args:
         test: The test of a window.
@@ -214,7 +215,7 @@ class Lock:
         covariance: NDArray[np.floating],
         searching: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Decide which estimates of some batches are told.
+        """Decide which estimates of some batches are reported.
 
         Args:
             events: Events of the recording up to the last time or further.
@@ -227,31 +228,40 @@ class Lock:
         Returns:
             (n,) booleans.
         """
-        told = np.zeros(len(t), bool)
+        reported = np.zeros(len(t), bool)
         if not len(t):
-            return told
+            return reported
         if self._end is not None and t[0] - self._end > 1e6 * self._longest:
             self._restart()
         ends = self._find_ends(count, t, mean, searching)
         self._end = int(t[-1])
         if ends.any():
-            told[: ends.argmax()] = self._is_settled
+            reported[: ends.argmax()] = self._is_settled
             self._restart()
         if not ends[-1]:
             if not self.sparse[-1]:
                 self._weigh(events, int(t[-1]), mean[-1], covariance[-1])
             first = len(t) - int(ends[::-1].argmax()) if ends.any() else 0
-            told[first:] = self._is_settled
-        return told & ~self.sparse
+            reported[first:] = self._is_settled
+        return reported & ~self.sparse
 
     def _find_ends(
         self, count: NDArray, t: NDArray, mean: NDArray, searching: NDArray
     ) -> NDArray[np.bool_]:
-        """Return (n,) whether a motion ends, and find `sparse` batches.
+        """Find the batches at which a motion ends, and the `sparse` ones.
 
         As long as a motion lasts, each px of it makes about as many events. Where batches hold far
         fewer, events may have been dropped. The motion ends where that lasts for longer than a
         window: then no event before has candidates any more.
+
+        Args:
+            count: (n,) number of events of each batch.
+            t: (n,) times, us.
+            mean: (n, d) motions.
+            searching: (n,) whether the filter searches.
+
+        Returns:
+            (n,) whether a motion ends.
         """
         speed, stretch = self._test.speed(mean), DENSITY_DISPLACEMENTS * self._displacement
         path = 1e-6 * np.diff(t, prepend=t[0] if self._end is None else self._end) * speed / stretch
@@ -272,7 +282,14 @@ class Lock:
         return ends
 
     def _weigh(self, events: Any, t: int, mean: NDArray, covariance: NDArray) -> None:
-        """Update the decision by the window before a time."""
+        """Update the decision by the window before a time.
+
+        Args:
+            events: Events of the recording up to the time or further.
+            t: Time, us.
+            mean: (d,) motion.
+            covariance: (d, d) its covariance.
+        """
         found = self._test.measure(events, t, mean, covariance, self._displacement, self._longest)
         if found is None:
             return
@@ -286,8 +303,8 @@ class Lock:
             return
         self._history.append((t, mean))
         is_large = self._blocks > MIN_BLOCKS or self._camera_moves
-        is_told = found.is_supported and is_large and self._is_steady(covariance, found.length)
-        self._supporting = self._supporting + 1 if is_told else 0
+        is_sure = found.is_supported and is_large and self._is_steady(covariance, found.length)
+        self._supporting = self._supporting + 1 if is_sure else 0
         if self._supporting >= N_SUPPORTING_WINDOWS:
             self._is_settled, self._history = True, []
 
@@ -295,6 +312,10 @@ class Lock:
         """Return whether the motion has not changed by more than its covariance and noise.
 
         A cloud that has just collapsed is too narrow, and drifts until it is at the motion.
+
+        Args:
+            covariance: (d, d) covariance of the last motion.
+            length: Length of the window, s.
         """
         t, mean = self._history[-1]
         if t - self._history[0][0] < 1e6 * length:
@@ -307,54 +328,67 @@ class Lock:
         return float(far @ np.linalg.solve(C, far)) < MAX_DRIFT_SIGMAS**2 * len(far)
 
 
-def tell_from_later(
+def report_before_lock(
     t: NDArray[np.int64],
     mean: NDArray[np.floating],
     covariance: NDArray[np.floating],
     searching: NDArray[np.bool_],
-    told: NDArray[np.bool_],
+    reported: NDArray[np.bool_],
     diffusion: Callable[[NDArray], Any],
 ) -> tuple[NDArray[np.bool_], NDArray[np.floating], NDArray[np.floating]]:
-    """Tell the estimates before a motion settled, too, as far as they agree with it.
+    """Report the estimates before a motion settled, too, as far as they agree with it.
 
-    A cloud that has just collapsed is too narrow, so how far they differ from it is added. The
-    motion drifts on for up to `DRIFT_RATIO` times as long as it took to settle. The square of the
-    difference of estimates until then from the motion there is to be added after smoothing.
+    A cloud that has just collapsed is too narrow, so the square of its difference from the settled
+    motion is added to its covariance. The motion drifts on for up to `DRIFT_RATIO` times as long as
+    it took to settle. Until then the square of the difference of estimates from the motion at the
+    end of the drift is to be added after smoothing.
 
     Args:
         t: (n,) times, us.
         mean: (n, d) motions.
         covariance: (n, d, d) covariances.
         searching: (n,) whether the filter searches.
-        told: (n,) whether the motion is told.
+        reported: (n,) whether the motion is reported.
         diffusion: Function that returns the process noise (d,) of a motion, per sqrt(s).
 
     Returns:
-        (n,) booleans, the covariances, and what is to be added to them after smoothing, (n, d, d).
+        (n,) whether estimates are reported, the covariances, and what is to be added to them after
+        smoothing, (n, d, d).
     """
-    told, covariance, added = told.copy(), covariance.copy(), np.zeros(covariance.shape)
+    reported, covariance, added = reported.copy(), covariance.copy(), np.zeros(covariance.shape)
     eye = np.eye(mean.shape[1])
-    for first in np.flatnonzero(told & ~np.r_[False, told[:-1]]):
+    for first in np.flatnonzero(reported & ~np.r_[False, reported[:-1]]):
         rate = eye * np.asarray(diffusion(mean[first]), np.float64) ** 2
-        begin = int(np.flatnonzero(searching[:first] | told[:first]).max(initial=-1)) + 1
+        begin = int(np.flatnonzero(searching[:first] | reported[:first]).max(initial=-1)) + 1
         for k in range(first - 1, begin - 1, -1):
             far = np.asarray(mean[k] - mean[first], np.float64)
             C = covariance[k] + covariance[first] + rate * (t[first] - t[k]) * 1e-6 + 1e-12 * eye
             if float(far @ np.linalg.solve(C, far)) > MAX_DRIFT_SIGMAS**2 * len(far):
                 break
-            told[k] = True
+            reported[k] = True
             covariance[k] += np.outer(far, far)
         until = t[first] + DRIFT_RATIO * (t[first] - t[begin])
         rows = np.arange(begin, np.searchsorted(t, until, "right"))
         rows = rows[np.cumsum(searching[rows]) == 0]
         drift = np.asarray(mean[rows] - mean[rows[-1]], np.float64)
         added[rows] = drift[:, :, None] * drift[:, None, :]
-    return told, covariance, added
+    return reported, covariance, added
 
 
 @njit_noalloc
 def _accumulate_votes(at, tau, sign, basis, hypotheses, images, columns, votes):
-    """Add for each hypothesis (H, d) the products of both images to its cells (H, cells)."""
+    """Add up for each hypothesis the products of the images before and after the middle.
+
+    Args:
+        at: (E, 2) positions of events, px.
+        tau: (E,) times from the window's middle, s.
+        sign: (E,) polarities, +-1.
+        basis: (E, 2, d) flow per unit of each component, px/s.
+        hypotheses: (H, d) motions.
+        images: (2, height, width) scratch.
+        columns: Number of columns of cells.
+        votes: (H, cells), changed in place.
+    """
     cell = int(CELL_PX / IMAGE_PIXEL_PX)
     for h in range(len(hypotheses)):
         images[:] = 0

@@ -270,7 +270,16 @@ def _estimate_flow(
 
 
 def _vote_speed(params: Params, grid: Array, found: _Displacements) -> Float[Array, " K"]:
-    """Return the speed (px/s) along the half-line for which most candidates vote."""
+    """Find the speed along the half-line for which most candidates vote.
+
+    Args:
+        params: The parameters.
+        grid: Speeds that are tried, px/s.
+        found: Candidates (C, K) of K events.
+
+    Returns:
+        (K,) speeds, px/s; 0 where there is no candidate.
+    """
     exponent = -0.5 / params.sigma_x**2
     weight = jnp.where(found.age > 0, jnp.exp(found.across2 * exponent), 0)
     speed = length(found.base[:, None] + grid[:, None] * found.a[:, None])  # K speeds
@@ -353,7 +362,17 @@ class RigidFlow:
     def _parallax(
         self, t: int, xi: NDArray[np.float64], model: Model, mean: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the flow (height, width, 2) that is due to translation."""
+        """Compute the flow that is due to translation.
+
+        Args:
+            t: Time, us.
+            xi: (height, width, 2) positions of pixels, px.
+            model: The model.
+            mean: (d,) motion.
+
+        Returns:
+            (height, width, 2) px/s.
+        """
         f = model.f
         first = max(t - DEPTH_WINDOW_US - CANDIDATE_WINDOW_US, self.recording.start)
         part = self.recording[first : t + DEPTH_WINDOW_US]
@@ -386,7 +405,17 @@ class RigidFlow:
 def _sum_by_pixel(
     shape: tuple[int, ...], y: NDArray, x: NDArray, values: NDArray
 ) -> NDArray[np.float64]:
-    """Sum the values of the events of each pixel."""
+    """Sum the values of the events of each pixel.
+
+    Args:
+        shape: (height, width).
+        y: (n,) rows, px.
+        x: (n,) columns, px.
+        values: (n,) values.
+
+    Returns:
+        (height, width).
+    """
     sums = np.bincount(y.astype(int) * shape[1] + x, values, shape[0] * shape[1])
     return np.asarray(sums, float).reshape(shape)
 

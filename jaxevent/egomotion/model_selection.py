@@ -196,7 +196,7 @@ class _WindowFits(NamedTuple):
     lens: NDArray[np.float64] | None = None  # (3,) rad, before a lens that distorts
 
     def motion(self, name: str, model: type[Model]) -> NDArray[np.float64]:
-        """Return what the fit of a model tells of the components of another, in the window."""
+        """Return the components of one model as the fit of another determines them."""
         turns = {Rotation.name: self.turn, General.name: self.general[3:], LENS: self.lens}
         turn = turns.get(name)
         if model is Planar:
@@ -275,6 +275,14 @@ def _fit_lens(
     A pixel x would be at u = x / (1 + l |x|^2 / f^2) without the distortion (Fitzgibbon,
     "Simultaneous linear estimation of multiple view geometry and lens distortion", 2001). It moves
     with (du / dx)^-1 B(u) Omega.
+
+    Args:
+        windows: Patches of windows.
+        f: Focal length, px.
+        turns: (3,) rotation vector of each window, rad, from which the fits start.
+
+    Returns:
+        The best fit; None if no distortion is possible.
     """
     tried = [_try_lens(windows, f, turns, division) for division in TRIED_DIVISIONS]
     likelihood = np.array([-np.inf if one is None else one.likelihood for one in tried])
@@ -291,7 +299,17 @@ def _fit_lens(
 def _try_lens(
     windows: list[PatchSharpness], f: float, turns: list[NDArray[np.float64]], division: float
 ) -> _LensFit | None:
-    """Fit rotations before a lens; None if it is impossible at the patches."""
+    """Fit rotations before a lens of a given distortion.
+
+    Args:
+        windows: Patches of windows.
+        f: Focal length, px.
+        turns: (3,) rotation vector of each window, rad, from which the fits start.
+        division: The distortion l, see `_fit_lens`.
+
+    Returns:
+        The fit; None if the distortion is impossible at the patches.
+    """
     likelihood, held, found = 0.0, [], []
     for window, turn in zip(windows, turns, strict=True):
         x = window.xi

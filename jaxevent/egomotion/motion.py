@@ -290,8 +290,8 @@ class MotionEstimate(HtmlRepr):
 
         if self.warning is not None:
             return self, self.warning
-        told = MotionRows(self.model, self.observed_t, self.mean, self.covariance, self.valid)
-        undecided, still = find_undecided(recording, told)
+        rows = MotionRows(self.model, self.observed_t, self.mean, self.covariance, self.valid)
+        undecided, still = find_undecided(recording, rows)
         if undecided.any():
             unsure = self._with_full_uncertainty().covariance
             covariance = np.where(undecided[:, None, None], unsure, self.covariance)
@@ -478,10 +478,19 @@ class MotionEstimate(HtmlRepr):
         before: NDArray[np.integer],
         after: NDArray[np.integer],
     ) -> NDArray[np.float64]:
-        """Return the covariance (times, d, d) of a motion that bends between estimates.
+        """Return the covariance of a motion that bends between estimates.
 
         The error of the straight line is c (t - t_before) (t_after - t) / 2, with c the mean of the
         second derivatives at both. Those of causal estimates are of the two estimates before.
+
+        Args:
+            at: (n,) times of the estimates, us.
+            times: (times,) us.
+            before: (times,) estimate before each time.
+            after: (times,) estimate after each time.
+
+        Returns:
+            (times, d, d).
         """
         n, d = self.mean.shape
         c = np.zeros((n, d))
@@ -491,8 +500,8 @@ class MotionEstimate(HtmlRepr):
             step = maximum_filter1d(np.maximum(np.diff(at), 1.0), 3, origin=late)[:, None]
             slope = np.diff(np.nan_to_num(self.mean), axis=0) / step
             inner = np.diff(slope, axis=0) / np.maximum(step[1:], step[:-1])
-            told = self.valid[2:] & self.valid[1:-1] & self.valid[:-2]
-            c[1 + late : n - 1 + late] = np.where(told[:, None], inner, 0)
+            is_inner = self.valid[2:] & self.valid[1:-1] & self.valid[:-2]
+            c[1 + late : n - 1 + late] = np.where(is_inner[:, None], inner, 0)
             if not self.causal:
                 c[0], c[-1] = c[1], c[-2]
         reach = np.maximum(times - at[before], 0) * np.maximum(at[after] - times, 0) / 2
@@ -502,10 +511,18 @@ class MotionEstimate(HtmlRepr):
     def _change_over_lag(
         self, times: NDArray[np.int64], mean: NDArray[np.floating], row: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return the covariance (times, d, d) of the change while estimates lag.
+        """Return the covariance of the change while estimates lag.
 
         The filter follows what its candidates show as late as these precede it, so the change is
         that over twice the lag, as it was before.
+
+        Args:
+            times: (times,) us.
+            mean: (times, d) motions at these times.
+            row: (times,) estimate whose lag counts.
+
+        Returns:
+            (times, d, d).
         """
         past = times - 2e6 * self.lag[row]
         found = self.valid & np.isfinite(self.mean).all(1)
@@ -521,8 +538,8 @@ class MotionEstimate(HtmlRepr):
         valid: NDArray[np.bool_],
     ) -> Estimate:
         """Make an estimate whose mean is NaN where it is lost or not observable."""
-        told = valid[:, None] & is_observable(self.model, covariance)
-        return Estimate(np.where(told, mean, np.nan), covariance, valid)
+        is_known = valid[:, None] & is_observable(self.model, covariance)
+        return Estimate(np.where(is_known, mean, np.nan), covariance, valid)
 
     def _with_gaps(self, longest: float) -> "MotionEstimate":
         """Add a lost estimate in each pause between estimates that is longer (s).

@@ -62,9 +62,8 @@ MAX_STATIC_EDGE_FRACTION = 0.3  # fraction of edges with events, below which the
 N_FIT_TIMES = 4  # at which patches are evaluated for fits
 MAX_FIT_DISPLACEMENT_PX = 10  # of their grid, in x and y
 FIT_WINDOW_DISPLACEMENT_PX = 5.0  # median displacement of the image in a window of a fit
-HALF_LINE_POSITIONS_PX = np.linspace(
-    0, 1.4 * MAX_FIT_DISPLACEMENT_PX, 29
-)  # positions along a half-line
+# Positions along a half-line.
+HALF_LINE_POSITIONS_PX = np.linspace(0, 1.4 * MAX_FIT_DISPLACEMENT_PX, 29)
 N_REFINED_HEADINGS = 6  # from which a general motion is refined
 MIN_INCONSISTENCY_Z = 3.0  # from which parts of the image move apart
 # Of the model's displacement; a roll moves half of the patches backwards.
@@ -307,7 +306,14 @@ class PatchEvents(NamedTuple):
 
 @njit_noalloc
 def _accumulate_energy(events, displacements, scratch, energy):
-    """Sum the squares of patches' signed images for every displacement."""
+    """Compute the sum of squares of patches' signed images for every displacement.
+
+    Args:
+        events: Positions, times, signs, patches and halves of events.
+        displacements: (n,) displacements along x and along y that are tried, px in the window.
+        scratch: (2, patches, side, side) images.
+        energy: (2, patches, n, n) output, by half, patch, and displacement along y and x.
+    """
     at, since, sign, patch, half = events
     side = scratch.shape[3]
     for row in range(len(displacements)):
@@ -356,7 +362,7 @@ def is_camera_known_to_move(recording: Recording, camera: PinholeCamera | None =
         camera: The camera; by default the recording's.
 
     Returns:
-        A boolean; false where nothing tells.
+        A boolean; false where it is not known.
     """
     if recording.imu is not None and gyro_speed(recording.imu) > MIN_GYRO_SPEED_RAD_S:
         return True

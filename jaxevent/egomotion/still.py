@@ -53,25 +53,25 @@ def find_undecided(recording: Recording, motion: MotionRows) -> tuple[NDArray[np
     Returns:
         (n,) booleans, and a warning; "" if there are none.
     """
-    told = motion.valid
-    none = np.zeros(len(told), bool)
-    if not told.any():
+    reported = motion.valid
+    none = np.zeros(len(reported), bool)
+    if not reported.any():
         return none, ""
     turns = [part.rows for part in motion.model.parts if part.figure == "Omega"]
     if recording.imu is not None and turns:
-        undecided = told & _contradicts(recording.imu, motion, turns[0])
+        undecided = reported & _contradicts(recording.imu, motion, turns[0])
         if not undecided.any():
             return none, ""
-        if undecided.sum() > told.sum() / 2:
-            undecided = told
+        if undecided.sum() > reported.sum() / 2:
+            undecided = reported
         return undecided, (
-            f"the gyro contradicts {100 * undecided.sum() / told.sum():.0f} % of the "
+            f"the gyro contradicts {100 * undecided.sum() / reported.sum():.0f} % of the "
             "estimates: things move, or the camera does otherwise; those rows are empty"
         )
     speed = measure_image_speed(recording)
     if recording.frames and edge_event_fraction(recording, speed) is not None:
         if is_camera_static(recording, speed):
-            return told, (
+            return reported, (
                 "the camera seems to stand still while objects move: edges in the frames make no "
                 "events; rows are empty, and jaxevent track follows objects"
             )
@@ -81,7 +81,7 @@ def find_undecided(recording: Recording, motion: MotionRows) -> tuple[NDArray[np
         blocks = N_BLOCKS**2 if speed is None else _active_blocks(recording, speed)
     if blocks >= MIN_BLOCKS:
         return none, ""
-    return told, (
+    return reported, (
         f"the camera may stand still while objects move: only about {blocks:.1f} of "
         f"{N_BLOCKS**2} parts of the image move so; rows are empty, and jaxevent track follows "
         "objects"

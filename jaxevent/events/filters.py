@@ -201,7 +201,18 @@ def filter_refractory(part: Part, period: int | float, *, size: Size | None = No
 
 @njit
 def _outside_dead_time(t, x, y, last, dead_us):
-    """Find events `dead_us` or more after the last one kept at their pixel; updates `last`."""
+    """Find the events that come late enough after the last one kept at their pixel.
+
+    Args:
+        t: (n,) times, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        last: (height, width) time of the last event kept, us, updated in place.
+        dead_us: Dead time, us.
+
+    Returns:
+        (n,) booleans.
+    """
     kept = np.empty(len(t), np.bool_)
     for i in range(len(t)):
         kept[i] = t[i] - last[y[i], x[i]] >= dead_us

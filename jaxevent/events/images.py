@@ -94,11 +94,19 @@ class _Increment(NamedTuple):
 def _accumulate(
     part: AnyEvents, size: Size | None, planes: int, kind: Any, increments: Callable, *span: Any
 ) -> Any:
-    """Sum the increments of events into images (planes, H, W).
+    """Sum the increments of events into images.
 
-    `increments(events, xp)` returns several `_Increment`; `xp` is numpy or jax.numpy. `span` limits
-    the times (us), start <= t <= stop, of events that are read from a recording; it need not be
-    exact.
+    Args:
+        part: Events, a recording, or `DeviceEvents`.
+        size: Width and height of the sensor, for events alone.
+        planes: Number of images.
+        kind: Type of the sums.
+        increments: Function of events and of numpy or jax.numpy that returns several `_Increment`.
+        *span: First and last time, us, of the events that are read from a recording; they need not
+            be exact.
+
+    Returns:
+        (planes, H, W).
     """
     if isinstance(part, DeviceEvents):
         width, height = part.size

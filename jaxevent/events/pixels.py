@@ -184,7 +184,19 @@ def downsample(
 
 @njit
 def _is_first(t, x, y, p, last, period):
-    """Find the first events of their pixel, polarity and period; updates `last`."""
+    """Find the first events of their pixel, polarity and period.
+
+    Args:
+        t: (n,) times, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        p: (n,) polarities.
+        last: (2, height, width) number of the last period with an event, updated in place.
+        period: Length of a period, us.
+
+    Returns:
+        (n,) booleans.
+    """
     kept = np.empty(len(t), np.bool_)
     for i in range(len(t)):
         number = t[i] // period

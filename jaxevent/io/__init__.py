@@ -55,9 +55,8 @@ _UNREADABLE_MAGICS = {
 }
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _NONE = "none"  # name of frames or events that are left out
-_PROPHESEE = re.compile(
-    rb"^% *(evt|format|version|data file|end)\b", re.I | re.M
-)  # lines of its headers
+# Lines of the headers of Prophesee's files.
+_PROPHESEE = re.compile(rb"^% *(evt|format|version|data file|end)\b", re.I | re.M)
 _MAX_LINE_BYTES = 1 << 12
 
 _READABLE_FORMATS = (

@@ -90,10 +90,8 @@ _DVS128_CHIPS = {"dvs128", "tmpdiff128", "dvs128phidget", "arctds_dvs128"}
 _RESET, _SIGNAL, _IMU = 0, 1, 3
 
 
-_COMPRESSION_MAGIC = (
-    b"\x04\x22\x4d\x18",
-    b"\x28\xb5\x2f\xfd",
-)  # the first bytes of LZ4 and Zstandard
+# The first bytes of LZ4 and Zstandard.
+_COMPRESSION_MAGIC = (b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +252,17 @@ def _last_number(text: str, allowed: set[int], otherwise: int) -> int:
 
 
 def _records(path: Path, start: int, state: Any) -> Iterator[tuple[Any, int, NDArray, NDArray]]:
-    """Yield blocks of records: the state, the number of the first, addresses and times."""
+    """Yield blocks of records of an AEDAT 2 file.
+
+    Args:
+        path: The file.
+        start: Offset of the first record, bytes.
+        state: State from which to go on; None at the start.
+
+    Yields:
+        The state before the block, the number of its first record, addresses (n,) and times (n,),
+            us.
+    """
     offset, before = state or (start, None)
     with path.open("rb") as file:
         file.seek(offset)
@@ -279,7 +287,12 @@ class _ImuSamples:
         self._pieces = [(np.empty(0, np.int64), np.empty((0, 7), np.int16))]
 
     def add(self, a: NDArray, t: NDArray) -> None:
-        """Keep the whole samples among further records, given by addresses and times."""
+        """Keep the whole samples among further records.
+
+        Args:
+            a: (n,) addresses.
+            t: (n,) times, us.
+        """
         records = np.concatenate([self._rest, np.stack([a, t], axis=1)])
         code = records[:, 0] >> 28 & 7
         begins = np.flatnonzero(code == 0)
@@ -322,7 +335,15 @@ class _Readouts:
         self.by_kind: dict[int, list[_Readout]] = {_RESET: [], _SIGNAL: []}
 
     def add(self, first: int, a: NDArray, t: NDArray, chosen: NDArray, kind: int) -> None:
-        """Add the chosen samples, of one kind, of a block that begins with record `first`."""
+        """Add samples of one kind from a block of records.
+
+        Args:
+            first: Number of the block's first record.
+            a: (n,) addresses.
+            t: (n,) times, us.
+            chosen: (n,) whether a record is such a sample.
+            kind: `_RESET` or `_SIGNAL`.
+        """
         rows = np.flatnonzero(chosen)
         if not len(rows):
             return
@@ -466,9 +487,17 @@ def _choose_streams(
 ) -> tuple[dict[str, int], dict[str, str]]:
     """Choose one stream of each kind.
 
+    Args:
+        path: The file.
+        streams: Descriptions of the streams by number.
+        options: Choices of the caller.
+
     Returns:
         Numbers of streams by kind, "events", "frame", "imus" and "triggers", and the entries of
         `Recording.left_out` where there are several.
+
+    Raises:
+        InputError: There is no stream that can be read, or none that was chosen.
     """
     of_kind = {
         kind: [number for number, stream in streams.items() if stream["type"] == kind]
@@ -519,7 +548,16 @@ def _event_columns(packets: list[NDArray]) -> Columns:
 def _read_others(
     path: Path, chosen: Mapping[str, int], in_memory: bool
 ) -> tuple[Frames | None, Imu | None, FirstPass, dict[str, Any]]:
-    """Read frames, inertial samples and triggers in one pass, and the entry of `extra`."""
+    """Read frames, inertial samples and triggers in one pass.
+
+    Args:
+        path: The file.
+        chosen: Numbers of the chosen streams by kind.
+        in_memory: Whether to read images into memory.
+
+    Returns:
+        Frames, IMU samples, the pass with the triggers, and entries of `Recording.extra`.
+    """
     stamps, exposures, samples = [], [], []
     first_pass = FirstPass()
     if not chosen.keys() & {"frame", "imus", "triggers"}:
@@ -602,6 +640,11 @@ def _max_unfolded_packet(file: Any, at: int, size: int) -> int:
 
     LZ4 (frame format 1.6): blocks of at most 2^(8 + 2 code) bytes. Zstandard (RFC 8878): of at most
     128 KiB, those of type 1 of the size stated, from one byte.
+
+    Args:
+        file: The open file.
+        at: Offset of the packet, bytes.
+        size: Its size, bytes.
     """
     file.seek(at)
     head = file.read(18)
@@ -634,6 +677,11 @@ def _is_packet_table(file: Any, at: int, length: int) -> bool:
     """Return whether the table of packets, plain or compressed, or the end of file is at a byte.
 
     Decoders stop there: a packet in its place would hide those after it.
+
+    Args:
+        file: The open file.
+        at: Offset, bytes.
+        length: Size of the file, bytes.
     """
     file.seek(at)
     head = file.read(12)

@@ -144,12 +144,18 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
 
 @njit
 def _decode_stream(data, t, is_atis):
-    """Decode whole events at the start of `data`, which begins at time `t` (us).
-
-    Returns the columns, the numbers of events, crossings and bytes used, and the time after them.
+    """Decode whole events at the start of some bytes.
 
     A first byte dddddddp holds time d and polarity p for a DVS, ddddddpc for an ATIS with c set for
     a crossing. All of d set: the time goes on by 127 p (DVS), or 63 times the two low bits (ATIS).
+
+    Args:
+        data: (bytes,) uint8.
+        t: Time at their start, us.
+        is_atis: Whether the stream is an ATIS's.
+
+    Returns:
+        The columns, the numbers of events, crossings and bytes used, and the time after them.
     """
     most = len(data) // 5
     ts, xs = np.empty(most, np.int64), np.empty(most, np.int32)

@@ -196,7 +196,15 @@ def _type_store(is_ros1: bool) -> Any:
 
 
 def _parse(kind: str, definition: Any) -> dict[str, Fields]:
-    """Parse the fields of a type and its parts; none if the definition is damaged."""
+    """Parse the definition of a type and its parts.
+
+    Args:
+        kind: Name of the type.
+        definition: Its definition, as rosbags reads it.
+
+    Returns:
+        Fields by the names of the types; none if the definition is damaged.
+    """
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
@@ -465,7 +473,14 @@ class _MessageReader:
 def _element_type(
     members: tuple[tuple[str, str], ...], order: str, start: int, is_ros1: bool
 ) -> np.dtype:
-    """Return the NumPy type of an element that begins at `start` modulo 8."""
+    """Return the NumPy type of an array's element.
+
+    Args:
+        members: Names of its members, and kinds such as "u4".
+        order: "<" or ">".
+        start: Offset at which the element begins, modulo 8: CDR aligns members.
+        is_ros1: Whether members are packed without gaps.
+    """
     at, offsets = start, []
     for _, kind in members:
         size = np.dtype(kind).itemsize

@@ -143,9 +143,8 @@ class Disorder:
                 f"event {self.first.row} is at {self.first.after} us, earlier than the one before "
                 f"it at {self.first.before} us: "
             )
-        if self.events <= 2 * _MAX_EDGE_OUTLIERS and (
-            self.resets or self.outliers
-        ):  # too few to distinguish
+        # With so few events, a reset of the clock and outliers at an edge look alike.
+        if self.events <= 2 * _MAX_EDGE_OUTLIERS and (self.resets or self.outliers):
             return OrderError(f"{where.rstrip(': ')}; sort the events by time (stable)")
         return OrderError(
             f"{where}{'; '.join(faults)}; mend this with repair={repairs!r} or jaxevent convert "
@@ -315,7 +314,12 @@ class _Scan:
         return block + np.rint(self.shift - shifts.sum() + np.cumsum(shifts)).astype(np.int64)
 
     def classify_steps(self, t: NDArray[np.int64], stop: int) -> None:
-        """Classify the steps before place `stop` of times whose last one is the last one read."""
+        """Classify the falls of times before a place as resets or as outliers.
+
+        Args:
+            t: Times of the latest events, us; the last one is the last one read.
+            stop: Place in `t` before which falls are classified.
+        """
         found = self.found
         origin = found.events - len(t)  # row of t[0]
         last_run = found.outliers[-1][1] if found.outliers else 0
@@ -333,7 +337,12 @@ class _Scan:
         self.settled = origin + stop
 
     def count_late(self, t: NDArray[np.int64], end: int) -> None:
-        """Count the late events before place `end` of such times; outliers are not late."""
+        """Count the late events before a place; outliers are not late.
+
+        Args:
+            t: Times of the latest events, us; the last one is the last one read.
+            end: Place in `t` before which events are counted.
+        """
         found = self.found
         origin = found.events - len(t)
         begin, self.counted = self.counted - origin, origin + end
@@ -383,10 +392,17 @@ class _Scan:
 
 
 def _periods(steps: NDArray[np.int64], bound: int) -> NDArray[np.float64]:
-    """Return the periods (us) of counters whose wraps may make steps; 0 where none does.
+    """Return the periods of counters whose wraps explain steps of the time.
 
     Between the last event before a wrap and the first one after it, a little time passes: the step
     is a little less than the period. Jitter can make it a little more.
+
+    Args:
+        steps: (n,) steps, us.
+        bound: Largest jitter, us.
+
+    Returns:
+        (n,) periods, us; 0 where no counter wraps so.
     """
     sizes = np.abs(steps).astype(np.float64)
     periods = np.zeros(len(steps))
@@ -403,10 +419,19 @@ def _periods(steps: NDArray[np.int64], bound: int) -> NDArray[np.float64]:
 def _run_of_outliers(
     t: NDArray[np.int64], at: int, bound: int, begins: bool
 ) -> tuple[int, int] | None:
-    """Find the places [begin, end) of outliers that make times fall at a place; None if none do.
+    """Find the outliers that make times fall at a place.
 
-    Times that return to where they were, before or after the fall, do so by a step of at least
+    Times that return to their former course, before or after the fall, do so by a step of at least
     half its size: a clock that was set back climbs there slowly.
+
+    Args:
+        t: (n,) times, us.
+        at: Place of the event that is earlier than the one before it.
+        bound: Largest jitter, us.
+        begins: Whether `t` begins with the recording.
+
+    Returns:
+        Their places [begin, end); None if the fall is none of outliers.
     """
     depth = t[at - 1] - t[at]
     ahead = t[at : at + _MAX_OUTLIER_RUN]
@@ -476,7 +501,16 @@ def _select_rows(columns: Columns, rows: Any) -> Columns:
 
 
 def _sort_events(columns: Columns, waiting: Columns | None, bound: int) -> tuple[Columns, Columns]:
-    """Sort events by time; those after which earlier ones may still come wait."""
+    """Sort events by time; those after which earlier ones may still come wait.
+
+    Args:
+        columns: Columns of further events.
+        waiting: Columns of the events that wait; None: none.
+        bound: Largest time by which an event is late, us.
+
+    Returns:
+        Columns of the sorted events that are ready, and of those that wait.
+    """
     if waiting is not None:
         pairs = zip(waiting, columns, strict=True)
         t, x, y, p = (np.concatenate(pair) for pair in pairs)

@@ -107,7 +107,13 @@ def decode(data: NDArray[np.uint8]) -> NDArray | None:
 
 @njit_inlined
 def _word(data, at, size):
-    """Read a number of `size` bytes."""
+    """Read a little-endian number.
+
+    Args:
+        data: (bytes,) uint8.
+        at: Offset of the number.
+        size: Number of its bytes.
+    """
     value = np.uint64(0)
     for k in range(size):
         value |= np.uint64(data[at + k]) << np.uint64(8 * k)
@@ -116,7 +122,18 @@ def _word(data, at, size):
 
 @njit_inlined
 def _runs(data, at, bits, size, out):
-    """Fill `out` by runs of numbers of `size` bytes, whose low bits are counts; return the end."""
+    """Decode run lengths: numbers with the count of their repetitions in the low bits.
+
+    Args:
+        data: (bytes,) uint8.
+        at: Offset of the first number.
+        bits: Number of bits of the count; if all are set the count follows as uint16.
+        size: Bytes of a number.
+        out: Output, filled.
+
+    Returns:
+        The offset after the last run; -1 if the data end before, or a count is not valid.
+    """
     most, i = (1 << bits) - 1, 0
     while i < len(out):
         if at + size > len(data):
@@ -136,6 +153,16 @@ def _runs(data, at, bits, size, out):
 
 @njit_inlined
 def _times(data, at, t):
+    """Decode the times of a chunk.
+
+    Args:
+        data: (bytes,) uint8.
+        at: Offset of the first time.
+        t: (n,) output, us.
+
+    Returns:
+        The offset after the times; -1 if the data end before, or a count is not valid.
+    """
     now, i = _word(data, at, 8), 0
     at += 8
     while i < len(t):
@@ -162,7 +189,14 @@ def _times(data, at, t):
 
 @njit_inlined
 def _packed(data, at, width, i):
-    """Read the i-th of numbers of `width` bits (24 or 12), of which three words hold four."""
+    """Read one of the numbers that are packed four to three words.
+
+    Args:
+        data: (bytes,) uint8.
+        at: Offset of the first number.
+        width: Bits of a number, 24 or 12.
+        i: Which of the numbers.
+    """
     size, begin = width // 6, i % 4 * width  # bytes of a word; the bit where the number begins
     bits = 8 * size
     first = min(begin // bits, 1)
@@ -173,7 +207,18 @@ def _packed(data, at, width, i):
 
 @njit
 def _decode(data, t, x, y, p):
-    """Fill t, x, y and p from a chunk; return whether it is whole."""
+    """Decode the events of a chunk.
+
+    Args:
+        data: (bytes,) uint8.
+        t: (n,) output, us.
+        x: (n,) output, px.
+        y: (n,) output, px.
+        p: (n,) output.
+
+    Returns:
+        Whether the chunk is whole.
+    """
     n, kind = len(t), data[0] & 3
     at = _times(data, 4, t)
     if at < 0:

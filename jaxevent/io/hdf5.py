@@ -207,7 +207,7 @@ class StoredEvents(EventsInFile):
         return self._t.shape[0]
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
-        """Read times of a range of rows in us, without the offset."""
+        """Read the times of a range of rows, us, without the offset."""
         stored = np.asarray(self._t[start:stop])
         return to_microseconds(stored, self._format.unit.name, self._source, "event", start)
 
@@ -444,7 +444,7 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
 def _stored_size(
     file: h5py.File, source: str, attributes: Mapping[str, Any]
 ) -> tuple[int, int] | None:
-    """Return the size of the sensor that a file tells by attributes, events or its kind."""
+    """Return the size of the sensor by a file's attributes, its events or its kind."""
     if "width" in attributes and "height" in attributes:
         return whole_size(attributes["width"], attributes["height"], source)
     if "events/width" in file and "events/height" in file:
@@ -456,7 +456,18 @@ def _stored_size(
 def _read_events(
     file: h5py.File, source: str, size: tuple[int, int], options: ReadOptions, states_unit: bool
 ) -> tuple[StoredEvents, list[str]]:
-    """Return the events, and notes about the unit of their times where it had to be inferred."""
+    """Open the events of a file of the package's own layout.
+
+    Args:
+        file: The open file.
+        source: Name of the file for messages.
+        size: (width, height) of the sensor in px.
+        options: Choices of the caller.
+        states_unit: Whether the file states that times are in us.
+
+    Returns:
+        The events, and notes about the unit of their times where it had to be inferred.
+    """
     columns: dict[str, Column] = {n: dataset(file, f"events/{n}", source) for n in "txyp"}
     offset = 0
     if "t_offset" in file:

@@ -158,7 +158,14 @@ def _stated_size(header: dict[str, str]) -> tuple[int, int] | None:
 
 
 def _words(path: Path, offset: int, dtype: str, count: int) -> Iterator[tuple[int, Any]]:
-    """Yield blocks of a file's words, each with its offset in bytes."""
+    """Yield blocks of a file's words, each with its offset in bytes.
+
+    Args:
+        path: The file.
+        offset: Offset of the first word, bytes.
+        dtype: Type of a word.
+        count: Number of words of a block.
+    """
     with path.open("rb") as file:
         file.seek(offset)
         while len(words := np.fromfile(file, dtype, count)):
@@ -234,7 +241,17 @@ def _continued(values: NDArray[np.int64], before: int | None, bits: int) -> NDAr
 def _timed(
     is_high: NDArray[np.bool_], high: NDArray[np.int64], chosen: NDArray, before: int | None
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the continued TIME_HIGH at each chosen word, and the number of words before any."""
+    """Find the high time of chosen words.
+
+    Args:
+        is_high: (n,) whether a word holds a high time.
+        high: Continued values of these high times.
+        chosen: Indices of the chosen words, or (n,) booleans.
+        before: Continued high time before the block; None if there is none.
+
+    Returns:
+        The high time at each chosen word, and the number of chosen words before any high time.
+    """
     number = np.cumsum(is_high)[chosen]
     untimed = int(np.count_nonzero(number == 0)) if before is None else 0
     values = np.concatenate([[0 if before is None else before], high])
@@ -307,7 +324,16 @@ def _decode_evt2(
 
 
 def _has_swapped_halves(path: Path, start: int, stated: str) -> bool:
-    """Return whether each EVT2.1 word has its high half first, as the IMX636 sends it."""
+    """Return whether each EVT2.1 word has its high half first, as the IMX636 sends it.
+
+    Args:
+        path: The file.
+        start: Offset of the first word, bytes.
+        stated: Text of the header that may state the order.
+
+    Raises:
+        InputError: The order is not known.
+    """
     if "endianness=little" in stated:
         return False
     if "endianness=legacy" in stated:
@@ -423,7 +449,12 @@ def _add_evt3_triggers(
 
 
 def _moved_base(base: int, kind: NDArray) -> int:
-    """Return the word of a base of vectors after a block, whose vectors have moved its x."""
+    """Return the word of a base of vectors after a block, whose vectors have moved its x.
+
+    Args:
+        base: The block's last word of a base, or the one before the block.
+        kind: (n,) types of the block's words.
+    """
     since = np.flatnonzero(kind == 3)[-1] if (kind == 3).any() else 0
     steps = int(12 * np.sum(kind[since:] == 4) + 8 * np.sum(kind[since:] == 5))
     # Only a damaged vector, refused as outside the sensor, or the end of a row exceeds 0x7FF.

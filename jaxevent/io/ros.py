@@ -313,7 +313,19 @@ def _read_frames(
 
 
 def _read_image(bag: Bag, topic: str, message: Any) -> NDArray:
-    """Read an image as it is stored, in colour (height, width, 3) with red first."""
+    """Read an image as it is stored, in colour with red first.
+
+    Args:
+        bag: The bag.
+        topic: Topic of the image.
+        message: The message.
+
+    Returns:
+        (height, width) or (height, width, 3).
+
+    Raises:
+        InputError: The encoding is not read.
+    """
     if bag.kind(topic) == _COMPRESSED:
         image = _decompress(bag, topic, message.data)
         encoding = message.format.partition(";")[0].strip()
@@ -542,7 +554,22 @@ def _columns(bag: Bag, topic: str, names: _EventFields, pieces: list[NDArray]) -
 def _packets(
     bag: Bag, topic: str, layout: MessageLayout, encoding: str, width: int, place: Place | None
 ) -> Iterator[tuple[Place, Any, NDArray[np.uint8]]]:
-    """Yield a topic's packets, each with its place and its whole words of `width` bytes."""
+    """Yield the packets of a topic.
+
+    Args:
+        bag: The bag.
+        topic: The topic.
+        layout: Layout of its messages.
+        encoding: Encoding that all packets must have.
+        width: Bytes of a word.
+        place: Place of the first packet; None: the start.
+
+    Yields:
+        The place of a packet, the packet, and its bytes (n,), whole words.
+
+    Raises:
+        InputError: A packet has another encoding, or holds parts of words.
+    """
     for here, packet in _messages(bag, topic, layout, place):
         is_bigendian = packet.get("is_bigendian", False)
         if packet["encoding"] != encoding or (is_bigendian and width == 8):
@@ -566,7 +593,16 @@ Packets = Callable[[str, int, Any], Iterator[tuple[Place, Any, NDArray[np.uint8]
 def _decode_mono(
     packets: Packets, shift: int, state: Place | None
 ) -> Iterator[tuple[Place, Columns]]:
-    """Decode packets of words; `shift` (ns) leads from time bases to the clock of headers."""
+    """Decode packets of mono words.
+
+    Args:
+        packets: Function that yields packets of an encoding.
+        shift: Difference from time bases to the clock of headers, ns.
+        state: Place of the first packet; None: the start.
+
+    Yields:
+        The place of a block, and its columns.
+    """
     pieces = (
         (place, len(content) // 8, (content.view("<u8"), packet["time_base"] + shift))
         for place, packet, content in packets("mono", 8, state)

@@ -76,15 +76,10 @@ if TYPE_CHECKING:
 NUMPY_MAGIC = b"\x93NUMPY"
 _TEXT_BLOCK_BYTES = 1 << 24  # of text parsed together: about a million events
 _MAX_LINE_BYTES = 1 << 12
-_TEXT_SAMPLE_BYTES = (
-    16 * SAMPLE_EVENTS
-)  # bytes of text from which order, unit and signs are inferred
-_OTHER_TIME_ARRAYS = (
-    "frame_t",
-    "exp_start",
-    "exp_end",
-    "imu_t",
-)  # of an archive, beside the events
+# Bytes of text from which order, unit and signs are inferred.
+_TEXT_SAMPLE_BYTES = 16 * SAMPLE_EVENTS
+# Arrays of an archive that hold other times than those of the events.
+_OTHER_TIME_ARRAYS = ("frame_t", "exp_start", "exp_end", "imu_t")
 _NO_SIZE = "the table does not state the sensor's size"
 
 
@@ -186,11 +181,16 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
 
 
 def _name_events(path: Path, arrays: dict[str, NDArray]) -> tuple[str, NDArray | None]:
-    """Give the columns of events the names t, x, y and p among the arrays.
+    """Give the columns of events the names t, x, y and p among the arrays, in place.
+
+    Args:
+        path: The file.
+        arrays: Arrays of the file by name.
 
     Returns:
-        The name that the column of times had, and events (n, 4) in place of columns, where they
-        stand in one array without names, which the sensor's size tells apart.
+        The name that the column of times had, and events (n, 4) in place of columns. The latter
+            stand
+        in one array without names, whose order is inferred.
     """
     # An archive of the layout may hold more times: t is t wherever there is one.
     fields = find_fields([name for name in arrays if name in "txyp"]) or find_fields(list(arrays))
@@ -369,7 +369,16 @@ def _read_head(file: Any, source: str) -> _Table:
 def _read_sample(
     path: Path, table: _Table, size: tuple[int, int] | None
 ) -> tuple[dict[str, NDArray], _Table]:
-    """Return the first events and the last one, and the table with the order of its columns."""
+    """Read the first events and the last one.
+
+    Args:
+        path: The file.
+        table: The table, whose columns may be unnamed.
+        size: (width, height) of the sensor in px.
+
+    Returns:
+        Columns of the events, and the table with the order of its columns.
+    """
     with reading(str(path)), path.open("rb") as file:
         file.seek(table.start)
         text = file.read(_TEXT_SAMPLE_BYTES)
@@ -409,7 +418,16 @@ def _is_number(field: str) -> bool:
 def _decode(
     path: Path, table: _Table, state: tuple[int, int] | None
 ) -> Iterator[tuple[tuple[int, int], Columns]]:
-    """Decode lines from a state on: the offset in bytes and the number of events before it."""
+    """Decode lines of a table.
+
+    Args:
+        path: The file.
+        table: Its layout.
+        state: Offset in bytes, and number of events before it; None: the start.
+
+    Yields:
+        The state before a block, and its columns.
+    """
     offset, row = state or (table.start, 0)
     with path.open("rb") as file:
         file.seek(offset)
@@ -447,7 +465,20 @@ def _parsed(path: Path, table: _Table, text: bytes, row: int) -> Columns:
 
 
 def _numbers(path: Path, table: _Table, text: bytes, row: int) -> dict[str, NDArray]:
-    """Parse the columns of some lines by the table's fields, integers where all are whole."""
+    """Parse the columns of some lines, as integers where all numbers are whole.
+
+    Args:
+        path: The file.
+        table: Its layout.
+        text: The lines.
+        row: Number of the first of their events, for messages.
+
+    Returns:
+        Arrays (n,) by the table's fields.
+
+    Raises:
+        InputError: A value is no number, or lines have too many columns.
+    """
     # The import takes a third of a second.
     import pandas as pd
 

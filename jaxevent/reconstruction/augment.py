@@ -641,9 +641,8 @@ class AugmentedFrame(LogIntensityModel):
         shift: Float[Array, "frames pixels"] | float = 0.0,
     ):
         left, right = deblur_frames(params, frames, shift)
-        span = integrate_counts(
-            params, frames.span[0], frames.span[1]
-        )  # row f: from frame f to f + 1
+        # Row f is the change from frame f to frame f + 1.
+        span = integrate_counts(params, frames.span[0], frames.span[1])
         following = jnp.roll(right, -1, axis=0)
         known = (span != 0) & params.calibrate
         shown = measured_share(params, frames)

@@ -125,7 +125,10 @@ def thresholds_are_doubtful(recording: Recording, params: Any) -> bool:
 
 
 def _is_beyond(found: ChangeRatio, factor: float) -> bool:
-    """Return whether changes of the same direction differ in size by more than a factor."""
+    """Return whether changes by events and by frames differ in size by more than a factor.
+
+    Changes of opposite signs do not count.
+    """
     reach = CONTRADICTION_SIGMAS * found.sigma
     is_beyond = found.ratio + reach < 1 / factor or found.ratio - reach > factor
     return is_beyond and found.agreement >= MIN_SIGN_AGREEMENT

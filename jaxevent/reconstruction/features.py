@@ -60,7 +60,15 @@ class Points(eqx.Module):
     def gather_piece_value(
         self, values: Float[Array, " pieces"], pixels: int
     ) -> Float[Array, "..."]:
-        """Return the values of the points' pieces, equal for all pixels."""
+        """Return the values of the points' pieces, which are equal for all pixels.
+
+        Args:
+            values: One value for each piece.
+            pixels: Number of pixels of the sensor.
+
+        Returns:
+            One value for each point.
+        """
 
 
 class EventPoints(Points):
@@ -332,7 +340,16 @@ def make_pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
 
 
 def shard_over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
-    """Shard arrays [..., n_pixels] along their last axis; put all others whole on every device."""
+    """Shard arrays [..., n_pixels] along their last axis; put all others whole on every device.
+
+    Args:
+        tree: Pytree of arrays.
+        mesh: Mesh of devices.
+        n_pixels: Number of pixels.
+
+    Returns:
+        The tree on the devices.
+    """
 
     def put(leaf: Any) -> Any:
         return shard(mesh, leaf, -1 if np.shape(leaf)[-1:] == (n_pixels,) else None)

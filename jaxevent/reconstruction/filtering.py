@@ -285,7 +285,17 @@ class Filter(KernelEstimator[P]):
         return jax.tree.map(jnp.ravel, path)
 
     def _scan(self, tiles: EventTiles, params: P, frame_model: FrameModel, state: Any) -> Any:
-        """Return the states after every event of one device's tiles, (tiles, slots)."""
+        """Filter the events of one device's tiles.
+
+        Args:
+            tiles: The events.
+            params: Parameters.
+            frame_model: Model of the window's frames.
+            state: (pixels,) state before the window.
+
+        Returns:
+            (tiles, slots) states after every event.
+        """
         frame = frame_model(tiles.points)
         events = Event(
             jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity), frame
@@ -307,10 +317,18 @@ class Filter(KernelEstimator[P]):
 
 
 def _scan_tiles(step: Callable, lanes: Any, block: LaneBlock, slots: Any) -> Any:
-    """Scan the tiles in order, and in each its ranks: `step(lanes, slots) -> lanes, output`.
+    """Scan the tiles in order, and in each its ranks.
 
-    `lanes` are arrays (lanes,), `slots` (tiles, slots). Returns the outputs, (tiles, slots). On
-    several devices each has an equal part of the lanes of every block of `MIN_TILE_LANES`.
+    On several devices each has an equal part of the lanes of every block of `MIN_TILE_LANES`.
+
+    Args:
+        step: Function of lanes and slots that returns new lanes and an output for each slot.
+        lanes: Arrays (lanes,).
+        block: Kinds and first lanes of the tiles.
+        slots: Arrays (tiles, slots).
+
+    Returns:
+        The outputs, (tiles, slots).
     """
     share = N_TILE_SLOTS // jax.tree.leaves(slots)[0].shape[1]
     shapes = [(ranks, width // share) for ranks, width in TILE_SHAPES]
@@ -344,7 +362,18 @@ def _scan_tiles(step: Callable, lanes: Any, block: LaneBlock, slots: Any) -> Any
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _filter_lanes(method: Filter, params: Any, events: Event, lanes: Any, block: LaneBlock) -> Any:
-    """Return the states after every event, (tiles, slots), from those of lanes, (lanes,)."""
+    """Filter the events of tiles from the states of lanes on.
+
+    Args:
+        method: The filter.
+        params: Its parameters.
+        events: Events, (tiles, slots).
+        lanes: (lanes,) states before the window.
+        block: Kinds and first lanes of the tiles.
+
+    Returns:
+        (tiles, slots) states after every event.
+    """
 
     def step(at: Any, event: Event) -> tuple[Any, Any]:
         at = _step_all(method, params, at, event)

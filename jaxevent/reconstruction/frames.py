@@ -149,7 +149,15 @@ class FrameClock:
         return piece, np.maximum(frame, 0), weight, blend
 
     def seconds_since_frame(self, elapsed_us: NDArray, frame: NDArray) -> NDArray:
-        """Return the seconds from the middle of frames to times in us; 0 without frames."""
+        """Return the time from the middle of frames to some times.
+
+        Args:
+            elapsed_us: (times,) us from the recording's start.
+            frame: (times,) numbers of frames.
+
+        Returns:
+            (times,) s; 0 without frames.
+        """
         return (elapsed_us - self.mid[frame]) * 1e-6 if len(self) else np.zeros(len(elapsed_us))
 
     def frames_within(self, start_us: int | None, stop_us: int | None) -> slice:
@@ -347,7 +355,15 @@ def make_frame_features(
 
 
 def sum_around(values: NDArray, width: int) -> NDArray:
-    """Sum values (frames, pixels) over the 3x3 pixels around each pixel of a sensor."""
+    """Sum values over the 3x3 pixels around each pixel of a sensor.
+
+    Args:
+        values: (frames, pixels).
+        width: Width of the sensor, px.
+
+    Returns:
+        (frames, pixels).
+    """
     image = np.pad(values.reshape(len(values), -1, width), ((0, 0), (1, 1), (1, 1)))
     rows = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
     around = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]
@@ -399,7 +415,16 @@ def make_segments(
 
 
 def make_start_points(clock: FrameClock, n_pixels: int, dtype: np.dtype) -> ImagePoints:
-    """Prepare the recording's start, before any event; the first window alone uses it."""
+    """Prepare the recording's start, before any event; the first window alone uses it.
+
+    Args:
+        clock: Times of the frames.
+        n_pixels: Number of pixels of the sensor.
+        dtype: Type of real numbers.
+
+    Returns:
+        One point in time for all pixels.
+    """
     piece, frame, weight, blend = clock.locate(np.zeros(1))
     counts = np.zeros((1, n_pixels), dtype)
     return ImagePoints(
@@ -415,10 +440,18 @@ def make_start_points(clock: FrameClock, n_pixels: int, dtype: np.dtype) -> Imag
 
 @njit
 def _cut_exposure(stream, weight, middle, row, edges, count):
-    """Cut one exposure into segments; events from row `middle` on lie after its middle.
+    """Cut one exposure into segments of constant brightness.
 
-    Returns the fields of `ExposureSegments`, one number for each event. `count` is (2, pixels) of
-    zeros.
+    Args:
+        stream: Events of the exposure, with times from the recording's start, us.
+        weight: (events,) number of events that each event stands for.
+        middle: Index of the first event after the exposure's middle.
+        row: Number of the frame.
+        edges: Left edge, middle and right edge, us.
+        count: (2, pixels) of zeros, scratch.
+
+    Returns:
+        The fields of `ExposureSegments`, one number for each event.
     """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     n, pixels = len(t), count.shape[1]

@@ -70,7 +70,15 @@ class FramePair(NamedTuple):
 
 
 def _warp(image: NDArray[np.floating], flow: NDArray[np.float32]) -> NDArray[np.floating]:
-    """Sample an image at the source of the flow of every pixel."""
+    """Sample an image at the source of the flow of every pixel.
+
+    Args:
+        image: (H, W).
+        flow: (H, W, 2) flow to each pixel, px.
+
+    Returns:
+        (H, W).
+    """
     cv2 = require("cv2", "vision")
     y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
     return cv2.remap(
@@ -107,6 +115,15 @@ def _levels(
     The range is common to both, as flow follows points of one brightness. Frames of different gain
     are brought to the lower one, at which neither clips anew. Levels are grey values rather than
     intensities, which would leave few levels for dark parts.
+
+    Args:
+        grey: (2, H, W) grey values, 0 to 1.
+        intensity: (2, H, W) intensities.
+        gain: (2,) exposure relative to the common one.
+        response: Response of the camera.
+
+    Returns:
+        (2, H, W) levels.
     """
     if gain[0] != gain[1]:
         grey = np.asarray(response.grey(jnp.asarray(intensity * gain.min())))

@@ -20,12 +20,12 @@ from jaxevent.events import crop
 from jaxevent.parameters import Positive
 from jaxevent.recording import Frames, Recording
 
-N_STRETCHES = 3
-FRAMES_PER_STRETCH = 9
+N_SEGMENTS = 3
+FRAMES_PER_SEGMENT = 9
 MIN_CHOICE_GAIN = 0.1  # the same of each choice, of a few frames
-FRAMES_TO_CHOOSE = 5  # of a stretch, where methods are slow
+FRAMES_TO_CHOOSE = 5  # of a segment, where methods are slow
 MAX_PIXELS = 40_000
-MAX_EVENTS = 400_000  # of all stretches
+MAX_EVENTS = 400_000  # of all segments
 N_STEPS = 6
 N_TRIES = 4  # of a step, each with more damping
 CLOCK_STEP_FRAMES = 0.02  # of differences, in the time between frames
@@ -78,7 +78,7 @@ def _busiest_band(recording: Recording, events: Any) -> tuple[int, int]:
 
 
 def choose_parts(
-    recording: Recording, clock_offset: float, each: int = FRAMES_PER_STRETCH
+    recording: Recording, clock_offset: float, each: int = FRAMES_PER_SEGMENT
 ) -> list[HiddenFrames]:
     """Choose parts of a recording that are spread over it.
 
@@ -94,7 +94,7 @@ def choose_parts(
     if frames is None or len(frames) < 3:
         return []
     each = min(each, len(frames))
-    number = min(N_STRETCHES, max(len(frames) // each, 1))
+    number = min(N_SEGMENTS, max(len(frames) // each, 1))
     found = []
     for begin in np.unique(np.linspace(0, len(frames) - each, number).astype(int)).tolist():
         rows = np.arange(begin, begin + each)

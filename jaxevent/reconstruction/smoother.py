@@ -340,10 +340,10 @@ def redistribute_counts(params: Params, frames: FrameFeatures, counts: Array) ->
         return sum_three(sum_three(values, values.ndim - 1), values.ndim - 2) - values
 
     given = neighbours(jnp.ones(image.shape[-2:], image.dtype)) / 8
-    return redistribute_events(params, image, neighbours(image), given).reshape(counts.shape)
+    return redistribute_pixel_count(params, image, neighbours(image), given).reshape(counts.shape)
 
 
-def redistribute_events(params: Params, own: Array, around: Array, given: Array) -> Array:
+def redistribute_pixel_count(params: Params, own: Array, around: Array, given: Array) -> Array:
     """Redistribute a pixel's event count: it gives the fraction `params.share` to its neighbours.
 
     Args:
@@ -368,10 +368,10 @@ class GapEvidence(eqx.Module):
     is_between: Bool[Numeric, "*#pixels"]  # whether a frame follows, and one is before
 
 
-def between_frames(
+def gap_evidence(
     params: Params, past: Gaussian, later: Message, counts: tuple[Array, Array], seconds: Any
 ) -> GapEvidence:
-    """Make the evidence of a gap.
+    """Compute the evidence of a gap between two frames, at a time inside it.
 
     Args:
         params: Parameters.
@@ -519,13 +519,13 @@ def single_pixel_frame(gain: Array, fixed: dict[str, Any], **image: Array) -> Fr
     )
 
 
-def combine_messages(m: Array, precision: Array, later: Message) -> Gaussian:
+def smoothed_state(m: Array, precision: Array, later: Message) -> Gaussian:
     """Combine a Gaussian from the past with the message of later frames.
 
     Args:
         m: Mean from the past, ln I.
-        precision: Its precision 1 / P.
-        later: Message.
+        precision: Its precision 1 / P, 1 / (ln I)^2; 0 without a past.
+        later: Message of later frames, at the same time.
 
     Returns:
         The smoothed state.
@@ -787,7 +787,7 @@ class Smoother(KernelEstimator[AnyParams]):
         # Times are whole microseconds, the middle of an exposure may lie up to one before.
         here = ~behind & (jnp.asarray(points.elapsed)[:, None] < 1e-6)
         info = jax.tree.map(lambda v: v[f], trajectory.info)
-        state = combine_messages(m, precision, later)
+        state = smoothed_state(m, precision, later)
         images = self.readout(params, state, info, here)
         if not self.has_unseen_errors:
             return images
@@ -797,7 +797,7 @@ class Smoother(KernelEstimator[AnyParams]):
         between = ~behind & (seconds > 0)
         total = jnp.where(between, since + until, jnp.where(behind, until, since))
         passed = jnp.where(behind, seconds, elapsed), jnp.where(between, seconds, 0)
-        gap = between_frames(params, past, following, (total[0], total[1]), passed)
+        gap = gap_evidence(params, past, following, (total[0], total[1]), passed)
         frames = trajectory.frames
         V = self.image_variance(params, state, gap, frames.flicker, frames.movement)
         return Estimate(images.mean, V, images.valid)
@@ -831,7 +831,7 @@ class Smoother(KernelEstimator[AnyParams]):
             return known[0].frame_delay - known[1]["frame_delay"]
 
         def counted(params, on, off, around_on, around_off, given):
-            return redistribute_events(params, on, around_on, given), redistribute_events(
+            return redistribute_pixel_count(params, on, around_on, given), redistribute_pixel_count(
                 params, off, around_off, given
             )
 
@@ -877,12 +877,12 @@ class Smoother(KernelEstimator[AnyParams]):
             rest = jnp.where(seconds > 0, seconds + lag(known), 0)
             left = predict_change(known[0], moved_on - on, moved_off - off, rest)
             S, q = predict_change(known[0], on, off, elapsed - lag(known))
-            state = combine_messages(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
+            state = smoothed_state(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
             image = self.readout(known[0], state, info, here)
             if self.has_unseen_errors:
                 total = jnp.where(seconds > 0, moved_on, on), jnp.where(seconds > 0, moved_off, off)
                 span = elapsed - lag(known), rest
-                gap = between_frames(known[0], past, message, total, span)
+                gap = gap_evidence(known[0], past, message, total, span)
                 image = with_variance(known, image, state, gap)
             return {"image": image}
 
@@ -890,12 +890,12 @@ class Smoother(KernelEstimator[AnyParams]):
             left = predict_change(known[0], *counted(known[0], **counts), seconds + lag(known))
             first = later + state_to_message(init(known[0]))
             zero = jnp.zeros_like(later.h)
-            state = combine_messages(zero, zero, first.propagate_back(*left))
+            state = smoothed_state(zero, zero, first.propagate_back(*left))
             image = self.readout(known[0], state, info, zero > 0)
             if self.has_unseen_errors:
                 total = counted(known[0], **counts)
                 none = Gaussian(zero, zero), Message(zero, zero)
-                gap = between_frames(known[0], *none, total, (seconds + lag(known), zero))
+                gap = gap_evidence(known[0], *none, total, (seconds + lag(known), zero))
                 image = with_variance(known, image, state, gap)
             return {"image": image}
 

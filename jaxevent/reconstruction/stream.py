@@ -86,7 +86,17 @@ class EdgeCounts(NamedTuple):
 
 @njit
 def count_events_per_pixel(x, y, width, n_pixels):
-    """Count the events at each pixel, (pixels,)."""
+    """Count the events at each pixel.
+
+    Args:
+        x: (events,) columns, px.
+        y: (events,) rows, px.
+        width: Width of the sensor, px.
+        n_pixels: Number of pixels of the sensor.
+
+    Returns:
+        (pixels,) counts.
+    """
     counts = np.zeros(n_pixels, np.int32)
     for i in range(len(x)):
         counts[np.int64(y[i]) * width + x[i]] += 1
@@ -95,7 +105,15 @@ def count_events_per_pixel(x, y, width, n_pixels):
 
 @njit_noalloc_inlined
 def event_weight(gap_us, dead_time):
-    """Return the number of events that one event stands for, `gap_us` us after its pixel's last."""
+    """Return the number of events that one event stands for.
+
+    Args:
+        gap_us: Time since the pixel's event before, us.
+        dead_time: `DeadTime`.
+
+    Returns:
+        The number; with `dead_time.derivative` its derivative by the dead time, 1/s.
+    """
     if dead_time.rho == 0:
         return 1.0
     if gap_us <= 1.5 * dead_time.rho:
@@ -106,7 +124,12 @@ def event_weight(gap_us, dead_time):
 
 @njit_noalloc
 def update_last_times(stream, out_last_us):
-    """Update the times of each pixel's last event to the stream's end, in place."""
+    """Update the times of each pixel's last event to the stream's end.
+
+    Args:
+        stream: `EventStream`.
+        out_last_us: (pixels,) times, us, changed in place.
+    """
     t, x, y = stream.t, stream.x, stream.y
     for i in range(len(t)):
         out_last_us[np.int64(y[i]) * stream.width + x[i]] = t[i]
@@ -209,7 +232,15 @@ def add_spread_events(stream, weight, edges_us, origin_us, reach_us, out_counts)
     """Add to the counts at each edge the fraction of the pixel's next event that has happened.
 
     The change of an event is spread evenly over the time since the pixel's event before, if that is
-    at most `reach_us` us and not the recording's start, `origin_us`.
+    not too long and the event before is not at the recording's start.
+
+    Args:
+        stream: `EventStream`.
+        weight: (events,) number of events that each event stands for.
+        edges_us: (edges,) sorted times, us.
+        origin_us: The recording's start, us.
+        reach_us: Longest time over which a change is spread, us.
+        out_counts: (edges, 2, pixels) counts before each edge, changed in place.
     """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     last = np.full(out_counts.shape[2], origin_us)

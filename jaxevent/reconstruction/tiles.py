@@ -32,10 +32,8 @@ from jaxevent.reconstruction.stream import (
     event_weight,
 )
 
-MIN_KIND_EVENTS = (
-    128,
-    1024,
-)  # events at a pixel from which the next, narrower kind of tile serves it
+# Events at a pixel from which the next, narrower kind of tile serves it.
+MIN_KIND_EVENTS = (128, 1024)
 N_TILE_THREADS = min(4, os.cpu_count() or 1)
 
 
@@ -159,7 +157,16 @@ class TileMemory:
         self._arrays: dict[str, NDArray] | None = {} if reuse else None
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray:
-        """Return the array of that name, allocated anew if its shape changed."""
+        """Return the array of a name, allocated anew if its shape changed.
+
+        Args:
+            name: Name of the array.
+            shape: Its shape.
+            dtype: Its type.
+
+        Returns:
+            The array; with `reuse` it holds what was written last.
+        """
         if self._arrays is None:
             return allocate_aligned(shape, dtype)
         if name not in self._arrays or self._arrays[name].shape != shape:
@@ -212,10 +219,17 @@ class TileArrays(NamedTuple):
 
     @classmethod
     def allocate(cls, n_tiles: int, memory: TileMemory) -> "TileArrays":
-        """Allocate a number of tiles, none of them used.
+        """Allocate tiles, none of them used.
 
         `_fill` clears what used tiles leave empty, unused tiles are skipped. (Derivatives are taken
         of all tiles, which must then hold numbers: memory is fresh, so cleared.)
+
+        Args:
+            n_tiles: Number of tiles.
+            memory: Memory of the tiles.
+
+        Returns:
+            The arrays.
         """
         reals = dict.fromkeys(("since", "near", "weight", "blend", "on", "off"), memory.dtype)
         kinds = reals | {"piece_cell": np.int32, "frame_cell": np.int32, "polarity": np.int8}
@@ -290,7 +304,17 @@ def _sort_events(
     latest: NDArray[np.int64],
     inputs: TileInputs,
 ) -> None:
-    """Write events in the order of lanes, whose events begin at `first`, to `inputs.order`."""
+    """Write events in the order of lanes to `inputs.order`, with several threads.
+
+    Args:
+        pool: Threads.
+        stream: Events of the window.
+        layout: Their lanes.
+        first: (lanes + 1,) place of each lane's first event.
+        latest: Time of the last event in each pixel's neighbourhood, us; see `StreamState.near`.
+            Updated in place.
+        inputs: Times of frames, and the order that is written.
+    """
     pixels = len(layout.counts)
     cursor = np.empty(pixels, np.int64)
     cursor[np.concatenate(layout.lanes)] = first[:-1]
@@ -311,7 +335,16 @@ def _fill_tiles(
     last: NDArray[np.int64],
     out: TileArrays,
 ) -> None:
-    """Write events in the order of lanes to slots, and update the `last` times of pixels."""
+    """Write the slots of all tiles, with several threads.
+
+    Args:
+        pool: Threads.
+        layout: Tiles, ranks and lanes.
+        first: (lanes + 1,) place of each lane's first event.
+        inputs: Events in the order of lanes, frames and counts.
+        last: (pixels,) time of each pixel's last event, us, updated in place.
+        out: Arrays of the tiles, output.
+    """
     begin, slot_map = 0, layout.slot_map
     for index, (ranks, width) in enumerate(TILE_SHAPES):
         own, offset = layout.lanes[index], layout.lane_begins()[index]
@@ -330,9 +363,18 @@ def _fill_tiles(
 def _sort(stream, band, origin, cursor, latest, order):
     """Sort events by lane, with the time since the 3x3 neighbourhood's previous event.
 
-    Serves the rows of `band`, top <= y < bottom, so that several can work side by side. Writing an
-    event's time to the nine pixels that it neighbours replaces a search over nine: the stream is
-    sorted, so the latest write is the maximum.
+    It serves some rows, so that several threads can work side by side. Writing an event's time to
+    the nine pixels that it neighbours replaces a search over nine: the stream is sorted, so the
+    latest write is the maximum.
+
+    Args:
+        stream: `EventStream`.
+        band: First row, and the one after the last.
+        origin: The recording's start, us.
+        cursor: (pixels,) place of each pixel's next event, changed in place.
+        latest: Time of the last event in each neighbourhood, us, with a border of one pixel;
+            changed in place.
+        order: `EventOrder`, output.
     """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     key, near = order.key, order.near
@@ -359,7 +401,16 @@ def _sort(stream, band, origin, cursor, latest, order):
 
 @njit
 def _fill(worker, workers, kind, inputs, last, out):
-    """Write the slots of 64 lanes at a time: 64 sequential streams in, whole cache lines out."""
+    """Write slots, 64 lanes at a time: 64 sequential streams in, whole cache lines out.
+
+    Args:
+        worker: Number of this thread, which takes every `workers`-th job.
+        workers: Number of threads.
+        kind: `TileKind`.
+        inputs: `TileInputs`.
+        last: (pixels,) time of each pixel's last event, us, updated in place.
+        out: `TileArrays`, output.
+    """
     start, origin = inputs.counts.start, inputs.times.origin
     lane_count, counted, integer = len(kind.pixels), start.dtype, np.int64
     lanes = LaneStates(
@@ -383,7 +434,16 @@ def _fill(worker, workers, kind, inputs, last, out):
 
 @njit_noalloc_inlined
 def _fill_lanes(lane0, mine, lanes, kind, inputs, out):
-    """Write the slots of the lanes from `lane0` on, of the pixels `mine`, and update `lanes`."""
+    """Write the slots of 64 lanes.
+
+    Args:
+        lane0: First of the lanes.
+        mine: Their pixels.
+        lanes: `LaneStates`, changed in place.
+        kind: `TileKind`.
+        inputs: `TileInputs`.
+        out: `TileArrays`, output.
+    """
     # Arrays get names of their own: reading them from tuples in the loop takes four times as long.
     order, times, counts, dead = inputs
     since, near, weight, blend = out.since, out.near, out.weight, out.blend

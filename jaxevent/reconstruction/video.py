@@ -248,7 +248,18 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         """Type of images and variances."""
 
     def _among_events(self, times: Times, extrapolate: bool) -> NDArray[np.int64]:
-        """Return when events show images at times, us; raise `InputError` for impossible ones."""
+        """Return the times of images on the clock of events.
+
+        Args:
+            times: Integers (us) or floats (s) on the recording's clock.
+            extrapolate: Allow times outside the recording.
+
+        Returns:
+            Times, us.
+
+        Raises:
+            InputError: A time is outside the recording.
+        """
         wanted = np.atleast_1d(microseconds(times))
         if not extrapolate:
             self.estimator.check_span(self.recording, wanted, self.params)
@@ -452,10 +463,8 @@ class Video(ImageSequence[P]):
         )
         self._starts = [WindowStart(None, self._windows.initial(), None)]
         self._current: FilteredWindow | None = None
-        self._pending: tuple[object, Any] = (
-            None,
-            None,
-        )  # the last reading and its images
+        # The last reading and its images.
+        self._pending: tuple[object, Any] = (None, None)
         self._future: dict[int | None, Any] | None = None  # by the start of the window
 
     def __reduce__(self) -> tuple[Any, ...]:

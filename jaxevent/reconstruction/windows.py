@@ -174,9 +174,19 @@ class ImageReader:
 
 @njit_noalloc
 def _read(inputs, row, times, exposure, states, out):
-    """Find every pixel's last slot, the time since, and its counts in the piece, at each time.
+    """Find every pixel's last event at each time of an image.
 
-    Begins with the event `row` of the window and returns the next one.
+    Args:
+        inputs: `ReaderInputs` of the window.
+        row: Row of the first event that has not been passed over.
+        times: Sorted times of images, us.
+        exposure: (times,) exposure from which the piece counts; -1: the window's start.
+        states: `PixelStates` at that row, changed in place.
+        out: `ImageRows`, output: the last event's slot, the time since, and the counts in the
+            piece.
+
+    Returns:
+        The next row.
     """
     stream, n_events, counts, slot_map, dead, reach, origin = inputs
     # Arrays get names of their own: reading them from tuples in the loops takes far longer.
@@ -406,7 +416,16 @@ class WindowedRecording:
     def extend_to_exposures(
         self, frame_range: slice, begin_row: int, end_row: int
     ) -> tuple[int, int]:
-        """Extend the rows [begin, end) of the events to those in the exposures of frames."""
+        """Extend a range of events to those in the exposures of frames.
+
+        Args:
+            frame_range: Range of frames.
+            begin_row: First row.
+            end_row: Row after the last.
+
+        Returns:
+            The new range, [begin, end).
+        """
         if frame_range.start < frame_range.stop:
             # Of overlapping exposures, a later one may begin or an earlier one end further out.
             left, _, right = self.clock.exposure_edges(frame_range)
@@ -416,7 +435,15 @@ class WindowedRecording:
         return begin_row, end_row
 
     def move_context(self, state: StreamState, context_row: int) -> StreamState:
-        """Return the state with each pixel's last event before the row `context_row`."""
+        """Move a state's context: each pixel's last event before a row.
+
+        Args:
+            state: State with a context.
+            context_row: The row.
+
+        Returns:
+            The state with the new context.
+        """
         last, row = state.context_last, state.context
         assert last is not None
         if row > context_row:
@@ -495,9 +522,18 @@ class WindowedRecording:
     def _count(
         self, start: int | None, used: slice, around: Events, before: StreamState
     ) -> tuple[NDArray, EdgeCounts]:
-        """Return each event's weight, and the counts at the window's start and the frames' edges.
+        """Weigh the events of a window, and count them before its start and the edges of exposures.
 
         The start is not moved by changes that are spread.
+
+        Args:
+            start: Start of the window, us; None: the recording's.
+            used: Range of the frames that the window uses.
+            around: Events of the window and of the frames' exposures.
+            before: State before the window.
+
+        Returns:
+            (events,) number of events that each event stands for, and the counts.
         """
         stream = self._stream(around)
         weight = np.ones(len(around), np.int8)

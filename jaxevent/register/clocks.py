@@ -125,7 +125,15 @@ def _frame_signatures(other: Recording) -> NDArray[np.float64]:
 
 
 def _event_signatures(recording: Recording, step: float) -> NDArray[np.float64]:
-    """Return signatures of 0.2 (ON - OFF) per pixel in windows of two steps (us), a step apart."""
+    """Return signatures of the events, in windows of two steps, a step apart.
+
+    Args:
+        recording: Events.
+        step: Step, us.
+
+    Returns:
+        A signature for each window, of 0.2 (ON - OFF) per pixel.
+    """
     down, along, rows = _cells(recording.width, recording.height)
     begin, end = recording.event_span()
     steps, out = int((end - begin) / step) + 1, []
@@ -145,9 +153,15 @@ def _event_signatures(recording: Recording, step: float) -> NDArray[np.float64]:
 def _correlate(
     one: NDArray[np.float64], two: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Pearson's correlation and the number of values that overlap, at every lag.
+    """Correlate two series at every lag.
 
-    Entry k: two[i] lies on one[i + k - (len(two) - 1)].
+    Args:
+        one: (n,) values.
+        two: (m,) values.
+
+    Returns:
+        Pearson's correlation, and the number of values that overlap, (n + m - 1,) each. Entry k:
+        two[i] lies on one[i + k - (m - 1)].
     """
 
     one, two = one - one.mean(), two - two.mean()

@@ -26,7 +26,16 @@ _IMAGE_TOLERANCE_PX = 1.5  # px of the HDR image per pixel of a frame, likewise
 
 
 def _detect(sift: Any, image: NDArray, scale: float = 1.0) -> tuple[NDArray, NDArray]:
-    """Detect features of an image, shrunk by a scale; return positions (n, 2) and descriptors."""
+    """Detect features of an image.
+
+    Args:
+        sift: OpenCV's detector.
+        image: (h, w).
+        scale: Factor by which the image is shrunk first.
+
+    Returns:
+        Positions (n, 2) x, y in px of the whole image, and descriptors (n, 128).
+    """
     cv2 = require("cv2", "vision")
     size = round(image.shape[1] * scale), round(image.shape[0] * scale)
     small = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -121,7 +130,18 @@ def _pair_images(
     rows: NDArray[np.intp],
     progress: bool | None,
 ) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating]]]:
-    """Yield pairs of images by the events and by the frames `rows`, whose times are t (us)."""
+    """Yield pairs of images by the events and by frames.
+
+    Args:
+        part: Events.
+        other: Frames of the other camera.
+        t: (frames,) times of the frames on the events' clock, us.
+        rows: Frames that are compared.
+        progress: Whether to show progress.
+
+    Yields:
+        An image of the events, and one of frames: levels, or changes between two of them.
+    """
     from jaxevent.reconstruction import high_pass
 
     if not len(rows):
@@ -147,7 +167,15 @@ def _pair_images(
 def _select_busiest_part(
     recording: Recording, t: NDArray[np.int64]
 ) -> tuple[Recording, NDArray[np.intp]]:
-    """Return the ten seconds with the most events, and frames in them, evenly spread."""
+    """Select the ten seconds with the most events, and frames in them.
+
+    Args:
+        recording: Events.
+        t: (frames,) times of the frames on the events' clock, us.
+
+    Returns:
+        The part of the recording, and rows of frames, evenly spread.
+    """
     begin, end = recording.event_span()
     first = np.arange(begin, max(end - 5_000_000, begin + 1), 5_000_000)
     index = [[recording.events.index(int(f + s)) for s in (0, 10_000_000)] for f in first]

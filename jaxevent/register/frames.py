@@ -199,7 +199,15 @@ class ResampledImages:
         return out if dtype is None else out.astype(dtype)
 
     def _local_extreme(self, extreme: Any, image: NDArray) -> NDArray[np.float64]:
-        """Return the least or greatest value within a pixel's reach, which limits overshoots."""
+        """Return the extreme value within each pixel's reach, which limits overshoots.
+
+        Args:
+            extreme: `np.fmin` for the least, `np.fmax` for the greatest value.
+            image: (h, w) or (h, w, 3), an image of the other camera.
+
+        Returns:
+            (pixels, 1) or (pixels, 3).
+        """
         reach = 2 * math.ceil(max(pixel_scale(self._grid), 1)) + 1
         size = (reach, reach) + (1,) * (image.ndim - 2)
         find = ndimage.minimum_filter if extreme is np.fmin else ndimage.maximum_filter

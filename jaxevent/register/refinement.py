@@ -189,7 +189,7 @@ class _Alignment:
         return float(log_image(self.other, row)[1].mean())
 
     def event_changes(self, offset: float, sigma: float) -> NDArray[np.float64]:
-        """Return smoothed numbers of ON and OFF events of each pair, (pairs, n, 2).
+        """Return smoothed numbers of ON and OFF events of each pair.
 
         An event shows that a threshold has been crossed since the pixel's last one, so counts lag
         behind intensity by half a threshold, in slow scenes by tens of ms. Each event therefore
@@ -199,6 +199,9 @@ class _Alignment:
         Args:
             offset: Offset of the clocks, s.
             sigma: Smoothing, px of the event camera.
+
+        Returns:
+            (pairs, n, 2) numbers at the compared pixels.
         """
         t = self.frames.t[self.pairs] + offset * 1e6
         width, height = self.size
@@ -235,11 +238,14 @@ class _Alignment:
         return self._near[1]
 
     def frame_changes(self, at: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-        """Return D, its gradient and its weight at the compared positions, (pairs, n, 4).
+        """Return the changes of frames at the compared pixels.
 
         Args:
             at: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px of the event camera.
+
+        Returns:
+            (pairs, n, 4): D, its gradient by x and y, and its weight.
         """
         where = self.positions(at)
         part = self.pixels[self.stride // 2 :: self.stride, self.stride // 2 :: self.stride]
@@ -252,7 +258,15 @@ class _Alignment:
         return values
 
     def _smoothed_changes(self, sigma: float, scale: float) -> NDArray[np.float64]:
-        """Return D of each pair, its gradient and if it is known, (other pixels, pairs * 4)."""
+        """Smooth the changes of the other camera's frames.
+
+        Args:
+            sigma: Smoothing, px of the event camera.
+            scale: Pixels of the other camera per pixel of the event camera.
+
+        Returns:
+            (other pixels, pairs * 4): D, its gradient by x and y, and 1 where it is known.
+        """
         blur = sigma * scale
         if self._images[0] is None or abs(math.log(self._images[0] / blur)) > 0.1:
             images = []
@@ -268,7 +282,15 @@ class _Alignment:
         return self._images[1]
 
     def solve(self, at: NDArray[np.float64], sigma: float) -> tuple[NDArray[np.float64], float]:
-        """Take Gauss-Newton steps until they are small; return the unknowns and the correlation."""
+        """Take Gauss-Newton steps until they are small.
+
+        Args:
+            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            sigma: Smoothing, px of the event camera.
+
+        Returns:
+            The unknowns, and the correlation of changes.
+        """
         self.choose_pairs(float(at[-1]))
         self.stride = max(self.finest, int(sigma / 1.3))  # neighbours in smooth images are alike
         fit = self.fit(at, sigma)
@@ -288,7 +310,18 @@ class _Alignment:
         return at, fit.agreement
 
     def fit(self, at: NDArray[np.float64], sigma: float) -> _Fit:
-        """Fit the thresholds at given unknowns, and correlate changes under Huber's weights."""
+        """Fit the thresholds at given unknowns, and correlate changes under Huber's weights.
+
+        Args:
+            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            sigma: Smoothing, px of the event camera.
+
+        Returns:
+            The fit.
+
+        Raises:
+            InputError: Frames and events show too little in common.
+        """
         D, slope_x, slope_y, counts = np.moveaxis(self.frame_changes(at, sigma), -1, 0)
         use = counts > 0.99
         if use.sum() < 100:
@@ -316,6 +349,9 @@ class _Alignment:
             at: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px.
             fit: Fit at these unknowns.
+
+        Returns:
+            The step, in the order of `at`.
         """
         offset, free = float(at[-1]), len(at) - 1
         columns = [fit.X]
@@ -342,7 +378,15 @@ class _Alignment:
 
 
 def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
-    """Return the matrix (n, pixels) of bilinear interpolation at positions x, y (n, 2)."""
+    """Return the matrix of bilinear interpolation of an image.
+
+    Args:
+        at: (n, 2) positions x, y, px.
+        shape: (height, width) of the image.
+
+    Returns:
+        (n, height * width) sparse matrix.
+    """
     height, width = shape
     i = np.clip(np.floor(at).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
     u, v = (at - i).T
@@ -357,7 +401,16 @@ def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
 def _least_squares(
     A: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Solve weighted least squares; columns that are 0 or copies of others get 0."""
+    """Solve weighted least squares; columns that are 0 or copies of others get 0.
+
+    Args:
+        A: (n, d) rows.
+        y: (n,) values.
+        weight: (n,) weights.
+
+    Returns:
+        (d,) solution.
+    """
     size = np.sqrt((weight[:, None] * A**2).sum(0)) + 1e-30
     A = A / size
     W = weight[:, None] * A

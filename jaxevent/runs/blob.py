@@ -105,7 +105,7 @@ class TrackWindow(NamedTuple):
     stop: int
     seeds: list[tuple[float, float, float, int]] | None  # x, y, size; 0: lambda0, and time (us)
     known: KnownPositions | None  # of the targets of these seeds
-    split: int  # the place in SPLITS
+    split: int  # index in SPLIT_NAMES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +134,7 @@ class TrackGoal(Goal):
 
         def make(params: TrackerParams) -> Batches:
             return batches_by_split(
-                found, jax.device_put(self._packed(found, params, self.loss.name))
+                found, jax.device_put(self._pack(found, params, self.loss.name))
             )
 
         return LastBatches(packing_key, make)
@@ -143,7 +143,7 @@ class TrackGoal(Goal):
         self, data: FitData, params: TrackerParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
         found = self._windows(data)
-        packed = self._packed(found, params, "likelihood")
+        packed = self._pack(found, params, "likelihood")
         for place, given, recording in data:
             errors = self.targets.errors(recording, self.tracker, params, progress)
             of_this = [
@@ -201,7 +201,18 @@ class TrackGoal(Goal):
     def _seeds(
         self, recording: Recording, known: KnownPositions | None, begins: NDArray
     ) -> Sequence[list[tuple[float, float, float, int]] | None]:
-        """Return for every window x, y, size (0: lambda0) and time of each target; NaN: absent."""
+        """Return the seeds of every window.
+
+        Args:
+            recording: The recording.
+            known: True positions of the targets, or None.
+            begins: (windows,) begins of the windows, us.
+
+        Returns:
+            For every window x and y (px; NaN where a target is absent), size (px; 0: lambda0) and
+                time (us)
+            of each target; None where targets are detected.
+        """
         if self.targets.seeds is None and known is None:
             return [None] * len(begins)
         given = [
@@ -232,9 +243,7 @@ class TrackGoal(Goal):
             for begin, cut in zip(begins, cuts, strict=True)
         ]
 
-    def _packed(
-        self, found: Sequence[TrackWindow], params: TrackerParams, loss: str
-    ) -> list[Batch]:
+    def _pack(self, found: Sequence[TrackWindow], params: TrackerParams, loss: str) -> list[Batch]:
         """Pack the windows into batches of one shape, so that one program serves all."""
         batches, used = [], [1, 1, 0, 0]
         no_times = np.empty(0, np.int64)
@@ -267,7 +276,7 @@ class TrackGoal(Goal):
             shape = last, features.t.shape[1], len(features.seed), times
             used = [max(pair) for pair in zip(used, shape, strict=True)]
             batches.append((batch, features, np.asarray(weight, features.xi.dtype)))
-        return [Batch(_filled(b, f, used), weight) for b, f, weight in batches]
+        return [Batch(_pad_batch(b, f, used), weight) for b, f, weight in batches]
 
 
 def _cut_window(
@@ -278,7 +287,19 @@ def _cut_window(
     known: KnownPositions | None,
     split: int,
 ) -> TrackWindow:
-    """Make a window with the seeds that begin in it on the sensor, and their positions."""
+    """Cut a window, with the seeds that begin in it on the sensor.
+
+    Args:
+        recording: The recording.
+        start: Begin of the window, us.
+        stop: Its end, us.
+        seeds: x, y, size (px) and time (us) of each target; None where targets are detected.
+        known: True positions of the targets, or None.
+        split: Index in `SPLIT_NAMES`.
+
+    Returns:
+        The window.
+    """
     if seeds is None:
         return TrackWindow(recording, start, stop, None, None, split)
     right, low = recording.width - 0.5, recording.height - 0.5
@@ -297,8 +318,17 @@ def _cut_window(
     return TrackWindow(recording, start, stop, chosen, known, split)
 
 
-def _filled(batch: Features | PositionBatch, f: Features, used: Sequence[int]) -> Any:
-    """Pad a batch with chunks, steps, seeds and times that do not count."""
+def _pad_batch(batch: Features | PositionBatch, f: Features, used: Sequence[int]) -> Any:
+    """Pad a batch with chunks, steps, seeds and times that do not count.
+
+    Args:
+        batch: The batch.
+        f: Its features.
+        used: Numbers of chunks, steps, seeds and times after padding.
+
+    Returns:
+        The padded batch.
+    """
     chunks, steps, seeds, times = used
 
     def fill(array: Any, *sizes: int, value: Any = 0) -> NDArray:

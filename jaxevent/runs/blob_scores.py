@@ -84,15 +84,8 @@ TARGET_SETTINGS: Mapping[str, Check] = {
 }
 
 
-OPTIONAL_COLUMNS = (
-    "vx",
-    "vy",
-    "lambda1",
-    "lambda2",
-    "theta",
-    "inverse_ttc",
-    "range",
-)  # columns beside x, y
+# Columns beside x, y.
+OPTIONAL_COLUMNS = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "range")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,30 +331,24 @@ class TrackProtocol(Protocol):
             mean, covariance = _states(tracks, known.t)
             noise = {"Q_lambda": float(tracks.params.Q_lambda), "smoothed": tracks.smooth}
         seconds = time.perf_counter() - clock
-        told = score_tracks(known.xi, mean[..., :2], options.get("reach", MATCH_DISTANCE_PX))
-        own = told.match
-        if begin == "positions" and not isinstance(
-            method, MethodFunction
-        ):  # whose a track is needs no matching
+        matched = score_tracks(known.xi, mean[..., :2], options.get("reach", MATCH_DISTANCE_PX))
+        own = matched.match
+        # A tracker that starts at the true positions keeps their order: track k is of target k.
+        if begin == "positions" and not isinstance(method, MethodFunction):
             own = np.where(np.isfinite(mean[..., 0]), np.arange(mean.shape[1]), -1)
         given = np.isfinite(known.xi).all(2)
-        distance = np.linalg.norm(_taken(mean, own)[..., :2] - known.xi, axis=2)[given]
+        mean, covariance = _select_matches(mean, own), _select_matches(covariance, own)
+        xi = mean[..., :2]
+        distance = np.linalg.norm(xi - known.xi, axis=2)[given]
         alive = np.isfinite(distance)
         names = ("tracks", "missed", "false", "switches", "mota", "idf1", "hota")
         return {
             "rmse": _rms(distance),
             "median": float(np.median(distance[alive])) if alive.any() else None,
             "covered": float(alive.mean()),
-            **{name: getattr(told, name) for name in names},
-            **_errors(
-                known,
-                _taken(mean, own),
-                _taken(covariance, own),
-                options,
-                noise=noise,
-                recording=recording.name,
-            ),
-            **{m.name: m(_taken(mean, own)[..., :2], known.xi, recording.name) for m in metrics},
+            **{name: getattr(matched, name) for name in names},
+            **_errors(known, mean, covariance, options, noise=noise, recording=recording.name),
+            **{m.name: m(xi, known.xi, recording.name) for m in metrics},
             **own_names(metrics),
             "times": len(distance),
             "events": len(recording.events),
@@ -386,6 +373,21 @@ def _track(
     options: Mapping[str, Any],
     progress: bool | None,
 ) -> Tracks:
+    """Track the targets of a recording, which begin as the protocol states.
+
+    Args:
+        recording: The recording.
+        method: The tracker.
+        params: Its parameters.
+        begin: "positions" for known positions, "born" for detection, "found" for a search.
+        targets: Seeds of the configuration.
+        known: True positions of the targets.
+        options: Settings of the protocol.
+        progress: Whether to show progress.
+
+    Returns:
+        The tracks.
+    """
     settings: dict[str, Any] = {"smooth": None if options.get("smooth", True) else False}
     if begin == "born":
         settings["detect"] = True
@@ -416,8 +418,16 @@ def _states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
     )
 
 
-def _taken(values: NDArray, match: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Select from (times, tracks, ...) the row of each target's track, (times, targets, ...)."""
+def _select_matches(values: NDArray, match: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Select the values of each target's track.
+
+    Args:
+        values: (times, tracks, ...).
+        match: (times, targets) index of the track of each target, -1 for none.
+
+    Returns:
+        (times, targets, ...), NaN where there is none.
+    """
     none = np.full((len(values), 1, *values.shape[2:]), np.nan)
     values = np.concatenate([values, none], 1)
     index = match.reshape(*match.shape, *[1] * (values.ndim - 2))
@@ -451,10 +461,20 @@ def _errors(
     noise: Mapping[str, Any],
     recording: str,
 ) -> dict[str, float | None]:
-    """Errors of what is known beside positions.
+    """Compute the errors of quantities that are known beside positions.
 
-    `mean` (times, targets, 8) is that of targets' tracks; `noise` are the settings of `growth`
-    that tell the errors of sizes, empty where the method does not.
+    Args:
+        known: True quantities of the targets.
+        mean: (times, targets, 8) states of the targets' tracks.
+        covariance: (times, targets, 8, 8).
+        options: Settings of the protocol.
+        noise: Settings of `growth` that describe the errors of sizes; empty where they are not
+            known.
+        recording: Name of the recording for messages.
+
+    Returns:
+        Root mean square errors by name: velocity in px/s, size in ln px, theta in degrees, range
+        relative, inverse_ttc in 1/s.
     """
     more, out = known.more, {}
     if {"vx", "vy"} <= more.keys():
@@ -475,12 +495,12 @@ def _errors(
         out["range"] = _rms(np.asarray(value) / more["range"] - 1)
     if "inverse_ttc" in more:
         out["inverse_ttc"] = _rms(
-            _closing(known, mean, covariance, options, noise=noise, recording=recording)
+            _closing_errors(known, mean, covariance, options, noise=noise, recording=recording)
         )
     return out
 
 
-def _closing(
+def _closing_errors(
     known: KnownPositions,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -489,7 +509,22 @@ def _closing(
     noise: Mapping[str, Any],
     recording: str,
 ) -> NDArray[np.float64]:
-    """Errors of 1 / TTC, of pairs and of the other targets' growth."""
+    """Compute the errors of 1 / TTC, by pairs and by the growth of the other targets.
+
+    Args:
+        known: True quantities of the targets.
+        mean: (times, targets, 8) states of the targets' tracks.
+        covariance: (times, targets, 8, 8).
+        options: Settings of the protocol, with the pairs.
+        noise: Settings of `growth`; without any, growth is left out.
+        recording: Name of the recording for messages.
+
+    Returns:
+        Errors of all pairs and targets at all times, 1/s, NaN where unknown.
+
+    Raises:
+        InputError: A pair is not two of the targets.
+    """
     truth, errors, ids = known.more["inverse_ttc"], [], known.id.tolist()
     x, P = jnp.asarray(mean), jnp.asarray(covariance)
     paired: set[int] = set()

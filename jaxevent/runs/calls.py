@@ -23,11 +23,11 @@ from jaxevent.runs.own import Metric, find_method, import_path, named_metric
 
 PathLike = str | os.PathLike
 TRUTH_SETTINGS = ("positions", "truth")  # settings that take tables
-CALL_HEADER = "# As called from Python; of objects only the names are told.\n"
+CALL_HEADER = "# As called from Python; objects are given by their names alone.\n"
 
 
-class Forms(NamedTuple):
-    """The two forms of a call: with a configuration, and with objects."""
+class CallForms(NamedTuple):
+    """The two forms of a call: with a configuration file, and with recordings and methods."""
 
     example: str  # of objects
     of_file: Collection[str]  # names of arguments that a configuration may have beside it
@@ -129,7 +129,7 @@ def _is_pair(given: Any) -> bool:
 
 def _method(given: Any) -> dict[str, Any]:
     if isinstance(given, Mapping):
-        return {name: to_toml_value(value) for name, value in given.items()}
+        return {name: plain_value(value) for name, value in given.items()}
     if isinstance(given, tuple):
         if not _is_pair(given):
             raise InputError(
@@ -137,7 +137,7 @@ def _method(given: Any) -> dict[str, Any]:
                 "mapping"
             )
         method, params = given
-        return {"name": method, "params": to_toml_value(params)}
+        return {"name": method, "params": plain_value(params)}
     return {"name": given}
 
 
@@ -194,20 +194,20 @@ def _metric(given: Any) -> str | Metric:
 def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
     """Convert settings to TOML's types, and tables of ground truth to `TruthTables`."""
     return {
-        name: TruthTables.of(value) if name in TRUTH_SETTINGS else to_toml_value(value)
+        name: TruthTables.of(value) if name in TRUTH_SETTINGS else plain_value(value)
         for name, value in given.items()
         if value is not None
     }
 
 
-def to_toml_value(value: Any) -> Any:
-    """Convert a value to TOML's types: lists, numbers, text; others stay objects."""
+def plain_value(value: Any) -> Any:
+    """Convert a value to lists, numbers and text; parameters and recordings stay objects."""
     if isinstance(value, Parameters | Recording | Estimator | TruthTables):
         return value
     if isinstance(value, Mapping):
-        return {name: to_toml_value(one) for name, one in value.items()}
+        return {name: plain_value(one) for name, one in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [to_toml_value(one) for one in value]
+        return [plain_value(one) for one in value]
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, np.generic | np.ndarray):
@@ -215,20 +215,20 @@ def to_toml_value(value: Any) -> Any:
     return value
 
 
-def to_toml_table(value: Any) -> Any:
-    """Convert a table to one that TOML can hold: objects become their names."""
+def table_with_names(value: Any) -> Any:
+    """Convert a table to one that TOML can hold: objects are replaced by their names."""
     if isinstance(value, NamedRecording):
-        return to_toml_table(value.recording) if is_path(value.recording) else value.name
+        return table_with_names(value.recording) if is_path(value.recording) else value.name
     if isinstance(value, Recording | Metric):
         return value.name
     if isinstance(value, TruthTables):
         return "given in Python"
     if isinstance(value, Parameters):
-        return to_toml_table(values_of(value))
+        return table_with_names(values_of(value))
     if isinstance(value, Mapping):
-        return {name: to_toml_table(one) for name, one in value.items() if one is not None}
+        return {name: table_with_names(one) for name, one in value.items() if one is not None}
     if isinstance(value, list):
-        return [to_toml_table(one) for one in value]
+        return [table_with_names(one) for one in value]
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, str | bool | int | float):

@@ -170,6 +170,7 @@ SIZE_CHECK: Check = (
 
 
 def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
+    """Check settings; raise `InputError` for an unknown one, or for a value of the wrong kind."""
     for name, value in table.items():
         check_choice(name, "setting", known)
         accepts, text = known[name]
@@ -180,10 +181,18 @@ def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
 def find_recordings(given: Any, folder: Path) -> list[tuple[str, Path | Recording]]:
     """Find recordings by name: objects, or the paths of those given by paths and globs.
 
-    Paths are relative to `folder` and named as they are given. "NAME:FOLDER" stands for all
-    recordings of a data set of `jaxevent.datasets`. $NAME is expanded. Objects have their own
-    names; further ones of a name get a number. Raises `InputError` for a recording that does not
-    exist.
+    "NAME:FOLDER" stands for all recordings of a data set of `jaxevent.datasets`. $NAME is expanded.
+    Objects have their own names; further ones of a name get a number.
+
+    Args:
+        given: Paths, globs and recordings of a configuration.
+        folder: Folder that paths are relative to.
+
+    Returns:
+        Names, as given, and recordings or their paths.
+
+    Raises:
+        InputError: A recording does not exist.
     """
     if not (given and PATHS_CHECK[0](given)):
         raise InputError('recordings is missing or not a list; give recordings = ["file.zip", ...]')
@@ -220,7 +229,7 @@ def _with_unique_names(
 
 
 def _find_paths(text: str, folder: Path) -> dict[Path, str]:
-    """The paths that a text of a configuration stands for, and what each is called."""
+    """Find the paths that a text of a configuration stands for, and the name of each."""
     expanded = os.path.expanduser(os.path.expandvars(text))
     unset = re.search(r"\$(\w+|\{[^}]*\})", expanded)
     if unset and not (folder / expanded).exists():
@@ -239,14 +248,14 @@ def _find_paths(text: str, folder: Path) -> dict[Path, str]:
 
 
 def _data_set(text: str, folder: Path) -> tuple[str, str]:
-    """The name and the folder of "NAME:FOLDER"; an empty name where it is a path."""
+    """Split "NAME:FOLDER" into name and folder; the name is empty if the text is a path."""
     name, _, rest = text.partition(":")
     known = rest and name in datasets.LAYOUTS and not (folder / text).exists()
     return (name, rest) if known else ("", text)
 
 
 def absolute_path(given: Any) -> Any:
-    """A recording as given in the working directory, named so that any configuration finds it."""
+    """Convert a path in the working directory to one that any configuration finds."""
     if isinstance(given, Recording | NamedRecording):
         return given
     given = os.fspath(given)

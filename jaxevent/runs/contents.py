@@ -35,6 +35,20 @@ class RecordingCache(threading.local):
     def load(
         self, path: Path, size: tuple[int, int] | None, stream: str | None, progress: bool | None
     ) -> Recording:
+        """Load a recording, unless it was the last one loaded and its files are unchanged.
+
+        Args:
+            path: File or folder of the recording.
+            size: (width, height) of the sensor in px, for files that do not state it.
+            stream: Name of the camera whose events are read.
+            progress: Whether to show progress.
+
+        Returns:
+            The recording, named by its path; events and images stay in the file.
+
+        Raises:
+            InputError: The recording cannot be read.
+        """
         size = None if size is None else (size[0], size[1])
         files = [*_files(path), *companions(path)]
         what = (path, size, stream, [_stamp(file) for file in files])
@@ -80,7 +94,7 @@ class FileHashes:
         self.objects: dict[int, tuple[Recording, str]] = {}  # held, so that no id is used again
 
     def of(self, path: Path) -> str:
-        """The hash of a file, or of all names and files in a folder; raises OSError."""
+        """Return the hash of a file, or of all names and files in a folder; raises OSError."""
         if path not in self.now:
             files = _files(path)
             hashes = [self._of_file(file) for file in files]
@@ -93,7 +107,7 @@ class FileHashes:
         return self.now[path]
 
     def of_object(self, recording: Recording) -> str:
-        """The hash of a recording's content; raises `InputError`."""
+        """Return the hash of a recording's content; raises `InputError`."""
         known = self.objects.get(id(recording))
         if known is None:
             known = self.objects[id(recording)] = recording, digest(recording)
@@ -136,7 +150,7 @@ HASHED_IMAGES = 64  # images that are hashed at once
 
 
 def digest(thing: Any) -> str:
-    """A hash of what recordings and settings hold: numbers, text, arrays, tables, dataclasses.
+    """Hash the content of recordings and settings: numbers, text, arrays, tables, dataclasses.
 
     Names of recordings do not count. Events and images in a file are read piece by piece. Raises
     `InputError` for anything else.

@@ -144,9 +144,9 @@ def _run_part(label: str, path: Path, results: Path, out: Path) -> dict[str, Any
 
     fused = method.fuses or method.needs_frames
     # The scale of images from events alone is not known, so it is fitted to the truth.
-    asked = ScoringOptions(normalise="none" if fused else "affine")
+    options = ScoringOptions(normalise="none" if fused else "affine")
     scored = method if fused else MethodFunction(name, estimate)
-    row, some = score_and_sample(recording, scored, params, asked, False)
+    row, some = score_and_sample(recording, scored, params, options, False)
     part = Part(some[len(some) // 2], kept[0] if kept else None)
     unfinished = results / f"{label}.part"
     unfinished.write_bytes(pickle.dumps(part))

@@ -202,7 +202,7 @@ class MotionProtocol(Protocol):
         options: Mapping[str, Any],
         progress: bool | None = None,
     ) -> dict[str, Any]:
-        """Raises `InputError` where there is no truth or no events."""
+        """Score a method; raises `InputError` where there is no truth or no events."""
         model, bias = model_of(options), _bias(options)
         first, last = recording.event_span()
         truth = true_motion(recording, options)
@@ -385,8 +385,8 @@ class MotionGoal(Goal):
             motion = self.method.estimate(recording, params, model=self.kind, progress=progress)
             t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / SCORE_RATE_HZ))
             t = t[known.covers(t)]
-            told = motion(t, centred=self.loss.centred)
-            mean, _, valid = told
+            estimate = motion(t, centred=self.loss.centred)
+            mean, _, valid = estimate
             truth = known(t)
             for k, name in enumerate(SPLIT_NAMES):
                 chosen = [

@@ -86,7 +86,7 @@ from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs.calls import (
     CALL_HEADER,
-    Forms,
+    CallForms,
     PathLike,
     format_setting,
     method_name,
@@ -94,7 +94,7 @@ from jaxevent.runs.calls import (
     metrics_of,
     recordings_of,
     settings_of,
-    to_toml_table,
+    table_with_names,
 )
 from jaxevent.runs.config import (
     NAME_CHECK,
@@ -216,7 +216,7 @@ def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
 
 # Arguments of both forms that say where rows are computed, and what may be replaced.
 RESOURCE_ARGUMENTS = ("workers", "cluster", "scheduler_file", "retries", "replace")
-CALL_FORMS = Forms(
+CALL_FORMS = CallForms(
     'jaxevent.evaluate(recording, ["akf"])',
     ("config", "out", "progress", "metrics", "calibrate", *RESOURCE_ARGUMENTS),
     ("recordings", "methods", "protocol"),
@@ -238,7 +238,7 @@ def _evaluate_file(
     if calibrate is not None:
         text = f"# With calibrate = {toml.text(calibrate)}.\n".encode() + text
     if further:
-        names = ", ".join(to_toml_table(further))
+        names = ", ".join(table_with_names(further))
         text = f"# With the further metrics {names}.\n".encode() + text
     return _evaluate(plan, Origin(path.name, text, plan.inputs(path)), out, progress, **where)
 
@@ -264,7 +264,7 @@ def _evaluate_objects(
     if further:
         table["metrics"] = further
     plan = plan_of(table, Path())
-    text = CALL_HEADER + toml.dump(to_toml_table(table))
+    text = CALL_HEADER + toml.dump(table_with_names(table))
     return _evaluate(
         plan,
         Origin("evaluation", text.encode(), plan.inputs()),
@@ -386,9 +386,18 @@ def _key(
     entry: "Entry",
     about: Mapping[str, Any],
 ) -> str | None:
-    """The key of all that a row depends on.
+    """Hash all that a row depends on.
 
-    None where a method or a metric is an object that no module holds: what it computes may change.
+    Args:
+        plan: The plan.
+        contents: Hashes of files.
+        recording: Name as given, and path or object.
+        entry: The method.
+        about: Arguments of the task.
+
+    Returns:
+        The key. None where a method or a metric is an object that no module holds: its results may
+        change.
     """
     objects = [entry.sent, *plan.options.get("metrics", ())]
     named = [one for one in objects if isinstance(one, str)]
@@ -430,7 +439,23 @@ def _compute(
     version: str,
     progress: bool | None,
 ) -> dict[str, Any]:
-    """Compute one task: {"row", "pictures"} of a recording and a method, on any machine."""
+    """Compute one task, a recording and a method, on any machine.
+
+    Args:
+        recording: Path or recording.
+        method: Name or object.
+        params: Parameters by name.
+        protocol: Name of the protocol.
+        options: Settings of the protocol.
+        size: (width, height) of the sensor in px, for files that do not state it.
+        stream: Name of the camera whose events are read.
+        double: Whether to compute in double precision.
+        version: Version of the package that made the task; another one is refused.
+        progress: Whether to show progress.
+
+    Returns:
+        {"row", "pictures"}.
+    """
     from jaxevent.show.page import picture
 
     path = recording if isinstance(recording, str) else recording.name
@@ -450,18 +475,18 @@ def _compute(
     with double_precision(double):
         if isinstance(recording, str):
             recording = _opened.load(Path(recording), size, stream, progress)
-        values, told = None, {}
+        values, shown_params = None, {}
         if source is not None:
-            told = source.values()
+            shown_params = source.values()
         else:
             source = find_method(method, family)
             if isinstance(source, Estimator):
                 values = source.Params.of(params)
-                told = values_of(values)
+                shown_params = values_of(values)
         row = kind.score(recording, source, values, options, progress)
         samples = row.pop("samples", ())
     row = {"recording": recording.name, "method": source.name, **row}
-    row.setdefault("params", told)
+    row.setdefault("params", shown_params)
     return {"row": row, "pictures": [picture(sample) for sample in samples] or None}
 
 
@@ -556,7 +581,7 @@ def plan_of(table: Mapping[str, Any], folder: Path, metrics: Sequence[str | Metr
     Raises:
         InputError: A setting cannot be used; the message names it.
     """
-    name = table.get("protocol") or _usual_protocol(table)
+    name = table.get("protocol") or _default_protocol(table)
     protocol, family = find_protocol(name)
     anything: Check = (lambda value: True, "")
     known = {
@@ -579,8 +604,8 @@ def plan_of(table: Mapping[str, Any], folder: Path, metrics: Sequence[str | Metr
     return Plan(recordings, methods, name, protocol, options, size, table.get("stream"))
 
 
-def _usual_protocol(table: Mapping[str, Any]) -> str:
-    """The first protocol of the family of the first method that is an estimator."""
+def _default_protocol(table: Mapping[str, Any]) -> str:
+    """Return the first protocol of the family of the first method that is an estimator."""
     given = table.get("method")
     for one in given if isinstance(given, list) else ():
         with contextlib.suppress(InputError):
@@ -617,7 +642,21 @@ def _entries(
     family: str,
     options: Mapping[str, Any],
 ) -> Iterator[Entry]:
-    """The method of one table, once for each combination of its grid."""
+    """Make the entries of one table of a method, one for each combination of its grid.
+
+    Args:
+        table: The table.
+        folder: Folder that paths are relative to.
+        protocol: Protocol of the evaluation.
+        family: Name of the methods' family.
+        options: Settings of the protocol.
+
+    Yields:
+        The entries.
+
+    Raises:
+        InputError: The table is not valid.
+    """
     rest = dict(table)
     name = rest.pop("name", None)
     label = rest.pop("label", name)

@@ -235,5 +235,5 @@ class PublishedResults(Source):
             if fnmatch.fnmatchcase(recording, name):
                 found = numbers
                 break
-        told = dict.fromkeys(("mse", "ssim", *self.measures))
-        return {**told, **dict(zip(self.measures, found, strict=False))}
+        blank = dict.fromkeys(("mse", "ssim", *self.measures))
+        return {**blank, **dict(zip(self.measures, found, strict=False))}

@@ -171,8 +171,9 @@ class Goal(abc.ABC):
     """Data and loss of the fit of one method, and the scores of the result."""
 
     loss: Loss  # of `optimise`; equal goals have losses that are equal and hash alike
-    forward: bool | None = None  # derivatives forwards or in reverse; None: see `tuning.FORWARD`
-    measure: str  # of a row, what the gain of a fit is told in; the smaller the better
+    # Whether derivatives are computed forwards; None decides by the number of parameters.
+    forward: bool | None = None
+    measure: str  # column of a row that states the gain of a fit; smaller is better
     part_name: str = "window"  # word for the parts that the loss averages over
 
     def files(self, recording: Path) -> list[Path]:

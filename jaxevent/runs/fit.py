@@ -16,7 +16,7 @@ describes it:
     loss = "held-out"                   # or "reference" (protocols of `jaxevent.runs.evaluate`), or
                                         # "likelihood" of the frames that the protocol gives
     protocol = "held-out"               # with the likelihood: what is given, and scored
-    error = "linear"                    # or "log", "nll"; see `objectives.Objective`
+    error = "linear"                    # or "log", "nll"; see `jaxevent.runs.reconstruction`
     dark_offset = 0.003                 # of the error "log"
     weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
     calibrate = false                   # start from the defaults, see below
@@ -68,11 +68,11 @@ from jaxevent.progress import stage
 from jaxevent.recording import Recording
 from jaxevent.runs.calls import (
     CALL_HEADER,
-    Forms,
+    CallForms,
     PathLike,
     recordings_of,
     settings_of,
-    to_toml_table,
+    table_with_names,
 )
 from jaxevent.runs.contents import digest
 from jaxevent.runs.family import SPLIT_NAMES, FitData
@@ -188,7 +188,7 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
     return _fit_objects(*arguments, **settings)
 
 
-CALL_FORMS = Forms(
+CALL_FORMS = CallForms(
     'jaxevent.fit(recording, akf, fit=["c_on"])',
     ("config", "out", "recordings", "resume", "progress", "replace", "calibrate"),
     ("method", "fit", "search", "params"),
@@ -235,7 +235,7 @@ def _fit_objects(
             table[split] = recordings_of(settings[split])
     if resume and out is None:
         raise InputError("resume goes on from the checkpoint in out; give out")
-    text = CALL_HEADER + toml.dump(to_toml_table(table))
+    text = CALL_HEADER + toml.dump(table_with_names(table))
     plan = devices.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
     if out is None:
         return _fit(plan, None, resume, progress, replace)
@@ -250,13 +250,8 @@ def _fit_objects(
     return _fit(plan, Path(out), resume, progress, replace)
 
 
-METHOD_SETTINGS = (
-    "fit",
-    "search",
-    "params",
-    "label",
-    "prior",
-)  # settings of a method, not of the file
+# Settings of a method, not of the file.
+METHOD_SETTINGS = ("fit", "search", "params", "label", "prior")
 
 
 def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
@@ -264,9 +259,9 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
     progress = progress if devices.is_process_zero() else False
     with contextlib.ExitStack() as held:
         if out is not None:
-            rows = devices.on_process_zero(lambda: _ended_before(out, plan, resume, replace, held))
+            rows = devices.on_process_zero(lambda: _ended_rows(out, plan, resume, replace, held))
             if rows is not None:
-                return _finished(rows, out, plan)
+                return _read_finished(rows, out, plan)
         data = devices.on_all_processes(lambda: _load_all(plan, progress))
         plan = devices.on_all_processes(lambda: calibrated_plan(plan, data))
         key = ""
@@ -284,17 +279,17 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
             rows = _score(plan, done, data, progress)
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
         gained = compute_gains(plan.tasks, rows_outside_fit(rows))
-        fits = Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
+        fits = Fits(rows, params, found, gained, _format_report(plan.tasks, rows, found, gained))
         if out is None or not devices.is_process_zero():
             return fits
         write("config.toml", plan.text)
-        write("loss.csv", _losses(plan.tasks, done).encode())
+        write("loss.csv", _format_losses(plan.tasks, done).encode())
         try:
-            write("loss.png", _curves(plan.tasks, done))
+            write("loss.png", _draw_losses(plan.tasks, done))
         except MissingExtra:
             (out / "loss.png").unlink(missing_ok=True)  # that of a run before
         write_rows(rows, write, lambda _: fits.table(), found=found, gains=gained)
-        write("params.toml", _tables(plan.tasks, done).encode())
+        write("params.toml", _format_params(plan.tasks, done).encode())
         (out / CHECKPOINT_FILE).unlink()
     return fits
 
@@ -316,27 +311,41 @@ def calibrated_plan(plan: Plan, data: FitData) -> Plan:
     return dataclasses.replace(plan, tasks=tasks)
 
 
-def _text(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
-    """results.md: the scores that no fit saw, what was found, and the gain."""
-    return _results(tasks, rows_outside_fit(rows)) + format_findings(found, gained)
+def _format_report(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
+    """Format results.md: the scores on images outside the fit, the numbers found, and the gain."""
+    return _format_scores(tasks, rows_outside_fit(rows)) + format_findings(found, gained)
 
 
-def _finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
+def _read_finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
     """Read the result of a run that had ended from its folder."""
     kept = json.loads((out / "results.json").read_bytes())
     params = {
         task.label: task.method.Params.load(out / "params.toml", task.label) for task in plan.tasks
     }
     found, gained = kept.get("found", []), kept.get("gains", [])
-    return Fits(rows, params, found, gained, _text(plan.tasks, rows, found, gained))
+    return Fits(rows, params, found, gained, _format_report(plan.tasks, rows, found, gained))
 
 
-def _ended_before(
+def _ended_rows(
     out: Path, plan: Plan, resume: bool, replace: bool, held: contextlib.ExitStack
 ) -> list[dict[str, Any]] | None:
-    """The rows of a run that had ended, if it is to go on; raises `InputError` if it had not.
+    """Return the rows of a run that had ended and is to go on; None if it is to be computed.
 
     A folder that exists is held until the stack is closed.
+
+    Args:
+        out: Folder of the results.
+        plan: The plan.
+        resume: Whether the run is to go on.
+        replace: Whether existing files may be replaced.
+        held: Stack that holds the lock of the folder.
+
+    Returns:
+        The rows, or None.
+
+    Raises:
+        InputError: The folder holds the checkpoint of an interrupted fit, and is not to go on; or
+            it holds files that may not be replaced.
     """
     if out.is_dir():
         held.enter_context(lock_folder(out))
@@ -362,10 +371,22 @@ def _fit_tasks(
 ) -> tuple[list[FitResult], list[dict[str, Any]], Any]:
     """Fit all methods, from the checkpoint in the folder on, if there is a folder.
 
-    Gives the fits, rows about what they found, and the function that writes to the folder.
+    The folder is made if missing, and then held until the stack is closed.
 
-    The folder is made if missing, and then held until the stack is closed. Raises `InputError`
-    naming the method.
+    Args:
+        plan: The plan.
+        data: Its recordings.
+        key: Hash of the plan, which a checkpoint must have.
+        out: Folder of the results, or None.
+        progress: Whether to show progress.
+        held: Stack that holds the lock of the folder.
+
+    Returns:
+        The fits, rows about the numbers that they found, and the function that writes to the
+            folder.
+
+    Raises:
+        InputError: A fit cannot be done; the message names the method.
     """
     saved = -math.inf
     done: list[FitResult] = []
@@ -428,7 +449,7 @@ def _fit_tasks(
 def _score(
     plan: Plan, done: Sequence[FitResult], data: FitData, progress: bool | None
 ) -> list[dict[str, Any]]:
-    """Rows of all methods, before and after; several processes share them out."""
+    """Score all methods before and after the fit; several processes share the work."""
     scored: list[tuple[Task, str, Any, dict[str, str]]] = []
     for task, one in zip(plan.tasks, done, strict=True):
         warning = {"warning": DIVERGED_WARNING.format(task.label)} if one.diverged else {}
@@ -441,12 +462,12 @@ def _score(
         return [{**row, "method": label, **warning} for row in rows]
 
     found = devices.on_all_processes(lambda: {k: score(*scored[k]) for k in mine})
-    told = {k: some for each in devices.allgather(found) for k, some in each.items()}
-    return [row for k in range(len(scored)) for row in told[k]]
+    gathered = {k: some for each in devices.allgather(found) for k, some in each.items()}
+    return [row for k in range(len(scored)) for row in gathered[k]]
 
 
-def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
-    """results.md: one table for the methods of each system."""
+def _format_scores(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
+    """Format the scores of results.md: one table for the methods of each system."""
     goals = {name: task.goal for task in tasks for name in (task.label, f"{task.label}, before")}
     kinds = dict.fromkeys(type(goal) for goal in goals.values())
     parts = []
@@ -457,7 +478,7 @@ def _results(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
 
 
 def rows_outside_fit(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of the test images; where there are none, of the validation or the fit."""
+    """Return the rows of the test images; where there are none, of the validation or the fit."""
     for split in reversed(SPLIT_NAMES):
         chosen = [row for row in rows if row["split"] == split]
         if chosen:
@@ -480,8 +501,8 @@ def _load(given: str, path: Path | Recording, plan: Plan, progress: bool | None)
     return dataclasses.replace(recording, name=str(path))  # for messages
 
 
-def _losses(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
-    """loss.csv; empty where a loss was not computed."""
+def _format_losses(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
+    """Format loss.csv; a field is empty where a loss was not computed."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["method", "start", "round", "iteration", "fit", "validation"])
@@ -490,16 +511,16 @@ def _losses(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
     return text.getvalue()
 
 
-def _curves(tasks: Sequence[Task], done: Sequence[FitResult]) -> bytes:
-    """loss.png: the losses of every method over iterations, a line for each start."""
+def _draw_losses(tasks: Sequence[Task], done: Sequence[FitResult]) -> bytes:
+    """Draw loss.png: the losses of every method over iterations, a line for each start."""
     figure = plot_losses(done, [task.label for task in tasks])
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=120)
     return image.getvalue()
 
 
-def _tables(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
-    """params.toml: a table for each method."""
+def _format_params(tasks: Sequence[Task], done: Sequence[FitResult]) -> str:
+    """Format params.toml: a table for each method."""
     pairs = zip(tasks, done, strict=True)
     return "\n".join(
         f"[{toml.key(task.label)}]\n{toml.parameters(one.params)}\n" for task, one in pairs

@@ -15,7 +15,7 @@ from jaxevent.io import toml
 from jaxevent.parameters import Parameters, read_toml
 from jaxevent.recording import Recording
 from jaxevent.runs import contents
-from jaxevent.runs.calls import to_toml_table
+from jaxevent.runs.calls import table_with_names
 from jaxevent.runs.config import (
     CALIBRATE_CHECK,
     FLAG_CHECK,
@@ -74,7 +74,7 @@ class Plan:
     window: float | int | None
 
     def inputs(self) -> list[Path]:
-        """All files that are read, and can be."""
+        """Return all files that are read, as far as they can be."""
         found = [] if self.config is None else [self.config, *files_named_in(self.config)]
         for split in SPLIT_NAMES:
             for name, path in self.recordings[split]:
@@ -88,11 +88,11 @@ class Plan:
         return found
 
     def where(self) -> str:
-        """The beginning of a message: the file, if there is one."""
+        """Return the beginning of a message: the file, if there is one."""
         return "" if self.config is None else f"{self.config}: "
 
     def digest(self) -> str:
-        """A number that changes with the configuration, the recordings and the precision."""
+        """Hash the configuration, the recordings and the precision."""
         digest = hashlib.sha256(self.text)
         digest.update(repr([task.params.values() for task in self.tasks]).encode())
         digest.update(str(jnp.result_type(float)).encode())
@@ -198,7 +198,7 @@ def read_plan(
         if calibrate is not None:
             table = {**table, "calibrate": calibrate}
         if recordings or calibrate is not None:
-            text = toml.dump(to_toml_table(table)).encode()
+            text = toml.dump(table_with_names(table)).encode()
         return plan_of(table, config.parent, config, text)
     except InputError as error:
         raise InputError(f"{config}: {error}") from None

@@ -113,7 +113,7 @@ class Objective:
     def __call__(self, params: FrameParams, batch: Any) -> Float[Array, ""]:
         if self.error is None:
             return self._of_frames(params, batch)
-        counted, each = self._counted(params, batch)
+        counted, each = self._weighted_errors(params, batch)
         return counted.sum() / (batch.weights.sum() * each)
 
     @property
@@ -130,22 +130,30 @@ class Objective:
         """
         if self.error is None:
             return self._of_frames(params, batch)[None], jnp.ones(1)
-        counted, each = self._counted(params, batch)
+        counted, each = self._weighted_errors(params, batch)
         weights = batch.weights.sum(1) * each
         return counted.sum(1) / jnp.where(weights > 0, weights, 1), weights
 
     def _of_frames(self, params: FrameParams, batch: LikelihoodBatch) -> Array:
-        """-ln p of the frames given, per frame and pixel."""
+        """Compute -ln p of the frames given, per frame and pixel."""
         return -self.method.log_likelihood(params, batch.features) / batch.weight  # ty: ignore[missing-attribute]
 
-    def _counted(self, params: FrameParams, batch: ImageBatch) -> tuple[Array, int]:
-        """Weighted errors (times, pixels), and how many pixels share a weight."""
+    def _weighted_errors(self, params: FrameParams, batch: ImageBatch) -> tuple[Array, int]:
+        """Compute the weighted errors of images.
+
+        Args:
+            params: Parameters of the method.
+            batch: The images.
+
+        Returns:
+            (times, pixels) errors, and the number of pixels that share a weight.
+        """
         surprising = self.error == "nll"
         image, variance, _ = batch.prepared(params, variance=surprising)
         if not self.method.is_absolute:
             image, variance = self._scale(params, image, variance, batch)
         if surprising:
-            errors = self._surprise(params, image, variance, batch.truth)
+            errors = self._negative_log_density(params, image, variance, batch.truth)
         else:
             errors = self._difference(image, batch) ** 2
         counted = jnp.where(batch.weights > 0, batch.weights * errors, 0)
@@ -154,7 +162,17 @@ class Objective:
     def _scale(
         self, params: FrameParams, image: Array, variance: Array, batch: ImageBatch
     ) -> tuple[Array, Array]:
-        """Fit offset and factor of each log image to the truth, by least squares."""
+        """Fit offset and factor of each log image to the truth, by least squares.
+
+        Args:
+            params: `I0`, the offset inside the logarithm.
+            image: (times, pixels) intensities.
+            variance: (times, pixels) variances, (ln I)^2.
+            batch: Truth and weights.
+
+        Returns:
+            The scaled images and variances.
+        """
         L, truth = jnp.log(image + params.I0), jnp.log(batch.truth + params.I0)
         weights = jnp.broadcast_to(batch.weights, L.shape)
         total = jnp.maximum(weights.sum(1, keepdims=True), 1)
@@ -166,7 +184,7 @@ class Objective:
         return image, factor**2 * variance
 
     def _difference(self, image: Array, batch: ImageBatch) -> Array:
-        """Image minus truth, linear or logarithmic.
+        """Compute image minus truth, linear or logarithmic.
 
         Evaluation clips images to what the truth can show. Clipped, a pixel beyond white has no
         gradient, and as it is, a hot pixel's exp(L) outweighs all others. So intensity beyond white
@@ -187,17 +205,28 @@ class Objective:
         return difference
 
     def _log(self, image: Array) -> Array:
-        """ln(I + dark_offset) - ln(dark_offset), continued below black as an odd function.
+        """Compute ln(I + dark_offset) - ln(dark_offset), continued below black as an odd function.
 
         exp(L) - I0 may be negative; the slope stays continuous and no value is -inf.
         """
         return jnp.sign(image) * jnp.log1p(jnp.abs(image) / self.dark_offset)
 
-    def _surprise(self, params: FrameParams, image: Array, variance: Array, truth: Array) -> Array:
-        """-ln p(I), p(I) = N(ln(I + I0); L, P) / (I + I0).
+    def _negative_log_density(
+        self, params: FrameParams, image: Array, variance: Array, truth: Array
+    ) -> Array:
+        """Compute -ln p(I) of the truth, p(I) = N(ln(I + I0); L, P) / (I + I0).
 
         The Jacobian 1 / (I + I0) makes values of different I0 comparable: without it, the best I0
         is infinite. A clipped truth counts with the probability of all that lies beyond it.
+
+        Args:
+            params: `I0`, the offset inside the logarithm.
+            image: (times, pixels) intensities exp(L) - I0.
+            variance: (times, pixels) P, (ln I)^2.
+            truth: (times, pixels) intensities.
+
+        Returns:
+            (times, pixels).
         """
         L, seen = jnp.log(image + params.I0), jnp.log(truth + params.I0)
         z = (seen - L) / jnp.sqrt(variance)
@@ -215,7 +244,7 @@ class RecordingWindow:
     recording: Recording
     truth: Frames  # of the whole recording
     rows: NDArray[np.int64]  # (images,), those of the truth in the window
-    split: NDArray[np.int64]  # (images,), the place in SPLITS of each; -1: not used
+    split: NDArray[np.int64]  # (images,), index in SPLIT_NAMES of each; -1: not used
 
 
 def cut_windows(
@@ -226,13 +255,26 @@ def cut_windows(
     warm_up: float | int = 0.2,
     gap: int = DEFAULT_GAP_FRAMES,
 ) -> list[RecordingWindow]:
-    """Cut a recording into windows of `window` seconds (None: one part, the whole).
+    """Cut a recording into windows.
 
     The true images are those that the protocol hides (`jaxevent.runs.protocols`), shared out by
-    `interleave`. A window's images are those stamped in it; it is prepared from `warm_up`
-    seconds more on either side: a filter needs them before to forget its initial state, and the
-    augmented frame and the smoother use frames after. Windows without events or frames are left
-    out. Raises `InputError` for recordings that the protocol cannot use.
+    `interleave`. A window's images are those stamped in it. Windows without events or frames are
+    left out.
+
+    Args:
+        recording: Events and frames.
+        protocol: Name of the protocol.
+        split: Shares of the images for fit, validation and test.
+        window: Length of a window, s; None: one window, the whole recording.
+        warm_up: Time that is prepared before and after a window, s: a filter needs it before, to
+            forget its initial state, and the augmented frame and the smoother use frames after.
+        gap: Every gap-th frame is given.
+
+    Returns:
+        The windows.
+
+    Raises:
+        InputError: The protocol cannot use the recording.
     """
     given, truth = divide(recording, protocol, gap)
     use = interleave(split, len(truth))
@@ -283,7 +325,7 @@ class Problem:
         self._last = LastBatches(EventTiming.of, self._prepare)
 
     def __call__(self, params: FrameParams) -> Batches:
-        """Batches to fit to, and batches to validate on."""
+        """Return the batches to fit to, and those to validate on."""
         return self._last(params)
 
     def _prepare(self, params: FrameParams) -> Batches:
@@ -472,7 +514,16 @@ N_LIKELIHOOD_WINDOWS = 8  # of a recording, where their distance is not given
 def _window_times(
     recording: Recording, split: Sequence[int], window: float | int | None
 ) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield the times (us) of windows, spread evenly over a recording, of each split that has."""
+    """Spread windows evenly over a recording.
+
+    Args:
+        recording: The recording.
+        split: Shares of the windows for fit, validation and test.
+        window: Distance of the windows, s; None: `N_LIKELIHOOD_WINDOWS` of them.
+
+    Yields:
+        The index in `SPLIT_NAMES` and the times of its windows, us, of each split that has any.
+    """
     span = recording.stop - recording.start
     count = N_LIKELIHOOD_WINDOWS if window is None else max(round(span / (window * 1e6)), 1)
     times = recording.start + (np.arange(count) + 0.5) * (span / count)

@@ -205,12 +205,12 @@ def find_intervals(
     `low` and `high` are the ends of the interval, None where it is open or there is none;
     `interval` describes it in words, and `of` names the parts that it rests on.
     """
-    told = confidence_intervals(
+    fitted = confidence_intervals(
         task.loss, task.params, one.params, task.names, problem, task.search,
         task.settings.forward,
     )  # fmt: skip
-    of = f"{told.parts} {task.goal.part_name}s" if told.parts else INDEPENDENT_MEASUREMENTS
-    return [_row(task, finding, of, one.rough) for finding in told.intervals]
+    of = f"{fitted.parts} {task.goal.part_name}s" if fitted.parts else INDEPENDENT_MEASUREMENTS
+    return [_row(task, finding, of, one.rough) for finding in fitted.intervals]
 
 
 def _row(
@@ -254,8 +254,8 @@ def compute_gains(tasks: Sequence[Task], rows: Sequence[Mapping[str, Any]]) -> l
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    told = [value for value in values if value is not None]
-    return float(np.mean(told)) if told and len(told) == len(values) else None
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known and len(known) == len(values) else None
 
 
 def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping[str, Any]]) -> str:

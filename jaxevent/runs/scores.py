@@ -133,10 +133,19 @@ def hidden_scores(
     measures: Measures = NO_FURTHER_MEASURES,
     recording: str = "",
 ) -> Scores:
-    """Score an image in the place of a hidden frame, a `Frames` of one; see `score`.
+    """Score an image in the place of a hidden frame; see `score`.
 
-    `variance` is that of ln(I + I0), None to leave it out; `moving` marks moving pixels, None to
-    leave them out; `recording` is the name for messages.
+    Args:
+        image: (height, width) intensity.
+        variance: (height, width) variance of ln(I + I0); None to leave it out.
+        truth: The hidden frame, a `Frames` of one.
+        I0: Offset inside the logarithm.
+        moving: (height, width) mask of moving pixels; None to leave them out.
+        measures: Further measures.
+        recording: Name of the recording for messages.
+
+    Returns:
+        The scores by name.
     """
     shown, true = np.clip(image, 0, 1), truth.intensity[0]
     known = {"mse": mse, "ssim": ssim, **{name: MEASURE_FUNCTIONS[name] for name in measures.names}}
@@ -153,10 +162,10 @@ def hidden_scores(
         # A black or clipped pixel tells a bound of the intensity, not the intensity.
         grey = np.asarray(truth.images)[0]
         white = 1 if grey.dtype.kind == "f" else np.iinfo(grey.dtype).max
-        told = (grey > 0) & (grey < white)
+        unclipped = (grey > 0) & (grey < white)
         z2, usable = _standardised(image.astype(np.float64), variance, true.astype(np.float64), I0)
         for name, mean in (("z2", np.mean), ("z2_median", np.median)):
-            scores[name] = math.nan if broken else _over(z2, told & usable, mean)
+            scores[name] = math.nan if broken else _mean_over(z2, unclipped & usable, mean)
     if moving is not None:
         scores["moving"] = {
             "share": float(moving.mean()),
@@ -171,9 +180,16 @@ def _standardised(
     truth: NDArray[np.float64],
     I0: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Compute squared errors of ln(I + I0) over the variance, and a mask of known variances.
+    """Compute squared errors of ln(I + I0) over the predicted variance.
 
-    The variance is of the type that the image was computed in.
+    Args:
+        image: (height, width) intensity.
+        variance: (height, width) variance, of the type that the image was computed in.
+        truth: (height, width) true intensity.
+        I0: Offset inside the logarithm.
+
+    Returns:
+        The squared errors, and a mask of known variances.
     """
     # L = ln(I + I0) cannot be known better than I is rounded.
     least = max(float(np.finfo(variance.dtype).eps) * I0, 1e-12)
@@ -182,7 +198,7 @@ def _standardised(
     return (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64), usable
 
 
-def _over(values: NDArray, mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
+def _mean_over(values: NDArray, mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
     return float(mean(values[mask])) if mask.any() else math.nan
 
 
@@ -196,7 +212,20 @@ def _hdr_measures(
     measures: Measures,
     recording: str,
 ) -> Scores:
-    """Score an image against an HDR reference, NaN where there is none."""
+    """Score an image against an HDR reference.
+
+    Args:
+        image: (height, width) intensity.
+        variance: (height, width) variance of ln(I + I0); None to leave it out.
+        truth: (height, width) intensity, NaN where there is none.
+        clip: Intensities below and above which frames clip.
+        I0: Offset inside the logarithm.
+        measures: Further measures.
+        recording: Name of the recording for messages.
+
+    Returns:
+        The scores by name, NaN where they are not known.
+    """
     known = np.isfinite(truth)
     covered = np.where(known, truth, 0)
     masks = {name: mask & known for name, mask in regions(covered, *clip).items()}
@@ -231,10 +260,10 @@ def _hdr_measures(
     }
     if variance is not None:
         z2, usable = _standardised(shown, variance, covered, I0)
-        scores["z2"] = _over(z2, known & usable, np.mean)
-        scores["z2_median"] = _over(z2, known & usable, np.median)
+        scores["z2"] = _mean_over(z2, known & usable, np.mean)
+        scores["z2_median"] = _mean_over(z2, known & usable, np.median)
         for name, mask in masks.items():
-            parts[name]["z2"] = _over(z2, mask & usable, np.mean)
+            parts[name]["z2"] = _mean_over(z2, mask & usable, np.mean)
     if broken:
         scores = dict.fromkeys(scores, math.nan)
         parts = {
@@ -290,10 +319,17 @@ def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
-    """The row of `score` had only some of its images been asked for; nothing is reconstructed.
+    """Return the row of `score` for some of its images, without reconstructing any.
 
-    `frames` is a mask over the images, bool, or their numbers. `seconds` stays that of all. Raises
-    `InputError` for numbers that there are not and for a mask of another length.
+    Args:
+        row: The row of all images.
+        frames: Mask over the images, bool, or their numbers.
+
+    Returns:
+        The row; `seconds` stays that of all images.
+
+    Raises:
+        InputError: There is no image of a number, or a mask has another length.
     """
     count = len(row["per_frame"]["t"])
     chosen = np.asarray(frames)
@@ -322,12 +358,12 @@ class Sample:
     image: NDArray[np.floating]
     truth: NDArray[np.floating]
     hdr: bool
-    deviation: NDArray[np.floating] | None = None  # of log intensity, where it is told
+    deviation: NDArray[np.floating] | None = None  # of log intensity, where it is estimated
     given: NDArray[np.floating] | None = None  # the last frame before
 
 
 def _frame_before(given: Recording, t: int) -> NDArray[np.float32] | None:
-    """The last frame up to a time (us, as stamped), of those that a method is given."""
+    """Return the last given frame up to a time (us, as stamped); None if there is none."""
     if given.frames is None:
         return None
     row = int(np.searchsorted(given.frames.t, t, "right")) - 1
@@ -382,8 +418,8 @@ def score(
     Raises `InputError` for a recording that the protocol or the method cannot use, for unknown
     metrics and for those whose extra is missing.
     """
-    asked = ScoringOptions(protocol, tuple(metrics), normalise, gap, moving)
-    return score_and_sample(recording, method, params, asked, progress)[0]
+    options = ScoringOptions(protocol, tuple(metrics), normalise, gap, moving)
+    return score_and_sample(recording, method, params, options, progress)[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -483,7 +519,7 @@ def score_and_sample(
     recording: Recording,
     method: ImageEstimator | ExternalImages | MethodFunction,
     params: FrameParams | None,
-    asked: ScoringOptions,
+    options: ScoringOptions,
     progress: bool | None,
     name: str | None = None,
 ) -> tuple[dict[str, Any], list[Sample]]:
@@ -491,8 +527,8 @@ def score_and_sample(
 
     `name` finds external images.
     """
-    given, hidden = divide(recording, asked.protocol, asked.gap)
-    measures, normalise = asked.measures, asked.normalise
+    given, hidden = divide(recording, options.protocol, options.gap)
+    measures, normalise = options.measures, options.normalise
     named: dict[str, Any] = {"measures": measures, "recording": recording.name}
     hdr = hidden if isinstance(hidden, Reference) else None
     seconds, estimated = 0.0, False  # whether the method estimates a variance
@@ -505,7 +541,7 @@ def score_and_sample(
         estimates = _of_function(given, hidden, method)
         values, I0 = {}, 0.0
     else:
-        chosen, calibrated = _calibrate(given, method, params, asked.calibrate)
+        chosen, calibrated = _calibrate(given, method, params, options.calibrate)
         estimates = _estimates(given, hidden, method, chosen, progress)
         values, I0 = values_of(chosen), float(chosen.I0)
     scores: list[Scores] = []
@@ -524,7 +560,7 @@ def score_and_sample(
                 image = fit_brightness(image, truth)
             P = variance if estimated else None
             if hdr is None:
-                where = moving_pixels(given, row, asked.gap) if asked.moving else None
+                where = moving_pixels(given, row, options.gap) if options.moving else None
                 scores.append(hidden_scores(image, P, frame, I0, where, **named))
             else:
                 scores.append(_hdr_measures(image, P, truth, hdr.clip, I0, **named))
@@ -548,7 +584,7 @@ def score_and_sample(
         "events": len(recording.events),
         "seconds": None if external else seconds,
         **({} if normalise == "none" else {"normalise": normalise}),
-        **({} if asked.gap == DEFAULT_GAP_FRAMES else {"gap": asked.gap}),
+        **({} if options.gap == DEFAULT_GAP_FRAMES else {"gap": options.gap}),
         **own_names(measures.own),
         **({"calibrated": calibrated} if calibrated else {}),
         "params": values,
@@ -595,8 +631,8 @@ def _estimates(
     options = {"devices": local_devices()} if "devices" in method.options else {}
     video = method.estimate(given, params, progress=progress, **options)
     first = 0
-    for times, told in video.batches(frame_times(hidden, params), extrapolate=True):
-        yield first, told.mean, told.covariance
+    for times, estimate in video.batches(frame_times(hidden, params), extrapolate=True):
+        yield first, estimate.mean, estimate.covariance
         first += len(times)
 
 

@@ -158,7 +158,7 @@ def run(
     found: dict[int, dict[str, Any]] = {}
     same: dict[Any, list[int]] = {}  # by key, the tasks that have it
     for number, task in enumerate(tasks):
-        record = _stored(folder, task.key)
+        record = _load_record(folder, task.key)
         if record is not None:
             found[number] = record
         else:
@@ -182,8 +182,8 @@ def run(
     ):
         for number, record in done:
             task = todo[number]
-            if "result" in record and _stored(folder, task.key) is None:
-                _store(folder, task.key, record)
+            if "result" in record and _load_record(folder, task.key) is None:
+                _store_record(folder, task.key, record)
             numbers = same[firsts[number] if task.key is None else task.key]
             found.update(dict.fromkeys(numbers, record))
             shown.set_postfix_str(task.name)
@@ -196,14 +196,22 @@ Records = Generator[tuple[int, dict[str, Any]], None, None]
 
 
 def attempt(function: Callable[..., Any], task: Task, folder: Path | None) -> dict[str, Any]:
-    """Run one task, on whichever machine: {"result", "host"}, or {"error", "skipped"}.
+    """Run one task, on whichever machine.
 
-    The error is that of an `InputError`; the task is skipped if that is a `MissingExtra`.
+    A stored result is read; a new one is stored if this machine sees the folder. Exceptions other
+    than `InputError` are raised.
 
-    A stored result is read; a new one is stored if this machine sees the folder. Any other
-    exception is raised.
+    Args:
+        function: Function of the task's arguments.
+        task: The task.
+        folder: Folder of the results, or None.
+
+    Returns:
+        {"result", "host"}, or {"error", "skipped"} for an `InputError`; the task is skipped if that
+            is
+        a `MissingExtra`.
     """
-    record = _stored(folder, task.key)
+    record = _load_record(folder, task.key)
     if record is not None:
         return record
     _log(folder, task.key, "started")
@@ -220,12 +228,12 @@ def attempt(function: Callable[..., Any], task: Task, folder: Path | None) -> di
         cache.release_compiled()  # a data set's recordings may have a hundred shapes
     # The caller stores it again where this fails, and says why if that fails too.
     with contextlib.suppress(InputError):
-        _store(folder, task.key, record)
+        _store_record(folder, task.key, record)
     _log(folder, task.key, "finished")
     return record
 
 
-def _said(error: BaseException) -> dict[str, Any]:
+def _error_record(error: BaseException) -> dict[str, Any]:
     reason = " ".join(str(error).split())
     return {"error": f"{type(error).__name__}{': ' * bool(reason)}{reason}"}
 
@@ -234,8 +242,8 @@ def _file(folder: Path | None, key: str | None) -> Path | None:
     return None if folder is None or key is None else folder / f"{key}.json"
 
 
-def _stored(folder: Path | None, key: str | None) -> dict[str, Any] | None:
-    """The record of a finished task; None if there is none, or none that can be read."""
+def _load_record(folder: Path | None, key: str | None) -> dict[str, Any] | None:
+    """Return the record of a finished task; None if there is none that can be read."""
     file = _file(folder, key)
     if file is None:
         return None
@@ -246,7 +254,7 @@ def _stored(folder: Path | None, key: str | None) -> dict[str, Any] | None:
     return None
 
 
-def _store(folder: Path | None, key: str | None, record: dict[str, Any]) -> None:
+def _store_record(folder: Path | None, key: str | None, record: dict[str, Any]) -> None:
     from jaxevent.io.output import complete
 
     file = _file(folder, key)
@@ -283,12 +291,12 @@ class _Work(NamedTuple):
             try:
                 return attempt(self.function, task, self.folder)
             except Exception as error:
-                record = _said(error)
+                record = _error_record(error)
         return record
 
 
 def _on_devices(work: _Work, devices: Sequence[Any]) -> Records:
-    """A thread for each device; a task finds it as JAX's default device."""
+    """Run tasks on a thread for each device, which is JAX's default device there."""
     idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for device in devices:
         idle.put(device)
@@ -312,7 +320,7 @@ def _on_devices(work: _Work, devices: Sequence[Any]) -> Records:
 
 
 def _in_processes(work: _Work, workers: int) -> Records:
-    """One pipe and one task at a time for each process, so that a death has one task to blame.
+    """Run tasks in worker processes, one at a time each, so that a death has one task to blame.
 
     A `ProcessPoolExecutor` breaks as a whole when a process dies, does not say which task it was,
     and leaves its processes behind when this one is killed.
@@ -391,7 +399,7 @@ def _serve(connection: multiprocessing.connection.Connection, threads: int, numb
         except EOFError:
             return
         except Exception as error:
-            answer = _said(error), True
+            answer = _error_record(error), True
         connection.send(answer)
 
 
@@ -441,4 +449,4 @@ def _by_client(client: Any, address: str, work: _Work) -> Records:
                 "finished tasks are kept"
             )
         error = future.exception()
-        yield numbers[future], future.result() if error is None else _said(error)
+        yield numbers[future], future.result() if error is None else _error_record(error)

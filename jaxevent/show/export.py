@@ -68,9 +68,9 @@ def within(
     if not len(chosen):
         span = f"from {format_span(times)}" if len(times) else "none"
         bounds = (("from --start", start), ("to --stop", stop))
-        asked = " ".join(f"{words} {float(s):g} s" for words, s in bounds if s is not None)
+        limits = " ".join(f"{words} {float(s):g} s" for words, s in bounds if s is not None)
         raise InputError(
-            f"{name}: there is no image {asked}; its times are {span}, so choose others"
+            f"{name}: there is no image {limits}; its times are {span}, so choose others"
         )
     return chosen
 

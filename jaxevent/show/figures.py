@@ -160,9 +160,17 @@ def plot_image(video: ImageSequence, time: Times, *, tone: Tone | None = None) -
 def _toned(
     image: NDArray[np.floating], tone: str, variance: NDArray[np.floating]
 ) -> tuple[NDArray[np.floating], Any]:
-    """Return what an image (height, width) with NaN shows in a tone, and its scale of greys.
+    """Return the values of an image in a tone, and the scale of greys for them.
 
-    Of tones in which equal intensities have different greys, these are the greys themselves.
+    For tones in which equal intensities have different greys, the values are the greys themselves.
+
+    Args:
+        image: (height, width) intensity, NaN where unknown.
+        tone: Name of the tone.
+        variance: (height, width) variance of log intensity.
+
+    Returns:
+        (height, width) values, and matplotlib's norm.
     """
     colors: Any = require("matplotlib.colors", "plot")
     known = np.isfinite(image)

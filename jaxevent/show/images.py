@@ -248,8 +248,8 @@ def video_writer(
 
         def failure() -> InputError:
             log.seek(0)
-            said = " ".join(log.read().decode(errors="replace").split())[-300:]
-            why = f" ({said})" if said else ""
+            output = " ".join(log.read().decode(errors="replace").split())[-300:]
+            why = f" ({output})" if output else ""
             return InputError(f"{path}: ffmpeg failed{why}; check the free space and the rate")
 
         def write(image: NDArray) -> None:

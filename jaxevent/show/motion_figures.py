@@ -104,7 +104,17 @@ def _plot_component(
     estimated: Estimate,
     truth: KnownMotion | None,
 ) -> None:
-    """Plot a component of a part of the model with its band and its truth."""
+    """Plot a component of a part of the model with its band and its truth.
+
+    Args:
+        axis: Axes that are drawn on.
+        i: Number of the component.
+        part: Part of the model that it belongs to.
+        model: The model.
+        times: (times,) us.
+        estimated: Estimates at these times.
+        truth: True motion, or None.
+    """
     seconds = times * 1e-6
     observable = is_observable(model, estimated.covariance)[:, i]
     value = np.where(estimated.valid & observable, estimated.mean[:, i], np.nan)
@@ -395,7 +405,16 @@ def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Arr
 def _linear_flow(
     model: Model, xi: NDArray[np.floating], mean: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Compute the flow (n, 2) px/s of n motions at n places, of half-lines without translation."""
+    """Compute the flow of motions at positions, without translation of half-line models.
+
+    Args:
+        model: The model.
+        xi: (n, 2) positions, px.
+        mean: (n, d) motions.
+
+    Returns:
+        (n, 2) px/s.
+    """
     return np.asarray(_flows(model, _padded(xi), _padded(mean)))[: len(xi)]
 
 

@@ -141,7 +141,7 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
         for row in rows
         if "error" in row
     ]
-    said = "".join(
+    details = "".join(
         f"\n{how} ({errors.count((how, one))}): {one}\n" for how, one in dict.fromkeys(errors)
     )
     columns = columns_of(rows)
@@ -149,7 +149,7 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
         results_table(rows, columns)
         + _table_of_means(rows)
         + (legend(columns) if rows else "")
-        + said
+        + details
     )
 
 

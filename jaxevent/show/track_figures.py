@@ -101,7 +101,25 @@ def draw_frames(
     window: float | int | None = None,
     scale: int | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
-    """Draw `track_frames` of `states` that come one by one: states (N, 8), and their validity."""
+    """Draw `track_frames` of states that come one by one.
+
+    Args:
+        recording: Recording of the tracks.
+        t: (T,) sorted times, us.
+        track_ids: (N,) ids.
+        states: For each time the states (N, 8), and whether each is valid (N,).
+        images: Images behind the tracks, (height, width[, 3]) uint8; None: the events.
+        sigmas: Size of the ellipses, standard deviations.
+        trail: Length of the trails, s.
+        window: Time in which events are shown, s; None: between two images.
+        scale: Enlargement; None: by the sensor's height.
+
+    Yields:
+        Images, uint8.
+
+    Raises:
+        InputError: An image behind the tracks is missing, or has another shape or type.
+    """
     if scale is None:
         scale = max(1, math.ceil(_MIN_VIDEO_HEIGHT_PX / recording.height))
     if window is None:
@@ -271,9 +289,15 @@ def _draw_states(
     growths: tuple[NDArray, NDArray, NDArray],
     ranges: tuple[Array, Array] | None,
 ) -> None:
-    """Draw both sizes (T, N, 2) of tracks, their growth and range (T, N), each with its variance.
+    """Draw sizes, growth and range of tracks, each with its variance.
 
-    The growth is drawn of those tracks (N) that the last of `growths` names.
+    Args:
+        bands: Panels.
+        known: (N,) ids.
+        valid: (T, N) whether a track is seen.
+        sizes: Both sizes (T, N, 2), px, and their variances.
+        growths: 1 / TTC (T, N), 1/s, its variance, and the tracks (N,) for which it is drawn.
+        ranges: Ranges (T, N), m, and their variances; None: not drawn.
     """
     grown, spread, grows = growths
     for i in np.flatnonzero(valid.any(0)).tolist():
@@ -300,11 +324,19 @@ def _choose_longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np
 def _changes_scale(
     sizes: NDArray, variances: NDArray, valid: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return which tracks (N,) change both of their sizes (T, N, 2) alike: they approach or recede.
+    """Return the tracks that change both of their sizes alike: they approach or recede.
 
     A target that turns, or comes into sight, changes one size. A target that flickers, or takes
     events of others for a while, grows and shrinks by turns. One as small as pixels has their size,
     and one that is seen shortly changes by no more than its errors.
+
+    Args:
+        sizes: (T, N, 2), px.
+        variances: (T, N, 2), px^2.
+        valid: (T, N) whether a track is seen.
+
+    Returns:
+        (N,) booleans.
     """
     alike = np.zeros(valid.shape[1], bool)
     for i, seen in enumerate(valid.T):
@@ -335,7 +367,20 @@ def _growths(
     *,
     smoothed: bool,
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return 1 / TTC of each growth (T, N), its variance, and the tracks (N,) where it is not 0."""
+    """Compute 1 / TTC of tracks by their growth.
+
+    Args:
+        t: (T,) times, us.
+        m: (T, N, 8) states.
+        P: (T, N, 8, 8) covariances.
+        valid: (T, N) whether a track is seen.
+        Q: See `growth`.
+        Q_lambda: (N,), see `growth`; None: independent errors.
+        smoothed: Whether the tracks are smoothed.
+
+    Returns:
+        1 / TTC (T, N), 1/s, its variance, and the tracks (N,) where it is significantly not 0.
+    """
     since = jnp.asarray((t - t[0]) * 1e-6, m.dtype)
     one = functools.partial(growth, since, Q=Q, smoothed=smoothed)
     grown, spread = jax.vmap(

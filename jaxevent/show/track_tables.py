@@ -223,7 +223,14 @@ def empty_rows() -> tuple[NDArray, NDArray, NDArray, NDArray]:
 
 
 def write_states(path: str | Path, times: Times, states: ArrayLike, valid: ArrayLike) -> None:
-    """Write known states (T, N, 8), say the truth, as CSV: t, id, x, ... q, where valid (T, N)."""
+    """Write known states, such as the truth, as CSV with the columns t, id, x, ... q.
+
+    Args:
+        path: File that is written.
+        times: (T,) integers (us) or floats (s).
+        states: (T, N, 8).
+        valid: (T, N) whether a state is written.
+    """
     t, ids = np.atleast_1d(microseconds(times)), np.arange(np.shape(states)[1])
     t, ids, states, _, valid = check_tracks(path, t, ids, states, None, valid)
     row, column = np.nonzero(valid)
@@ -246,7 +253,22 @@ def check_tracks(
     covariance: ArrayLike | None,
     valid: ArrayLike | None,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Return the arguments as arrays whose shapes fit; raise `InputError` if they do not."""
+    """Convert tracks to arrays whose shapes fit.
+
+    Args:
+        place: Name for messages.
+        times: (T,) integers (us) or floats (s).
+        ids: (N,) ids; (T,) for single rows.
+        mean: (T, N, 8) states; (T, 8) for single rows.
+        covariance: (T, N, 8, 8) covariances; None: 0.
+        valid: (T, N) whether a track is alive; None: all, or single rows.
+
+    Returns:
+        Times in us, ids, mean, covariance and valid.
+
+    Raises:
+        InputError: The shapes do not fit.
+    """
     t, ids, mean = np.atleast_1d(microseconds(times)), np.asarray(ids), np.asarray(mean)
     if covariance is None:
         covariance = np.broadcast_to(0.0, (*mean.shape, 8))

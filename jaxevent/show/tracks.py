@@ -249,7 +249,7 @@ class Output:
         return SIZE_FACTORS["ring"] if self.size_factor is None else self.size_factor
 
     def _event_quantities(self, now: "_EventStates") -> Iterator[tuple[NDArray, ...]]:
-        """Columns `QUANTITIES` of the events of some times."""
+        """Yield the columns `QUANTITIES` of the events of some times."""
         states = now.states
 
         def columns(row: NDArray, one: Any, other: int, *values: NDArray) -> tuple[NDArray, ...]:
@@ -432,7 +432,15 @@ class _TrackRows:
         return self._joined[2][self._slice(place)]
 
     def longest(self, most: int, also: Sequence[int]) -> list[int]:
-        """Return places of the tracks seen at the most times, and of some ids, by rising id."""
+        """Return the places of the tracks that are seen at the most times, and of some others.
+
+        Args:
+            most: Number of tracks.
+            also: Ids of the others.
+
+        Returns:
+            Places, ascending.
+        """
         count = np.bincount(self._joined[1], minlength=len(self.ids))
         order = np.argsort(-count, kind="stable")[:most].tolist()
         return sorted({*order, *(int(np.flatnonzero(self.ids == one)[0]) for one in also)})
@@ -472,7 +480,15 @@ def _read_states(
 
 
 def _within(t: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return the places in t (sorted) of the times (sorted) in its range; t holds them all."""
+    """Return the places in a range of times of those that are among some times.
+
+    Args:
+        t: (n,) sorted times, which hold all of `some` in their range.
+        some: Sorted times.
+
+    Returns:
+        Indices of `t`.
+    """
     first, last = np.searchsorted(some, [t[0], t[-1] + 1]) if len(t) else (0, 0)
     return np.searchsorted(t, some[first:last])
 

@@ -329,7 +329,16 @@ class Target:
     def _offsets(
         self, count: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Draw offsets (count, 2) of unit covariance along the axes; return which are in front."""
+        """Draw the offsets of events, of unit covariance along the axes.
+
+        Args:
+            count: Number of events.
+            rng: Generator.
+
+        Returns:
+            (count, 2) offsets, and whether each is in front, on the positive side of the first
+                axis.
+        """
         if self.shape == "gaussian":
             offsets = rng.normal(size=(count, 2))
         elif self.shape == "disc":

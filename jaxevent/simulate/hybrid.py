@@ -304,9 +304,17 @@ def _simulate_events(
     rngs: tuple[np.random.Generator, np.random.Generator],
     name: str,
 ) -> tuple[Events, NDArray[np.int64]]:
-    """Simulate the events, and draw x, y of the hot pixels.
+    """Simulate the events of a sensor.
 
-    `thresholds` are of ON and OFF events, (pixels,) each; `rngs` draw pixels and noise events.
+    Args:
+        source: Intensity in time.
+        sensor: The sensor.
+        thresholds: (pixels,) thresholds of ON and of OFF events, ln intensity.
+        rngs: Generators for pixels and for noise events.
+        name: Name of the recording for messages.
+
+    Returns:
+        The events, and x, y of the hot pixels, (n, 2).
     """
     (on, off), (rng, noise_rng) = thresholds, rngs
     width, height = source.size
@@ -349,10 +357,21 @@ def _simulate_events(
 
 @njit_noalloc
 def _cross_thresholds(times, levels, pixels, noise, refractory, out):
-    """Write the events of one block, pixel by pixel, and return their number.
+    """Write the events of one block, pixel by pixel.
 
-    Between samples the level is linear in time. After an event at t the pixel is dead until
-    t + refractory, and its reference is then the level at that time: the change during it is lost.
+    Between samples the level is linear in time. After an event at t the pixel is dead until t +
+    refractory, and its reference is then the level at that time: the change during it is lost.
+
+    Args:
+        times: (samples,) us.
+        levels: (samples, pixels) log intensity.
+        pixels: `_Pixels`; reference and end of the dead time are updated.
+        noise: `_NoiseEvents`; the next event of each pixel is updated.
+        refractory: Dead time, us.
+        out: Times, pixels and polarities, output.
+
+    Returns:
+        Number of events.
     """
     on, off, reference, ready = pixels
     noise_t, noise_p, following, stop = noise

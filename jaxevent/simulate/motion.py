@@ -85,7 +85,15 @@ class CameraMotion:
         return grid[k] @ self._steps(k * _STEP_S, t - k * _STEP_S)
 
     def _steps(self, t: NDArray[np.floating], h: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return P(t)^-1 P(t + h), by the Magnus series for dP/dt = P X, to fourth order."""
+        """Return changes of the pose, by the Magnus series for dP/dt = P X, to fourth order.
+
+        Args:
+            t: (n,) times, s.
+            h: (n,) steps, s.
+
+        Returns:
+            (n, 4, 4) P(t)^-1 P(t + h).
+        """
         gauss = math.sqrt(3) / 6  # of the two points of Gauss' quadrature from the middle
         (v1, w1), (v2, w2) = (
             np.split(self.twist(t + (0.5 + s * gauss) * h), 2, axis=-1) for s in (-1, 1)
@@ -474,9 +482,16 @@ def _room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
 def _scatter_patches(
     rng: np.random.Generator, kinds: Sequence[str], count: int, half: tuple[float, float]
 ) -> tuple[FlatPatch, ...]:
-    """Scatter patches at 1.4 to 3 m within 75 degrees of the axis, the farthest first.
+    """Scatter patches at 1.4 to 3 m within 75 degrees of the axis.
 
-    Their half axes are `half` times their distance.
+    Args:
+        rng: Generator.
+        kinds: Textures, by turns.
+        count: Number of patches.
+        half: Least and greatest half axis, relative to the distance.
+
+    Returns:
+        The patches, the farthest first.
     """
     textures = [
         make_texture(kind, _GRAIN_M * 0.7, int(rng.integers(1 << 30)), 1.0) for kind in kinds
@@ -516,7 +531,17 @@ def _six(T: ArrayLike, Omega: ArrayLike) -> Six:
 
 
 def _draw_motion(rng: np.random.Generator, motion: str, speed: float, rate: float) -> CameraMotion:
-    """Draw a motion of the mean |T| = speed and |Omega| = rate in random directions."""
+    """Draw a motion in random directions.
+
+    Args:
+        rng: Generator.
+        motion: "constant", "linear" or "varying".
+        speed: Mean |T|, m/s.
+        rate: Mean |Omega|, rad/s.
+
+    Returns:
+        The motion.
+    """
     T, Omega = speed * _random_direction(rng), rate * _random_direction(rng)
     if motion == "constant":
         return CameraMotion(_six(T, Omega))
@@ -705,9 +730,17 @@ def simulate_frame_events(
 def _bilinear(
     image: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Sample an image by B.10.
+    """Sample an image by B.10, periodic beyond its border.
 
     v = d2 (d0 v0 + d1 v1) + d3 (d0 v2 + d1 v3), d0 = i_p - x, d1 = x - i_m.
+
+    Args:
+        image: (height, width).
+        x: Columns, px, of any shape.
+        y: Rows, px, of that shape.
+
+    Returns:
+        Values of that shape.
     """
     height, width = image.shape
     i, j = np.floor(x).astype(int), np.floor(y).astype(int)

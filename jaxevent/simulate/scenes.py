@@ -246,10 +246,8 @@ _SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
     "tunnel": (_tunnel, 0.13),
 }
 SCENES = tuple(_SCENES)
-FITTING_SCENES, TESTING_SCENES = (
-    SCENES[:2],
-    SCENES[2:],
-)  # for fits of parameters, and for held-out scores
+# Scenes for fits of parameters, and for held-out scores.
+FITTING_SCENES, TESTING_SCENES = SCENES[:2], SCENES[2:]
 
 
 def scene(

@@ -194,7 +194,21 @@ def _read_video(
     start: float | int,
     stop: float | int | None,
 ) -> tuple[NDArray[np.uint8], float]:
-    """Read the frames (frames, height, width, 3) of a video, and frames per second."""
+    """Read a video by ffmpeg.
+
+    Args:
+        path: The file.
+        max_size: Longer side to which larger frames are scaled down, px.
+        rate: Frames per second; None: as the file states.
+        start: First second.
+        stop: Second at which to stop; None: the end.
+
+    Returns:
+        (frames, height, width, 3), and frames per second.
+
+    Raises:
+        InputError: ffmpeg cannot read the file, it states no rate, or it is too long.
+    """
     program = require("imageio_ffmpeg", "video").get_ffmpeg_exe()
     # PPM images have their size after rotation, the log has the rate. -t is the input's time.
     part = ["-ss", str(start)] + ([] if stop is None else ["-t", str(stop - start)])

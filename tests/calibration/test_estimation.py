@@ -155,15 +155,15 @@ def test_polarity_swapped(recording):
 
 def test_correlation_is_pearsons(recording):
     sample = take_sample(recording)
-    (stretch,) = sample.stretches
+    (segment,) = sample.segments
     offset = -70_000
-    change = np.diff(np.log(stretch.intensity + np.float32(0.02)), axis=0)
-    used = stretch.clear[1:] & stretch.clear[:-1]
+    change = np.diff(np.log(segment.intensity + np.float32(0.02)), axis=0)
+    used = segment.clear[1:] & segment.clear[:-1]
     net = np.zeros(change.shape)
     for k in range(len(change)):
-        part = slice(*np.searchsorted(stretch.t, stretch.frame_t[k : k + 2] + offset))
-        np.add.at(net[k], stretch.pixel[part], np.where(stretch.p[part], 1, -1))
-    inside = stretch.frame_t[:-1] + offset >= stretch.t[0]
+        part = slice(*np.searchsorted(segment.t, segment.frame_t[k : k + 2] + offset))
+        np.add.at(net[k], segment.pixel[part], np.where(segment.p[part], 1, -1))
+    inside = segment.frame_t[:-1] + offset >= segment.t[0]
     r = np.corrcoef(change[inside][used[inside]], net[inside][used[inside]])[0, 1]
     found, number = correlate(sample, np.array([offset]), 0.02)
     assert found[0] == pytest.approx(r, abs=1e-5) and number[0] == used[inside].sum()
@@ -229,11 +229,11 @@ def test_counts_of_smooth_brightness_are_exact(rho):
         times.append(t)
     us = np.rint(1e9 * np.array(times)).astype(np.int64)  # ns in place of us, against rounding
     none = np.zeros((2, 1), np.float32)
-    stretch = SampledSegment(
+    segment = SampledSegment(
         us, np.zeros(len(us), np.int32), np.ones(len(us), bool), (0, 10**9), np.arange(2),
         np.zeros(2, np.int64), np.zeros(2, np.int64), none, none, np.ones((2, 1), bool),
     )  # fmt: skip
-    events = sort_by_pixel(stretch, stretch.clear)
+    events = sort_by_pixel(segment, segment.clear)
     path = interpolate(events, 1e9 * rho)
     middle, length = np.array([0.1e9, 0.2e9]), np.array([0.02e9, 0.03e9])
     at = read_positions(events, path, middle - path.origin, length, np.inf)
@@ -254,10 +254,10 @@ def test_pixels_are_whole_tiles():
 
 def test_the_sample_of_a_long_recording_is_bounded(recording, monkeypatch):
     monkeypatch.setattr("jaxevent.calibration.sampling.MAX_INTERVALS", 8)
-    monkeypatch.setattr("jaxevent.calibration.sampling.N_STRETCHES", 4)
+    monkeypatch.setattr("jaxevent.calibration.sampling.N_SEGMENTS", 4)
     sample = take_sample(recording)
-    assert len(sample.stretches) == 4
-    assert sum(len(s.rows) - 1 for s in sample.stretches) == 8
+    assert len(sample.segments) == 4
+    assert sum(len(s.rows) - 1 for s in sample.segments) == 8
     found = jaxevent.calibrate(recording, 0.02)
     assert found.clock_offset.value == pytest.approx(SENSOR.clock_offset, abs=3e-3)
 
@@ -265,27 +265,27 @@ def test_the_sample_of_a_long_recording_is_bounded(recording, monkeypatch):
 def test_a_sample_of_dense_events_has_fewer_pixels_but_whole_intervals(recording, monkeypatch):
     monkeypatch.setattr("jaxevent.calibration.sampling.MAX_EVENTS", len(recording.events) // 4)
     sample = take_sample(recording)
-    assert sum(len(s.t) for s in sample.stretches) <= len(recording.events) // 4
+    assert sum(len(s.t) for s in sample.segments) <= len(recording.events) // 4
     assert 0 < len(sample.places) < recording.width * recording.height
-    for stretch in sample.stretches:
-        assert stretch.is_covered().all()
+    for segment in sample.segments:
+        assert segment.is_covered().all()
         events = recording.events
-        inside = (events.t >= stretch.span[0]) & (events.t <= stretch.span[1])
+        inside = (events.t >= segment.span[0]) & (events.t <= segment.span[1])
         place = events.y.astype(int) * recording.width + events.x
         known = inside & np.isin(place, sample.places) & ~sample.hot[events.y, events.x]
-        np.testing.assert_array_equal(stretch.t, events.t[known])
-        np.testing.assert_array_equal(sample.places[stretch.pixel], place[known])
+        np.testing.assert_array_equal(segment.t, events.t[known])
+        np.testing.assert_array_equal(sample.places[segment.pixel], place[known])
 
 
 @pytest.mark.parametrize("most", [60_000, 10_000])
-def test_of_dense_events_few_stretches_are_read(recording, most, monkeypatch):
+def test_of_dense_events_few_segments_are_read(recording, most, monkeypatch):
     """The last one ends early where two frames have more events between them than that."""
     monkeypatch.setattr("jaxevent.calibration.sampling.MAX_EVENTS", 20_000)
     monkeypatch.setattr("jaxevent.calibration.sampling.MAX_READ_EVENTS", most)
     sample = take_sample(recording)
-    assert 0 < sample.counts.sum() <= most and len(sample.stretches) < 8
+    assert 0 < sample.counts.sum() <= most and len(sample.segments) < 8
     times = recording.events.t
-    inside = [np.sum((times >= s.span[0]) & (times <= s.span[1])) for s in sample.stretches]
+    inside = [np.sum((times >= s.span[0]) & (times <= s.span[1])) for s in sample.segments]
     assert sample.counts.sum() == sum(inside)
 
 

@@ -557,9 +557,9 @@ def test_reconstruct_to_hdf5(folder, capsys):
 
 
 def test_the_usual_method(folder, capsys, monkeypatch):
-    assert reconstruct._usual(True, 2800 * 240 * 180) == "aks"  # ten minutes of a core
-    assert reconstruct._usual(True, 2700 * 240 * 180) == "mc"
-    assert reconstruct._usual(False, 1400 * 240 * 180) == "high-pass"
+    assert reconstruct._choose_method(True, 2800 * 240 * 180) == "aks"  # ten minutes of a core
+    assert reconstruct._choose_method(True, 2700 * 240 * 180) == "mc"
+    assert reconstruct._choose_method(False, 1400 * 240 * 180) == "high-pass"
     capsys.readouterr()
     bare = folder / "bare.h5"
     jaxevent.save(small(frames=None), bare)

@@ -121,7 +121,7 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
     recording = jaxevent.load(folder / "planar.h5")
     long = recording.stop - recording.start
 
-    def told(estimator, *_):
+    def estimate(estimator, *_):
         share = first if estimator.name == "voting" else other
         if share is None:
             return MotionEstimate.empty(Planar)
@@ -130,11 +130,13 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing_soon(
             Planar, t, np.ones((1, 2)), np.eye(2)[None], np.array([True])
         )
 
-    monkeypatch.setattr(command, "_told", told)
+    monkeypatch.setattr(command, "_estimate", estimate)
     monkeypatch.setattr(Planar, "fallback_method", "planes")
     suited = AdaptedParams(voting.Params(), None, "", "")
     monkeypatch.setattr(MotionEstimator, "adapt_params", lambda *_, **__: suited)
-    used, seen, _ = command.estimated(voting, recording, None, {"model": Planar}, None, True)
+    used, seen, _ = command.estimate_or_fall_back(
+        voting, recording, None, {"model": Planar}, None, True
+    )
     assert used.name == taken and seen.valid.any() == (first is not None)
     late = " before the recording's middle" if first else ""
     said = f"voting found no motion{late}, so planes is tried"

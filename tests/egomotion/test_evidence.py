@@ -9,7 +9,7 @@ from points import HEIGHT, WIDTH, moved, recorded, turning
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.estimator import HostEstimator, InconsistentMotionWarning
-from jaxevent.egomotion.evidence import Evidence, EvidenceTest, Lock, tell_from_later
+from jaxevent.egomotion.evidence import Evidence, EvidenceTest, LockDetector, report_before_lock
 from jaxevent.egomotion.models import Planar, Rotation
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.scores import errors_by_part
@@ -101,7 +101,7 @@ class Script(EvidenceTest):
 
 def told_by(rows, drift=0.0, moves=False):
     """Whether each of some windows 10 ms apart is told, whose motion drifts by so many sigmas."""
-    lock = Lock(Script(rows), 6.5, 0.1, lambda m: np.zeros(2), moves)
+    lock = LockDetector(Script(rows), 6.5, 0.1, lambda m: np.zeros(2), moves)
     mean = np.array([100.0, 0.0])
     return [
         bool(lock.update(None, np.array([50]), np.array([10_000 * k]), mean[None] + drift * k,
@@ -121,7 +121,7 @@ def test_a_lock_needs_evidence_twice_and_keeps_until_it_fails():
 
 
 def test_a_search_and_a_pause_begin_anew():
-    lock = Lock(Script([(4.0, 1.0, 9.0)] * 20), 6.5, 0.1, lambda m: np.ones(2))
+    lock = LockDetector(Script([(4.0, 1.0, 9.0)] * 20), 6.5, 0.1, lambda m: np.ones(2))
 
     def update(t, searching):
         n = len(t)
@@ -142,7 +142,7 @@ def test_a_motion_whose_events_cease_is_lost_with_them():
     """Noise alone after 10 batches of 50 events; a motion half as fast makes half as many."""
 
     def told(count, speed):
-        lock = Lock(Script([(4.0, 1.0, 9.0)] * 20), 6.5, 0.1, lambda m: np.ones(2), True)
+        lock = LockDetector(Script([(4.0, 1.0, 9.0)] * 20), 6.5, 0.1, lambda m: np.ones(2), True)
         n = len(count)
         mean = np.stack([speed, np.zeros(n)], 1)
         return [
@@ -161,7 +161,7 @@ def test_a_motion_is_told_again_after_a_pause_shorter_than_a_window():
     """A window is 6.5 px at 100 px/s, 65 ms; batches of 10 ms hold 50 events, in a pause 2."""
 
     def told(pause):
-        lock, n = Lock(Script([(4.0, 1.0, 9.0)] * 30), 6.5, 0.1, lambda m: np.ones(2)), 30
+        lock, n = LockDetector(Script([(4.0, 1.0, 9.0)] * 30), 6.5, 0.1, lambda m: np.ones(2)), 30
         count = np.full(n, 50)
         count[10 : 10 + pause] = 2
         return [
@@ -177,7 +177,7 @@ def test_a_motion_is_told_again_after_a_pause_shorter_than_a_window():
 
 def test_earlier_estimates_are_told_where_they_agree():
     mean = np.array([[0.0], [9.0], [1.0], [1.1], [1.0]])
-    told, covariance, drift = tell_from_later(
+    told, covariance, drift = report_before_lock(
         np.arange(5) * 1000, mean, np.full((5, 1, 1), 0.1), np.zeros(5, bool),
         np.array([False, False, False, False, True]), lambda m: np.zeros(1),
     )  # fmt: skip
@@ -191,7 +191,7 @@ def test_a_motion_that_was_just_told_drifts_on():
     mean = np.array([9.0, 3, 3, 2.5, 2, 1.5, 1.2, 1, 1, 1])[:, None]
     searching = np.arange(10) == 0
     told = np.arange(10) >= 3
-    found, _, drift = tell_from_later(
+    found, _, drift = report_before_lock(
         np.arange(10) * 1000, mean, np.full((10, 1, 1), 0.1), searching, told,
         lambda m: np.full(1, 9.0),
     )  # fmt: skip

@@ -156,7 +156,16 @@ class _NewTrack(NamedTuple):
 
 @njit_noalloc
 def run(kernel, chunks, state, out, scratch, updates):
-    """Track through chunks; the state becomes that at their end."""
+    """Track through chunks.
+
+    Args:
+        kernel: `TrackKernel`.
+        chunks: `ChunkArrays`.
+        state: `KernelState` at the first chunk's start; it becomes that at the last one's end.
+        out: `KernelOutput`, output.
+        scratch: `Scratch`.
+        updates: `UpdateRecord`, output; without rows nothing is recorded.
+    """
     reals, integers = state.reals, state.integers
     pointers = (
         reals.ctypes, integers.ctypes, scratch.work.ctypes, scratch.owners.ctypes,
@@ -272,7 +281,15 @@ def _run_steps(context, chunk):
 
 @njit_noalloc_inlined
 def _record(updates, reals, integers, k, step):
-    """Record a track after its update in a step."""
+    """Record a track after its update in a step.
+
+    Args:
+        updates: `UpdateRecord`.
+        reals: (targets, ...) real numbers of all tracks.
+        integers: (targets, ...) integers of all tracks.
+        k: The track's entry in the buffer.
+        step: The step of the chunk; -1 for the chunk's start.
+    """
     row = updates.count[0]
     updates.count[0] = row + 1
     if row >= len(updates.target):
@@ -288,7 +305,14 @@ def _record(updates, reals, integers, k, step):
 
 @njit_noalloc_inlined
 def _report_association(context, chunk, step, alive):
-    """Report the likeliest track of each event of a step, and its weight."""
+    """Report the likeliest track of each event of a step, and its weight.
+
+    Args:
+        context: `_Context`.
+        chunk: Number of the chunk.
+        step: Number of the step in it.
+        alive: Number of tracks that are alive, the first in `scratch.alive`.
+    """
     work, tracks = context.scratch.work, context.scratch.alive
     target, weight = context.out.target[chunk, step], context.out.weight[chunk, step]
     for i in range(len(target)):
@@ -301,7 +325,13 @@ def _report_association(context, chunk, step, alive):
 
 @njit_noalloc_inlined
 def _associate(context, alive, size):
-    """Compute the weight of each event for each track."""
+    """Compute the weight of each event of a step for each track.
+
+    Args:
+        context: `_Context`; weights go to the rows of the tracks in `scratch.work`.
+        alive: Number of tracks that are alive.
+        size: Number of events of the step.
+    """
     functions, work = context.functions, context.scratch.work
     alone = context.config.alone
     if alone:
@@ -323,7 +353,18 @@ def _associate(context, alive, size):
 
 @njit_noalloc_inlined
 def _accumulate_clutter(context, t, stop, alive, faded):
-    """Add a step's unassociated events to the grid, as `lifecycle.accumulate_clutter` does."""
+    """Add a step's unassociated events to the grid, as `lifecycle.accumulate_clutter` does.
+
+    Args:
+        context: `_Context`.
+        t: (events,) times, us since the chunk's start.
+        stop: End of the chunk, us since its start; the grid's weights are those at that time.
+        alive: Number of tracks that are alive.
+        faded: Whether the grid has been brought to the time `stop` already.
+
+    Returns:
+        Whether it has been brought to that time now.
+    """
     sums, counters, work = context.state.sums, context.state.counters, context.scratch.work
     rows, columns = sums.shape[1:]
     micro, tau = sums.dtype.type(1e-6), sums.dtype.type(context.config.tau)
@@ -396,7 +437,14 @@ def _manage_tracks(context, chunk):
 
 @njit_noalloc_inlined
 def _begin_tracks(context, stop):
-    """Begin tracks where the grid's 3x3 sums are largest, which empties 5x5 cells."""
+    """Begin tracks where the grid's 3x3 sums are largest.
+
+    The 5x5 cells around each are emptied.
+
+    Args:
+        context: `_Context`.
+        stop: End of the chunk, us since its start, at which the tracks begin.
+    """
     integers, sums, counters = context.state.integers, context.state.sums, context.state.counters
     config, real = context.config, sums.dtype.type
     elapsed = real(stop - counters[GRID_TIME]) * real(1e-6)
@@ -440,7 +488,13 @@ def _sum_near(counts, row, column):
 
 @njit_noalloc_inlined
 def _sum_3x3(counts, sums3x1, sums3x3):
-    """Sum over the 3x3 cells around each cell."""
+    """Sum over the 3x3 cells around each cell.
+
+    Args:
+        counts: (rows, columns).
+        sums3x1: (columns + 2,) scratch.
+        sums3x3: (rows, columns) output.
+    """
     rows, columns = counts.shape
     sums3x1[0] = sums3x1[columns + 1] = 0
     for r in range(rows):

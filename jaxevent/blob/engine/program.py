@@ -369,7 +369,21 @@ def write_track(program: TrackProgram) -> ModuleText:
 def trace_readout(
     filter: Filter, params: TrackerParams, track: Any, layout: Layout, dtype: np.dtype
 ) -> TracedProgram:
-    """Trace the functions of the readout; raises `TranslationError`."""
+    """Trace the functions of the readout.
+
+    Args:
+        filter: Filter of the track.
+        params: Parameters of the tracker.
+        track: Shapes of one track.
+        layout: Places of a track's numbers, see `trace_track`.
+        dtype: Type of real numbers.
+
+    Returns:
+        The program.
+
+    Raises:
+        TranslationError: A function does what cannot be translated.
+    """
     host, graph, steps, shape = (
         _host_program(params),
         Graph(),

@@ -98,7 +98,17 @@ def backward_pass(kernel, updates, elapsed, info, rows, scratch):
 
 @njit_noalloc
 def readout(kernel, updates, rows, query, scratch, out):
-    """Read out tracks at times, smoothed where there are `rows` of the backward pass."""
+    """Read out tracks at times, smoothed where the backward pass was run.
+
+    Args:
+        kernel: `ReadoutKernel`.
+        updates: `UpdateRecord` of the chunks.
+        rows: (rows, INFO_SIZE) backward information of each recorded row; empty for filtered
+            states.
+        query: `ReadoutQuery`.
+        scratch: `ReadoutScratch`.
+        out: `ReadoutArrays`, output where the query requests a state.
+    """
     context = _Context(kernel, updates, scratch)
     for track in range(len(query.serial)):
         _readout_track(context, rows, query, track, out)
@@ -106,7 +116,14 @@ def readout(kernel, updates, rows, query, scratch, out):
 
 @njit_noalloc_inlined
 def _propagate_to_chunk_end(integers, info, elapsed):
-    """Propagate from the start of the next chunk; tracks that are gone in it have nothing."""
+    """Propagate backward information from the start of the next chunk, in place.
+
+    Args:
+        integers: (targets, ...) integers of the tracks at the chunk's start. A track that is not
+            the same in the next chunk has no information.
+        info: (targets, INFO_SIZE) backward information.
+        elapsed: Time between the starts of both chunks, us.
+    """
     for k in range(len(info)):
         id = integers[k, ID]
         if info[k, KNOWN] != 0 and info[k, INFO_ID] == id and id >= 0:
@@ -139,8 +156,16 @@ def _predict(context, row, dt, silence):
 def _smooth_chunk(context, begin, end, info, rows):
     """Smooth the updates in rows [begin, end), from the last to the first.
 
-    With g = F^T r' and G = F^T N' F of the next update, r = (P-)^-1 (x - x- + P g) and
-    N = (P-)^-1 (P + P G P - P-) (P-)^-1.
+    With g = F^T r' and G = F^T N' F of the next update, r = (P-)^-1 (x - x- + P g) and N = (P-)^-1
+    (P + P G P - P-) (P-)^-1.
+
+    Args:
+        context: `_Context`.
+        begin: First row of the chunk.
+        end: Row after the last one.
+        info: (targets, INFO_SIZE) backward information after the chunk; it becomes that at its
+            start.
+        rows: (rows, INFO_SIZE) output, backward information after each row's update.
     """
     kernel, updates = context.kernel, context.updates
     work, matrices = context.scratch.work, context.scratch.matrices
@@ -174,7 +199,17 @@ def _smooth_chunk(context, begin, end, info, rows):
 
 @njit_noalloc_inlined
 def _transport(context, info, row, time):
-    """Compute g = F^T r and G = F^T N F, F from a time to the next update of a row's track."""
+    """Transport backward information from a track's next update to an earlier time.
+
+    It is g = F^T r and G = F^T N F, with F the transition between both; g goes to vectors[1], G to
+    matrices[0] of the scratch memory.
+
+    Args:
+        context: `_Context`.
+        info: (INFO_SIZE,) backward information of the track.
+        row: Recorded row of the track before the time.
+        time: Time, us since the chunk's start.
+    """
     kernel, scratch = context.kernel, context.scratch
     work, g, G, product = scratch.work, scratch.vectors[1], scratch.matrices[0], scratch.matrices[3]
     next = np.int64(info[NEXT])
@@ -200,7 +235,14 @@ def _transport(context, info, row, time):
 
 @njit_noalloc_inlined
 def _smooth_update(members, smallest, info, scratch):
-    """Compute r and N before an update, of components that depend on each other."""
+    """Compute r and N before an update, of components that depend on each other.
+
+    Args:
+        members: Indices of these components.
+        smallest: Number that is added to correlations, for what rounding makes singular.
+        info: (INFO_SIZE,) backward information of the track, output.
+        scratch: `ReadoutScratch` with G, P and P- in matrices 0 to 2, x - x- and g in the vectors.
+    """
     matrices, e, g = scratch.matrices, scratch.vectors[0], scratch.vectors[1]
     G, now, before, product, inverse, other = (
         matrices[0], matrices[1], matrices[2], matrices[3], matrices[4], matrices[5],
@@ -235,7 +277,15 @@ def _multiply(members, a, b, out):
 
 @njit_noalloc_inlined
 def _invert(members, smallest, P, out, work):
-    """Invert a covariance by sweeps, scaled to correlations; 0 for exactly known components."""
+    """Invert a covariance by sweeps, scaled to correlations; 0 for exactly known components.
+
+    Args:
+        members: Indices of the components that depend on each other; others are left alone.
+        smallest: Number that is added to correlations, for what rounding makes singular.
+        P: (8, 8) covariance.
+        out: (8, 8) output.
+        work: (8, 8) scratch.
+    """
     for i in members:
         for j in members:
             scale = P[i, i] * P[j, j]
@@ -262,7 +312,15 @@ def _invert(members, smallest, P, out, work):
 
 @njit_noalloc_inlined
 def _readout_track(context, rows, query, track, out):
-    """Read out a track at all times."""
+    """Read out a track at all times at which it is requested.
+
+    Args:
+        context: `_Context`.
+        rows: (rows, INFO_SIZE) backward information; empty for filtered states.
+        query: `ReadoutQuery`.
+        track: The track's column in the query.
+        out: `ReadoutArrays`, output.
+    """
     updates, work, smooth = context.updates, context.scratch.work, len(rows) > 0
     targets, micro = len(updates.latest), work.dtype.type(1e-6)
     chunk = target = row = following = np.int64(-1)
@@ -297,7 +355,14 @@ def _readout_track(context, rows, query, track, out):
 
 @njit_noalloc_inlined
 def _smooth_state(context, info, row, time):
-    """Smooth X and P: X + P g, P + P G P."""
+    """Smooth the predicted state in the scratch memory: X + P g and P + P G P.
+
+    Args:
+        context: `_Context` with X and P of the prediction in `scratch.work`.
+        info: (INFO_SIZE,) backward information of the track.
+        row: Recorded row of the track before the time.
+        time: Time, us since the chunk's start.
+    """
     kernel, scratch = context.kernel, context.scratch
     work, matrices, e, g = scratch.work, scratch.matrices, scratch.vectors[0], scratch.vectors[1]
     now, product, other = matrices[1], matrices[3], matrices[4]

@@ -255,6 +255,9 @@ def _measure_mean(
         residuals: Residuals of the step.
         trusted: Whether the position is certain enough for the orientation to be measured.
         on_size: Factor of the derivative by lambda; None: the mean does not act on the sizes.
+
+    Returns:
+        One measurement for each axis.
     """
     unit = jnp.eye(len(state.x), dtype=state.P.dtype)
     size, mean = residuals.size, residuals.mean
@@ -280,7 +283,16 @@ def _size_derivative(state: Chi2State) -> Array:
 
 @full_precision
 def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tuple[Array, Array]:
-    """Update by one scalar after the other, all at the predicted state: equal to a joint update."""
+    """Update by one scalar after the other, all at the predicted state: equal to a joint update.
+
+    Args:
+        x: (d,) predicted state.
+        P: (d, d) its covariance.
+        measurements: Scalar measurements with independent noise.
+
+    Returns:
+        The state and its covariance.
+    """
     # Rounding may take a variance that falls a millionfold below 0; the last term is as large.
     step, rounding = jnp.zeros_like(x), 4 * jnp.finfo(P.dtype).eps * jnp.diagonal(P)
     for row, innovation, noise, weight in measurements:
@@ -306,7 +318,18 @@ def _update(
     weight: Array,
     measure: Callable[[Any, Chi2State, _WindowStep], list[_Measurement]],
 ) -> Chi2State:
-    """Update by a step's mean residual and the window's sums, which `measure` compares."""
+    """Update by a step's mean residual and by the window's sums of squares.
+
+    Args:
+        params: Parameters.
+        state: Predicted state.
+        batch: The M events of the step.
+        weight: (M,) weights of the events, 0 to 1.
+        measure: Function that makes measurements of the predicted state and the window.
+
+    Returns:
+        The state after the step.
+    """
     authors = not state.logarithmic
     residuals = _rotate_residuals(params, state, batch, weight)
     P, trusted = (state.P, jnp.bool(True)) if authors else _limit_variances(params, state)

@@ -81,9 +81,16 @@ class LinearMotion(eqx.Module):
     def residuals(
         self, batch: EventBatch, weight: Array
     ) -> tuple[Array, Array, list[Array | float]]:
-        """Return the events' residuals (M, 2) in px, their weighted mean, and its model.
+        """Compute the residuals of events, their weighted mean, and the model of that mean.
 
-        The model is the factor of each component of x in the mean position of the events.
+        Args:
+            batch: The M events.
+            weight: (M,) weights of the events, 0 to 1.
+
+        Returns:
+            Residuals (M, 2) and their mean (2,), px, and the factors of position, velocity and
+                offset in
+            the mean.
         """
         total = weight.sum()
         share = weight / jnp.where(total > 0, total, 1)
@@ -231,11 +238,18 @@ def gated_moments(params: TrackerParams) -> tuple[Array | float, Array | float]:
 
 
 def log_size_step(step: Array, derivative: Array) -> Array:
-    """Return log(1 + derivative step) / derivative, a step of log lambda valid for any length.
+    """Return a step of log lambda of any length, log(1 + derivative step) / derivative.
 
     Without P_p and a gate, log lambda of variance P is lambda^2 of an inverse gamma distribution of
     the shape 1 / (4 P). Its update by u^2 multiplies lambda^2 by 1 + 2 step, `step` being that of
-    the Kalman filter, and has the same variance. From a size twice too large the Kalman
-    filter's variance would shrink long before the size is right, as u^2 / V - 1 is never below -1.
+    the Kalman filter, and has the same variance. From a size twice too large the Kalman filter's
+    variance would shrink long before the size is right, as u^2 / V - 1 is never below -1.
+
+    Args:
+        step: Step of the Kalman filter, of log lambda.
+        derivative: Derivative of the measured u^2 / V by log lambda.
+
+    Returns:
+        The step.
     """
     return jnp.log1p(jnp.maximum(derivative * step, -0.999)) / jnp.maximum(derivative, 1e-15)

@@ -246,7 +246,17 @@ def objective(
 
 @eqx.filter_jit
 def _value_and_grad(params: Params, window: Window, z: Array, times: Array) -> tuple[Array, Array]:
-    """Return the objective and its gradient for a motion in px at the window's end."""
+    """Compute the objective and its gradient.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        z: (d,) motion, px at the window's end.
+        times: Number of times that images are blurred.
+
+    Returns:
+        The objective and its gradient (d,).
+    """
     scale = jnp.asarray(window.scale)
     return jax.value_and_grad(lambda z: objective(params, window, z * scale, times))(z)
 
@@ -284,7 +294,17 @@ def _cell_profile(
 def _evaluate(
     params: Params, window: Window, z: NDArray, times: int
 ) -> tuple[float, NDArray[np.float64]]:
-    """Return the objective and its gradient on the host, in double precision."""
+    """Compute the objective and its gradient on the host, in double precision.
+
+    Args:
+        params: The parameters.
+        window: The window.
+        z: (d,) motion, px at the window's end.
+        times: Number of times that images are blurred.
+
+    Returns:
+        The objective and its gradient (d,).
+    """
     real, number = jnp.result_type(float), jnp.asarray(times)
     value, slope = _value_and_grad(params, window, jnp.asarray(z, real), number)
     return float(value), np.asarray(slope, np.float64)
@@ -684,7 +704,15 @@ class WindowSequence:
         return max(refined, key=lambda one: one[1])[0]
 
     def _grid_peaks(self, window: Window, bound: float) -> list[NDArray[np.float64]]:
-        """Return the best local maxima of a grid of motions within +- bound."""
+        """Find the best local maxima of a grid of motions.
+
+        Args:
+            window: The window.
+            bound: Largest size of each component.
+
+        Returns:
+            The motions, the best first.
+        """
         dimension, number = self.model.dimension, self.params.starts
         axis = np.linspace(-bound, bound, number) if number > 1 else np.zeros(1)
         motions = np.stack(np.meshgrid(*[axis] * dimension, indexing="ij"), -1)
@@ -699,7 +727,15 @@ class WindowSequence:
 def _drop_duplicates(
     refined: list[tuple[NDArray[np.float64], float]], scale: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Sort motions by their values, the best first, and keep one of those that are near."""
+    """Keep one of those motions that are near to each other, the best.
+
+    Args:
+        refined: Motions (d,) and their objectives.
+        scale: (d,) motion of 1 px at the window's end.
+
+    Returns:
+        The motions, the best first.
+    """
     kept: list[NDArray[np.float64]] = []
     for motion, _ in sorted(refined, key=lambda one: -one[1]):
         if all(

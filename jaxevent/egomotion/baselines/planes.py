@@ -175,7 +175,15 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
 
 
 def _pixels_of(recording: Recording, rows: NDArray) -> tuple[NDArray, NDArray]:
-    """Return columns and rows of the pixels of some events."""
+    """Return the pixels of some events.
+
+    Args:
+        recording: The recording.
+        rows: (n,) ascending rows of the events.
+
+    Returns:
+        (n,) columns and rows, px.
+    """
     if not len(rows):
         return np.zeros(0, int), np.zeros(0, int)
     events = recording.events[int(rows[0]) : int(rows[-1]) + 1]
@@ -223,7 +231,15 @@ class PlaneRules(NamedTuple):
 
 @njit_noalloc
 def _fit_planes(stream, surfaces, rules, out):
-    """Update the surface event by event, and fit a plane to it around each event."""
+    """Update the surface event by event, and fit a plane to it around each event.
+
+    Args:
+        stream: Times (us), columns, rows and polarities of events, and whether each is wanted.
+        surfaces: `EventSurface`, changed in place.
+        rules: `PlaneRules`.
+        out: Output: flow (n, 2) px/s, mean age (n,) s of the plane's events, and whether there is a
+            flow.
+    """
     # Names of their own: numba reads arrays out of tuples anew in every loop.
     t, x, y, p, wanted = stream
     position, surface, latest, scratch = surfaces

@@ -128,7 +128,15 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
 
 
 def pair_frames(frames: Frames, span: float) -> list[tuple[int, int]]:
-    """Pair each frame with the first that is `span` s later; at least the first and the last."""
+    """Pair each frame with a later one.
+
+    Args:
+        frames: The frames.
+        span: Least time between the two, s.
+
+    Returns:
+        Rows of the pairs; at least the first and the last frame.
+    """
     t = np.asarray(frames.t)
     later = np.searchsorted(t, t + max(round(1e6 * span), 1))
     pairs = [(k, int(two)) for k, two in enumerate(later) if two < len(t)]
@@ -166,7 +174,18 @@ def _track_pair(
     two: NDArray[np.uint8],
     at: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Track points (n, 2) of an image to the next one; return which returned (n,)."""
+    """Track points from an image to the next one and back.
+
+    Args:
+        cv2: The module of OpenCV.
+        params: The parameters.
+        one: (height, width) image.
+        two: (height, width) next image.
+        at: (n, 2) positions in the first, px.
+
+    Returns:
+        (n, 2) positions in the second, px, and whether tracking back returned to `at`.
+    """
     if not len(at):
         return at, np.zeros(0, bool)
     at = at.reshape(-1, 1, 2).astype(np.float32)
@@ -282,7 +301,17 @@ def _mean_parallax(
     two: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> float:
-    """Average the displacement along that of points before the camera; below 0 if T is wrong."""
+    """Average the displacement along that of points before the camera; it is below 0 if T is wrong.
+
+    Args:
+        motion: (6,) T and Omega for unit time.
+        one: (n, 3) rays in the first view, of depth 1.
+        two: (n, 3) rays in the second view, of depth 1.
+        weight: (n,) weights.
+
+    Returns:
+        The mean, for f = 1.
+    """
     R, t = _relative_pose(motion)
     turned = one @ R.T
     displacement = two[:, :2] - turned[:, :2] / turned[:, 2:]
@@ -300,7 +329,16 @@ def _relative_pose(motion: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
 def _sampson_distances(
     motion: NDArray[np.float64], one: NDArray[np.float64], two: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the distances of rays (n, 3) from epipolar lines, for f = 1."""
+    """Return the distances of rays from epipolar lines, for f = 1.
+
+    Args:
+        motion: (6,) T and Omega for unit time.
+        one: (n, 3) rays in the first view, of depth 1.
+        two: (n, 3) rays in the second view, of depth 1.
+
+    Returns:
+        (n,) signed distances.
+    """
     R, t = _relative_pose(motion)
     E = np.cross(t, R, axisb=0, axisc=0)
     to, fro = one @ E.T, two @ E

@@ -64,7 +64,16 @@ class ImageScratch(NamedTuple):
 
     @classmethod
     def of(cls, shape: tuple[int, int], real: np.dtype, sums: NDArray) -> "ImageScratch":
-        """Allocate it for images of a shape."""
+        """Allocate the scratch memory for images.
+
+        Args:
+            shape: (height, width), px.
+            real: Type of the numbers.
+            sums: Sums over parts of the image, which are kept with the images.
+
+        Returns:
+            The memory, not initialised.
+        """
         return cls(np.empty((2, *shape), real), np.empty(shape, real), sums)
 
 
@@ -93,7 +102,14 @@ class VisibleRegion(NamedTuple):
 
 @njit_fastmath_inlined
 def splat(image, x, y, weight):
-    """Add an event at (x, y) px from the corner; the part outside the image is lost."""
+    """Add an event to the four pixels about it, bilinearly; the part outside the image is lost.
+
+    Args:
+        image: (height, width), changed in place.
+        x: Column, px from the first pixel.
+        y: Row, px from the first pixel.
+        weight: Amount to add, such as the polarity.
+    """
     height, width = image.shape
     if not (x > -1 and y > -1 and x < width and y < height):
         return
@@ -111,9 +127,12 @@ def splat(image, x, y, weight):
 
 @njit_fastmath
 def blur(image, work, times):
-    """Blur an image by [1 2 1] / 4 in x and in y, `times` times, in place; black beyond its border.
+    """Blur an image by [1 2 1] / 4 in x and in y, in place; it is black beyond its border.
 
-    `work` is scratch of the same shape.
+    Args:
+        image: (height, width).
+        work: (height, width) scratch.
+        times: Number of blurs.
     """
     height, width = image.shape
     quarter, half = image.dtype.type(0.25), image.dtype.type(0.5)
@@ -135,7 +154,12 @@ def blur(image, work, times):
 
 @njit_fastmath
 def _accumulate_segments(window, images):
-    """Add the signed images of segments (S, height, width) of warped events."""
+    """Add the warped events to a signed image for each segment of the window.
+
+    Args:
+        window: `WindowEvents`, with positions in the reference view.
+        images: (S, height, width), changed in place.
+    """
     segments, height, width = images.shape
     half = window.half
     for e in range(len(window.x)):
@@ -184,9 +208,14 @@ def _compare_segments(images, cell, region, others, share, sums):
 
 @njit_fastmath
 def _accumulate_gradients(images, others, gain, cell, sums):
-    """Add sums over cells (S, cells, 6) of d = gain T - I and the gradient g of T.
+    """Add up over cells the products of the difference d = gain T - I and the gradient g of T.
 
-    They are those of d^2, gx^2, gx gy, gy^2, gx d, gy d.
+    Args:
+        images: (S, height, width) images I of the segments.
+        others: (S, height, width) images T of all other segments.
+        gain: (S, cells) factors.
+        cell: Size of a cell, px.
+        sums: (S, cells, 6), changed in place: d^2, gx^2, gx gy, gy^2, gx d and gy d.
     """
     segments, height, width = images.shape
     columns = width // cell
@@ -209,7 +238,12 @@ def _accumulate_gradients(images, others, gain, cell, sums):
 
 @njit_fastmath
 def _accumulate_events(window, images):
-    """Add the signed image and the number of warped events to images (2, height, width)."""
+    """Add the warped events to a signed image and to an image of their number.
+
+    Args:
+        window: `WindowEvents`, with positions in the reference view.
+        images: (2, height, width), changed in place.
+    """
     for e in range(len(window.x)):
         x, y = window.x[e] - window.corner[0], window.y[e] - window.corner[1]
         splat(images[0], x, y, window.p[e])
@@ -239,6 +273,9 @@ def align_segments(
         degree: Highest row of O and D that is fitted, at most 2.
         blurs: Number of times that images are blurred by [1 2 1] / 4.
         steps: Number of Gauss-Newton steps.
+
+    Returns:
+        The refined path.
     """
     times = warp.segment_times(window.half)[:, None]
     parts = np.broadcast_arrays(*window.cell_positions, times)
@@ -252,7 +289,16 @@ def align_segments(
 
 
 def _trace_cells(path: warp.Path, window: WindowEvents, centres: warp.Points) -> warp.Points:
-    """Find the positions of the cells' centres (S, cells) at the segments' times."""
+    """Find where the centres of cells are at the segments' times.
+
+    Args:
+        path: Path, with log depths of cells.
+        window: Events.
+        centres: (S, cells) the centres in the reference view, px, and the segments' times, s.
+
+    Returns:
+        (S, cells) positions at these times.
+    """
     rho, (x, y, tau) = np.exp(path.log_rho), centres
     for _ in range(4):
         X, Y = warp.warp(path, window.f, warp.Points(x, y, tau), rho)
@@ -270,6 +316,9 @@ def _measure_displacements(
         window: Events.
         shifts: (S, cells) px, shifts of cells' centres from the reference to the segments' times.
         blurs: Number of times that images are blurred.
+
+    Returns:
+        The displacements with their information.
     """
     real, cells = window.x.dtype, shifts.X.shape[1]
     own = np.zeros((warp.N_WINDOW_SEGMENTS, *window.shape), real)
@@ -311,9 +360,20 @@ def _take_step(
     prior: warp.Prior,
     degree: int,
 ) -> warp.Path:
-    """Take a Gauss-Newton step of the rows up to `degree` and the depths of cells.
+    """Take a Gauss-Newton step of the path's first rows and of the depths of cells.
 
     Unknowns are the path's first rows, in px at the window's end, and the cells' log depths.
+
+    Args:
+        path: Path at which the step begins.
+        window: Events.
+        tracks: (S, cells) positions of cells at the segments' times.
+        found: Displacements of cells in segments.
+        prior: Priors on path and depths.
+        degree: Highest row of O and D that is fitted.
+
+    Returns:
+        The path after the step; `path` itself if the step is not finite.
     """
     f, half, (_, cells), n = window.f, window.half, tracks.x.shape, tracks.x.size
     rho = np.broadcast_to(np.exp(path.log_rho), tracks.x.shape)
@@ -380,7 +440,15 @@ def _take_step(
 
 
 def _smoothness_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
-    """Return the matrix of a weighted sum of squared differences to the cells before."""
+    """Return the matrix of a weighted sum of squared differences between neighbouring cells.
+
+    Args:
+        across: (rows, columns) weights of differences to the column before.
+        down: (rows, columns) weights of differences to the row before.
+
+    Returns:
+        (cells, cells) matrix K: the sum is v' K v.
+    """
     number = np.arange(across.size).reshape(across.shape)
     found = np.zeros((across.size, across.size))
     for a, b, weight in (
@@ -393,7 +461,17 @@ def _smoothness_matrix(across: NDArray, down: NDArray) -> NDArray[np.float64]:
 
 
 def contrast_score(window: WindowEvents, path: warp.Path) -> float:
-    """Score a path by the mean over blocks of n (log S - 1.5 log n) / N, S the contrast."""
+    """Score a path by the contrast of the image of warped events.
+
+    Args:
+        window: Events.
+        path: Path, with log depths of cells.
+
+    Returns:
+        The mean over blocks of n (log S - 1.5 log n) / N: S is the sum of squares of the signed
+            image
+        in a block, n its number of events and N that of all events. More is better.
+    """
     images = np.zeros((2, *window.shape), window.x.dtype)
     work = np.empty_like(images[0])
     _accumulate_events(_warp_by_cells(path, window), images)

@@ -73,7 +73,17 @@ def coarse_shape(rows: int, columns: int) -> tuple[int, int]:
 
 @njit_fastmath_inlined
 def _coarse_node(j, i, corner, columns):
-    """Return the coarse node at one of four corners about a node, and its weight."""
+    """Return the coarse node at one of four corners about a node, and its weight.
+
+    Args:
+        j: Row of the node of depth.
+        i: Column of the node of depth.
+        corner: 0 to 3: upper left, upper right, lower left, lower right.
+        columns: Number of columns of coarse nodes.
+
+    Returns:
+        Number of the coarse node, counted row by row, and its weight in the bilinear interpolation.
+    """
     row, column = j // NODES_PER_COARSE_NODE, i // NODES_PER_COARSE_NODE
     u, v = (
         (i - column * NODES_PER_COARSE_NODE) / NODES_PER_COARSE_NODE,
@@ -85,7 +95,15 @@ def _coarse_node(j, i, corner, columns):
 
 @njit_fastmath
 def _add_depth_priors(hold, across, down, begin, out):
-    """Add damping and bonds of depths to P' H P, whose row `begin` is the first coarse node's."""
+    """Add damping and bonds of depths to P' H P, in place.
+
+    Args:
+        hold: (rows, columns) damping of log depths at nodes.
+        across: (rows, columns) bonds to the column before.
+        down: (rows, columns) bonds to the row before.
+        begin: Row of the first coarse node in `out`.
+        out: (n + m, n + m) matrix P' H P of the path's unknowns and of coarse depths.
+    """
     rows, columns = hold.shape
     wide = (columns - 1) // NODES_PER_COARSE_NODE + 2
     for j in range(rows):
@@ -125,7 +143,12 @@ def cholesky(matrix):
 
 @njit_fastmath
 def cholesky_solve(lower, side):
-    """Solve for a right side, in place, by the factor of `cholesky`."""
+    """Solve a system for one right side, in place, by the factor of `cholesky`.
+
+    Args:
+        lower: (n, n) factor; its diagonal holds reciprocals.
+        side: (n,) right side, overwritten by the solution.
+    """
     for i in range(len(side)):
         row, s = lower[i], side[i]
         for k in range(i):
@@ -166,7 +189,15 @@ def coarse_factor(
 
 @njit_fastmath
 def precondition_path_and_depths(system, t, depth, out_t, out_depth):
-    """Write the preconditioned unknowns of path (n,) and depths (rows, columns)."""
+    """Apply the preconditioner to the unknowns of path and depths.
+
+    Args:
+        system: `System`; its `side` is scratch.
+        t: (n,) unknowns of the path.
+        depth: (rows, columns) log depths at nodes.
+        out_t: (n,) output.
+        out_depth: (rows, columns) output.
+    """
     side, n, (rows, columns) = system.side, len(t), depth.shape
     wide = (columns - 1) // NODES_PER_COARSE_NODE + 2
     for i in range(n):
@@ -191,7 +222,13 @@ def precondition_path_and_depths(system, t, depth, out_t, out_depth):
 
 @njit_fastmath_inlined
 def _add_prior_products(system, vector, out):
-    """Add the products of the priors' part of H with map and depths."""
+    """Add the products of the priors' part of H with map and depths, in place.
+
+    Args:
+        system: `System`.
+        vector: `BlockVector` that is multiplied.
+        out: `BlockVector` that the products are added to.
+    """
     map_, depth, out_depth, lumped = vector.map, vector.depth, out.depth, system.depth_damping
     across, down, (height, width) = system.across, system.down, map_.shape
     real = map_.dtype.type
@@ -221,7 +258,14 @@ def _add_prior_products(system, vector, out):
 
 @njit_fastmath
 def multiply(system, vector, value, out):
-    """Write H times a `BlockVector` to `out`; `value` (E,) is scratch."""
+    """Multiply H by a vector.
+
+    Args:
+        system: `System`; its `coefficients` and `more` are scratch.
+        vector: `BlockVector` that is multiplied.
+        value: (E,) scratch.
+        out: `BlockVector`, output.
+    """
     jacobian, real, t, out_t = system.jacobian, vector.map.dtype.type, vector.t, out.t
     n, m = len(t), 6 * N_COEFFICIENT_ROWS
     coefficients, more = system.coefficients, system.more
@@ -294,7 +338,19 @@ def _flat(vector):
 
 @njit_fastmath
 def _conjugate_gradients(system, vectors, steps, tolerance, value):
-    """Solve in place, in five vectors, the first the right side; return the number of steps."""
+    """Solve H x = side by conjugate gradients, in place; see `conjugate_gradients`.
+
+    Args:
+        system: `System`.
+        vectors: Five `BlockVector`s: the right side, which becomes the residual; x, which is 0; and
+            three of scratch.
+        steps: Most steps.
+        tolerance: Relative size of the residual at which steps end.
+        value: (E,) scratch.
+
+    Returns:
+        Number of steps taken.
+    """
     residual, found, direction, out, better = vectors
     (q, left_t, b), (p, found_t, a), (d, way_t, c) = _flat(residual), _flat(found), _flat(direction)
     (r, out_t, g), (_, better_t, h) = _flat(out), _flat(better)
@@ -348,7 +404,13 @@ class ColumnVectors(NamedTuple):
 
 @njit_fastmath
 def add_inner_products(a, b, out):
-    """Add a b' of rows (S, N), a part at a time: single precision would not hold all."""
+    """Add a b' to a matrix, in place, a part at a time: single precision would not hold all.
+
+    Args:
+        a: (S, N) rows.
+        b: (S, N) rows.
+        out: (S, S) matrix, in double precision.
+    """
     for begin in range(0, a.shape[1], N_CACHED_VALUES):
         for k in range(len(a)):
             one = a[k, begin : begin + N_CACHED_VALUES]
@@ -361,7 +423,13 @@ def add_inner_products(a, b, out):
 
 @njit_fastmath
 def _add_combinations(by, a, out):
-    """Add by' a, of rows a (S, N) and factors (S, S)."""
+    """Add linear combinations of rows, by' a, to other rows in place.
+
+    Args:
+        by: (S, S) factors.
+        a: (S, N) rows.
+        out: (S, N) rows that are added to.
+    """
     for begin in range(0, a.shape[1], N_CACHED_VALUES):
         for c in range(len(out)):
             to = out[c, begin : begin + N_CACHED_VALUES]

@@ -182,12 +182,15 @@ class WindowFitter(Windows):
         return self.gyro(np.array([middle], np.int64))[1][0]
 
     def initial_paths(self, centre: int, Omega: NDArray, planes: list[PlanarMotion]) -> list[Path]:
-        """Return aligned paths of constant twist, with depths of cells, the best first.
+        """Make aligned paths of constant twist, with depths of cells.
 
         Args:
             centre: Middle of the window, us; a third of it is used.
             Omega: (3,) rotation about there, rad/s.
             planes: Motions before planes.
+
+        Returns:
+            The paths, the best first.
         """
         params, half = self.params, self.half / 3
         window = self.sample_events(centre, half, MAX_ALIGNED_EVENTS)
@@ -202,7 +205,15 @@ class WindowFitter(Windows):
         return self._align(window, centre, found, (0, 4, 6), (0, 1, 6))[:MAX_INITIAL_PATHS]
 
     def align(self, centre: int, paths: list[Path]) -> list[Path]:
-        """Align paths over longer windows; return the best, some degrees apart."""
+        """Align paths over longer windows.
+
+        Args:
+            centre: Middle of the window, us.
+            paths: Paths with depths of cells.
+
+        Returns:
+            The best, some degrees apart, the best first.
+        """
         middle = self.sample_events(centre, 2 * self.half / 3, MAX_ALIGNED_EVENTS)
         last = self.sample_events(centre, self.half, MAX_SCORED_EVENTS)
         best = self._align(middle, centre, paths, (1, 2, 8))[: 2 * self.params.rivals]
@@ -212,7 +223,17 @@ class WindowFitter(Windows):
     def _align(
         self, window: WindowEvents, centre: int, paths: list[Path], *passes: tuple[int, int, int]
     ) -> list[Path]:
-        """Align paths in passes of some degree, blurs and steps; sort them by their score."""
+        """Align paths in passes, and sort them by their score.
+
+        Args:
+            window: Events.
+            centre: Middle of the window, us, for its prior.
+            paths: Paths with depths of cells.
+            *passes: Degree, number of blurs and number of steps of each pass, see `align_segments`.
+
+        Returns:
+            The paths, the best first, without those near to a better one.
+        """
         prior = self.prior(centre, window.half)
 
         def align(path: Path) -> tuple[float, Path]:
@@ -268,11 +289,14 @@ class WindowFitter(Windows):
         return found
 
     def hypotheses(self, centre: int, warm: Path | None = None) -> list[Hypothesis]:
-        """Make hypotheses for the final refinement, the best first.
+        """Make hypotheses for the final refinement.
 
         Args:
             centre: Middle of the window, us.
             warm: A path with depths at nodes that is one of the starts.
+
+        Returns:
+            Scenes and reports of their fits, the best first.
         """
         paths = [] if warm is None else [warm]
         Omega = self.rotation(centre)
@@ -295,7 +319,17 @@ class WindowFitter(Windows):
     def refine_coarse_to_fine(
         self, centre: int, series: PixelSeries, paths: list[Path], stages: tuple[Stage, ...]
     ) -> list[Hypothesis]:
-        """Refine paths with depths at nodes by stages, each after a search of depths."""
+        """Refine paths by stages, each after a search of depths.
+
+        Args:
+            centre: Middle of the window, us.
+            series: Events.
+            paths: Paths with depths at nodes.
+            stages: The stages, from large to small sigma.
+
+        Returns:
+            The hypotheses that remain, in no order.
+        """
         prior = self.prior(centre, self.half)
         found: list[Hypothesis] = []
         scenes = [blank_scene(series, path, prior) for path in paths]
@@ -320,7 +354,15 @@ class WindowFitter(Windows):
         return found
 
     def refine_from(self, centre: int, warm: Path) -> Hypothesis:
-        """Refine a path with depths at nodes that is about right, but for the last stage."""
+        """Refine a path that is about right, up to the last stage.
+
+        Args:
+            centre: Middle of the window, us.
+            warm: The path, with depths at nodes.
+
+        Returns:
+            The scene and the report of its fit.
+        """
         series = self.series(centre, self.half, MAX_HYPOTHESIS_EVENTS)
         (found,) = self.refine_coarse_to_fine(
             centre, series, [warm], PREDICTED_COARSE_TO_FINE_STAGES
@@ -329,7 +371,15 @@ class WindowFitter(Windows):
         return _refine(found, series, prior, PREDICTED_STAGES, sigma_floor=floor)
 
     def fit(self, centre: int, warm: Path | None = None) -> WindowFit | None:
-        """Fit a window from new starts, and from a path with depths at nodes if one is given."""
+        """Fit a window from new initial paths, and from a known one.
+
+        Args:
+            centre: Middle of the window, us.
+            warm: The known path, with depths at nodes, or None.
+
+        Returns:
+            The fit; None if no hypothesis converged.
+        """
         return self.refine_final(centre, self.hypotheses(centre, warm), FINAL_STAGES)
 
     def refine_final(
@@ -394,9 +444,15 @@ class WindowFitter(Windows):
         return WindowFit(scene.path, covariance, report.inliers, report.cost, scene.map, spread)
 
     def lens_covariance(self, path: Path) -> NDArray[np.float64]:
-        """Return the covariance (6, 6) by the errors of a distorting lens's calibration.
+        """Return the covariance due to the errors of a distorting lens's calibration.
 
-        They are a share of the image's motion, which heading and Omega make up for.
+        The errors are a share of the image's motion, which heading and Omega make up for.
+
+        Args:
+            path: Path with log depths.
+
+        Returns:
+            (6, 6), of heading and Omega.
         """
         rho, heading = float(np.exp(np.median(path.log_rho))), path.D[0]
         moved = self.lens * (rho + float(np.linalg.norm(path.O[0])))  # rad/s
@@ -406,12 +462,27 @@ class WindowFitter(Windows):
         return left
 
     def parallax(self, path: Path, series: PixelSeries) -> float:
-        """Return the motion (px) of a point of median depth by translation, while events last."""
+        """Return the motion of a point of median depth by translation, while events last.
+
+        Args:
+            path: Path with log depths.
+            series: Events.
+
+        Returns:
+            px.
+        """
         lasts = float(np.ptp(series.tau)) if len(series.tau) else 0.0
         return lasts * self.f * float(np.exp(np.median(path.log_rho)))
 
     def held_out_test(self, centre: int) -> "HeldOutTest":
-        """Divide pixels of a window for a comparison of hypotheses."""
+        """Divide the pixels of a window for a comparison of hypotheses on held-out pixels.
+
+        Args:
+            centre: Middle of the window, us.
+
+        Returns:
+            The test.
+        """
         half = self.half
         first, last = self.event_range(centre, half)
         limit = min(MAX_HYPOTHESIS_EVENTS, int(0.6 * (last - first)))
@@ -431,10 +502,18 @@ class WindowFitter(Windows):
 def _without_heading(
     path: Path, still: Path, covariance: NDArray[np.float64]
 ) -> tuple[Path, NDArray[np.float64]]:
-    """Return path and covariance if rotation alone, `still`, is not refuted.
+    """Return path and covariance of a window whose rotation alone is not refuted.
 
     The path is the rotation's, with hardly a translation, and Omega may be either's. The heading is
     not observable.
+
+    Args:
+        path: The path with a translation.
+        still: The path by rotation alone.
+        covariance: (6, 6) of heading and Omega of `path`.
+
+    Returns:
+        The path, and its covariance (6, 6).
     """
     found, heading, turn = covariance.copy(), path.D[0], still.O[0] - path.O[0]
     found[:3], found[:, :3] = 0, 0
@@ -472,7 +551,15 @@ def is_near(path: Path, other: Path) -> bool:
 
 
 def _drop_near(ranked: list[Any], path: Callable[[Any], Path]) -> list[Any]:
-    """Keep the items whose paths are not near to that of an earlier kept one."""
+    """Keep the items whose paths differ from those of all items kept before.
+
+    Args:
+        ranked: Items, the best first.
+        path: Function that returns an item's path.
+
+    Returns:
+        The items that are kept, in order.
+    """
     best: list[Any] = []
     for one in ranked:
         if not any(is_near(path(one), path(other)) for other in best):
@@ -494,7 +581,19 @@ def _settle_and_refine(
     plane: bool = False,
     sigma_floor: float = 0.0,
 ) -> Hypothesis:
-    """Refine a scene by stages, after its map has been fitted; see `_refine`."""
+    """Refine a scene by stages, after its map has been fitted.
+
+    Args:
+        series: Events.
+        scene: Scene, whose map may be empty.
+        prior: Priors, which stages scale.
+        stages: See `_refine`.
+        plane: Whether depths are a plane's.
+        sigma_floor: Least sigma, C.
+
+    Returns:
+        The scene and the report of its fit.
+    """
 
     def settle(scene: Scene, sigma: float, steps: int) -> Hypothesis:
         return adjust(series, scene, prior, sigma=sigma, map_steps=steps, steps=steps, plane=plane)
@@ -524,6 +623,9 @@ def _refine(
         stages: Sigma and steps; sigma is not much less than the noise of the fit before.
         plane: Whether depths are a plane's.
         sigma_floor: Least sigma, C.
+
+    Returns:
+        The scene and the report of its fit.
     """
     scene, report = hypothesis
     for stage in stages:

@@ -50,7 +50,18 @@ STRAIN_GENERATORS = np.array(
 
 @njit_fastmath_inlined
 def _warp_point(M, x, y, t, f):
-    """Move a point by exp(M t), px."""
+    """Move a point by the homography exp(M t).
+
+    Args:
+        M: (3, 3) generator, 1/s.
+        x: px from the principal point.
+        y: px from the principal point.
+        t: Time, s.
+        f: Focal length, px.
+
+    Returns:
+        The position, px from the principal point.
+    """
     a, b, c = x / f, y / f, 1.0
     X, Y, Z = a, b, c
     for k in range(1, MATRIX_EXPONENTIAL_ORDER + 1):
@@ -66,7 +77,16 @@ def _warp_point(M, x, y, t, f):
 
 @njit_fastmath_inlined
 def _image_gradient(image, x, y):
-    """Return the gradient of an image between its pixels, 0 beyond it."""
+    """Return the gradient of an image between its pixels, 0 beyond it.
+
+    Args:
+        image: (height, width).
+        x: Column, px from the first pixel.
+        y: Row, px from the first pixel.
+
+    Returns:
+        The derivatives by x and y, 1/px, of the bilinear interpolation.
+    """
     height, width = image.shape
     if not (x > -1 and y > -1 and x < width and y < height):
         return 0.0, 0.0
@@ -88,7 +108,7 @@ def contrast_and_gradient(window, M, basis, blurs, scratch, gradient):
         M: (3, 3) generator, 1/s.
         basis: (n, 3, 3) generators that M is a combination of.
         blurs: Number of times that the image is blurred.
-        scratch: `ImageScratch` with sums (3, EXPONENTIAL_ORDER + 1, 3).
+        scratch: `ImageScratch` with sums (3, MATRIX_EXPONENTIAL_ORDER + 1, 3).
         gradient: (n,) output, by the factors of `basis`.
     """
     x, y, tau, p, f, corner = window.x, window.y, window.tau, window.p, window.f, window.corner
@@ -148,7 +168,14 @@ def contrast_and_gradient(window, M, basis, blurs, scratch, gradient):
 
 @njit_fastmath
 def _warp_by_generator(window, M, X, Y):
-    """Write the positions of events moved by exp(M tau)."""
+    """Move events by the homographies exp(M tau).
+
+    Args:
+        window: `WindowEvents`.
+        M: (3, 3) generator, 1/s.
+        X: (n,) output, px from the principal point.
+        Y: (n,) output.
+    """
     for e in range(len(window.x)):
         X[e], Y[e] = _warp_point(M, window.x[e], window.y[e], window.tau[e], window.f)
 
@@ -312,9 +339,16 @@ class PlanarMotion(NamedTuple):
 
 
 def homography_flow(window: WindowEvents, Omega: NDArray) -> NDArray[np.float64]:
-    """Return M (3, 3), 1/s, of the homographies exp(M tau) of highest contrast, from a rotation.
+    """Find the generator M of the homographies exp(M tau) of highest contrast.
 
-    Of a camera that moves before a plane M is [Omega]x + T n' but for a multiple of 1.
+    For a camera that moves before a plane M is [Omega]x + T n' but for a multiple of 1.
+
+    Args:
+        window: Events.
+        Omega: (3,) rotation that the search begins with, rad/s.
+
+    Returns:
+        M (3, 3), 1/s.
     """
     basis = np.concatenate([ROTATION_GENERATORS, STRAIN_GENERATORS])
     values = np.append(Omega, np.zeros(len(STRAIN_GENERATORS)))
@@ -341,7 +375,16 @@ def planar_solutions(M: NDArray) -> list[PlanarMotion]:
 
 
 def _contrast_of_flows(window: WindowEvents, Omega: NDArray, flows: NDArray) -> ContrastMaps:
-    """Return the `ContrastMaps` (n, rows, columns) of patches of derotated events by flow, px/s."""
+    """Compute the contrast of patches of derotated events, by flow.
+
+    Args:
+        window: Events.
+        Omega: (3,) rotation that is taken off, rad/s.
+        flows: (n, 2) px/s.
+
+    Returns:
+        Maps (n, rows, columns) of patches.
+    """
     real = window.x.dtype
     X, Y = np.empty_like(window.x), np.empty_like(window.x)
     _warp_by_generator(window, np.tensordot(Omega, ROTATION_GENERATORS, 1), X, Y)
@@ -413,7 +456,15 @@ class InitialMotion(NamedTuple):
     information: NDArray[np.float64]  # (patches,) of rho
 
     def path(self, window: WindowEvents, flows: PatchFlows) -> Path:
-        """Return the path of this twist, with depths of cells by those of the patches nearby."""
+        """Return the path of this twist, with depths of cells by those of the patches nearby.
+
+        Args:
+            window: Events, which define the cells.
+            flows: Flows of the patches, for their positions.
+
+        Returns:
+            The path.
+        """
         x, y = window.cell_positions
         far = (x[:, None] - flows.xi[:, 0]) ** 2 + (y[:, None] - flows.xi[:, 1]) ** 2
         weight, rho = self.information, self.rho
@@ -437,6 +488,9 @@ def search_headings(
         f: Focal length, px.
         Omega: (3,) rotation that was taken off, rad/s.
         number: Most motions.
+
+    Returns:
+        The motions, the best first.
     """
     k = np.arange(N_SEARCHED_HEADINGS) + 0.5
     z, azimuth = k / N_SEARCHED_HEADINGS, np.pi * (1 + 5**0.5) * k
@@ -482,6 +536,14 @@ def search_headings(
 
 
 def map_parallel(function: Callable[[Any], Any], items: list[Any]) -> list[Any]:
-    """Return the results of a function for some items, computed by threads."""
+    """Apply a function to items, on as many threads as there are cores.
+
+    Args:
+        function: Function of one item.
+        items: The items.
+
+    Returns:
+        The results, in the items' order.
+    """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(function, items))

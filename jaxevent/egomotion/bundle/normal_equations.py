@@ -29,9 +29,8 @@ from jaxevent.egomotion.bundle.residuals import (
     subtract_mean,
 )
 
-N_PATH_UNKNOWNS = (
-    6 * warp.N_COEFFICIENT_ROWS
-)  # numbers of a path's rows; after them come the skew and the plane's normal
+# Numbers of a path's rows; after them come the skew and the plane's normal.
+N_PATH_UNKNOWNS = 6 * warp.N_COEFFICIENT_ROWS
 NODE_EDGE_LOG_DEPTH = 0.1  # a larger difference of log depth between nodes is an edge
 # Less accurate solutions save a sixth of the time and lose 0.3 degrees of heading on slider_depth.
 MAX_CG_STEPS, CG_TOLERANCE = 40, 0.01
@@ -45,16 +44,24 @@ Unknowns = tuple[NDArray, NDArray, NDArray]
 
 
 class BlockScratch(NamedTuple):
-    """Scratch of `path_blocks`: a batch of rows with weights, a mean, and their squares."""
+    """Scratch memory of `path_blocks`: a batch of weighted rows, a mean, and the rows' products."""
 
-    rows: NDArray  # (BATCH_ROWS, n, rounded up)
-    weight: NDArray  # (BATCH_ROWS,)
+    rows: NDArray  # (ROWS_PER_SINGLE_PRECISION_SUM, n, rounded up)
+    weight: NDArray  # (ROWS_PER_SINGLE_PRECISION_SUM,)
     mean: NDArray  # (n, rounded up)
     part: NDArray  # (n, n, rounded up)
 
     @classmethod
     def of(cls, n: int, real: np.dtype) -> "BlockScratch":
-        """Allocate it for n unknowns."""
+        """Allocate the scratch memory.
+
+        Args:
+            n: Number of the path's unknowns.
+            real: Type of the numbers.
+
+        Returns:
+            The memory, all 0.
+        """
         wide = -(-n // N_SIMD_LANES) * N_SIMD_LANES
         rows, part = (
             np.zeros((ROWS_PER_SINGLE_PRECISION_SUM, wide), real),
@@ -65,7 +72,13 @@ class BlockScratch(NamedTuple):
 
 @njit_fastmath_inlined
 def _write_jacobian_row(jacobian, e, row):
-    """Write the derivatives of one residual by coefficients, axis by axis, and by `more`."""
+    """Write the derivatives of one residual by the path's unknowns.
+
+    Args:
+        jacobian: `ResidualJacobian`.
+        e: Number of the residual.
+        row: Output: derivatives by the coefficients, axis by axis, and then by `more`.
+    """
     t = jacobian.tau[e]
     for axis in range(6):
         value = jacobian.base[axis, e]
@@ -78,7 +91,13 @@ def _write_jacobian_row(jacobian, e, row):
 
 @njit_fastmath_inlined
 def _add_outer_products(scratch, number, upper):
-    """Add rows' diag(weight) rows of `number` rows of the batch, on and below the diagonal."""
+    """Add rows' diag(weight) rows of a batch of rows, on and below the diagonal.
+
+    Args:
+        scratch: `BlockScratch` with rows and weights.
+        number: Number of rows of the batch that count.
+        upper: (n, n) matrix, changed in place.
+    """
     rows, weight, _, part = scratch
     part[:] = 0
     for r in range(number, (number + 3) // 4 * 4):
@@ -98,7 +117,17 @@ def _add_outer_products(scratch, number, upper):
 
 @njit_fastmath_inlined
 def _coarse_corner(jacobian, e):
-    """Return the first of the four coarse nodes about an event, and its distance from it."""
+    """Return the first of the four coarse nodes about an event, and the event's place between them.
+
+    Args:
+        jacobian: `ResidualJacobian`.
+        e: Number of the event.
+
+    Returns:
+        Number of the node above and to the left, counted row by row, and the distance from it to
+            the
+        right and downwards, 0 to 1 coarse nodes.
+    """
     columns = jacobian.columns
     row = jacobian.node[e] // columns
     x, y = jacobian.node[e] - row * columns + jacobian.across[e], row + jacobian.down[e]
@@ -201,7 +230,13 @@ def depth_blocks(jacobian, weight, begin, scratch, coarse_block, lumped):
 
 @njit_fastmath
 def map_diagonal(jacobian, weight, diagonal):
-    """Write the diagonal of the map's block of J' W J, without the means of series."""
+    """Compute the diagonal of the map's block of J' W J, without the means of series.
+
+    Args:
+        jacobian: `ResidualJacobian`.
+        weight: (E,) weights of events.
+        diagonal: (height * width,) output.
+    """
     diagonal[:] = 0
     for e in range(len(weight)):
         k, w = jacobian.first[e], weight[e]
@@ -231,7 +266,14 @@ class Problem(NamedTuple):
         return 1 / (float(self.prior.alike) * self.sigma**2)
 
     def path_prior(self, unit: NDArray) -> tuple[NDArray, NDArray, float]:
-        """Return K, b and c of the priors on path and skew, t' K t / 2 - b' t + c."""
+        """Return the cost of the priors on path and skew as t' K t / 2 - b' t + c.
+
+        Args:
+            unit: (N_PATH_UNKNOWNS,) units of the path's rows, see `warp.row_units`.
+
+        Returns:
+            K, b and c; t are the unknowns of `path_unknowns`.
+        """
         K, b, c = warp.row_priors(self.prior, unit, self.series.half)
         matrix, side = (
             np.zeros((N_PATH_UNKNOWNS + 4, N_PATH_UNKNOWNS + 4)),
@@ -255,7 +297,17 @@ class Evaluation(NamedTuple):
 
 
 def path_unknowns(scene: Scene, unit: NDArray) -> NDArray[np.float64]:
-    """Return the path's rows in units `unit`, the skew, and 0 for the change of the plane."""
+    """Return the unknowns of the path's block at a scene.
+
+    Args:
+        scene: The scene.
+        unit: (N_PATH_UNKNOWNS,) units of the path's rows, see `warp.row_units`.
+
+    Returns:
+        (N_PATH_UNKNOWNS + 4,): the path's rows in these units, the skew, and 0 for the change of
+            the
+        plane.
+    """
     return np.concatenate([warp.pack_rows(scene.path) / unit, [scene.skew, 0, 0, 0]])
 
 
@@ -279,7 +331,11 @@ def evaluate(
         problem: Data and settings.
         scene: Scene to evaluate.
         weight: (E,) weights of the step before.
-        before: Evaluation of a similar scene. If its path is the same object, projections are too.
+        before: Evaluation of a similar scene. Its projections are taken if its path is the same
+            object.
+
+    Returns:
+        The scaled scene with its residuals, weights and cost.
     """
     series, prior, _, plane, _ = problem
     most = MAX_SKEW_SIGMAS / math.sqrt(float(prior.skew_weight))
@@ -360,12 +416,15 @@ class NormalEquations(NamedTuple):
 
 
 def linearise(problem: Problem, evaluation: Evaluation, map_only: bool) -> NormalEquations:
-    """Return the normal equations of a scene.
+    """Compute the normal equations of a scene.
 
     Args:
         problem: Data and settings.
         evaluation: The scene, with residuals and weights.
         map_only: Whether the map alone is free.
+
+    Returns:
+        The equations.
     """
     series, prior, _, plane, _ = problem
     scene, weight, real = evaluation.scene, evaluation.weight, series.x.dtype
@@ -440,7 +499,15 @@ def gradient(equations: NormalEquations) -> Unknowns:
 
 
 def damped_system(equations: NormalEquations, damping: float) -> cg.System:
-    """Return H with its diagonal enlarged by a fraction `damping`, and its preconditioner."""
+    """Return the damped normal matrix and its preconditioner.
+
+    Args:
+        equations: The normal equations.
+        damping: Fraction by which the diagonal of H is enlarged.
+
+    Returns:
+        The system for `cg`.
+    """
     series, real = equations.problem.series, equations.evaluation.residual.dtype
     n = equations.n
     damped = damping * np.diag(np.diag(equations.path_block)[:n])
@@ -465,7 +532,15 @@ def damped_system(equations: NormalEquations, damping: float) -> cg.System:
 
 
 def inverse_columns(equations: NormalEquations, rows: list[int]) -> list[Unknowns]:
-    """Return columns of H^-1, undamped, of some of the path's unknowns, each in its own unit."""
+    """Return columns of the inverse of the undamped normal matrix.
+
+    Args:
+        equations: The normal equations.
+        rows: Numbers of the path's unknowns.
+
+    Returns:
+        For each of these the column of H^-1, times the unknown's own unit.
+    """
     n = equations.n
     sides = np.zeros((len(rows), n))
     sides[range(len(rows)), rows] = equations.unit[rows]
@@ -489,7 +564,17 @@ def inverse_columns(equations: NormalEquations, rows: list[int]) -> list[Unknown
 def solve(
     equations: NormalEquations, damping: float, side: Unknowns, tolerance: float = CG_TOLERANCE
 ) -> Unknowns:
-    """Solve the damped normal equations for a right side by conjugate gradients."""
+    """Solve the damped normal equations for a right side by conjugate gradients.
+
+    Args:
+        equations: The normal equations.
+        damping: Fraction by which the diagonal of H is enlarged.
+        side: Right side.
+        tolerance: Relative size of the residual at which steps end.
+
+    Returns:
+        The solution: map, unknowns of the path, and log depths at nodes.
+    """
     n, real = equations.n, equations.evaluation.residual.dtype
     vector = cg.BlockVector(
         np.ascontiguousarray(side[0], real),

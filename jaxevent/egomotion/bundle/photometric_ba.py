@@ -92,6 +92,9 @@ def update_control(
         gain: Reduction of the objective.
         objective: Objective before the step.
         builds_momentum: Whether an accepted step adds momentum.
+
+    Returns:
+        The state after it.
     """
     damping = control.damping
     damping = (
@@ -157,7 +160,18 @@ def adjust(
 def init_problem(
     series: PixelSeries, scene: Scene, prior: warp.Prior, sigma: float, plane: bool
 ) -> tuple[Problem, Evaluation]:
-    """Return the problem of a bundle adjustment, and the evaluation of its first scene."""
+    """Make the problem of a bundle adjustment, and evaluate its first scene.
+
+    Args:
+        series: Events.
+        scene: Scene to begin with.
+        prior: Priors.
+        sigma: Standard deviation of residuals, C.
+        plane: Whether depths stay a plane's.
+
+    Returns:
+        The problem, with the typical cost of positions at the first scene, and the evaluation.
+    """
     weight = np.ones_like(series.x)
     problem = Problem(series, prior, sigma, plane, math.inf)
     first = evaluate(problem, scene, weight)
@@ -169,6 +183,15 @@ def extrapolate(scene: Scene, last: Scene, factor: float, plane: bool) -> Scene:
     """Extrapolate a scene by a multiple of its last step (Nesterov).
 
     A plane's inverse depths are extrapolated, others' logarithms: only so is it a plane again.
+
+    Args:
+        scene: The scene.
+        last: The scene before its last step.
+        factor: Multiple of the step; 0 returns `scene`.
+        plane: Whether depths are a plane's.
+
+    Returns:
+        The extrapolated scene.
     """
     if not factor:
         return scene
@@ -188,7 +211,17 @@ def extrapolate(scene: Scene, last: Scene, factor: float, plane: bool) -> Scene:
 
 
 def gauss_newton_step(problem: Problem, kept: Evaluation, damping: float, map_only: bool) -> Scene:
-    """Return the scene after a damped Gauss-Newton step, of the map alone if `map_only`."""
+    """Take a damped Gauss-Newton step.
+
+    Args:
+        problem: Data and settings.
+        kept: Evaluation of the scene at which the step begins.
+        damping: Fraction by which the diagonal of the normal matrix is enlarged.
+        map_only: Whether the map alone moves.
+
+    Returns:
+        The scene after the step; the same scene if the step is not finite.
+    """
     scene = kept.scene
     equations = linearise(problem, kept, map_only)
     down: tuple = tuple(-part for part in gradient(equations))
@@ -219,6 +252,9 @@ def update_plane_normal(
         path: Path, with a plane's depths but at nodes where they would be too small.
         series: Events, which define the nodes.
         change: (3,) change of the normal, in median inverse depths.
+
+    Returns:
+        (nodes,) log inverse depths.
     """
     level = np.exp(path.log_rho.astype(np.float64))
     median = float(np.median(level))
@@ -245,7 +281,18 @@ def summarise(problem: Problem, kept: Evaluation) -> FitReport:
 def compute_covariance(
     series: PixelSeries, scene: Scene, prior: warp.Prior, *, sigma: float | int, plane: bool = False
 ) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of heading C1 and Omega O0 of a scene that was adjusted."""
+    """Return the covariance of heading and rotation of an adjusted scene.
+
+    Args:
+        series: Events.
+        scene: The adjusted scene.
+        prior: Priors.
+        sigma: Standard deviation of residuals, C, which scales outliers.
+        plane: Whether depths are a plane's.
+
+    Returns:
+        (6, 6), of the heading C1 and of Omega O0 (rad/s).
+    """
     path = scene.path
     median = np.median(path.log_rho)
     depth = np.clip(path.log_rho, median - MAX_LOG_DEPTH_SPREAD, median + MAX_LOG_DEPTH_SPREAD)
@@ -289,7 +336,7 @@ def sandwich_covariance(equations: NormalEquations) -> NDArray[np.float64]:
 
 @njit_fastmath
 def _contrast_by_depth(rays, p, depths, series, scratch, out):
-    """Write contrast and number of events about nodes, by inverse depth.
+    """Compute contrast and number of events about nodes, by inverse depth.
 
     Args:
         rays: r and d (4, events): at inverse depth rho an event lies at r + rho d, px.
@@ -297,7 +344,8 @@ def _contrast_by_depth(rays, p, depths, series, scratch, out):
         depths: (n,) inverse depths.
         series: `PixelSeries`, for the nodes.
         scratch: `ImageScratch` with sums (2, rows, width).
-        out: `ContrastMaps` (n, rows, columns), of the square of SPOT_PX about each node.
+        out: `ContrastMaps` (n, rows, columns), of the square of `DEPTH_SEARCH_SQUARE_PX` about each
+            node.
     """
     rx, ry, dx, dy = rays
     images, strips, node = scratch.images, scratch.sums, series.node
@@ -333,7 +381,16 @@ def _contrast_by_depth(rays, p, depths, series, scratch, out):
 
 
 def _contrast_of_depths(path: warp.Path, series: PixelSeries, depths: NDArray) -> ContrastMaps:
-    """Return contrast and number of events about nodes by inverse depth, (n, rows, columns)."""
+    """Compute contrast and number of events about nodes for some inverse depths of all nodes.
+
+    Args:
+        path: Path of the camera.
+        series: Events.
+        depths: (n,) inverse depths, in units of 1/|T|.
+
+    Returns:
+        Maps (n, rows, columns).
+    """
     events = slice(series.n_events)
     at = warp.Points(series.x[events], series.y[events], series.tau[events])
     real, none = series.x.dtype, np.zeros_like(at.x)

@@ -95,7 +95,7 @@ class RobustLoss(NamedTuple):
 
 
 class WeightScratch(NamedTuple):
-    """Scratch of `robust_weights`, of the map's shape and of the events'."""
+    """Scratch memory of `robust_weights`, of the map's shape and of the events'."""
 
     image: NDArray
     rows: NDArray  # four columns wider
@@ -106,7 +106,15 @@ class WeightScratch(NamedTuple):
 
     @classmethod
     def of(cls, shape: tuple[int, int], residual: NDArray) -> "WeightScratch":
-        """Allocate it for a map's shape and residuals (E,)."""
+        """Allocate the scratch memory.
+
+        Args:
+            shape: (height, width) of the map, px.
+            residual: (E,) residuals, of which length and type count.
+
+        Returns:
+            The memory, not initialised.
+        """
         image, sums, number = np.empty((3, *shape), residual.dtype)
         rows = np.empty((shape[0], shape[1] + 4), residual.dtype)
         return cls(image, rows, sums, number, np.empty_like(residual), np.empty_like(residual))
@@ -114,7 +122,14 @@ class WeightScratch(NamedTuple):
 
 @njit_fastmath
 def interpolate_map(image, grid, samples):
-    """Write the map's values at `samples.X` and `samples.Y`, and the splines they are made of."""
+    """Interpolate the map at events by quadratic B-splines.
+
+    Args:
+        image: (height * width,) coefficients of the map.
+        grid: `MapGrid`.
+        samples: `MapSamples`, of which X and Y are read, and the splines, `inside` and `value` are
+            written.
+    """
     width = grid.width
     for e in range(len(samples.X)):
         i, j = samples.X[e] - grid.x, samples.Y[e] - grid.y
@@ -137,19 +152,30 @@ def interpolate_map(image, grid, samples):
 
 @njit_fastmath_inlined
 def bspline(m, t):
-    """Evaluate the m-th of three quadratic B-splines, t px beside the middle one."""
+    """Evaluate one of the three quadratic B-splines about a position.
+
+    Args:
+        m: 0 to 2, the spline before, at and after the middle one.
+        t: Position, -0.5 to 0.5 px from the centre of the middle one.
+    """
     return 0.75 - t * t if m == 1 else (0.5 + (m - 1) * t) ** 2 / 2
 
 
 @njit_fastmath_inlined
 def bspline_derivative(m, t):
-    """Evaluate the derivative of the m-th of three quadratic B-splines."""
+    """Evaluate the derivative (1/px) of a quadratic B-spline; arguments as of `bspline`."""
     return -2 * t if m == 1 else (m - 1) * 0.5 + t
 
 
 @njit_fastmath_inlined
 def _sum_boxes(image, rows, sums):
-    """Write sums over squares of 5 px about each pixel; `rows` is scratch, four columns wider."""
+    """Sum an image over the square of 5 px about each pixel.
+
+    Args:
+        image: (height, width).
+        rows: (height, width + 4) scratch.
+        sums: (height, width) output.
+    """
     height, width = image.shape
     rows[:] = 0
     for j in range(height):
@@ -164,7 +190,13 @@ def _sum_boxes(image, rows, sums):
 
 @njit_fastmath
 def subtract_mean(values, weight, begin):
-    """Subtract from values (E,) the weighted mean of their series, in place."""
+    """Subtract the weighted mean of each series from its values, in place.
+
+    Args:
+        values: (E,) values.
+        weight: (E,) weights.
+        begin: (series + 1,) first row of each series, and E.
+    """
     for k in range(len(begin) - 1):
         total, s = 0.0, 0.0
         for e in range(begin[k], begin[k + 1]):
@@ -263,8 +295,11 @@ def sample_map(
     Args:
         scene: Path, depths and map.
         series: The events.
-        before: Samples of a similar scene.
+        before: Samples of a similar scene, whose depths save time.
         same_path: Whether path and depths are those of `before`.
+
+    Returns:
+        Positions and map values of the events.
     """
     if before is not None and same_path:
         X, Y, depth = before.X, before.Y, before.log_rho
@@ -401,7 +436,13 @@ def residual_jacobian(
 
 @njit_fastmath
 def multiply_jacobian(jacobian, direction, value):
-    """Write the changes of residuals (E,) by a `Direction` of the unknowns."""
+    """Compute the changes of residuals for a change of the unknowns.
+
+    Args:
+        jacobian: `ResidualJacobian`.
+        direction: `Direction`, the change.
+        value: (E,) output, C.
+    """
     image, coefficients, more, depth = direction
     width, columns = jacobian.width, jacobian.columns
     real = value.dtype.type
@@ -436,7 +477,13 @@ def multiply_jacobian(jacobian, direction, value):
 
 @njit_fastmath
 def multiply_transpose(jacobian, z, out):
-    """Write the `Direction` J' z of values z (E,)."""
+    """Multiply the transposed Jacobian by a vector.
+
+    Args:
+        jacobian: `ResidualJacobian`.
+        z: (E,) vector.
+        out: `Direction`, output.
+    """
     image, coefficients, more, depth = out
     width, columns = jacobian.width, jacobian.columns
     real = z.dtype.type

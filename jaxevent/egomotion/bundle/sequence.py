@@ -16,10 +16,8 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
 from jaxevent.progress import bar
 
-WINDOW_DISPLACEMENT_RANGE_PX = (
-    24.0,
-    150.0,
-)  # motion of the image in a window, with which the default length stays
+# Motion of the image in a window, with which the default length stays.
+WINDOW_DISPLACEMENT_RANGE_PX = (24.0, 150.0)
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.02, 2.0
 # Uncertainty of the motion at the end of a window without neighbour, by its difference from that at
 # the middle. Squared errors of Omega 0.1 s from the middle are then 0.1 to 2 times the variance.
@@ -213,9 +211,17 @@ def _blend(
 
 
 def _scale_heading_covariance(covariance: NDArray, speed: NDArray) -> NDArray[np.float64]:
-    """Scale a covariance (6, 6) to times at which |T| has changed by factors `speed` (times,).
+    """Scale a window's covariance to times at which the speed has changed.
 
-    The velocity is determined, whose direction is the less certain the slower it is.
+    The fit determines the velocity. The direction of a velocity is the less certain the slower it
+    is.
+
+    Args:
+        covariance: (6, 6), of heading and Omega at the window's middle.
+        speed: (times,) |T| in units of that at the middle.
+
+    Returns:
+        (times, 6, 6).
     """
     variance = float(np.trace(covariance[:3, :3]))
     most = np.pi / 2 / np.sqrt(variance) if variance > 0 else np.inf
@@ -226,7 +232,16 @@ def _scale_heading_covariance(covariance: NDArray, speed: NDArray) -> NDArray[np
 
 
 def _has_no_neighbour(fits: list[WindowFit | None], row: int, since: NDArray) -> NDArray[np.bool_]:
-    """Return whether a window has no neighbour on the side of times since its middle."""
+    """Return whether a window lacks a neighbour on the side of some times.
+
+    Args:
+        fits: Fits of all windows, None where one failed.
+        row: Number of the window.
+        since: (times,) times from the window's middle; the sign counts.
+
+    Returns:
+        (times,) booleans.
+    """
     there = [0 <= other < len(fits) and fits[other] is not None for other in (row - 1, row + 1)]
     return np.where(since < 0, not there[0], not there[1])
 
@@ -234,10 +249,18 @@ def _has_no_neighbour(fits: list[WindowFit | None], row: int, since: NDArray) ->
 def _disagreements(
     centres: NDArray, fits: list[WindowFit | None], half: int
 ) -> list[NDArray[np.float64]]:
-    """Return mean squares (6, 6) of the differences of windows from those that they overlap.
+    """Measure how much overlapping windows disagree, halfway between their middles.
 
-    They are taken halfway between both middles. Another window has other events in part, and a
-    false minimum comes and goes.
+    Another window has other events in part, and a false minimum comes and goes.
+
+    Args:
+        centres: (windows,) middles, us.
+        fits: Fits of the windows, None where one failed.
+        half: Half the length of a window, us.
+
+    Returns:
+        For each window the mean square (6, 6) of the differences of heading and Omega from those of
+        its neighbours.
     """
     found: list[list[NDArray[np.float64]]] = [[] for _ in fits]
     for k, (one, other) in enumerate(zip(fits[:-1], fits[1:], strict=True)):

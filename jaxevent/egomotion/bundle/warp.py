@@ -90,7 +90,13 @@ class DepthField(NamedTuple):
 
 @njit_fastmath_inlined
 def _polynomial(c, tau, axis):
-    """Evaluate sum_k c_k tau^k of one component, k from 1."""
+    """Evaluate sum_k c_k tau^k of one component, k from 1.
+
+    Args:
+        c: (rows, 3) factors of tau, tau^2, ...
+        tau: Time from the reference time, s.
+        axis: The component, 0 to 2.
+    """
     s = c[N_COEFFICIENT_ROWS - 1, axis]
     for k in range(N_COEFFICIENT_ROWS - 2, -1, -1):
         s = s * tau + c[k, axis]
@@ -99,7 +105,14 @@ def _polynomial(c, tau, axis):
 
 @njit_fastmath_inlined
 def _rotate(phi, x, y, z):
-    """Rotate a point by exp[phi]x, to the sixth order of |phi|, which is below 1."""
+    """Rotate a point by exp[phi]x, to the sixth order of |phi|, which is below 1.
+
+    Args:
+        phi: Three components of the rotation vector, rad.
+        x: Coordinate of the point, as are y and z.
+        y: Coordinate.
+        z: Coordinate.
+    """
     a, b, c = phi
     s = a * a + b * b + c * c
     one, two = 1 - s / 6 + s * s / 120, 0.5 - s / 24 + s * s / 720
@@ -110,7 +123,18 @@ def _rotate(phi, x, y, z):
 
 @njit_fastmath_inlined
 def reference_ray(motion, x, y, tau):
-    """Return the ray r + rho d of an event in the reference view: (rx, ry, dx, dy), px."""
+    """Return the ray r + rho d on which an event lies in the reference view.
+
+    Args:
+        motion: `CameraMotion`.
+        x: Column of the event, px from the principal point, undistorted.
+        y: Row of the event, likewise.
+        tau: Time of the event from the reference time, s.
+
+    Returns:
+        (rx, ry, dx, dy): the position at infinity, px, and its change with the inverse depth rho,
+            px.
+    """
     phi, C, f = motion
     turn = _polynomial(phi, tau, 0), _polynomial(phi, tau, 1), _polynomial(phi, tau, 2)
     rx, ry, rz = _rotate(turn, x, y, f)
@@ -122,7 +146,14 @@ def reference_ray(motion, x, y, tau):
 
 @njit_fastmath
 def warp_points(points, rho, motion, out):
-    """Write the reference `Positions` of points of inverse depths rho (n,)."""
+    """Warp points of known depth to the reference view.
+
+    Args:
+        points: `Points` (n,).
+        rho: (n,) inverse depths, in units of 1/|T|.
+        motion: `CameraMotion`.
+        out: `Positions` (n,), output.
+    """
     x, y, tau = points
     for e in range(len(x)):
         rx, ry, dx, dy = reference_ray(motion, x[e], y[e], tau[e])
@@ -131,7 +162,13 @@ def warp_points(points, rho, motion, out):
 
 @njit_fastmath_inlined
 def _cell_index(x, y, cells):
-    """Return the cell of a position, or the nearest cell."""
+    """Return the number of the cell that holds a position, or of the nearest cell.
+
+    Args:
+        x: px from the principal point.
+        y: px from the principal point.
+        cells: `CellGrid`.
+    """
     left, top = cells.corner
     i = min(max(int(np.floor((x - left + 0.5) / cells.size)), 0), cells.columns - 1)
     j = min(max(int(np.floor((y - top + 0.5) / cells.size)), 0), cells.rows - 1)
@@ -161,7 +198,18 @@ def assign_cells(points, motion, rho, cells, index, out):
 
 @njit_fastmath_inlined
 def bilinear_corner(x, y, grid):
-    """Return the first of four nodes about a position, and its distance from it, in nodes."""
+    """Return the first of the four nodes about a position, and the position between them.
+
+    Args:
+        x: px from the principal point.
+        y: px from the principal point.
+        grid: `MapGrid`.
+
+    Returns:
+        Number of the node above and to the left, counted row by row, and the distance from it to
+            the
+        right and downwards, 0 to 1 nodes.
+    """
     i = min(max((x - grid.x) / grid.node, 0.0), grid.columns - 1.001)
     j = min(max((y - grid.y) / grid.node, 0.0), grid.rows - 1.001)
     column, row = int(i), int(j)
@@ -170,13 +218,29 @@ def bilinear_corner(x, y, grid):
 
 @njit_fastmath_inlined
 def bilinear_weight(u, v, corner):
-    """Return the weight of one of four corners at a position (u, v) cells from the first."""
+    """Return the weight of one of four corners in bilinear interpolation.
+
+    Args:
+        u: Distance from the first corner to the right, 0 to 1 cells.
+        v: Distance downwards.
+        corner: 0 to 3: upper left, upper right, lower left, lower right.
+    """
     return (u if corner % 2 else 1 - u) * (v if corner > 1 else 1 - v)
 
 
 @njit_fastmath_inlined
 def interpolate_depth(log_rho, x, y, grid):
-    """Interpolate log inverse depth between nodes; return also its x and y derivatives, 1/px."""
+    """Interpolate log inverse depth between nodes, bilinearly.
+
+    Args:
+        log_rho: (nodes,) log inverse depths.
+        x: px from the principal point.
+        y: px from the principal point.
+        grid: `MapGrid`.
+
+    Returns:
+        The log inverse depth and its derivatives by x and y, 1/px.
+    """
     k, u, v = bilinear_corner(x, y, grid)
     a, b = log_rho[k], log_rho[k + 1]
     c, d = log_rho[k + grid.columns], log_rho[k + grid.columns + 1]
@@ -187,7 +251,13 @@ def interpolate_depth(log_rho, x, y, grid):
 
 @njit_fastmath_inlined
 def _newton_step(field, ray, log_rho):
-    """Return the log inverse depth at which a ray meets the scene, from a nearby value."""
+    """Refine the log inverse depth at which a ray meets the scene, by one step of Newton's method.
+
+    Args:
+        field: `DepthField` of the scene.
+        ray: (rx, ry, dx, dy) as of `reference_ray`, px.
+        log_rho: Log inverse depth to start from.
+    """
     rx, ry, dx, dy = ray
     rho = np.exp(log_rho)
     there, lx, ly = interpolate_depth(field.log_rho, rx + rho * dx, ry + rho * dy, field.grid)
@@ -196,7 +266,17 @@ def _newton_step(field, ray, log_rho):
 
 @njit_fastmath_inlined
 def _first_intersection(field, ray, top, bottom):
-    """Search a ray from near to far for the first depth that is not nearer than the scene's."""
+    """Search a ray, from near to far, for the first surface of the scene.
+
+    Args:
+        field: `DepthField` of the scene.
+        ray: (rx, ry, dx, dy) as of `reference_ray`, px.
+        top: Log inverse depth at which the search begins.
+        bottom: Log inverse depth at which it ends, smaller.
+
+    Returns:
+        The log inverse depth; `bottom` if the ray meets no surface.
+    """
     rx, ry, dx, dy = ray
     depth, grid = field.log_rho, field.grid
     rho = np.exp(top)
@@ -254,8 +334,19 @@ def project(points, motion, field, log_rho, out):
 def coefficient_gradient(motion, tau, ray, rho, hx, hy):
     """Return the gradient of hx X + hy Y by phi and C, (X, Y) the end of an event's ray.
 
-    Of a rotation dR x = J dphi x R x, J the left Jacobian of phi; J' w = w - one phi x w + two
-    phi x (phi x w).
+    For a rotation dR x = J dphi x R x, J the left Jacobian of phi; J' w = w - one phi x w + two phi
+    x (phi x w).
+
+    Args:
+        motion: `CameraMotion`.
+        tau: Time of the event from the reference time, s.
+        ray: (rx, ry), px: the ray's position at infinity.
+        rho: Inverse depth, in units of 1/|T|.
+        hx: Factor of X.
+        hy: Factor of Y.
+
+    Returns:
+        Six derivatives: by the three components of phi at tau, then by those of C.
     """
     phi, C, f = motion
     rx, ry = ray
@@ -279,7 +370,15 @@ def coefficient_gradient(motion, tau, ray, rho, hx, hy):
 
 @njit_fastmath
 def point_derivatives(points, rho, motion, by, by_depth):
-    """Write the derivatives of points by phi and C (n, 6, 2), and by log inverse depth (n, 2)."""
+    """Differentiate the warped positions of points.
+
+    Args:
+        points: `Points` (n,).
+        rho: (n,) inverse depths, in units of 1/|T|.
+        motion: `CameraMotion`.
+        by: (n, 6, 2) output, derivatives of X and Y by phi and C at the points' times.
+        by_depth: (n, 2) output, derivatives of X and Y by log inverse depth, px.
+    """
     x, y, tau = points
     for e in range(len(x)):
         rx, ry, dx, dy = reference_ray(motion, x[e], y[e], tau[e])
@@ -305,7 +404,16 @@ class Path:
 
     @classmethod
     def constant_twist(cls, heading: NDArray, Omega: NDArray, log_rho: NDArray) -> "Path":
-        """Make the path of a unit heading and a constant Omega (rad/s)."""
+        """Make the path of a constant twist.
+
+        Args:
+            heading: (3,) direction of T, of length 1, or 0 at rest.
+            Omega: (3,) angular velocity, rad/s.
+            log_rho: Log inverse depths of cells or nodes, in units of 1/|T|.
+
+        Returns:
+            The path.
+        """
         O, D = np.zeros((N_COEFFICIENT_ROWS, 3)), np.zeros((N_COEFFICIENT_ROWS, 3))  # noqa: E741
         O[0], D[0] = Omega, heading
         return cls(O, D, log_rho)
@@ -359,7 +467,7 @@ def _taylor_powers(tau: NDArray, first: int, number: int) -> NDArray[np.float64]
 
 
 def segment_times(half: float) -> NDArray[np.float64]:
-    """Return the middles (N_SEGMENTS,) of a window's segments, s from its middle."""
+    """Return the middles (N_WINDOW_SEGMENTS,) of a window's segments, s from its middle."""
     return ((np.arange(N_WINDOW_SEGMENTS) + 0.5) / N_WINDOW_SEGMENTS * 2 - 1) * half
 
 
@@ -390,7 +498,7 @@ class Prior(NamedTuple):
     smooth: float
     relief: float
     change: float
-    gyro: NDArray[np.float64]  # (N_SEGMENTS, 3) Omega, rad/s, at the segments' middles
+    gyro: NDArray[np.float64]  # (N_WINDOW_SEGMENTS, 3) Omega, rad/s, at the segments' middles
     gyro_weight: float  # 1 / (rad/s)^2, 0: none
     bond: float
     flat: float
@@ -414,7 +522,16 @@ def cross_matrix(v: NDArray) -> NDArray[np.float64]:
 
 
 def pixel_rays(x: NDArray, y: NDArray, f: float) -> NDArray[np.float64]:
-    """Return rays (n, 3) of depth 1 through pixels x, y px from the principal point."""
+    """Return the rays of depth 1 through pixels.
+
+    Args:
+        x: (n,) px from the principal point, undistorted.
+        y: (n,) px from the principal point, undistorted.
+        f: Focal length, px.
+
+    Returns:
+        (n, 3) points x / f, y / f, 1.
+    """
     return np.stack([x / f, y / f, np.ones(len(x))], 1)
 
 
@@ -513,7 +630,16 @@ def row_priors(
 
 
 def gauge_direction(path: Path, unit: NDArray, size: int) -> NDArray[np.float64]:
-    """Return the direction in `size` unknowns, the rows first, that changes |C1|, which is 1."""
+    """Return the direction in the unknowns that changes |C1|, which is fixed to 1.
+
+    Args:
+        path: The path.
+        unit: (6 k,) units of its first rows, see `row_units`.
+        size: Number of unknowns; the rows are the first.
+
+    Returns:
+        (size,) vector.
+    """
     k, found = len(unit) // 6, np.zeros(size)
     found[3 * k : 3 * k + 3] = np.asarray(path.D[0]) * unit[3 * k : 3 * k + 3]
     return found

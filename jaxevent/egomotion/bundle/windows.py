@@ -58,8 +58,8 @@ class StampOffsetMethod(NamedTuple):
     step_us: int  # between offsets that are tried
 
 
-# Both methods must find the same offset within MAX_OFFSET_DIFFERENCE_US, else it is taken for 0:
-# walls of little contrast do not determine it.
+# Both methods must find the same offset within MAX_STAMP_OFFSET_DIFFERENCE_US, else it is taken for
+# 0: walls of little contrast do not determine it.
 STAMP_OFFSET_METHODS = (
     StampOffsetMethod(50_000, False, 2000),
     StampOffsetMethod(100_000, True, 4000),
@@ -178,7 +178,17 @@ def stamp_offset(recording: Recording) -> int:
 def _best_offset(
     recording: Recording, pairs: list[FramePair], most: int, method: StampOffsetMethod
 ) -> int | None:
-    """Return the offset, us, up to `most`, of highest correlation; None if that is no maximum."""
+    """Find the offset of stamps at which changes of frames correlate best with events.
+
+    Args:
+        recording: Events.
+        pairs: Consecutive frames.
+        most: Largest offset, us.
+        method: Steps of the search, and the estimate of levels between events.
+
+    Returns:
+        The offset, us; None if the correlation has no clear maximum.
+    """
     end = most // method.step_us * method.step_us
     tried = np.arange(-end, end + 1, method.step_us)
     correlation = [_change_correlation(recording, pairs, int(us), method) for us in tried]
@@ -237,7 +247,17 @@ def _level_changes(
 def _change_correlation(
     recording: Recording, pairs: list[FramePair], offset_us: int, method: StampOffsetMethod
 ) -> float:
-    """Return the correlation of levels' changes and events' sums, for an offset of the stamps."""
+    """Correlate the changes of frames with the sums of events between them.
+
+    Args:
+        recording: Events.
+        pairs: Consecutive frames.
+        offset_us: Offset that is added to the frames' stamps, us.
+        method: Estimate of levels between events.
+
+    Returns:
+        The correlation; 0 if no pair can be compared.
+    """
     found = [
         _level_changes(recording, (t + offset_us, level, known), method)
         for t, level, known in pairs
@@ -254,7 +274,17 @@ def _change_correlation(
 def _contrast_threshold(
     recording: Recording, t: NDArray, level: NDArray, known: NDArray
 ) -> float | None:
-    """Return the contrast threshold, ln I; None if events do not agree with the frames."""
+    """Estimate the contrast threshold by events and consecutive frames.
+
+    Args:
+        recording: Events.
+        t: (n,) times of frames, us.
+        level: (n, height, width) log intensities.
+        known: (n, height, width) whether a pixel is not clipped.
+
+    Returns:
+        The threshold, ln I; None if events do not agree with the frames.
+    """
     parts = []
     for k in range(len(t) - 1):
         pair = t[k : k + 2], level[k : k + 2], known[k] & known[k + 1]
@@ -312,12 +342,26 @@ class Windows:
         return read_frame_pixels(self.recording, first, last, self.frame_delay_us)
 
     def event_range(self, centre: int, half: float) -> tuple[int, int]:
-        """Return the range [begin, end) of a window's events."""
+        """Return the range [begin, end) of a window's events.
+
+        Args:
+            centre: Middle of the window, us.
+            half: Half its length, s.
+        """
         span, index = round(half * 1e6), self.recording.events.index
         return index(centre - span), index(centre + span)
 
     def sample_events(self, centre: int, half: float, most: int) -> WindowEvents:
-        """Sample at most `most` of a window's events at random."""
+        """Sample a window's events at random.
+
+        Args:
+            centre: Middle of the window, us.
+            half: Half its length, s.
+            most: Most events.
+
+        Returns:
+            The events, in order.
+        """
         most = min(most, self.params.events)
         first, last = self.event_range(centre, half)
         events = self.recording.events[first:last]
@@ -334,7 +378,15 @@ class Windows:
         )
 
     def prior(self, centre: int, half: float) -> Prior:
-        """Return the priors of a window, by the parameters, the gyro and counts of events."""
+        """Make the priors of a window from the parameters, the gyro and counts of events.
+
+        Args:
+            centre: Middle of the window, us.
+            half: Half its length, s.
+
+        Returns:
+            The priors.
+        """
         params = self.params
         gyro, weight = np.zeros((N_WINDOW_SEGMENTS, 3)), 0.0
         if self.gyro is not None:
@@ -349,10 +401,17 @@ class Windows:
         )  # fmt: skip
 
     def skew(self, centre: int, half: float) -> tuple[float, float]:
-        """Return the skew of the thresholds by counts of events, and its weight.
+        """Estimate the skew of the thresholds by counts of events.
 
         Levels that end where they begin have N_on C (1 + skew) = N_off C (1 - skew). Without a
         prior the fit of real events runs away to skew = -1: no ON threshold, so all ON events fit.
+
+        Args:
+            centre: Middle of the window, us.
+            half: Half its length, s.
+
+        Returns:
+            The skew, and its weight, 1 / variance.
         """
         first, last = self.event_range(centre, half)
         events = self.recording.events[first:last]
@@ -381,6 +440,9 @@ class Windows:
             most: Most events, and most pixels of frames.
             limit: Most events, without frames.
             skip: Number of events of pixels that are left out, with `limit`.
+
+        Returns:
+            The series, one per pixel.
         """
         frames = None
         if limit is None and self.params.frames:
@@ -427,7 +489,17 @@ class Windows:
     def _with_frames(
         self, series: PixelSeries, frames: FramePixels, centre: int, most: int
     ) -> PixelSeries:
-        """Append at most `most` pixels of frames to a series."""
+        """Append pixels of frames, taken at random, to a series of events.
+
+        Args:
+            series: The events.
+            frames: Pixels of frames in the window.
+            centre: Middle of the window, us.
+            most: Most pixels.
+
+        Returns:
+            The longer series; the same one if a frame has no pixel to offer.
+        """
         each, rng = most // len(frames.t), np.random.default_rng([self.seed, abs(centre), most])
         chosen = []
         for precision in frames.precision:

@@ -38,11 +38,10 @@ MOTIONS_PER_BLOCK = 16  # motions that are scored together
 MIN_CHECKED_PARTICLES = 4  # particles that are scored beside the nodes
 MIN_NODES_PER_COMPONENT, MAX_NODES_PER_COMPONENT = 3, 7  # of a component
 MAX_SCORED_FRACTION = 0.6  # of the particles, number of nodes and checks
-N_BATCHES_WITHOUT_NODES = 64  # without nodes, after MAX_NODES were too few
+N_BATCHES_WITHOUT_NODES = 64  # after the most nodes per component were too few
 REDUCING_ERROR_RATIO = 0.05  # of the bound, error at which there may be fewer nodes
-NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(
-    4
-)  # in `Interpolation.counters`
+# Places in `Interpolation.counters`.
+NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(4)
 
 
 class ModelFunctions(NamedTuple):
@@ -118,7 +117,8 @@ class Interpolation(NamedTuple):
     bound: float  # largest error of a weight, relative to the largest; 0: no interpolation
     # Nodes of a component, batches to wait, batches so far, and batches with nodes.
     counters: NDArray[np.int64]
-    basis: NDArray  # (d, MAX_NODES, N) polynomial of each node of a component at the particles
+    # (d, MAX_NODES_PER_COMPONENT, N) polynomial of each node of a component at the particles.
+    basis: NDArray
     product: NDArray  # (N,) scratch
     checked: NDArray[np.int64]  # particles
 
@@ -160,7 +160,16 @@ def init_interpolation(
 
 @njit
 def run(functions, memory, rows, batches, out, nodes):
-    """Run the filter over batches; `memory` holds the state, before and afterwards."""
+    """Run the filter over batches.
+
+    Args:
+        functions: `ModelFunctions`.
+        memory: Cells, work and parameters' numbers; they hold the state, before and afterwards.
+        rows: `RowIndices` of the work.
+        batches: `BatchArrays`.
+        out: Reports of the batches, output.
+        nodes: `Interpolation`, changed in place.
+    """
     cells, work, numbers = memory
     chosen = np.empty(batches.age.shape[2] + 1, np.int64)
     pointers = (
@@ -191,7 +200,16 @@ def run(functions, memory, rows, batches, out, nodes):
 
 @njit_inlined
 def _score(context, b, nodes):
-    """Compute the log-likelihoods of a batch for all particles, into their row; return the lag."""
+    """Compute the log-likelihoods of a batch for all particles, into their row of the work.
+
+    Args:
+        context: `Context`.
+        b: Number of the batch.
+        nodes: `Interpolation`.
+
+    Returns:
+        The mean lag of the batch, s.
+    """
     rows, cells, work = context.rows, context.cells, context.work
     count = context.batches.normal.shape[1]
     searching, d = cells[SEARCHING] != 0, len(rows.predicted)
@@ -219,7 +237,14 @@ def _score(context, b, nodes):
 
 @njit_inlined
 def _place_particles(rows, work, order, count):
-    """Copy particles in an order to the motions; the last is repeated, without weight."""
+    """Copy particles to the motions that are scored; the last one is repeated, without weight.
+
+    Args:
+        rows: `RowIndices`.
+        work: (rows, motions) numbers of the motions.
+        order: Order of the particles.
+        count: Number of particles.
+    """
     for i in range(work.shape[1]):
         particle = order[min(i, count - 1)]
         for k in range(len(rows.motions)):
@@ -229,7 +254,12 @@ def _place_particles(rows, work, order, count):
 
 @njit_inlined
 def _sort(order, values):
-    """Order numbers by their values, smallest first, by Shell's method."""
+    """Order numbers by their values, smallest first, by Shell's method.
+
+    Args:
+        order: Numbers, ordered in place.
+        values: Value of each number.
+    """
     gap = len(order) // 2
     while gap > 0:
         for i in range(gap, len(order)):
@@ -243,7 +273,16 @@ def _sort(order, values):
 
 @njit_inlined
 def _score_events(context, b, lanes):
-    """Sum the log-likelihoods of a batch's events for some motions; return the mean lag."""
+    """Sum the log-likelihoods of a batch's events for some motions.
+
+    Args:
+        context: `Context`.
+        b: Number of the batch.
+        lanes: Number of motions.
+
+    Returns:
+        The mean lag, s.
+    """
     cells, batches = context.cells, context.batches
     context.work[context.rows.total, :lanes] = 0
     cells[BATCH_VOTES] = cells[BATCH_CHANCE] = 0
@@ -262,7 +301,14 @@ def _score_events(context, b, lanes):
 
 @njit_inlined
 def _score_event(context, b, e, blocks):
-    """Add the log-likelihoods of an event for some blocks of motions."""
+    """Add the log-likelihoods of an event for some motions.
+
+    Args:
+        context: `Context`.
+        b: Number of the batch.
+        e: Number of the event in it.
+        blocks: Number of blocks of `MOTIONS_PER_BLOCK` motions.
+    """
     cells, batches, functions = context.cells, context.batches, context.functions
     most = batches.age.shape[2]
     cells[XI], cells[XI + 1] = batches.xi[b, e, 0], batches.xi[b, e, 1]
@@ -329,7 +375,14 @@ def _copy(source, out, count):
 
 @njit_inlined
 def _draw(log_weights, drawn, uniform, count):
-    """Draw particles at equal steps of their summed weights."""
+    """Draw particles at equal steps of their summed weights.
+
+    Args:
+        log_weights: (N,) log weights.
+        drawn: Output, numbers of the particles.
+        uniform: Place of the first step, 0 to 1.
+        count: Number of particles, N.
+    """
     edges = np.empty(count, log_weights.dtype)
     total = log_weights.dtype.type(0)
     for i in range(count):
@@ -356,7 +409,13 @@ def _count_lanes(nodes, dimension):
 
 @njit_inlined
 def _can_interpolate(nodes, dimension, count):
-    """Count a batch; return whether it may have nodes, and these are fewer than particles."""
+    """Count a batch, and return whether it may have nodes, and these are fewer than particles.
+
+    Args:
+        nodes: `Interpolation`, whose counters are changed.
+        dimension: Number of components, d.
+        count: Number of particles.
+    """
     nodes.counters[BATCH_COUNTER] += 1
     if nodes.counters[WAIT_COUNTER] > 0:
         nodes.counters[WAIT_COUNTER] -= 1
@@ -366,9 +425,18 @@ def _can_interpolate(nodes, dimension, count):
 
 @njit_inlined
 def _place_nodes(nodes, work, rows, count):
-    """Write nodes, and particles that check them, to the motions; return their number.
+    """Write nodes, and particles that check them, to the motions that are scored.
 
     The weight of a node is the sum of its polynomial over the weighted particles.
+
+    Args:
+        nodes: `Interpolation`.
+        work: (rows, motions) numbers of the motions.
+        rows: `RowIndices`.
+        count: Number of particles.
+
+    Returns:
+        Number of nodes and checks.
     """
     motions, predicted, weights = rows.motions, rows.predicted, rows.motion_weights
     real, d, k = work.dtype.type, len(predicted), nodes.counters[NODES_COUNTER]
@@ -401,7 +469,18 @@ def _place_nodes(nodes, work, rows, count):
 
 @njit_inlined
 def _interpolate(nodes, work, rows, lanes, count):
-    """Interpolate particles' log-likelihoods; return whether the checks are within the bound."""
+    """Interpolate particles' log-likelihoods from those of the nodes.
+
+    Args:
+        nodes: `Interpolation`, whose counters are changed.
+        work: (rows, motions) numbers of the motions.
+        rows: `RowIndices`.
+        lanes: Number of nodes and checks.
+        count: Number of particles.
+
+    Returns:
+        Whether the checks are within the bound.
+    """
     of_particles, of_motions, d = rows.log_likelihood, rows.total, len(rows.motions)
     number = nodes.counters[NODES_COUNTER] ** d
     work[of_particles, :count] = 0
@@ -444,7 +523,18 @@ def _chebyshev(k, j):
 
 @njit_fastmath_inlined
 def _fill_basis(basis, row, middle, half, k, z):
-    """Evaluate Lagrange's polynomial of a node z at particles y: 2 / k sum_m' T_m(z) T_m(y)."""
+    """Evaluate Lagrange's polynomial of a node at particles.
+
+    At a particle y it is 2 / k sum_m' T_m(z) T_m(y), of Chebyshev polynomials T.
+
+    Args:
+        basis: (N,) output.
+        row: (N,) a component of the particles.
+        middle: Middle of its range.
+        half: Half of its range.
+        k: Number of nodes.
+        z: The node, -1 to 1.
+    """
     real = row.dtype.type
     for i in range(len(basis)):
         y = (row[i] - middle) / half
@@ -459,7 +549,13 @@ def _fill_basis(basis, row, middle, half, k, z):
 
 @njit_fastmath_inlined
 def _fill_product(nodes, j, d):
-    """Multiply the polynomials of the components of node j."""
+    """Multiply the polynomials of the components of a node, into `nodes.product`.
+
+    Args:
+        nodes: `Interpolation`.
+        j: Number of the node among those of all components.
+        d: Number of components.
+    """
     k = nodes.counters[NODES_COUNTER]
     product, one = nodes.product, nodes.basis[d - 1, j % k]
     for i in range(len(product)):

@@ -24,7 +24,7 @@ from jaxevent.egomotion.estimator import (
     TrainingRuns,
     TrainingSegment,
 )
-from jaxevent.egomotion.evidence import EvidenceTest, Lock, tell_from_later
+from jaxevent.egomotion.evidence import EvidenceTest, LockDetector, report_before_lock
 from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model
@@ -338,14 +338,14 @@ class VotingEstimator(MotionEstimator[Params]):
         model: Model,
         sampler: CandidateSampler,
         camera: PinholeCamera | None,
-    ) -> Lock | None:
+    ) -> LockDetector | None:
         """Return the test of what the filter finds; None for likelihoods and models without one."""
         if params.likelihood == "literal" or model.half_line:
             return None
         diffusion = jax.jit(functools.partial(model.diffusion, params))
         moves = is_camera_known_to_move(recording, camera)
         test = EvidenceTest(model, sampler.xi)
-        return Lock(test, float(params.baseline), float(params.tau_max), diffusion, moves)
+        return LockDetector(test, float(params.baseline), float(params.tau_max), diffusion, moves)
 
     def _kernel(
         self, params: Params, model: Model, compiler: str | None, events: int
@@ -439,7 +439,7 @@ class ChunkRunner:
         model: Model,
         sampler: CandidateSampler,
         kernel: CompiledFilter | None,
-        lock: Lock | None,
+        lock: LockDetector | None,
         *,
         camera: PinholeCamera | None,
         seed: int,
@@ -482,7 +482,7 @@ class ChunkRunner:
         drift, longest = np.zeros_like(motion.covariance), float(self.params.tau_max)
         if self.lock is not None:
             searching = np.concatenate([info.searching for _, info, _ in parts])
-            valid, covariance, drift = tell_from_later(
+            valid, covariance, drift = report_before_lock(
                 motion.t, motion.mean, motion.covariance, searching, motion.valid,
                 self.lock.diffusion,
             )  # fmt: skip
@@ -547,7 +547,8 @@ class ChunkRunner:
             cloud: Number of particles to report.
 
         Returns:
-            Times (n,) of its batches, us, their stacked reports, and whether the motion is told.
+            Times (n,) of its batches, us, their stacked reports, and whether the motion is
+                reported.
         """
         key = jax.random.fold_in(self._key, self._number)
         noise = _draw(key, self.batches, self.params, self.model)
@@ -569,17 +570,19 @@ class ChunkRunner:
         lag = np.where(row >= 0, (info.lag + duration / 2)[row], self._lag)
         self._lag = float(lag[-1]) if used else self._lag
         info = eqx.tree_at(lambda report: report.lag, info, lag)
-        t, told = sample.t[:used], ~info.searching
+        t, reported = sample.t[:used], ~info.searching
         if self.lock is not None:
             events = self.sampler.recording.events
             count = np.diff(sample.row[:used].max(1), prepend=self.row - 1)
-            told = self.lock.update(events, count, t, info.mean, info.covariance, info.searching)
-            # No motion is told backwards across a pause.
+            reported = self.lock.update(
+                events, count, t, info.mean, info.covariance, info.searching
+            )
+            # No motion is reported backwards across a pause.
             searching = info.searching | self.lock.sparse
             info = eqx.tree_at(lambda report: report.searching, info, searching)
         self._number += 1
         self.row = int(sample.row.max(initial=self.row - 1)) + 1
-        return t, info, told
+        return t, info, reported
 
 
 class WarmStartedRuns(TrainingRuns):
@@ -694,7 +697,7 @@ def join_reports(model: Model, parts: list[tuple[NDArray, Any, NDArray]]) -> Mot
         np.concatenate([t for t, *_ in parts]),
         join("mean"),
         join("covariance"),
-        np.concatenate([told for *_, told in parts]),
+        np.concatenate([reported for *_, reported in parts]),
         join("lag"),
         join("contrast"),
         join("evidence"),

@@ -547,7 +547,14 @@ def undo_averages(
 def _mean_weights(
     x: NDArray, params: Params, basis: NDArray[np.floating] | None
 ) -> NDArray[np.float64]:
-    """Return what motions at knots k - back to k + `KNOTS_PER_LAG` count in x_k, for x (n, d).
+    """Return the weights with which motions at knots count in the estimate at each knot.
+
+    The estimate x_k is a mean of motions from knot k - back to knot k + `KNOTS_PER_LAG`.
+
+    Args:
+        x: (n, d) estimates at knots.
+        params: The parameters.
+        basis: (pixels, 2, d) flow per unit of each component, px/s; None: all components lag alike.
 
     Returns:
         (n, knots, d, d) weights, whose sum over knots is 1.
@@ -571,10 +578,17 @@ def _mean_weights(
 
 
 def _box_weights(ratio: NDArray, knots: NDArray) -> NDArray[np.float64]:
-    """Return what values at knots count in means over spans (p, knots).
+    """Return the weights of values at knots in means over spans.
 
-    Values between knots are interpolated. Spans end at `KNOTS_PER_LAG` and are `ratio` (p,) times
-    twice as long.
+    Values between knots are interpolated. Spans end at `KNOTS_PER_LAG` and are `ratio` times twice
+    as long.
+
+    Args:
+        ratio: (p,) lengths of the spans.
+        knots: (knots,) positions of the knots.
+
+    Returns:
+        (p, knots).
     """
     length = 2 * KNOTS_PER_LAG * ratio[:, None]
     return (
@@ -591,13 +605,16 @@ def _hat_integral(z: NDArray) -> NDArray[np.float64]:
 def _solve_averages(
     x: NDArray, S: NDArray, q: NDArray, weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, d) of which weighted sums are x (n, d).
+    """Solve for the values whose weighted sums are known.
 
     Args:
-        x: The sums.
+        x: (n, d) sums.
         S: (n, d, d) their covariances.
         q: (n - 1, d) variances of steps.
         weights: (n, knots, d, d) of `_mean_weights`.
+
+    Returns:
+        (n, d) values.
     """
     after = KNOTS_PER_LAG
     back = weights.shape[1] - after - 1

@@ -72,7 +72,18 @@ class ImageBuffers(NamedTuple):
     def empty(
         cls, n_times: int, n_pixels: int, dtype: np.dtype, n_outputs: int = 0, n_lanes: int = 0
     ) -> "ImageBuffers":
-        """Make buffers for some times, with derivatives of `n_outputs` images."""
+        """Allocate buffers for images.
+
+        Args:
+            n_times: Number of images.
+            n_pixels: Number of pixels of each.
+            dtype: Type of real numbers.
+            n_outputs: Number of images that have derivatives, of mean and variance; 0 for none.
+            n_lanes: Numbers of a vector of derivatives.
+
+        Returns:
+            The buffers; derivatives are 0, images are not initialised.
+        """
         mean, variance = (np.empty((n_times, n_pixels), dtype) for _ in range(2))
         valid = np.empty((n_times, n_pixels), np.uint8)
         return cls(mean, variance, valid, np.zeros((n_times, n_pixels, n_outputs, n_lanes), dtype))
@@ -122,7 +133,15 @@ class BandLayout:
 
     @classmethod
     def of(cls, width: int, height: int, derivatives: bool = False) -> "BandLayout":
-        """Lay out the bands of a sensor, for kernels with derivatives or without.
+        """Lay out the bands of a sensor.
+
+        Args:
+            width: Width of the sensor, px.
+            height: Height of the sensor, px.
+            derivatives: Whether kernels carry derivatives, and bands are smaller.
+
+        Returns:
+            The layout.
 
         Raises:
             TranslationError: The sensor is too wide for a band.
@@ -220,9 +239,18 @@ def _count_rows(y, counts):
 
 @njit_noalloc
 def _partition(stored, weight, rows, origin, at, bands):
-    """Write each event to its band and to one that it borders on; return whether all are valid.
+    """Write each event to its band, and to one that it borders on.
 
-    `at` are the places where each band's events begin, and one more.
+    Args:
+        stored: `EventColumns` of a block.
+        weight: (n,) events that each one stands for; empty: one.
+        rows: `_Rows`.
+        origin: Time from which to count, on the columns' own clock, us.
+        at: (bands + 1,) places at which each band's next event goes, changed in place.
+        bands: `EventBands`, output.
+
+    Returns:
+        Whether all events are in order and on the sensor.
     """
     t, x, y, p, previous = stored.t, stored.x, stored.y, stored.p, stored.previous
     events, weights, width = bands.events, bands.weights, bands.width
@@ -367,7 +395,18 @@ class PartitionedRecording:
     def _bands_of_source(
         self, source: ColumnSource, begin_row: int, end_row: int
     ) -> EventBands | None:
-        """Divide events block by block, each of which stays in the cache: 5 M would fill 65 MB."""
+        """Divide the events of a source among the bands, block by block.
+
+        Each block stays in the processor's cache; 5 million events would fill 65 MB.
+
+        Args:
+            source: The events.
+            begin_row: First row.
+            end_row: Row after the last.
+
+        Returns:
+            The bands, or None if the source cannot be read so or events are not valid.
+        """
         steps = range(begin_row, end_row, N_BLOCK_EVENTS)
         blocks = [slice(row, min(row + N_BLOCK_EVENTS, end_row)) for row in steps]
         counts = np.zeros(N_ROWS, np.int64)
@@ -416,7 +455,14 @@ class PartitionedRecording:
 # Compilers take several numbers at once where no place can be negative: in parts from 0 on.
 @njit_noalloc_inlined
 def copy_field(cells, out_begin, in_begin, count):
-    """Copy some numbers from one place to another."""
+    """Copy numbers from one place of an array to another.
+
+    Args:
+        cells: The array.
+        out_begin: First place that is written.
+        in_begin: First place that is read.
+        count: Number of numbers.
+    """
     out, given = cells[out_begin : out_begin + count], cells[in_begin : in_begin + count]
     for z in range(len(out)):
         out[z] = given[z]
@@ -438,7 +484,16 @@ def ceil_to_us(time_us):
 
 @njit_noalloc_inlined
 def load_frame_image(frames, table_kind, frame, bands, band, out_field):
-    """Write grey values (kind 0), intensities or certainties of frame k into a field."""
+    """Write what a table says of a frame's pixels into a field of a band.
+
+    Args:
+        frames: `FrameRows`.
+        table_kind: 0 for grey values, 1 for intensities, 2 for certainties.
+        frame: Row of the frame in `frames`.
+        bands: `EventBands`.
+        band: Number of the band.
+        out_field: (stride,) output; the band's border stays as it is.
+    """
     gain, width = frames.gain[frame], bands.width
     is_plain = table_kind != 1 or gain == 1  # divisions take longest
     for line in range(bands.edges[band], bands.edges[band + 1]):
@@ -459,7 +514,17 @@ def load_frame_image(frames, table_kind, frame, bands, band, out_field):
 
 @njit_noalloc_inlined
 def find_first_event(events, begin, end, time_us):
-    """Find the first of a band's events, from begin to end, that is not before a time."""
+    """Find the first of a band's events that is not before a time.
+
+    Args:
+        events: Packed events, sorted by time; see `EventBands`.
+        begin: First place of the search.
+        end: Place after the last one.
+        time_us: Time, us since the recording's start.
+
+    Returns:
+        The place; `end` if all events are before the time.
+    """
     while begin < end:
         middle = (begin + end) >> 1
         if events[middle] >> 17 < time_us:
@@ -471,7 +536,16 @@ def find_first_event(events, begin, end, time_us):
 
 @njit_noalloc_inlined
 def count_band_events(bands, band, span_us, cells, on_field, off_field):
-    """Count each pixel's ON and OFF events with span[0] <= t < span[1] into two fields."""
+    """Count each pixel's ON and OFF events in a span of time.
+
+    Args:
+        bands: `EventBands`.
+        band: Number of the band.
+        span_us: Begin, which is included, and end, us since the recording's start.
+        cells: Numbers of the band's pixels.
+        on_field: Place of the field for ON events in `cells`.
+        off_field: Place of the field for OFF events; may be the same.
+    """
     events, weights, stride, end = bands.events, bands.weights, bands.stride, bands.first[band + 1]
     weighted, (left, right) = len(weights) > 0, span_us
     fill_field(cells, on_field, stride, 0.0)
@@ -496,7 +570,16 @@ class ExposureSums(NamedTuple):
 
 @njit_noalloc_inlined
 def sum_exposure_segments(bands, band, frames, frame, cells, sums):
-    """Add up what the segments of constant brightness of frame k's exposure say, into fields."""
+    """Add up, in fields, the contributions of the segments of constant brightness in an exposure.
+
+    Args:
+        bands: `EventBands`.
+        band: Number of the band.
+        frames: `FrameRows`.
+        frame: Row of the frame in `frames`.
+        cells: Numbers of the band's pixels.
+        sums: `ExposureSums`.
+    """
     events, weights, stride = bands.events, bands.weights, bands.stride
     excess, numbers, totals, counts, bound = sums
     begin, end = bands.first[band], bands.first[band + 1]

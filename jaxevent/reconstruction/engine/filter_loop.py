@@ -88,6 +88,9 @@ def cut_window(
         recording: The recording.
         start_us: Start of the window, us; None: the recording's.
         state: State of the stream at the end of the window before.
+
+    Returns:
+        The window.
     """
     windows, source = recording.windows, recording.recording.events
     stop = windows.choose_stop(start_us)
@@ -110,6 +113,9 @@ def make_timeline(
         stop_us: End of the window.
         gain: (frames,) gain of each frame.
         dtype: Kind of real numbers.
+
+    Returns:
+        The timeline.
     """
     begin = -NEVER_US if start_us is None else start_us - clock.origin
     end = NEVER_US if stop_us is None else stop_us - clock.origin
@@ -132,7 +138,15 @@ def make_timeline(
 
 
 def _intervals(breaks: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the begins of the intervals after breaks, and 1 / length; 0 outside the breaks."""
+    """Return the intervals between breaks at some places.
+
+    Args:
+        breaks: (n,) sorted times, us.
+        at: Numbers of intervals; that of the first break is 0.
+
+    Returns:
+        The begins of the intervals, us, and 1 / length, 1/us; 0 outside the breaks.
+    """
     if len(breaks) < 2:
         return np.zeros(len(at)), np.zeros(len(at))
     inside = (at >= 0) & (at < len(breaks) - 1)
@@ -193,6 +207,9 @@ def entry_steps(
         frames: Frames of the window.
         entry_point: Interval in which the window is entered, with no frame known, and the time, us
             since the recording's start; the steps of the intervals before are left out.
+
+    Returns:
+        The steps.
     """
     first, now = entry_point
     ends, before, found = (
@@ -223,7 +240,16 @@ class _FrameEntry:
         self.left, self.mid, self.right = (np.ceil(e).astype(int).tolist() for e in edges)
 
     def steps(self, frame: int, before: int, now: int) -> Iterator[tuple[int, ...]]:
-        """List the steps where pieces of `frame` follow those of the frame `before`, at a time."""
+        """List the steps where pieces of a frame begin.
+
+        Args:
+            frame: Number of the frame that the pieces count from; -1 before the first.
+            before: Number of the frame of the pieces before, or `NO_PREVIOUS_FRAME`.
+            now: Time, us since the recording's start.
+
+        Yields:
+            Kind and arguments of a step.
+        """
         places, number = self.places, self.number
         count = len(self.left) + number
         base = max(frame - 1, 0)
@@ -258,7 +284,16 @@ class _FrameEntry:
             yield from self._count(places.before, self.opening, self.right[0])
 
     def _images(self, k: int, row: int, rows: int) -> Iterator[tuple[int, ...]]:
-        """List the steps for a row's images, and for the sums over its exposure."""
+        """List the steps for the images of one frame of a piece, and for its exposure's sums.
+
+        Args:
+            k: Row of the frame in the window's frames.
+            row: Number of the frame among the piece's three.
+            rows: Number of the three that exist.
+
+        Yields:
+            Kind and arguments of a step.
+        """
         places, stride = self.places, self.places.stride
         for kind in range(3):
             field = int(places.image[kind, row]) * stride
@@ -306,7 +341,14 @@ class WindowInputs(NamedTuple):
 
 @njit_noalloc_inlined
 def _sum_around(cells, fields, sums, shape):
-    """Sum two fields over the 3x3 pixels around each of a band's own pixels, into another."""
+    """Sum two fields over the 3x3 pixels around each of a band's own pixels, into another field.
+
+    Args:
+        cells: Numbers of the band's pixels.
+        fields: Places of the output and of the two fields.
+        sums: Scratch, of a band's size.
+        shape: Rows of the band, and width of a row with its border.
+    """
     rows, padded = shape
     (out_begin, on, off), n = fields, rows * padded
     above_on, at_on, below_on = cells[on:], cells[on + padded :], cells[on + 2 * padded :]
@@ -320,7 +362,16 @@ def _sum_around(cells, fields, sums, shape):
 
 @njit_noalloc_inlined
 def _take_steps(steps, begin, end, given, band, memory):
-    """Take the steps from begin to end, of a band."""
+    """Take the steps of a band at the beginning of an interval.
+
+    Args:
+        steps: (steps, 5), see `EntrySteps`.
+        begin: First of the steps.
+        end: The one after the last.
+        given: `WindowInputs`.
+        band: Number of the band.
+        memory: `BandMemory`.
+    """
     bands, frames, cells = given.bands, given.frames, memory.cells[band]
     stride = bands.stride
     for i in range(begin, end):
@@ -358,7 +409,15 @@ class PassRequest(NamedTuple):
 
 @njit_noalloc
 def filter_events(begin, end, inputs, memory, request):
-    """Pass over the events of some bands, and make images."""
+    """Pass over the events of some bands, and make images.
+
+    Args:
+        begin: First band.
+        end: Band after the last.
+        inputs: `WindowInputs`.
+        memory: `BandMemory`, changed in place.
+        request: `PassRequest`; its images are written.
+    """
     enter, until, times, images = request
     bands, line, functions, steps = inputs.bands, inputs.line, inputs.functions, inputs.steps.step
     first, edges, starts, ends = bands.first, bands.edges, line.start, inputs.steps.end
@@ -550,7 +609,13 @@ class FilterPasses:
         self.run(window, -NEVER_US, entry_point=(0, -NEVER_US))
 
     def resume(self, window: BandedWindow, states: PixelStates, now_us: int) -> None:
-        """Enter a later window at its beginning (us since the recording's start)."""
+        """Enter a later window at its beginning.
+
+        Args:
+            window: The window.
+            states: State of all pixels at that time.
+            now_us: Begin of the window, us since the recording's start.
+        """
         memory = self._memory
         memory.cells[:, : states.cells.shape[1]] = states.cells
         memory.whole[:], memory.last[:] = states.whole, states.last

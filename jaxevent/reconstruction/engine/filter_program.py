@@ -361,7 +361,15 @@ def translate_filter(trace: TracedJaxpr, known: tuple[Any, ...], kind: KernelKin
 def _input(
     graph: Graph, name: str, leaf: jax.ShapeDtypeStruct, variant: Variant, last: int
 ) -> Value:
-    """Return an input of the traced function, an array of nodes."""
+    """Return an input of the traced function, an array of nodes.
+
+    Args:
+        graph: Graph of the nodes.
+        name: Name of the input.
+        leaf: Its shape and type.
+        variant: Piece, and frame before, of the translation.
+        last: Row of the last frame that a following frame may change.
+    """
     if name in ("piece", "frame"):
         return ConstantArray(np.asarray(getattr(variant, name)), at_point=True)
     level = Level.POINT
@@ -470,7 +478,18 @@ class PixelFields:
 
     @classmethod
     def of(cls, program: FilterProgram, stride: int) -> "PixelFields":
-        """Lay out the numbers of a program, for bands of `stride` pixels."""
+        """Lay out the numbers of a program.
+
+        Args:
+            program: The program.
+            stride: Pixels of a band, with its border.
+
+        Returns:
+            The layout.
+
+        Raises:
+            TranslationError: A table is not of real numbers.
+        """
         cells: dict[str, int] = {}
         whole: dict[str, int] = {}
         for name, node in program.state.items():
@@ -524,7 +543,16 @@ class PixelFields:
         return (len(self.cells) + self.record) * self.stride
 
     def of_bands(self, name: str, cells: NDArray, whole: NDArray) -> NDArray:
-        """Return a field's numbers in `BandMemory`, [bands, stride]."""
+        """Return one field of all bands.
+
+        Args:
+            name: Name of the field.
+            cells: Real numbers of `BandMemory`.
+            whole: Whole numbers of `BandMemory`.
+
+        Returns:
+            (bands, stride) view.
+        """
         array, place = (whole, self.whole) if name in self.whole else (cells, self.cells)
         return array[:, place[name] * self.stride : (place[name] + 1) * self.stride]
 
@@ -653,7 +681,14 @@ def excess(share64, edge64, on, off, numbers, out):
 
 
 def write_filter(program: FilterProgram, stride: int) -> ModuleText:
-    """Write the module of a program, for bands of `stride` pixels.
+    """Write the module of a program.
+
+    Args:
+        program: The program.
+        stride: Pixels of a band, with its border.
+
+    Returns:
+        The text, with the places of the fields.
 
     Raises:
         TranslationError: A number of the piece is not looked up at a point.
@@ -741,7 +776,7 @@ def _write_images(program: FilterProgram, writer: ModuleWriter, fields: PixelFie
 
 
 def _write_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
-    """Write what a piece says, for the pixels from begin to end."""
+    """Write the function that computes what is constant in a piece, for some pixels."""
     stored = _stored_slots(program, fields, False)
     out, changes = list[str](), []
     for variant, table in enumerate(program.tables):
@@ -767,7 +802,7 @@ def _write_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFie
 
 
 def _write_image_tables(program: FilterProgram, writer: ModuleWriter, fields: PixelFields) -> str:
-    """Write what a piece says for the variance of images alone."""
+    """Write the function that computes what is constant in a piece for the variance of images."""
     stored, out = _stored_slots(program, fields, True), ["        pass"]
     for variant, table in enumerate(program.tables if stored else ()):
         out.append(f"        if variant == {variant}:")
@@ -779,9 +814,17 @@ def _write_image_tables(program: FilterProgram, writer: ModuleWriter, fields: Pi
 
 
 def _stored_slots(program: FilterProgram, fields: PixelFields, of_variance: bool) -> dict[int, int]:
-    """Return the fields of slots by number: of those for the variance of images, or of all others.
+    """Return the fields in which slots are stored.
 
-    Slots that derivatives of the variance need are among the others.
+    Slots that derivatives of the variance need are among those for all else.
+
+    Args:
+        program: The program.
+        fields: Its layout.
+        of_variance: Whether slots for the variance of images alone are wanted, or all others.
+
+    Returns:
+        Fields by the number of the slot.
     """
     rest = {**program.state, "mean": program.mean}
     needed = _slots(
@@ -818,7 +861,7 @@ def filter_kernel(
 def check_filter_kernel(
     method: FilterMethod, params: Any, fixed: dict[str, NDArray], kind: KernelKind
 ) -> None:
-    """Raise `TranslationError` if there is no such kernel; see `filter_kernel`."""
+    """Raise `TranslationError` if `filter_kernel` can make no kernel of these arguments."""
     _kernels.find_program(*_request(method, params, fixed, kind))
 
 

@@ -162,9 +162,8 @@ class FilterVideo(ImageSequence[P]):
         begin = WindowStart(window.stop, window.context, self._passes.copy_states())
         if all(b.start != window.stop for b in self._begins):
             self._begins = sorted([*self._begins, begin], key=lambda b: b.time)
-            if (
-                len(self._begins) > MAX_WINDOW_STARTS
-            ):  # the first one, the last one, and half of the others
+            # Keep the first one, the last one, and half of the others.
+            if len(self._begins) > MAX_WINDOW_STARTS:
                 self._begins = [self._begins[0], *self._begins[1:-1][::2], self._begins[-1]]
         return begin
 
@@ -181,7 +180,16 @@ class FilterVideo(ImageSequence[P]):
 
 
 def _make_segments(clock: FrameClock, recording: Recording, events: int) -> list[FrameSegment]:
-    """Divide frames into segments of so many events, one frame at least."""
+    """Divide frames into segments of at most so many events, one frame at least.
+
+    Args:
+        clock: Times of the frames.
+        recording: Events and frames.
+        events: Most events of a segment of several frames.
+
+    Returns:
+        The segments, in order.
+    """
     most = max(6, MAX_SEGMENT_FRAME_PIXELS // (recording.width * recording.height))
     rows = [recording.events.index(int(np.ceil(t)) + clock.origin) for t in clock.mid]
     rows.append(len(recording.events))
@@ -279,13 +287,22 @@ class SmootherVideo(ImageSequence[P]):
         return given
 
     def _smooth(self, place: int, given: SegmentInputs) -> None:
+        """Smooth a segment whose frames are filtered."""
         for name, values in zip(LATER_FIELDS, self._later[place], strict=True):
             self._field(name)[:] = values
         self._over_bands(smooth_frames, given, self._memory)
         self._open = place, given
 
     def _filter(self, place: int, linked: bool) -> SegmentInputs:
-        """Divide a segment's events among the bands, and filter its frames."""
+        """Divide a segment's events among the bands, and filter its frames.
+
+        Args:
+            place: Number of the segment.
+            linked: Whether to compose the maps of messages through it, too.
+
+        Returns:
+            The arguments of passes over the segment.
+        """
         segment, passes = self._segments[place], self._passes
         bands, self._context = passes.partition(segment, self._context)
         given = passes.inputs(segment, bands, np.arange(passes.layout.bands))
@@ -301,7 +318,7 @@ class SmootherVideo(ImageSequence[P]):
             return np.stack([self._field(name) for name in names])
 
         with bar(
-            total=last + 1, desc="look ahead", unit="stretch", progress=self.progress
+            total=last + 1, desc="look ahead", unit="segment", progress=self.progress
         ) as shown:
             for place in range(last + 1):
                 states.append(fields(STATE_FIELDS))
@@ -535,7 +552,16 @@ def _smooth_bands(
     image_times: ImageTimes,
     images: ImageBuffers,
 ) -> None:
-    """Make the images of some bands, one after another in the same memory."""
+    """Make the images of some bands, one after another in the same memory.
+
+    Args:
+        begin: First band.
+        end: Band after the last.
+        passes: The smoother.
+        given: Arguments of passes over all frames.
+        image_times: Times of the images.
+        images: Output.
+    """
     try:
         memory = passes.spare.get_nowait()
     except queue.Empty:
@@ -669,7 +695,7 @@ def _images(about: Any, number: Any, rows: Any, params: Any) -> Any:
 
 @full_precision
 def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
-    """Return the images' changes: sums of derivatives by numbers times the numbers' changes."""
+    """Return the changes of images: derivatives by numbers times the numbers' changes, summed."""
     number, rows, params = primals
     changes = jax.tree.leaves(tangents[2], is_leaf=_is_zero)
     moving = [k for k, change in enumerate(changes) if not _is_zero(change)]

@@ -144,6 +144,7 @@ def _fill_spread_rates(bands, reach, ahead, rates):
 
 @njit_noalloc_inlined
 def _init_last(scratch, band):
+    """Return scratch memory of a band for pixels' last events, without any event."""
     times = scratch.times[band]
     for z in range(times.shape[1]):
         times[1, z] = times[2, z] = 0
@@ -152,7 +153,18 @@ def _init_last(scratch, band):
 
 @njit_noalloc_inlined
 def _advance_last(given, i, end, until, last):
-    """Note events from place i on that are before a time; return the first that is not."""
+    """Note each pixel's last event before a time.
+
+    Args:
+        given: `SegmentInputs`.
+        i: Place of the first event that is not yet noted.
+        end: Place after the band's last event.
+        until: Time, us since the recording's start.
+        last: `LastEvents`, changed in place.
+
+    Returns:
+        The place of the first event that is not before the time.
+    """
     events, rates = given.bands.events, given.rates
     while i < end and events[i] >> 17 < until:
         z = (events[i] >> 1) & 0xFFFF
@@ -164,7 +176,17 @@ def _advance_last(given, i, end, until, last):
 
 @njit_noalloc_inlined
 def _seek_last(given, band, time, last):
-    """Note the last events before a time, from as early as matters; see `_advance_last`."""
+    """Note each pixel's last event before a time, from as early as matters.
+
+    Args:
+        given: `SegmentInputs`.
+        band: Number of the band.
+        time: Time, us since the recording's start.
+        last: `LastEvents`, output.
+
+    Returns:
+        The place of the first event that is not before the time.
+    """
     for z in range(len(last.rate)):
         last.rate[z] = 0
     a, b = given.bands.first[band], given.bands.first[band + 1]
@@ -174,7 +196,15 @@ def _seek_last(given, band, time, last):
 
 @njit_noalloc_inlined
 def _add_partial_events(out, fields, time, last, sign):
-    """Add (sign 1) or take away (-1) the parts of pixels' next events that have happened."""
+    """Add or take away the parts of pixels' next events that have happened by a time.
+
+    Args:
+        out: Counts of the band's pixels, changed in place.
+        fields: Places of the ON and of the OFF counts in it.
+        time: Time, us since the recording's start.
+        last: `LastEvents` at that time.
+        sign: 1 to add, -1 to take away.
+    """
     on, off = fields
     for z in range(len(last.time)):
         begun = sign * last.rate[z] * (time - last.time[z])
@@ -184,7 +214,16 @@ def _add_partial_events(out, fields, time, last, sign):
 
 @njit_noalloc_inlined
 def _count_between(given, band, span, cells, fields, last):
-    """Count events as `count_band_events` does, with changes spread over time."""
+    """Count events as `count_band_events` does, with changes spread over time.
+
+    Args:
+        given: `SegmentInputs`.
+        band: Number of the band.
+        span: Begin, which is included, and end, us since the recording's start.
+        cells: Numbers of the band's pixels.
+        fields: Places of the ON and of the OFF counts in `cells`.
+        last: `LastEvents`, scratch.
+    """
     count_band_events(given.bands, band, span, cells, fields[0], fields[1])
     left, right = span
     if len(given.rates) > 0 and right > left:
@@ -196,7 +235,14 @@ def _count_between(given, band, span, cells, fields, last):
 
 @njit_noalloc_inlined
 def _sum_neighbours(given, band, cells, above):
-    """Sum ON and OFF events of the eight neighbours of a band's own pixels."""
+    """Sum ON and OFF events of the eight neighbours of a band's own pixels.
+
+    Args:
+        given: `SegmentInputs`.
+        band: Number of the band.
+        cells: Numbers of the band's pixels; counts are read, sums written.
+        above: (stride,) scratch.
+    """
     bands, counts, stride = given.bands, given.places.counts, given.places.stride
     padded, rows = bands.width + 2, bands.edges[band + 1] - bands.edges[band]
     for k in range(2):
@@ -209,7 +255,16 @@ def _sum_neighbours(given, band, cells, above):
 
 @njit_noalloc_inlined
 def _load_frame(band, k, given, cells, last, begin):
-    """Load a frame's image, and sum over its exposure; the scratch is that of band `begin`."""
+    """Load a frame's image into a band, and sum over its exposure.
+
+    Args:
+        band: Number of the band.
+        k: Row of the frame in the segment.
+        given: `SegmentInputs`.
+        cells: Numbers of the band's pixels.
+        last: `LastEvents`, scratch.
+        begin: First band of the pass, whose scratch memory is used.
+    """
     bands, frames, places = given.bands, given.frames, given.places
     stride = places.stride
     for kind in range(3):
@@ -233,7 +288,16 @@ def _load_frame(band, k, given, cells, last, begin):
 
 @njit_noalloc_inlined
 def _measure_clipped(k, row, given, cells, begin, end):
-    """Measure again where a frame is clipped: most pixels are not, and that is dear."""
+    """Measure again where a frame is clipped, as a censored measurement takes long and is seldom.
+
+    Args:
+        k: Row of the frame in the segment.
+        row: Place of the frame's stored fields in `cells`.
+        given: `SegmentInputs`.
+        cells: Numbers of the band's pixels.
+        begin: First pixel.
+        end: Pixel after the last.
+    """
     places, line, gain = given.places, given.line, np.float64(given.frames.gain[k])
     side = places.side * places.stride
     z = begin
@@ -251,9 +315,18 @@ def _measure_clipped(k, row, given, cells, begin, end):
 
 @njit_noalloc
 def filter_frames(begin, end, inputs, memory, starts, linked):
-    """Pass forwards over a segment of frames; its state is the one before the first frame.
+    """Pass forwards over a segment of frames, for some bands.
 
-    Afterwards it is that before the frame after the last. `starts`: the recording does here.
+    The state of a band is that before the first frame; it becomes that before the frame after the
+    last.
+
+    Args:
+        begin: First band.
+        end: Band after the last.
+        inputs: `SegmentInputs`.
+        memory: (slots, ...) numbers of the bands, changed in place.
+        starts: Whether the recording starts with this segment.
+        linked: Whether to compose the maps of messages through the segment, too.
     """
     bands, line, places, functions = inputs.bands, inputs.line, inputs.places, inputs.functions
     numbers, stride, counts = inputs.numbers, places.stride, places.counts
@@ -283,7 +356,15 @@ def filter_frames(begin, end, inputs, memory, starts, linked):
 
 @njit_noalloc
 def smooth_frames(begin, end, inputs, memory):
-    """Pass backwards; the message of the frames after the segment is known at the next one."""
+    """Pass backwards over a segment of frames, for some bands.
+
+    Args:
+        begin: First band.
+        end: Band after the last.
+        inputs: `SegmentInputs`.
+        memory: (slots, ...) numbers of the bands, with the message of all later frames at the frame
+            after the segment; changed in place.
+    """
     bands, line, places = inputs.bands, inputs.line, inputs.places
     padded = np.int64(bands.width + 2)
     for band in range(begin, end):
@@ -299,10 +380,18 @@ def smooth_frames(begin, end, inputs, memory):
 
 @njit_noalloc_inlined
 def _count_since(given, band, to, begin, cells, scratch):
-    """Count the events from the middle of a frame to a time, `to`, in us.
+    """Count the events from the middle of a frame to a time.
 
-    The counts so far of the frame `begin[0]` are in `scratch[0]`, with the events before place
-    `begin[1]`. Returns the next place.
+    Args:
+        given: `SegmentInputs`.
+        band: Number of the band.
+        to: Row of the frame, and the time in us.
+        begin: Row of the frame that the counts so far are of, and place of the next event.
+        cells: Numbers of the band's pixels; counts are written.
+        scratch: Counts so far (2 stride,), and `LastEvents`.
+
+    Returns:
+        The place of the next event.
     """
     (f, now), (known, i), (so_far, last) = to, begin, scratch
     bands, counts, stride = given.bands, given.places.counts, given.places.stride
@@ -331,7 +420,15 @@ def _count_since(given, band, to, begin, cells, scratch):
 
 @njit_noalloc_inlined
 def _count_until(given, band, now, cells, last):
-    """Count the events after a time (us) until the middle of the first frame."""
+    """Count the events after a time until the middle of the first frame.
+
+    Args:
+        given: `SegmentInputs`.
+        band: Number of the band.
+        now: Time, us since the recording's start.
+        cells: Numbers of the band's pixels; counts are written.
+        last: `LastEvents`, scratch.
+    """
     counts, stride, mid = given.places.counts, given.places.stride, given.line.mid[0]
     fields = counts[0] * stride, counts[1] * stride
     count_band_events(given.bands, band, (now + 1, mid), cells, fields[0], fields[1])
@@ -344,7 +441,16 @@ def _count_until(given, band, now, cells, last):
 
 @njit_noalloc
 def read_images(begin, end, inputs, memory, times, out_images):
-    """Make images at sorted times of a smoothed segment."""
+    """Make images of a smoothed segment, for some bands.
+
+    Args:
+        begin: First band.
+        end: Band after the last.
+        inputs: `SegmentInputs`.
+        memory: (slots, ...) numbers of the bands.
+        times: `ImageTimes`, sorted.
+        out_images: `ImageBuffers`, output.
+    """
     bands, places, functions = inputs.bands, inputs.places, inputs.functions
     numbers, stride = inputs.numbers, places.stride
     width, pixels = np.int64(bands.width), out_images.mean.shape[1]
@@ -474,7 +580,15 @@ class SmootherPasses:
         self.places = _places(self.kernel.program, self.kind.stride, self.kind.exposed)
 
     def memory(self, n_bands: int, n_frames: int) -> NDArray:
-        """Make memory for so many bands and frames of each, [bands, ...]."""
+        """Make memory for some bands.
+
+        Args:
+            n_bands: Number of bands.
+            n_frames: Number of frames of each.
+
+        Returns:
+            (bands, ...) numbers, with 0.5 as grey value of what is no pixel.
+        """
         places = self.places
         memory = np.zeros(
             (n_bands, (places.work + n_frames * places.row) * places.stride), self.dtype
@@ -484,7 +598,15 @@ class SmootherPasses:
         return memory
 
     def field(self, memory: NDArray, number: str) -> NDArray:
-        """Return a number of the frame that a pass has come to, [bands, stride]."""
+        """Return one field of the frame that a pass has come to.
+
+        Args:
+            memory: (bands, ...) as of `memory`.
+            number: Name of the field's number, such as "given.0".
+
+        Returns:
+            (bands, stride) view.
+        """
         at, stride = self.kernel.program.work.index(number), self.places.stride
         return memory[:, at * stride : (at + 1) * stride]
 
@@ -511,7 +633,16 @@ class SmootherPasses:
     def inputs(
         self, segment: FrameSegment, bands: EventBands, slot: NDArray[np.int64]
     ) -> SegmentInputs:
-        """Return the arguments of passes over a segment; each band has a `slot` of the memory."""
+        """Make the arguments of passes over a segment.
+
+        Args:
+            segment: The segment.
+            bands: Its events, by band.
+            slot: (bands,) place of each band in the memory.
+
+        Returns:
+            The arguments.
+        """
         reach, n, stride = self.recording.windows.reach, self.layout.bands, self.kind.stride
         scratch = SegmentScratch(
             np.empty((n, 3 * stride), self.dtype),
@@ -535,7 +666,15 @@ class SmootherPasses:
         return np.searchsorted(self.clock.mid, times_us.astype(float), "right") - 1
 
     def image_times(self, times_us: NDArray, first_frame: int) -> ImageTimes:
-        """Locate times that lie in a segment which begins with that frame."""
+        """Locate times of images in a segment.
+
+        Args:
+            times_us: Sorted times, us since the recording's start.
+            first_frame: First frame of the segment.
+
+        Returns:
+            The times with their positions among the segment's frames.
+        """
         mid, frame = self.clock.mid, self.frame_before(times_us)
         behind, following = frame < 0, np.minimum(frame + 1, len(mid) - 1)
         elapsed = np.where(behind, 0, 1e-6 * (times_us - mid[np.maximum(frame, 0)]))

@@ -234,7 +234,15 @@ IMAGES_LOOP_TEMPLATE = """        for column in range(width):
 
 
 def write_smoother(program: SmootherProgram, stride: int) -> ModuleText:
-    """Write the module of a program, for bands of `stride` pixels."""
+    """Write the module of a program.
+
+    Args:
+        program: The program.
+        stride: Pixels of a band, with its border.
+
+    Returns:
+        The text.
+    """
     addresses: dict[str, Address] = {
         name: ("cells", index, i * stride)
         for index, names in (("z", program.work), ("k", program.row))
@@ -285,6 +293,16 @@ def _write_loops(
 
     LLVM computes several pixels at once only where loops read and write few fields: that is worth
     computing factors again. Derivatives rest on numbers that the last loop may write.
+
+    Args:
+        results: Nodes of the results by name.
+        targets: Texts of the places where results are stored, by name.
+        writer: Writer of the module.
+        loop: Template of a loop, with `lines`.
+        indent: Number of spaces before these lines.
+
+    Returns:
+        The text.
     """
     groups: dict[int, list[str]] = {}
     for key in targets:
