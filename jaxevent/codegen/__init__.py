@@ -191,7 +191,7 @@ def map_ahead(
     """Yield `function(item)` for each item, in order, while later items are made.
 
     The caller's thread makes the items. Others compute, each one item at a time, and share the
-    cores for the rows of kernels. If one item may be held the caller's thread computes, too.
+    cores for the rows of kernels. With one core or one item the caller's thread computes, too.
 
     Args:
         function: Function of one item alone; it should release the interpreter's lock.
@@ -205,14 +205,12 @@ def map_ahead(
         Exception: What making an item or the function raises, when its result is due.
     """
     most = N_THREADS if most is None else most
-    if most == 1:
+    threads = min(most, N_THREADS)
+    if threads == 1:
         yield from map(function, items)
         return
-    share = max(N_THREADS // most, 1)
-    process, pool = (
-        os.getpid(),
-        ThreadPoolExecutor(most, initializer=_limit_cores, initargs=(share,)),
-    )
+    pool = ThreadPoolExecutor(threads, initializer=_limit_cores, initargs=(N_THREADS // threads,))
+    process = os.getpid()
 
     def begin(item: T) -> Callable[[], R]:
         """Begin to compute an item; return a function that waits for its result."""

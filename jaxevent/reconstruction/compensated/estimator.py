@@ -88,7 +88,7 @@ from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times
 from jaxevent.threads import synchronized
 
-# Pixels of all targets that are refined at once, each with a kilobyte.
+# Pixels of all targets that are held at once, each with a kilobyte while it is refined.
 MAX_PIXELS_AT_ONCE = 1 << 19
 
 
@@ -214,7 +214,8 @@ class CompensatedVideo(ImageSequence[Params]):
     def _each(self, times: Sequence[int]) -> Iterator[Target]:
         """Yield targets at times (us), each of which is refined while the next ones are begun."""
         pixels = self.recording.width * self.recording.height
-        most = max(min(codegen.N_THREADS, len(times), MAX_PIXELS_AT_ONCE // pixels), 1)
+        # Some take ten times as long to begin as others, so that several wait meanwhile.
+        most = max(min(2 * codegen.N_THREADS, len(times), MAX_PIXELS_AT_ONCE // pixels), 1)
         for target in map_ahead(lambda refine: refine(), map(self._begin, times), most):
             self._latest = target
             yield target
