@@ -76,6 +76,21 @@ def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:
     return enable_x64(enabled)
 
 
+def with_own_settings(function: Callable[Q, T]) -> Callable[Q, T]:
+    """Make a function compute with this thread's precision and device on other threads, too.
+
+    JAX keeps for each thread what `with` blocks set.
+    """
+    double, device = jax.config.jax_enable_x64, jax.config.jax_default_device  # ty: ignore[missing-attribute]
+
+    @functools.wraps(function)
+    def called(*args: Q.args, **kwargs: Q.kwargs) -> T:
+        with double_precision(double), jax.default_device(device):
+            return function(*args, **kwargs)
+
+    return called
+
+
 def has_accelerator() -> bool:
     """Return true if JAX computes on a GPU, or another device than the CPU, by default."""
     check_platform_available()

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,20 @@ def test_meshes_take_as_many_devices_as_divide():
     for places, sizes in (("abcd", [4, 3, 3, None]), ("a", [None] * 4)):
         meshes = [devices.make_mesh(list(places), n) for n in (64, 6, 9, 7)]
         assert [mesh and mesh.size for mesh in meshes] == sizes
+
+
+def test_precision_and_device_of_a_thread_go_with_a_function():
+    device = jax.local_devices()[0]
+
+    def settings():
+        found = jax.numpy.ones(1)
+        return found.dtype, jax.config.jax_default_device
+
+    with jax.enable_x64(not jax.config.jax_enable_x64), jax.default_device(device):
+        given, expected = devices.with_own_settings(settings), settings()
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(given).result() == expected
+        assert pool.submit(settings).result() != expected
 
 
 def test_an_error_of_one_process_is_one_of_all(monkeypatch):

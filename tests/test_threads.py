@@ -84,6 +84,21 @@ def test_a_failure_comes_where_its_result_is_due(cores, monkeypatch):
         list(found)
 
 
+def test_kernels_of_several_items_share_the_cores(monkeypatch):
+    monkeypatch.setattr(codegen, "N_THREADS", 4)
+
+    def parts(_=None):
+        found = []
+        run_over_rows(lambda *rows: found.append(rows), 8)
+        return sorted(found)
+
+    halves = [(0, 4), (4, 8)]
+    assert list(map_ahead(parts, range(3), 2)) == [halves] * 3
+    assert len(parts()) == 4
+    names = map_ahead(lambda _: (threading.get_ident(), len(parts())), range(2), 1)
+    assert list(names) == [(threading.get_ident(), 4)] * 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), RESULTS)
 def test_images_of_a_shared_video(name, options):

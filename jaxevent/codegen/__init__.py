@@ -25,11 +25,13 @@ R = TypeVar("R")
 _COMMON_OPTIONS: dict[str, Any] = {"nogil": True}
 # Counting references to arrays is two thirds of a function that takes many of them.
 _NOALLOC_OPTIONS: dict[str, Any] = {}
+_DISJOINT_OPTIONS: dict[str, Any] = {}
 if support.HAS_INTERNALS:
     from jaxevent.codegen.internals import njit_linked
 
     _COMMON_OPTIONS |= {"no_cfunc_wrapper": True}
     _NOALLOC_OPTIONS |= {"_nrt": False}
+    _DISJOINT_OPTIONS |= {"disjoint": True}
 # Sums in any order, so that several are taken at once.
 _FASTMATH_OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
@@ -63,6 +65,17 @@ def njit_noalloc(function: Callable) -> Any:
 def njit_noalloc_inlined(function: Callable) -> Any:
     """Compile a function that only `njit_noalloc` ones call; Python cannot call it."""
     return _lean_inside(function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS)
+
+
+def njit_disjoint_inlined(function: Callable) -> Any:
+    """Compile as `njit_noalloc_inlined` does a function whose arrays do not overlap.
+
+    Loops over any number of arrays take several numbers at once then. Otherwise they do so over few
+    arrays alone, which are compared first.
+    """
+    return _lean_inside(
+        function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS, **_DISJOINT_OPTIONS
+    )
 
 
 def njit_fastmath(function: Callable) -> Any:
@@ -137,6 +150,19 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(N_THREADS)
 
 
+class _CoreShare(threading.local):
+    """The number of cores over which kernels on a thread divide rows; None: all."""
+
+    cores: int | None = None
+
+
+_share = _CoreShare()
+
+
+def _limit_cores(cores: int) -> None:
+    _share.cores = cores
+
+
 def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
     """Run a kernel on parts of the rows, each on a thread of its own.
 
@@ -147,7 +173,7 @@ def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
         n_rows: Number of rows.
         *args: Further arguments.
     """
-    parts = min(N_THREADS, n_rows)
+    parts = min(N_THREADS if _share.cores is None else _share.cores, n_rows)
     if parts <= 1:
         kernel(0, n_rows, *args)
         return
@@ -164,15 +190,18 @@ def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
         wait(jobs)  # interrupted, too: what they write is the caller's
 
 
-def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+def map_ahead(
+    function: Callable[[T], R], items: Iterable[T], most: int | None = None
+) -> Iterator[R]:
     """Yield `function(item)` for each item, in order, while later items are made.
 
-    The caller's thread makes the items. Others compute, each one item at a time, so that as many
-    items as there are cores are held.
+    The caller's thread makes the items. Others compute, each one item at a time, and share the
+    cores for the rows of kernels. With one core or one item the caller's thread computes, too.
 
     Args:
         function: Function of one item alone; it should release the interpreter's lock.
         items: The items.
+        most: Items that are held at once; None: as many as there are cores.
 
     Yields:
         The results.
@@ -180,13 +209,21 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     Raises:
         Exception: What making an item or the function raises, when its result is due.
     """
-    process, pool = os.getpid(), ThreadPoolExecutor(N_THREADS)
+    most = N_THREADS if most is None else most
+    threads = min(most, N_THREADS)
+    if threads == 1:
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(threads, initializer=_limit_cores, initargs=(N_THREADS // threads,))
+    process = os.getpid()
 
     def begin(item: T) -> Callable[[], R]:
         """Begin to compute an item; return a function that waits for its result."""
-        future = pool.submit(function, item)
-        # A forked process has none of the threads.
-        return lambda: future.result() if os.getpid() == process else function(item)
+        # A forked process has none of the threads, and locks of the pool may be theirs.
+        future = pool.submit(function, item) if os.getpid() == process else None
+        return lambda: (
+            function(item) if future is None or os.getpid() != process else future.result()
+        )
 
     def begun() -> Iterator[Callable[[], R]]:
         try:
@@ -201,12 +238,13 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     try:
         for result in begun():
             results.append(result)
-            if len(results) == N_THREADS:
+            if len(results) == most:
                 yield results.popleft()()
         while results:
             yield results.popleft()()
     finally:
-        pool.shutdown(cancel_futures=True)
+        if os.getpid() == process:
+            pool.shutdown(cancel_futures=True)
 
 
 if hasattr(os, "register_at_fork"):  # the threads stay behind

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,12 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from traced import FULL, products
 
 import jaxevent
+from jaxevent import codegen
 from jaxevent.errors import InputError
 from jaxevent.methods import find
 from jaxevent.reconstruction.colour import chrominance, colour_video, luminance
 from jaxevent.reconstruction.compensated import (
+    estimator,
     exposures,
     fusion,
     instants,
@@ -792,6 +795,41 @@ def test_images_do_not_depend_on_others():
         alone = mc.estimate(slide(), params(), progress=False)(np.array([t]))
         for one, other in zip(together, alone, strict=True):
             np.testing.assert_array_equal(one[row], other[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"motion": Sliding()}])
+def test_images_are_made_beside_each_other(options, monkeypatch):
+    times = np.array([105_000, 206_000, 206_000, 210_000])
+
+    def make(cores):
+        monkeypatch.setattr(codegen, "N_THREADS", cores)
+        return mc.estimate(slide(), params(), progress=False, **options)(times)
+
+    alone, refine, both = make(1), target_motion.TrajectoryEstimator.refine, threading.Barrier(2)
+
+    def refine_two(self, initial):
+        both.wait(60)
+        return refine(self, initial)
+
+    monkeypatch.setattr(target_motion.TrajectoryEstimator, "refine", refine_two)
+    for one, other in zip(make(2), alone, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_large_images_are_made_one_after_another(monkeypatch):
+    monkeypatch.setattr(codegen, "N_THREADS", 2)
+    monkeypatch.setattr(estimator, "MAX_PIXELS_AT_ONCE", 2 * 40 * 48 - 1)
+    refine, found = target_motion.TrajectoryEstimator.refine, []
+
+    def note(self, initial):
+        found.append(threading.get_ident())
+        return refine(self, initial)
+
+    monkeypatch.setattr(target_motion.TrajectoryEstimator, "refine", note)
+    mc.estimate(slide(), params(), progress=False)(np.array([105_000, 206_000]))
+    assert found == [threading.get_ident()] * 2
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ target (`trajectories`). Along these paths the images are fused (`fusion`).
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,8 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent import threads
+from jaxevent import codegen, threads
+from jaxevent.codegen import map_ahead
 from jaxevent.deprecated import RenamedAttribute, renamed_names
+from jaxevent.devices import with_own_settings
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.compensated.event_noise import (
@@ -29,6 +31,7 @@ from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
     AdjacentFrames,
     ExposureModel,
+    FrameExposures,
     constrain_image,
     constrain_image_jax,
 )
@@ -61,6 +64,7 @@ from jaxevent.reconstruction.compensated.robust_mean import (
 )
 from jaxevent.reconstruction.compensated.target_motion import (
     InitialMotion,
+    InitialTarget,
     TrajectoryEstimate,
     TrajectoryEstimator,
     add_smooth_part,
@@ -83,6 +87,9 @@ from jaxevent.reconstruction.video import FlowSource, ImageSequence
 from jaxevent.reconstruction.windows import MAX_WINDOW_EVENTS, prepare
 from jaxevent.recording import Recording, Times
 from jaxevent.threads import synchronized
+
+# Pixels of all targets that are held at once, each with a kilobyte while it is refined.
+MAX_PIXELS_AT_ONCE = 1 << 19
 
 
 class PreparedTarget(NamedTuple):
@@ -129,6 +136,19 @@ def _carry(images: Array, times: PathTimes, paths: Array) -> Array:
 _visibility = jax.jit(visibility)
 
 
+class Target(NamedTuple):
+    """A target, with the motion of its points and its image."""
+
+    motion: TrajectoryEstimate
+    image: FusedImage
+
+    @property
+    def t(self) -> int:
+        """Its time, us."""
+        instants = self.motion.instants
+        return int(instants.t[instants.target])
+
+
 class CompensatedVideo(ImageSequence[Params]):
     """Images of `mc`: `image, variance, valid = video(times)`; also `flow` and `sources`.
 
@@ -165,7 +185,7 @@ class CompensatedVideo(ImageSequence[Params]):
         self._start = None if motion is None else InitialMotion(motion, delay, refine)
         self._window_events = window_events
         self._trajectories: TrajectoryEstimator | None = None
-        self._latest: tuple[int, TrajectoryEstimate, FusedImage] | None = None
+        self._latest: Target | None = None
         self._frames = FrameImages(recording, np.dtype(np.float32))
         self._response = self._frames.response()
 
@@ -187,24 +207,50 @@ class CompensatedVideo(ImageSequence[Params]):
     follow = RenamedAttribute("trajectories")
 
     @synchronized
-    def _target(self, t: int) -> tuple[TrajectoryEstimate, FusedImage]:
-        if self._latest is None or self._latest[0] != t:
-            threads.check_not_forked()
-            target = self.trajectories(t)
-            self._latest = t, target, self._fuse(t, target)
-        return self._latest[1:]
+    def _target(self, t: int) -> Target:
+        (target,) = self._each([t])
+        return target
 
-    def _fuse(self, t: int, target: TrajectoryEstimate) -> FusedImage:
+    def _each(self, times: Sequence[int]) -> Iterator[Target]:
+        """Yield targets at times (us), each of which is refined while the next ones are begun."""
+        pixels = self.recording.width * self.recording.height
+        # Some take ten times as long to begin as others, so that several wait meanwhile.
+        most = max(min(2 * codegen.N_THREADS, len(times), MAX_PIXELS_AT_ONCE // pixels), 1)
+        for target in map_ahead(lambda refine: refine(), map(self._begin, times), most):
+            self._latest = target
+            yield target
+
+    def _begin(self, t: int) -> Callable[[], Target]:
+        """Begin the target at a time (us); return what refines it, on any thread."""
+        latest = self._latest
+        if latest is not None and latest.t == t:
+            return lambda: latest
+        threads.check_not_forked()
+        # Other threads may not ask for it while this one has its turn.
+        trajectories = self.trajectories
+        initial, brightness = trajectories.begin(t), trajectories.brightness.prior(t)
+        return with_own_settings(lambda: self._refine(trajectories, initial, brightness))
+
+    def _refine(
+        self, trajectories: TrajectoryEstimator, initial: InitialTarget, brightness: BrightnessPrior
+    ) -> Target:
+        threads.check_not_forked()
+        motion = trajectories.refine(initial)
+        return Target(motion, self._fuse(trajectories.exposures, motion, brightness))
+
+    def _fuse(
+        self, exposures: FrameExposures, target: TrajectoryEstimate, brightness: BrightnessPrior
+    ) -> FusedImage:
         """Fuse a target's images, and fit the result to the frames next to it."""
-        fused, brightness = fuse_target(self.params, target), self.trajectories.brightness.prior(t)
-        exposures = self.trajectories.exposures
+        fused = fuse_target(self.params, target)
         samples = exposures.samples
         if target.smooth is not None:
             fused = add_smooth_part(target, fused, brightness)
             # Frames of another brightness are no constraint, but for white.
             samples = None if samples is None else 1
         if samples is not None:
-            adjacent = exposures(t, target.instants)
+            instants = target.instants
+            adjacent = exposures(int(instants.t[instants.target]), instants)
             low, high = int(adjacent.frame.min()), int(adjacent.frame.max()) + 1
             grey, intensity, _, gain = self._frames.read(slice(low, high), high - low)
             rows = adjacent.frame - low
@@ -218,18 +264,14 @@ class CompensatedVideo(ImageSequence[Params]):
         return dataclasses.replace(fused, P=fused.P + brightness.variance)
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
-        for n, t in enumerate(times.tolist()):
-            _, fused = self._target(t)
+        for n, (_, fused) in enumerate(self._each(times.tolist())):
             image = np.exp(np.asarray(fused.L)) - np.asarray(self.params.I0)
             valid = np.isfinite(image) & (np.sqrt(fused.P) < np.asarray(self.params.vague))
             whole = (image.astype(self.dtype), np.asarray(fused.P, self.dtype), valid)
             yield times[n : n + 1], tuple(v[None] for v in whole)
 
-    def _targets(
-        self, times: Times, extrapolate: bool
-    ) -> Iterator[tuple[TrajectoryEstimate, FusedImage]]:
-        for t in self._among_events(times, extrapolate).tolist():
-            yield self._target(t)
+    def _targets(self, times: Times, extrapolate: bool) -> Iterator[Target]:
+        return self._each(self._among_events(times, extrapolate).tolist())
 
     @synchronized
     def carry(
@@ -293,7 +335,7 @@ class CompensatedVideo(ImageSequence[Params]):
             Shares (T, H, W) by source, whose sum is 1. `visible_before` and `visible_after` are 1
             where the frame next to the target shows the point, 0 where it is hidden.
         """
-        found = [fused for _, fused in self._targets(times, extrapolate)]
+        found = [target.image for target in self._targets(times, extrapolate)]
         shares = {name: [one.sources[k] for one in found] for k, name in enumerate(SOURCE_NAMES)}
         shares["visible_before"] = [one.visible[0] for one in found]
         shares["visible_after"] = [one.visible[1] for one in found]

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from jaxevent.calibration.light import common_change
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
 from jaxevent.reconstruction.compensated.params import Params
@@ -127,6 +127,10 @@ class InstantImages:
         chosen = self._read(times)
         L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
         return L, V, clear
+
+    def read_ahead(self, times: NDArray[np.int64]) -> None:
+        """Read the images at sorted times (us) that are asked for next, all in one pass."""
+        self._read(times)
 
     def logs(self, times: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return L alone (times, h, w) at sorted times (us)."""
@@ -297,24 +301,53 @@ class FrameBrightness:
         source, size = self._recording.events, (self._recording.height, self._recording.width)
         begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
         grey, intensity, _, _ = self._images.read(slice(frame, frame + 2), 2)
-        black, white = UNCLIPPED_GREY_RANGE
-        unclipped = ((grey > black) & (grey < white)).all(0).reshape(size)
         events = source[begin:end]
         counts = count_events_per_pixel(events.x, events.y, size[1], size[0] * size[1])
-        counts = counts.reshape(size).astype(np.float32)
-        quiet = unclipped & (uniform_filter(counts, 3) < 1 / 18)
-        change = np.diff(np.log(intensity + self._I0), axis=0).reshape(size)
         h, w = (length // MEDIAN_BLOCK_PX for length in size)
-
-        def blocks(image: NDArray) -> NDArray:
-            cut = image[: h * MEDIAN_BLOCK_PX, : w * MEDIAN_BLOCK_PX].reshape(
-                h, MEDIAN_BLOCK_PX, w, MEDIAN_BLOCK_PX
-            )
-            return cut.swapaxes(1, 2).reshape(h * w, MEDIAN_BLOCK_PX**2)
-
-        chosen = blocks(quiet)
-        number, found = chosen.sum(1), np.sort(np.where(chosen, blocks(change), np.inf), axis=1)
-        rows = np.flatnonzero(number >= MIN_BLOCK_PIXELS)
-        low, high = (number[rows] - 1) // 2, number[rows] // 2
-        changes = (found[rows, low] + found[rows, high]) / 2
+        number = np.zeros((h, w), np.int64)
+        found = np.full((h, w, MEDIAN_BLOCK_PX**2), np.inf, np.float32)
+        pair = grey.reshape(2, *size), intensity.reshape(2, *size)
+        _list_quiet_changes(pair, counts.reshape(size), np.float32(self._I0), number, found)
+        chosen = number >= MIN_BLOCK_PIXELS
+        number, found = number[chosen], np.sort(found[chosen], axis=1)
+        rows = np.arange(len(number))
+        changes = (found[rows, (number - 1) // 2] + found[rows, number // 2]) / 2
         return float(np.median(changes)) if len(changes) >= MIN_BLOCKS else 0.0
+
+
+@njit_noalloc_inlined
+def _is_quiet(counts, y, x):
+    """Return whether a pixel and those around it have no events."""
+    if counts[y, x] != 0:
+        return False
+    h, w = counts.shape
+    for i in range(max(y - 1, 0), min(y + 2, h)):
+        for j in range(max(x - 1, 0), min(x + 2, w)):
+            if counts[i, j] != 0:
+                return False
+    return True
+
+
+@njit_noalloc
+def _list_quiet_changes(frames, counts, I0, number, found):
+    """Write the changes of ln(I + I0) of each block's unclipped pixels without events around them.
+
+    Args:
+        frames: Grey values and intensities of two frames, (2, h, w) each.
+        counts: (h, w) events of each pixel between them.
+        I0: Offset inside the logarithm.
+        number: (rows, columns) of blocks, output: the number of such pixels.
+        found: (rows, columns, pixels) output: their changes.
+    """
+    (grey, intensity), size = frames, MEDIAN_BLOCK_PX
+    black, white = np.float32(UNCLIPPED_GREY_RANGE[0]), np.float32(UNCLIPPED_GREY_RANGE[1])
+    for y in range(len(number) * size):
+        for x in range(number.shape[1] * size):
+            if not _is_quiet(counts, y, x):
+                continue
+            low, high = min(grey[0, y, x], grey[1, y, x]), max(grey[0, y, x], grey[1, y, x])
+            if low > black and high < white:
+                i, j = y // size, x // size
+                change = np.log(intensity[1, y, x] + I0) - np.log(intensity[0, y, x] + I0)
+                found[i, j, number[i, j]] = change
+                number[i, j] += 1

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 
 from jaxevent.calibration.gaps import Gaps, find_gaps
+from jaxevent.codegen import njit_noalloc
 from jaxevent.reconstruction.compensated.warp import PathTimes
 from jaxevent.recording import Recording
 
@@ -167,12 +168,18 @@ def _count_parts(recording: Recording, begin: int, length: int) -> NDArray[np.fl
     """Count the events of a segment, (parts, bins)."""
     source = recording.events
     events = source[source.index(begin) : source.index(begin + length)]
-    row = events.y.astype(np.int64) * N_PARTS // recording.height
-    column = events.x.astype(np.int64) * N_PARTS // recording.width
-    bin_ = (events.t - begin) * N_BINS // max(length, 1)
-    cell = (row * N_PARTS + column) * N_BINS + bin_
-    counts = np.bincount(cell, minlength=N_PARTS**2 * N_BINS)
-    return counts.reshape(N_PARTS**2, N_BINS).astype(float)
+    counts, size = np.zeros((N_PARTS**2, N_BINS)), (recording.height, recording.width)
+    _add_to_cells((events.t, events.x, events.y), begin, max(length, 1), size, counts)
+    return counts
+
+
+@njit_noalloc
+def _add_to_cells(events, begin, length, image_shape, counts):
+    """Add events to the counts (parts, bins) of parts of the image and of a span of time."""
+    (t, x, y), (height, width) = events, image_shape
+    for i in range(len(t)):
+        part = np.int64(y[i]) * N_PARTS // height * N_PARTS + np.int64(x[i]) * N_PARTS // width
+        counts[part, (t[i] - begin) * N_BINS // length] += 1.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -194,6 +194,27 @@ class TrajectoryEstimate(NamedTuple):
         return paths if self.path_index is None else paths.reshape(-1, 4)[self.path_index]
 
 
+class InstantStack(NamedTuple):
+    """Images at the K instants of a target, each (K, h, w)."""
+
+    L: NDArray[np.float32]  # log intensity
+    V: NDArray[np.float32]  # its variance
+    clear: NDArray[np.float32]  # 1 where a frame shows the pixel unclipped
+    smooth: NDArray[np.float32] | None  # subtracted from L; None: nothing is
+
+
+class InitialTarget(NamedTuple):
+    """A target, and the motion that its own is refined from."""
+
+    instants: TargetInstants
+    images: InstantStack
+    noise: NDArray[np.float32] | float  # (h, w), as of `fusion.ReferenceImages`
+    # (rows, columns, 4), trajectories of nodes known beforehand, px; None: those of anchors.
+    known: NDArray[np.float32] | None
+    anchor: Anchor | None
+    beside: NodeMotion | None  # of the anchor on the other side, at half resolution
+
+
 @dataclasses.dataclass(frozen=True)
 class InitialMotion:
     """Motion that is known beforehand.
@@ -277,9 +298,10 @@ class TrajectoryEstimator:
         self._frame_motion = cached(self._seek_by_frames)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
         self._latest: tuple[NDArray[np.int64], Any] | None = None  # times, and images
+        self._anchors: list[int] = []  # times of those whose images were read last, us
 
-    def _images(self, instants: TargetInstants) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
-        """Return L, V and clear at instants, and the smooth part that is subtracted from L.
+    def _images(self, instants: TargetInstants) -> InstantStack:
+        """Return the images at instants.
 
         The latest ones are remembered: motion that was sought is next refined on them.
         """
@@ -288,16 +310,14 @@ class TrajectoryEstimator:
             self._latest = instants.t, self._read_images(instants)
         return self._latest[1]
 
-    def _read_images(
-        self, instants: TargetInstants
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
+    def _read_images(self, instants: TargetInstants) -> InstantStack:
         L, V, clear = self.images(instants.t)
         self.event_noise.inflate(instants.t, V)
         first, last = int(instants.t[0]), int(instants.t[-1])
         if self.brightness.is_steady(first, last) and is_equally_bright(L):
-            return L, V, clear, None
+            return InstantStack(L, V, clear, None)
         smooth = gaussian_blur(L)
-        return L - smooth, V, clear, smooth
+        return InstantStack(L - smooth, V, clear, smooth)
 
     def _noise(self, t: int) -> NDArray[np.float32] | float:
         """Return the factor (h, w) on the variance of the events' images at a target (us)."""
@@ -397,15 +417,16 @@ class TrajectoryEstimator:
 
     def _make_anchor(self, at: int, timed: bool) -> Anchor:
         """Find the motion of the target at a time (us) on one of its clocks, and fuse its image."""
-        return self._refine(self._sought_motion(at).on(timed))
+        motion = self._sought_motion(at).on(timed)
+        return self._refine(motion, self._images(motion.instants), self._noise(at))
 
-    def _refine(self, motion: NodeMotion) -> Anchor:
+    def _refine(
+        self, motion: NodeMotion, images: InstantStack, noise: NDArray[np.float32] | float
+    ) -> Anchor:
         """Refine motion at half resolution with the image that it gives."""
-        instants, p = motion
-        L, V, clear, smooth = self._images(instants)
-        t, size = int(instants.t[instants.target]), self.images.image_shape
-        p = NodeTrajectories(p, 1).at_level(0, size).p
-        estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=self._noise(t))
+        (instants, p), (L, V, clear, smooth) = motion, images
+        p = NodeTrajectories(p, 1).at_level(0, self.images.image_shape).p
+        estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=noise)
         fused = fuse_target(self.params, estimate)
         image, P = np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)
         packed = self._pack(estimate, image, P)
@@ -454,31 +475,49 @@ class TrajectoryEstimator:
 
     def __call__(self, t: int) -> TrajectoryEstimate:
         """Estimate the motion of the target at a time (us)."""
+        return self.refine(self.begin(t))
+
+    def begin(self, t: int) -> InitialTarget:
+        """Find all that the motion of the target at a time (us) is refined from."""
         instants = self.schedule(t)
-        L, V, clear, smooth = self._images(instants)
-        size, noise = self.images.image_shape, self._noise(t)
         known = None if self.start is None else self.start(t, self.schedule.step, instants.unit)
-        others: list[int] = []
-        if known is None:
-            nearest, *others = anchors = self._anchor_times(t)
-            timed = self._prefers_time(t, anchors)
-            anchor = self._anchor(nearest, timed)
-        elif self.start is not None and self.start.refine:
-            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-            known = NodeTrajectories(known, 0).at_level(1, size).p
-            found = self._improve(pyramid[1], NodeMotion(instants, known))
-            timed = found.evidence <= 0
-            anchor = self._refine(found.on(timed))
-        else:
-            return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
+        if known is not None:
+            return InitialTarget(
+                instants, self._images(instants), self._noise(t), known, None, None
+            )
+        nearest, *others = anchors = self._anchor_times(t)
+        new = [self.schedule(at).t for at in anchors if at not in self._anchors]
+        self.images.read_ahead(np.unique(np.concatenate([instants.t, *new])))
+        self._anchors = anchors
+        images, noise = self._images(instants), self._noise(t)
+        timed = self._prefers_time(t, anchors)
+        anchor = self._anchor(nearest, timed)
+        beside = self._sought_motion(others[0]).on(timed) if others else None
         instants = instants.with_common_motion(anchor.motion.instants.common)
         if timed:
             instants = instants.with_clock(TIME_CLOCK)
+        return InitialTarget(instants, images, noise, None, anchor, beside)
+
+    def refine(self, initial: InitialTarget) -> TrajectoryEstimate:
+        """Refine the motion of a target; threads may do so for several at once."""
+        instants, images, noise, known, anchor, beside = initial
+        (L, V, clear, smooth), size = images, self.images.image_shape
+        if known is not None:
+            if self.start is None or not self.start.refine:
+                return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
+            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+            half = NodeTrajectories(known, 0).at_level(1, size).p
+            found = self._improve(pyramid[1], NodeMotion(instants, half))
+            timed = found.evidence <= 0
+            anchor = self._refine(found.on(timed), images, noise)
+            if timed:
+                instants = instants.with_clock(TIME_CLOCK)
+        assert anchor is not None
         p = anchor.motion.carry(instants)
         target = TrajectoryEstimate(instants, L, V, clear, p, smooth=smooth, noise=noise)
         packed = self._pack(target, *self._carry_image(anchor, target))
-        for at in others:
-            p = self._choose(packed, p, self._sought_motion(at).on(timed).carry(instants))
+        if beside is not None:
+            p = self._choose(packed, p, beside.carry(instants))
         p = gauss_newton_step(packed, p, self._cost)
         # Nodes of the anchor have taken paths from farther away.
         path_index = select_paths(packed, interpolate_paths(p, size), self._cost, PATH_SEARCHES[1:])
