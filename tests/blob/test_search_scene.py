@@ -136,7 +136,7 @@ def test_only_what_goes_its_own_way_is_a_target():
 
 @pytest.mark.slow
 def test_of_a_camera_that_shakes_it_is_said_that_it_moves():
-    recording = seen_by_a_moving_camera(before_noise([])[0], rate=4e5, maps=shaking)
+    recording = seen_by_a_moving_camera(before_noise([])[0], 2, rate=4e5, maps=shaking)
     found = blob.find(recording, stop=0.4, progress=False)
     assert found.camera_moves and not len(found)
 

@@ -5,14 +5,8 @@ import pytest
 
 from jaxevent import blob
 from jaxevent.blob.search.background import measure_background
-from jaxevent.blob.search.merge import (
-    Turn,
-    _centre_of_turn,
-    _events_within,
-    _measure_turn,
-    _rate_of_pieces,
-)
-from jaxevent.blob.search.paths import TargetPath
+from jaxevent.blob.search.merge import _events_within
+from jaxevent.blob.search.scene import measure_scene_motion
 from jaxevent.blob.search.stream import Stream
 from jaxevent.recording import Events, Recording
 
@@ -71,23 +65,11 @@ def test_the_turn_of_events_is_what_it_was_made():
     stream = Stream(disc, 0, round(1e6 * DURATION))
     bright = measure_background(stream).rate
     own = _events_within(stream, bright > 4 * np.median(bright))
-    centre = _centre_of_turn(own)
-    assert np.hypot(*(centre - HUB)) < 0.8
-    # Told a rate that is a third too small.
-    scene = _measure_turn(own, Turn(0.67 * OMEGA, centre), 0.006)
-    angle = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
-    np.testing.assert_allclose(angle, OMEGA * (scene.t - scene.t[0]), atol=0.05)
+    scene = measure_scene_motion(own, 0.006)
+    turns, shifts = scene.maps[:, :, :2], scene.maps[:, :, 2]
     np.testing.assert_allclose(
-        np.einsum("nij,j->ni", scene.maps[:, :, :2], centre) + scene.maps[:, :, 2],
-        np.tile(centre, (len(scene.t), 1)),
+        turns @ turns.swapaxes(1, 2), np.tile(np.eye(2), (100, 1, 1)), atol=1e-9
     )
-
-
-def test_velocities_of_pieces_tell_the_rate_as_their_median_by_distance():
-    rng = np.random.default_rng(3)
-    p = HUB + rng.uniform(-20, 20, (101, 2))
-    v = OMEGA * (p - HUB)[:, ::-1] * [-1, 1]
-    v[:20] *= -3
-    C = np.tile(np.eye(2), (101, 1, 1))
-    path = TargetPath(np.arange(101), p, v, C, np.ones(101), 1000, 1.0)
-    assert np.isclose(_rate_of_pieces([path], HUB), OMEGA)
+    angle = np.unwrap(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))
+    np.testing.assert_allclose(angle, OMEGA * (scene.t - scene.t[0]), atol=0.05)
+    np.testing.assert_allclose(turns @ HUB + shifts, np.tile(HUB, (100, 1)), atol=1)

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.stream import CountedSpans, Stream, cell_at
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
+from jaxevent.codegen import njit_noalloc_inlined
 from jaxevent.events.filters import busiest_neighbour
 
 N_TIME_SLICES = 64  # equal parts of the recording's time
@@ -369,39 +369,15 @@ def _dispersion(
     N: NDArray[np.int32], background: Background, slices: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Compute the dispersion of counts (windows, rows, columns) of windows in given slices."""
-    calm, activity = background.calm[slices], background.activity[slices]
-    sums = np.zeros((4, *N.shape[1:]))
-    _sum_calm_counts(N, calm, activity, background.bright, sums)
-    squares, expected, fullest, windows = sums
+    calm, bright = background.calm[slices], background.bright
+    N, active = N * calm, background.activity[slices, None, None] * calm
+    mu = N.sum(0) / np.maximum(active.sum(0), 1) * active
+    squares, expected, windows = ((N - mu) ** 2).sum(0), mu.sum(0), calm.sum(0)
+    fullest = np.zeros(bright.shape)
+    fullest[bright] = clutter_evidence(N[:, bright], mu[:, bright], 1).max(0, initial=0)
     full = expected >= CONFIG.min_dispersion_events
     own = np.where(full, squares / np.maximum(expected, CONFIG.min_dispersion_events), 1.0)
     usual = max(1.0, float(np.median(own[full]))) if full.mean() >= 0.5 else 1.0
     # Of many windows chance alone makes the fullest one as unlikely as there are windows.
     own = np.maximum(own, fullest / np.log(np.maximum(windows, 10)))
-    return np.where(background.bright & full, np.maximum(own, usual), usual)
-
-
-@njit_noalloc
-def _sum_calm_counts(N: Any, calm: Any, activity: Any, bright: Any, sums: Any) -> None:
-    """Fill in sums over the calm windows of each cell.
-
-    The sums are: squares about the mean count, expected events, nats of the fullest window of a
-    bright cell, and the number of windows.
-    """
-    squares, expected, fullest, seen = sums[0], sums[1], sums[2], sums[3]
-    for i in range(N.shape[1]):
-        for j in range(N.shape[2]):
-            total = active = 0.0
-            for k in range(len(N)):
-                if calm[k, i, j]:
-                    total += N[k, i, j]
-                    active += activity[k]
-                    seen[i, j] += 1
-            mean = total / max(active, 1.0)
-            for k in range(len(N)):
-                if calm[k, i, j]:
-                    mu = mean * activity[k]
-                    squares[i, j] += (N[k, i, j] - mu) ** 2
-                    expected[i, j] += mu
-                    if bright[i, j]:
-                        fullest[i, j] = max(fullest[i, j], poisson_nats(N[k, i, j], mu))
+    return np.where(bright & full, np.maximum(own, usual), usual)

@@ -8,13 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.search.background import (
-    CELL_PX,
-    Background,
-    CellField,
-    poisson_nats,
-    value_at,
-)
+from jaxevent.blob.search.background import CELL_PX, Background, CellField, poisson_nats, value_at
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.stream import PixelCounts, WindowEvents
 from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
@@ -198,7 +192,9 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
     count = 0
     for i in range(filled):
         cell = scratch.filled[i]
-        total = _sum_around(cells, cell, wide)
+        total = 0
+        for row in (cell - wide, cell, cell + wide):
+            total += cells[row - 1] + cells[row] + cells[row + 1]
         if total < few:
             continue
         x, y = (cell % wide - 1) * g + g // 2, (cell // wide - 1) * g + g // 2
@@ -207,15 +203,6 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
             hit[count] = cell
             count += 1
     return count
-
-
-@njit_noalloc_inlined
-def _sum_around(cells: Any, cell: int, wide: int) -> Any:
-    """Sum the counts of a cell and its eight neighbours."""
-    total = 0
-    for row in (cell - wide, cell, cell + wide):
-        total += cells[row - 1] + cells[row] + cells[row + 1]
-    return total
 
 
 @njit_noalloc_inlined

@@ -4,11 +4,17 @@ What is in contact with an object all its life and goes along with it is a part 
 meet or cross come from apart, and those that stand side by side do not go anywhere. What turns
 about each other by a whole turn at one distance, as blades of a propeller do, is rigid.
 
-An object that turns in its place fills a place that is never dark, and all its events show about
-which point it turns. Velocities of its pieces give roughly the rate: pieces slide along edges, and
-the rate comes out up to twice too small. Events aligned window by window in polar coordinates give
-it to 0.1 %. It is one object if a map that turns so predicts its events better than one at rest,
-and if what is bright in that map is connected: birds that circle alike turn as well, but are apart.
+The edge that goes ahead of an object and the one that follows change the light in opposite ways:
+what is left behind is as bright as what was there before. So a target whose events are nearly all
+of one polarity may be a piece, and its object has the events of the other polarity too. Where few
+events come from each pixel of an outline, a window shows pieces of it. Events of all windows, at
+their places relative to a common path, as an observer sees them who goes along, show whether and
+where an outline connects the pieces.
+
+An object that turns in its place fills a place that is never dark. Its events are a scene that
+turns, and are aligned window by window like one before a moving camera. It is one object if a map
+that turns so predicts its events better than one at rest, and if what is bright in that map is
+connected: birds that circle alike turn as well, but are apart.
 """
 
 import copy
@@ -24,24 +30,105 @@ from jaxevent.blob.search.background import (
     FINE_CELL_PX,
     N_TIME_SLICES,
     Background,
-    SceneMotion,
     clutter_evidence,
     look_up,
 )
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import larger_variance
-from jaxevent.blob.search.own_frame import OwnFrame, differ
+from jaxevent.blob.search.detection import (
+    Scale,
+    clutter_model,
+    detect,
+    larger_variance,
+    measure_blobs,
+)
 from jaxevent.blob.search.paths import (
     TargetPath,
     fit_velocity_noise,
     interpolate_path,
     log_likelihood,
     merge_paths,
+    tabulate_paths,
 )
-from jaxevent.blob.search.scene import BLUR_SIGMAS_BINS, map_gain, measure_moving_background
+from jaxevent.blob.search.scene import (
+    map_gain,
+    measure_moving_background,
+    measure_scene_motion,
+)
 from jaxevent.blob.search.stream import Stream, WindowEvents
 
-N_ANGLE_BINS = 256  # bins of a turn
+
+class OwnFrame(NamedTuple):
+    """Events in the frames of their targets, which are all seen in windows of one length."""
+
+    stream: Stream
+    background: Background  # at rest
+    scale: Scale  # windows and cells in which the targets were seen
+
+    def measure_balances(self, paths: list[TargetPath]) -> list[TargetPath]:
+        """Return paths with the balances of their events' polarities."""
+        sums = np.zeros((2, len(paths) + 1))
+        for part, owner in self.stream.near(tabulate_paths(paths), CONFIG.gate_sigmas):
+            owners, signs = owner[:, 0] + 1, np.where(part.p, 1, -1)
+            sums += [np.bincount(owners, weights, len(sums[0])) for weights in (signs, signs**2)]
+        balances = (sums[0] / np.maximum(sums[1], 1))[1:].tolist()
+        pairs = zip(paths, balances, strict=True)
+        return [dataclasses.replace(path, balance=balance) for path, balance in pairs]
+
+    def whole(
+        self, one: TargetPath, other: TargetPath, others: list[TargetPath]
+    ) -> TargetPath | None:
+        """Return the path of the object of which two paths are pieces.
+
+        Args:
+            one: Path of a piece.
+            other: That of another piece.
+            others: Paths of other targets, whose events connect nothing.
+
+        Returns:
+            A path with the place and shape of what connects the pieces; None if nothing does.
+        """
+        found = self._connect(one, other)
+        if found is None or not others:  # to leave out events takes long
+            return found
+        stream = self.stream.without(others, CONFIG.gate_sigmas)
+        return self._replace(stream=stream)._connect(one, other)
+
+    def _connect(self, one: TargetPath, other: TargetPath) -> TargetPath | None:
+        """Return the path of what connects two pieces by all events of the stream."""
+        rows = merge_paths(one, other)
+        both = [interpolate_path(path, rows.t).p for path in (one, other)]
+        # Means of several windows, for pieces slide along their outline.
+        way = np.average(both, 0, [np.median(path.n) for path in (one, other)])
+        width = min(CONFIG.min_windows, len(rows.t)) | 1
+        way = ndimage.uniform_filter1d(way, width, axis=0, mode="nearest")
+        size, shape = np.array(self.stream.shape[::-1]), self.stream.shape
+        begin, end = ((at - self.stream.start) * 1e-6 for at in (rows.begin, rows.end))
+        events, t = self.stream.window(begin, end), (rows.t - self.stream.start) * 1e-6
+        x, y = (
+            np.rint(xy - np.interp(events.t, t, along) + half).astype(np.int32)
+            for xy, along, half in zip((events.x, events.y), way.T, size // 2, strict=True)
+        )
+        inside = (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
+        moved = WindowEvents(events.t[inside], x[inside], y[inside])
+        # Cells no larger than the larger piece.
+        large = max(float(np.median(path.size[:, 0])) for path in (one, other))
+        cell = max(self.scale.cell, 2 ** int(np.log2(max(large, 1))))
+        life = dataclasses.replace(self.scale, window=end - begin, cell=cell)
+        clutter = clutter_model(self.background, life, shape, (begin + end) / 2)
+        labels, number = detect(moved, clutter, shape)
+        if number == 0:
+            return None
+        _, p, C = measure_blobs(moved, labels, number)
+        places = np.stack([np.median(path - way, 0) for path in both]) + size // 2
+        away = places[:, None] - p
+        squared = np.einsum("kbi,bij,kbj->kb", away, np.linalg.inv(C), away).max(0)
+        k = int(squared.argmin())
+        # What is much larger than what the pieces span is something else that goes along.
+        span = float(np.median(np.hypot(*(both[0] - both[1]).T))) / 2 + large
+        if squared[k] >= CONFIG.contact_distance**2 or larger_variance(C)[k] > span**2:
+            return None
+        C = np.broadcast_to(C[k], rows.C.shape)
+        return dataclasses.replace(rows, p=way + p[k] - size // 2, C=C)
 
 
 def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[TargetPath]:
@@ -51,37 +138,29 @@ def merge_parts(paths: list[TargetPath], frame: OwnFrame | None = None) -> list[
         paths: Paths of targets, all seen in the same windows.
         frame: Their events, which show pieces of outlines; None: only the paths are compared.
     """
+    paths = frame.measure_balances(paths) if frame else paths
     paths = sorted(paths, key=lambda path: path.n.sum(), reverse=True)
-    balances: list[float] = []  # of each path, once they are asked for
     # The whole may be in contact with what none of its parts was.
-    while (found := _first_whole(paths, balances, frame)) is not None:
+    while (found := _first_whole(paths, frame)) is not None:
         k, i, whole = found
-        if balances:
-            n = [paths[j].n.sum() for j in (k, i)]
-            balances[k] = float(np.average([balances[k], balances.pop(i)], weights=n))
         paths[k] = whole
         del paths[i]
     return paths
 
 
 def _first_whole(
-    paths: list[TargetPath], balances: list[float], frame: OwnFrame | None
+    paths: list[TargetPath], frame: OwnFrame | None
 ) -> tuple[int, int, TargetPath] | None:
-    """Return the indices of the first two paths that are parts of one object, and its path.
-
-    `balances` are filled in when they are needed.
-    """
+    """Return the indices of the first two paths that are parts of one object, and its path."""
     for k, i in itertools.combinations(range(len(paths)), 2):
-        are_parts, may_be_pieces = _compare(paths[k], paths[i])
+        one, other = paths[k], paths[i]
+        are_parts, may_be_pieces = _compare(one, other)
         if are_parts:
-            return k, i, merge_paths(paths[k], paths[i])
-        if not (may_be_pieces and frame):
-            continue
-        if not balances:
-            balances += frame.balances(paths)
-        if differ(balances[k], balances[i]):
-            others = [path for j, path in enumerate(paths) if j not in (k, i)]
-            whole = frame.whole(paths[k], paths[i], others)
+            return k, i, merge_paths(one, other)
+        # Different parts of an outline have different balances.
+        if frame and may_be_pieces and abs(one.balance - other.balance) > CONFIG.majority:
+            others = [path for path in paths if path is not one and path is not other]
+            whole = frame.whole(one, other, others)
             if whole is not None:
                 return k, i, whole
     return None
@@ -245,13 +324,6 @@ def _whole_rows(path: TargetPath) -> NDArray[np.int64]:
     return np.flatnonzero(whole) if whole.any() else np.arange(len(size))
 
 
-class Turn(NamedTuple):
-    """A rotation in the image: rad/s, from x to y, about a point (px)."""
-
-    rate: float
-    centre: NDArray[np.float64]
-
-
 def merge_turning(
     paths: list[TargetPath], stream: Stream, background: Background
 ) -> list[TargetPath]:
@@ -270,14 +342,11 @@ def merge_turning(
     out = list(paths)
     for place in range(1, int(places.max()) + 1):
         there = places == place
-        pieces = [
-            path
-            for path in out
-            if look_up(there, FINE_CELL_PX, *path.p.T).mean() >= CONFIG.nearly_all
-        ]
+        inside = [look_up(there, FINE_CELL_PX, *path.p.T).mean() for path in out]
+        pieces = [path for path, n in zip(out, inside, strict=True) if n >= CONFIG.nearly_all]
         # An object is seen whole, not at many sides of the sensor.
         sides = sum(bool(s.any()) for s in (there[0], there[-1], there[:, 0], there[:, -1]))
-        if not pieces or sides > CONFIG.majority * 4 or len(pieces) < 2:
+        if len(pieces) < 2 or sides > CONFIG.majority * 4:
             continue
         whole = _turning_path(pieces, _events_within(stream, there), background)
         if whole is not None:
@@ -296,98 +365,31 @@ def _events_within(stream: Stream, there: NDArray[np.bool_]) -> Stream:
 def _turning_path(
     pieces: list[TargetPath], own: Stream, background: Background
 ) -> TargetPath | None:
-    """Return the path of the object of some pieces; None if it is not one that turns."""
-    centre = _centre_of_turn(own)
-    window = max(pieces, key=lambda path: path.n.sum()).window
-    scene = _measure_turn(own, Turn(_rate_of_pieces(pieces, centre), centre), window * 1e-6)
-    moving = measure_moving_background(own, scene)
-    if not _is_connected(moving, centre) or map_gain(own, moving, window * 1e-6) < CONFIG.min_gain:
+    """Return the path of the object of some pieces; None if it is not one that turns.
+
+    Pieces slide along edges: a turn explains a part of their motion, and hardly any of others'.
+    """
+    p, v = (np.concatenate([getattr(path, name) for path in pieces]) for name in "pv")
+    p = p - p.mean(0)
+    momentum, inertia = (p[:, 0] * v[:, 1] - p[:, 1] * v[:, 0]).sum(), (p**2).sum()
+    if momentum**2 < (1 - CONFIG.nearly_all) * inertia * (v**2).sum():
+        return None
+    largest = max(pieces, key=lambda path: path.n.sum())
+    w, begin = largest.window * 1e-6, max(largest.begin - own.start, 0) * 1e-6
+    part = own.between(begin, min(begin + 2 * N_TIME_SLICES * w, own.duration))
+    part.hot = own.hot
+    scene = measure_scene_motion(part, w)
+    # The point that stays in its place.
+    turns, shifts = np.split(scene.maps, [2], -1)
+    centre = np.linalg.lstsq((turns - np.eye(2)).reshape(-1, 2), -shifts.ravel())[0]
+    centre = np.asarray(centre, np.float64)
+    moving = measure_moving_background(part, scene)
+    if not _is_connected(moving, centre) or map_gain(part, moving, w) < CONFIG.min_gain:
         return None
     angles = np.unwrap(np.arctan2(scene.maps[:, 1, 0], scene.maps[:, 0, 0]))
     rate = float((angles[-1] - angles[0]) / (scene.t[-1] - scene.t[0]))
-    path = _path_of_all(own, centre, window, background.min_rate)
+    path = _path_of_all(own, centre, largest.window, background.min_rate)
     return None if path is None else dataclasses.replace(path, turn_rate=rate)
-
-
-def _centre_of_turn(own: Stream) -> NDArray[np.float64]:
-    """Return the point (px) about which the events are most symmetric.
-
-    What turns in its place leaves equal events on both sides of its centre. The centre is half of
-    where the convolution of the roots of counts with themselves is largest.
-    """
-    pixels = own.pixel_counts(0, own.duration)
-    image = np.zeros((2 * own.height, 2 * own.width))
-    image[pixels.y, pixels.x] = np.sqrt(pixels.n)
-    convolved = np.fft.irfft2(np.fft.rfft2(image) ** 2, image.shape)
-    y, x = np.unravel_index(convolved.argmax(), convolved.shape)
-    return np.array([x, y]) / 2
-
-
-def _rate_of_pieces(pieces: list[TargetPath], centre: NDArray[np.float64]) -> float:
-    """Return the rate (rad/s) of pieces about a point, their median by squared distance."""
-    (x, y), v = (np.concatenate([getattr(path, name) for path in pieces]).T for name in "pv")
-    x, y = x - centre[0], y - centre[1]
-    square = np.maximum(x * x + y * y, 1e-9)
-    rate = (x * v[1] - y * v[0]) / square
-    order = np.argsort(rate)
-    total = np.cumsum(square[order])
-    return float(rate[order][np.searchsorted(total, total[-1] / 2)])
-
-
-def _measure_turn(own: Stream, turn: Turn, window: float) -> SceneMotion:
-    """Measure the turn window by window (s), where events correlate most with those before.
-
-    Each angle is sought about the one that `turn` leads to, as far as the turn of a window: the
-    rate of pieces is up to twice too small.
-    """
-    number = int(own.duration / window)
-    whole = own.pixel_counts(0, own.duration)
-    far = np.hypot(whole.x - turn.centre[0], whole.y - turn.centre[1])
-    rings = int(np.quantile(far, CONFIG.nearly_all, method="lower") / FINE_CELL_PX) + 1
-    order = 1j * np.arange(N_ANGLE_BINS // 2 + 1)
-    step = turn.rate * window
-    reach = max(2, int(abs(step) / (2 * np.pi) * N_ANGLE_BINS))
-    reach = min(reach, N_ANGLE_BINS // 2 - 1)
-    near = np.arange(-reach, reach + 1)
-
-    def spectrum(k: int) -> NDArray[np.complex128]:
-        part = own.window(k * window, (k + 1) * window)
-        return _ring_spectrum(part, turn, (k + 0.5) * window, rings)
-
-    angles, seen = [0.0], spectrum(0)
-    for k in range(1, number):
-        now = spectrum(k)
-        expected = angles[-1] + step
-        correlation = np.fft.irfft(
-            (now * seen.conj()).sum(0) * np.exp(order * expected), N_ANGLE_BINS
-        )
-        best = int(near[np.argmax(correlation[near])])
-        before, peak, after = (correlation[i % N_ANGLE_BINS] for i in (best - 1, best, best + 1))
-        bend = before - 2 * peak + after
-        top = best + (0.5 * (before - after) / bend if bend < 0 else 0.0)
-        angles.append(expected + top * 2 * np.pi / N_ANGLE_BINS)
-        gain = max(CONFIG.reference_gain, 1 / (k + 1))
-        seen = (1 - gain) * seen + gain * now * np.exp(order * angles[-1])
-    c, s = np.cos(angles), np.sin(angles)
-    A = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1)
-    maps = np.concatenate([A, (turn.centre - A @ turn.centre)[..., None]], 2)
-    t = np.asarray((np.arange(number) + 0.5) * window, np.float64)
-    return SceneMotion(t, maps)
-
-
-def _ring_spectrum(part: WindowEvents, turn: Turn, t: float, rings: int) -> NDArray[np.complex128]:
-    """Transform roots of counts in rings and angles about a point to (rings, frequencies).
-
-    Events are carried to a time t (s) as they turn.
-    """
-    dx, dy = part.x - turn.centre[0], part.y - turn.centre[1]
-    angle = (np.arctan2(dy, dx) - turn.rate * (part.t - t)) / (2 * np.pi) % 1
-    ring = (np.hypot(dx, dy) / FINE_CELL_PX).astype(np.int64)
-    place = ring * N_ANGLE_BINS + (angle * N_ANGLE_BINS).astype(np.int64) % N_ANGLE_BINS
-    size = rings * N_ANGLE_BINS
-    counts = np.bincount(place[place < size], minlength=size).reshape(-1, N_ANGLE_BINS)
-    image = ndimage.gaussian_filter1d(np.sqrt(counts), BLUR_SIGMAS_BINS[-1], axis=1, mode="wrap")
-    return np.fft.rfft(image - image.mean(1, keepdims=True))
 
 
 def _is_connected(moving: Background, centre: NDArray[np.float64]) -> bool:

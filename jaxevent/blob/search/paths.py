@@ -30,7 +30,7 @@ class TargetPath:
         velocity_noise: px^2/s^3, density of the white noise that drives the velocity.
         polarity: Polarity of the target's events, 1 ON and 0 OFF; None for both.
         turn_rate: rad/s at which it turns in place, from x to y; None if it is not known to turn.
-        lone_edge: Whether it seems to be one edge of an object of which no more is seen.
+        balance: Share of ON less that of OFF among its events; 0 where it is not measured.
     """
 
     t: NDArray[np.int64]
@@ -42,7 +42,7 @@ class TargetPath:
     velocity_noise: float
     polarity: int | None = None
     turn_rate: float | None = None
-    lone_edge: bool = False
+    balance: float = 0.0
 
     agility = RenamedAttribute("velocity_noise")
     turn = RenamedAttribute("turn_rate")
@@ -68,6 +68,17 @@ class TargetPath:
         way = self.p[-1] - self.p[0]
         along = way @ np.median(self.C, 0) @ way / max(float(way @ way), 1e-9)
         return bool(along < (1 - CONFIG.considerable) * np.median(self.size[:, 0]) ** 2)
+
+    @property
+    def lone_edge(self) -> bool:
+        """True if it seems to be one edge of an object of which no more is seen.
+
+        It is long across its way, and has nearly all events of one polarity.
+        """
+        long, wide = np.median(self.size, 0)
+        is_long = bool(wide < CONFIG.majority * long) and self.is_across_way
+        # The balance is the difference of both shares.
+        return is_long and abs(self.balance) > 2 * CONFIG.nearly_all - 1
 
     def at(self, t: NDArray[np.int64]) -> NDArray[np.float64]:
         """Interpolate positions (times, 2) linearly at times (us)."""
@@ -100,7 +111,9 @@ def merge_paths(one: TargetPath, other: TargetPath) -> TargetPath:
     p = rows[0].p + share[:, None] * d
     v = rows[0].v + share[:, None] * (rows[1].v - rows[0].v)
     noise = min(one.velocity_noise, other.velocity_noise)
-    return TargetPath(t, p, v, C, n, one.window, noise)
+    weights = one.n.sum(), other.n.sum()
+    balance = float(np.average([one.balance, other.balance], weights=weights))
+    return TargetPath(t, p, v, C, n, one.window, noise, balance=balance)
 
 
 def interpolate_path(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:

@@ -77,34 +77,19 @@ class _PredictionScratch(NamedTuple):
     detection: DetectionScratch
     before: Blobs
     last: Blobs
-    p: NDArray[np.float64]  # (pixels, 2) px, predicted means of the blobs
-    S: NDArray[np.float64]  # (pixels, 2, 2) px^2, and covariances of their events
-    moved: NDArray[np.float64]  # (2, pixels) px, places of pixels that move with their blobs
-    events: NDArray[np.int32]  # (pixels,) and their events
+    predicted: Blobs
     touches: NDArray[np.bool_]  # (pixels,) whether a blob is in contact with another
-    near: NDArray[np.int64]  # scored pixels near blobs
     bins: tuple[NDArray[np.int32], ...]  # zeros, one image of bins for each kernel
     tables: tuple[NDArray[np.float64], ...]  # `_kernel_weights`
 
     @classmethod
-    def empty(cls, pixels: int, scored: int, shape: tuple[int, int]) -> "_PredictionScratch":
-        """Allocate scratch memory.
-
-        Args:
-            pixels: Number of pixels with events in a window, at most.
-            scored: Number of pixels with scored events, at most.
-            shape: Rows and columns of the sensor.
-
-        Returns:
-            The memory.
-        """
+    def empty(cls, pixels: int, shape: tuple[int, int]) -> "_PredictionScratch":
+        """Allocate scratch memory for windows of so many pixels at most, of a sensor's shape."""
         tables = tuple(map(_kernel_weights, KERNEL_RADII_PX, KERNEL_BINS_PX))
         bins = tuple(_bins(*(n // len(one) + one.shape[-1] for n in shape)) for one in tables)
         return cls(
-            DetectionScratch.empty(pixels), Blobs.zeros(pixels), Blobs.zeros(pixels),
-            np.empty((pixels, 2)), np.empty((pixels, 2, 2)), np.empty((2, pixels)),
-            np.empty(pixels, np.int32), np.empty(pixels, bool),
-            np.empty(scored, np.int64), bins, tables,
+            DetectionScratch.empty(pixels), *(Blobs.zeros(pixels) for _ in range(3)),
+            np.empty(pixels, bool), bins, tables,
         )  # fmt: skip
 
 
@@ -144,7 +129,7 @@ def predict(
         A prediction for each scale.
     """
     number = len(scored.pixels)
-    scratch = _PredictionScratch.empty(max(map(len, before)), number, shape)
+    scratch = _PredictionScratch.empty(max(map(len, before)), shape)
     order = np.argsort(scored.pixels.y)
     rows, out = (order, scored.pixels.y[order]), []
     for clutter in clutters:
@@ -159,61 +144,25 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
     """Score the predictions of one scale for several windows."""
     scored = [one.scored for one in predictions]
     number = sum(one.number for one in scored)
-    ends = np.cumsum([0, *(len(one.pixels) for one in scored)])
-    if not ends[-1]:
-        return PredictionScore(0.0, 0.0, 0.0, np.zeros(len(predictions)), number)
-    density = np.concatenate([one.density for one in predictions])
+    windows = np.arange(len(scored)).repeat([len(one.pixels) for one in scored])
     b = np.concatenate([one.background for one in scored])
+    ratio = np.concatenate([one.density for one in predictions]) / b[:, None]
     most = CONFIG.max_scored_events
     weight = np.concatenate([max(1.0, one.number / most) * one.pixels.n for one in scored])
     expected, large, split = np.array([one.sums for one in predictions]).T
-    gains, near = np.zeros(len(predictions)), np.empty(len(b), np.int64)
-    shares = np.full((2, N_DENSITIES), 1 / (N_DENSITIES))
-    _sum_gains(density, b, weight, ends, (near, shares), gains)
-    parts = (gains - expected) / number
+    near = ratio.any(1)  # pixels that a blob may reach
+    windows, ratio, weight = windows[near], ratio[near], weight[near]
+    # The likeliest shares of the densities.
+    shares = np.full(N_DENSITIES, 1 / N_DENSITIES)
+    for _ in range(N_EM_STEPS):
+        shares = shares * ((weight / (1 + ratio @ shares)) @ ratio) + 1e-12
+        shares /= shares.sum()
+    gains = weight * np.log1p(ratio @ shares)
+    parts = (np.bincount(windows, gains, len(scored)) - expected) / max(number, 1)
     raw = float(parts.sum())
-    ellipses = float(weight @ np.log1p(density[:, 0] / b) - expected.sum()) / number
+    ellipses = float(weight @ np.log1p(ratio[:, 0]) - expected.sum()) / max(number, 1)
     lost = CONFIG.split_loss * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
     return PredictionScore(raw, raw - lost, ellipses - lost, parts, number)
-
-
-@njit_noalloc
-def _sum_gains(density: Any, b: Any, weight: Any, ends: Any, scratch: Any, gains: Any) -> None:
-    """Sum the log likelihood ratios of windows, with the likeliest shares of the densities."""
-    near, (share, new), number = scratch[0], scratch[1], 0
-    for i in range(len(b)):
-        total = 0.0
-        for j in range(N_DENSITIES):
-            total += density[i, j]
-        if total > 0:  # a blob may reach the pixel
-            near[number] = i
-            number += 1
-    for _ in range(N_EM_STEPS):
-        for j in range(N_DENSITIES):
-            new[j] = 0.0
-        for k in range(number):
-            i = near[k]
-            total = b[i]
-            for j in range(N_DENSITIES):
-                total += density[i, j] * share[j]
-            part = weight[i] / total
-            for j in range(N_DENSITIES):
-                new[j] += part * density[i, j]
-        total = 0.0
-        for j in range(N_DENSITIES):
-            share[j] = share[j] * new[j] + 1e-12
-            total += share[j]
-        for j in range(N_DENSITIES):
-            share[j] /= total
-    window = 0
-    for k in range(number):
-        i = near[k]
-        while i >= ends[window + 1]:
-            window += 1
-        total = 0.0
-        for j in range(N_DENSITIES):
-            total += density[i, j] * share[j]
-        gains[window] += weight[i] * np.log(total / b[i] + 1)
 
 
 @njit_noalloc
@@ -227,24 +176,12 @@ def _predict(
     sum_blobs(first.x, first.y, first.n, labels, earlier, scratch.before)
     number = find_blobs(second.x, second.y, second.n, clutter, cells, scratch.detection)
     sum_blobs(second.x, second.y, second.n, labels, number, scratch.last)
-    near, order = len(scored.x), scratch.near
-    if near == 0 or number == 0:
+    if number == 0:
         return
     _extrapolate(earlier, number, scratch)
     _add_ellipses(density, scored, rows, number, scratch)
-    pixels = _move_pixels(second, scratch)
-    for j in range(near):
-        order[j] = j
-    for k in range(len(KERNEL_RADII_PX) - 1, -1, -1):
-        added = density[:, k + 1]
-        _add_kernels(added, scored, order[:near], pixels, k, scratch)
-        # What the widest one does not reach the others do not.
-        if k == len(KERNEL_RADII_PX) - 1:
-            near = 0
-            for j in range(len(scored.x)):
-                if added[j] > 0:
-                    order[near] = j
-                    near += 1
+    for k in range(len(KERNEL_RADII_PX)):
+        _add_kernels(density[:, k + 1], scored, second, k, scratch)
     for k in range(number):
         sums[0] += scratch.last.n[k]
     sums[1], sums[2] = _count_split(number, scratch)
@@ -252,8 +189,8 @@ def _predict(
 
 @njit_noalloc_inlined
 def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
-    """Predict means and covariances of the blobs' next events."""
-    (n0, p0, C0), (n, p1, C1), p, S = scratch.before, scratch.last, scratch.p, scratch.S
+    """Predict the blobs of the next events."""
+    (n0, p0, C0), (n, p1, C1), (new, p, S) = scratch.before, scratch.last, scratch.predicted
     for k in range(number):
         least, nearest = np.inf, -1
         for j in range(earlier):
@@ -261,6 +198,7 @@ def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
             apart = ex * ex + ey * ey
             if apart < least:
                 least, nearest = apart, j
+        new[k] = n[k]
         moves = np.sqrt(least) < 6 * np.sqrt(larger_variance_of(C1[k])) + 2
         for i in range(2):
             p[k, i] = p1[k, i]
@@ -278,8 +216,7 @@ def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: An
 
     `rows` are the order of pixels by their rows, and these rows: a blob visits those it reaches.
     """
-    n, p, S, x, y = scratch.last.n, scratch.p, scratch.S, scored.x, scored.y
-    order, sorted_y = rows
+    (n, p, S), x, y, (order, sorted_y) = scratch.predicted, scored.x, scored.y, rows
     for k in range(number):
         a, b, c = S[k, 0, 0], S[k, 0, 1], S[k, 1, 1]
         determinant = a * c - b * b
@@ -298,32 +235,14 @@ def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: An
 
 
 @njit_noalloc_inlined
-def _move_pixels(pixels: Any, scratch: Any) -> int:
-    """Move pixels of blobs along with them, and return their number."""
-    moved, p, last, m = scratch.moved, scratch.p, scratch.last.p, 0
-    for i in range(len(pixels.x)):
-        k = scratch.detection.labels[i] - 1
-        if k >= 0:
-            moved[0, m] = pixels.x[i] + (p[k, 0] - last[k, 0])
-            moved[1, m] = pixels.y[i] + (p[k, 1] - last[k, 1])
-            scratch.events[m] = pixels.n[i]
-            m += 1
-    return m
-
-
-@njit_noalloc_inlined
-def _add_kernels(out: Any, scored: Any, near: Any, pixels: int, k: int, scratch: Any) -> None:
-    """Sum kernel k about moved pixels at some scored pixels; events lie in middles of bins."""
-    table, counts, events = scratch.tables[k], scratch.bins[k], scratch.events
-    (rows, columns), g, reach = counts.shape, len(table), table.shape[2] // 2
-    px, py = scratch.moved[0], scratch.moved[1]
-    for i in range(pixels):
-        row, column = int(py[i] / g + reach), int(px[i] / g + reach)
-        if 0 <= row < rows and 0 <= column < columns:
-            counts[row, column] += events[i]
+def _add_kernels(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> None:
+    """Sum kernel k about moved pixels at the scored ones; events lie in middles of bins."""
+    table, counts = scratch.tables[k], scratch.bins[k]
+    g, reach = len(table), table.shape[2] // 2
+    _add_counts(counts, pixels, 1, (g, reach), scratch)
     # numba checks signed indices at every place, which takes two fifths of the time.
     wide, side = np.uint64(2 * reach + 1), np.uint64(g)
-    for j in near:
+    for j in range(len(out)):
         at_y, at_x, total = np.uint64(scored.y[j]), np.uint64(scored.x[j]), 0.0
         row, column = at_y // side, at_x // side
         v, u = at_y - row * side, at_x - column * side
@@ -331,10 +250,24 @@ def _add_kernels(out: Any, scored: Any, near: Any, pixels: int, k: int, scratch:
             for b in range(wide):
                 total += table[v, u, a, b] * counts[row + a, column + b]
         out[j] = total
-    for i in range(pixels):
-        row, column = int(py[i] / g + reach), int(px[i] / g + reach)
-        if 0 <= row < rows and 0 <= column < columns:
-            counts[row, column] = 0
+    _add_counts(counts, pixels, -1, (g, reach), scratch)
+
+
+@njit_noalloc_inlined
+def _add_counts(counts: Any, pixels: Any, sign: int, bins: Any, scratch: Any) -> None:
+    """Add the events of blobs' pixels, which move along with them, to bins, or take them away.
+
+    `bins` are their side and the number of those beyond the sensor.
+    """
+    (rows, columns), (g, reach) = counts.shape, bins
+    p, last = scratch.predicted.p, scratch.last.p
+    for i in range(len(pixels.x)):
+        k = scratch.detection.labels[i] - 1
+        if k >= 0:
+            row = int((pixels.y[i] + (p[k, 1] - last[k, 1])) / g + reach)
+            column = int((pixels.x[i] + (p[k, 0] - last[k, 0])) / g + reach)
+            if 0 <= row < rows and 0 <= column < columns:
+                counts[row, column] += sign * pixels.n[i]
 
 
 @njit_noalloc_inlined

@@ -19,10 +19,7 @@ from numpy.typing import NDArray
 
 from jaxevent.blob.search.background import Background, measure_dispersions
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import (
-    Scale,
-    clutter_model,
-)
+from jaxevent.blob.search.detection import Scale, clutter_model
 from jaxevent.blob.search.prediction import ScalePrediction, predict, sample_scored, score
 from jaxevent.blob.search.stream import Stream
 
@@ -38,12 +35,8 @@ class ScaleSelection:
     score: float  # nats per event
     nats: float  # of a window in which it was tried, in the mean
 
-    def is_worth_a_pass(self, background: Background) -> bool:
-        """Return whether blobs at this scale are evident."""
-        return _are_evident(self.score, self.nats, background)
 
-
-def _are_evident(score: float, nats: float, background: Background) -> bool:
+def are_evident(score: float, nats: float, background: Background) -> bool:
     """Return whether blobs are, that gain so much per event and in a window.
 
     The Bayes factor of a window decides, whatever share of the events they send. The map of a
@@ -146,7 +139,7 @@ class _ScaleTrial:
             best = max(scores, key=lambda one: one.raw)
             for i, one in enumerate(scores):
                 most, number = _upper_bound(one.parts), one.number / len(one.parts)
-                evident |= _are_evident(most, most * number, self.background)
+                evident |= are_evident(most, most * number, self.background)
                 excess = _upper_bound(one.parts - CONFIG.dropped_score * best.parts)
                 self.tried[i, j] = one is best or excess >= 0
         return evident

@@ -27,23 +27,14 @@ from jaxevent.blob.search.background import (
     pool,
 )
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import (
-    Blobs,
-    clutter_model,
-    detect,
-    larger_variance,
-    sum_blobs,
-)
+from jaxevent.blob.search.detection import Blobs, clutter_model, detect, larger_variance, sum_blobs
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.scale import TRIED_WINDOWS_US, ScaleSelection
 from jaxevent.blob.search.stream import Stream, WindowEvents
 from jaxevent.codegen import njit, njit_inlined
 
 BLUR_SIGMAS_BINS = (4, 2, 1)  # standard deviations of blurs, from coarse to fine
-MAX_GAUSS_NEWTON_STEPS, MIN_STEP_BINS = (
-    8,
-    0.02,
-)  # Gauss-Newton steps, and the step at which they end
+MAX_GAUSS_NEWTON_STEPS, MIN_STEP_BINS = 8, 0.02  # steps, and the step at which they end
 N_TILES_PER_SIDE = 4  # along each side of the sensor
 # Windows in those of blobs: of a shaking scene any of them may be suitable.
 TRIED_WINDOW_RATIOS = (1, 1 / 4, 1 / 16, 4)
@@ -52,7 +43,8 @@ TRIED_WINDOW_RATIOS = (1, 1 / 4, 1 / 16, 4)
 def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
     """Measure the shift and turn of the whole scene, from windows aligned to those before.
 
-    The reference is a mean of earlier windows, each moved along with the scene.
+    The reference is a mean of earlier windows, each moved along with the scene. Images are those of
+    the part of the sensor that is not left out.
 
     Args:
         stream: Events.
@@ -60,36 +52,47 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
     """
     steps = int(min(2 * N_TIME_SLICES, stream.duration / window))
     begins = np.linspace(0, stream.duration - window, steps)
-    bins = -(-max(stream.width, stream.height) // CONFIG.max_image_bins)
+    seen = [np.flatnonzero(~stream.hot.all(axis)) for axis in (0, 1)]
+    corner, size = (np.array([fit(one) for one in seen]) for fit in (np.min, np.ptp))
+    bins = int(size.max()) // CONFIG.max_image_bins + 1
+    shape = size[::-1] // bins + 1
     maps, motion, reference = [np.eye(2, 3)], None, None
     for number, begin in enumerate(begins):
-        image = _event_image(stream.window(begin, begin + window), stream, bins)
+        image = _event_image(stream.window(begin, begin + window), corner, bins, shape)
         if reference is None:
             reference = image
             continue
         motion = _align(reference, image, _shift(reference, image) if motion is None else motion)
-        step, last = _as_map(motion, image.shape, bins), maps[-1]
-        turned = step[:, :2] @ last[:, :2], step[:, :2] @ last[:, 2:] + step[:, 2:]
-        maps.append(np.concatenate(turned, 1))
+        turn, shift = _rigid_motion(motion, shape)
+        middle = corner + (bins * shape[::-1] - 1) / 2
+        moved = bins * shift + middle - turn @ middle
+        maps.append(turn @ maps[-1] + np.outer(moved, (0, 0, 1)))
+        # Rows and columns of the image are turned back.
+        middle = (shape - 1) / 2
+        offset = middle - turn @ (middle + shift[::-1])
+        before = ndimage.affine_transform(reference, turn, offset, order=1, cval=np.nan)
         gain = max(CONFIG.reference_gain, 1 / (number + 1))
-        reference = _update_reference(reference, motion, image, gain)
+        reference = np.where(np.isnan(before), image, (1 - gain) * before + gain * image)
     return SceneMotion(begins + window / 2, np.array(maps))
 
 
-def _event_image(events: WindowEvents, stream: Stream, bins: int) -> NDArray[np.float64]:
+def _event_image(
+    events: WindowEvents, corner: NDArray, bins: int, shape: NDArray
+) -> NDArray[np.float64]:
     """Return roots of counts in bins of so many px, whose noise is the same everywhere."""
-    rows, columns = -(-stream.height // bins), -(-stream.width // bins)
-    place = events.y // bins * columns + events.x // bins
-    return np.sqrt(np.bincount(place, minlength=rows * columns).reshape(rows, columns))
+    row, column = (events.y - corner[1]) // bins, (events.x - corner[0]) // bins
+    counts = np.bincount(row * shape[1] + column, minlength=int(shape.prod()))
+    return np.sqrt(counts.reshape(shape))
 
 
-def _as_map(motion: NDArray, shape: tuple[int, ...], bins: int) -> NDArray[np.float64]:
-    """Convert a motion of bins to a map (2, 3) of px."""
-    turn = motion[0] / (sum(shape) / 4)
-    A = np.array([[0, -turn], [turn, 0]])
-    middle = (np.array(shape[::-1]) - 1) / 2
-    b = bins * (motion[1:] - A @ middle) - A @ np.full(2, (bins - 1) / 2)
-    return np.concatenate([A, b[:, None]], 1) + np.eye(2, 3)
+def _rigid_motion(motion: NDArray, shape: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the turn (2, 2) about the middle of an image, and the shift (2,) bins, of a motion.
+
+    `_normal_equations` moves both images by half of it.
+    """
+    half = motion[0] / (shape.sum() / 2) * np.array([[0, -1], [1, 0]])
+    after_half = np.linalg.inv(np.eye(2) - half)
+    return after_half @ (np.eye(2) + half), after_half @ motion[1:]
 
 
 def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
@@ -113,18 +116,6 @@ def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]
             if abs(step).max() < MIN_STEP_BINS:
                 break
     return motion
-
-
-def _update_reference(
-    image: NDArray, motion: NDArray, now: NDArray, gain: float
-) -> NDArray[np.float64]:
-    """Move an image, and blend it with a new one, which is taken alone where it was not seen."""
-    turn = motion[0] / (sum(image.shape) / 4)
-    A = np.array([[1, -turn], [turn, 1]])
-    middle = (np.array(image.shape) - 1) / 2
-    b = middle - A @ middle - motion[:0:-1]
-    before = ndimage.affine_transform(image, A, b, order=1, cval=np.nan)
-    return np.where(np.isnan(before), now, (1 - gain) * before + gain * now)
 
 
 @njit
@@ -296,8 +287,8 @@ def _count_filled_tiles(stream: Stream, background: Background, selection: Scale
         y, x = part.y[labels > 0], part.x[labels > 0]
         place = y * N_TILES_PER_SIDE // rows * N_TILES_PER_SIDE + x * N_TILES_PER_SIDE // columns
         tiles.append((np.bincount(place, minlength=N_TILES_PER_SIDE**2) >= few).sum())
-        strips = [width * v < n for v, n in ((x, columns), (y, rows))]
-        strips += [width * (n - 1 - v) < n for v, n in ((x, columns), (y, rows))]
+        edges = (x, columns), (columns - 1 - x, columns), (y, rows), (rows - 1 - y, rows)
+        strips = [width * v < n for v, n in edges]
         sides.append(sum(strip.sum() >= few for strip in strips))
     wide = np.mean(np.array(sides) > CONFIG.majority * 4) >= CONFIG.considerable
     return float(np.median(tiles)) if wide else 0.0
@@ -338,26 +329,15 @@ def has_own_motion(path: TargetPath, scene: SceneMotion, start: int) -> bool:
     t = np.asarray((path.t - start) * 1e-6, np.float64)
     if len(t) < 2:
         return False
-    flow = _scene_flow(path, scene, t)
+    # From each window to the next, and the scene's motion from the same place.
+    moved, before = np.diff(path.p, axis=0), path.p[:-1]
+    carried = move_places(scene.at(t[1:]), *move_places(scene.to_scene(t[:-1]), *before.T))
+    flow = np.stack(carried, 1) - before
     along = flow / np.maximum(np.hypot(*flow.T), 1e-9)[:, None]
-    moved = np.diff(path.p, axis=0)
-    with_scene = (moved * along[1:]).sum(1)
-    own = moved - np.maximum(with_scene, 0)[:, None] * along[1:]
+    own = moved - np.maximum((moved * along).sum(1), 0)[:, None] * along
     way = np.cov(np.concatenate([[[0, 0]], np.cumsum(own, 0)]).T)
     ratio = np.linalg.solve(np.median(path.C, 0) + FINE_CELL_PX**2 * np.eye(2), way)
     return bool(np.linalg.eigvals(ratio).real.max() > CONFIG.common_way_sizes**2)
-
-
-def _scene_flow(
-    path: TargetPath, scene: SceneMotion, t: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Compute velocities (rows, 2) px/s of the scene at a path's places."""
-    step = path.window * 1e-6
-    now = np.clip(t[:, None] + [-step, step], scene.t[0], scene.t[-1])
-    x, y = move_places(scene.to_scene(t), *path.p.T)
-    x, y = move_places(scene.at(now), x[:, None], y[:, None])
-    flow = np.stack([x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]], 1)
-    return flow / np.maximum(now[:, 1] - now[:, 0], 1e-9)[:, None]
 
 
 def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:

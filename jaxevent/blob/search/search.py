@@ -15,17 +15,11 @@ from numpy.typing import NDArray
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.search.background import Background, clutter_evidence, measure_background
 from jaxevent.blob.search.config import CONFIG
-from jaxevent.blob.search.detection import (
-    Scale,
-    clutter_at,
-    clutter_model,
-    larger_variance,
-)
-from jaxevent.blob.search.merge import merge_parts, merge_turning, stitch_paths
-from jaxevent.blob.search.own_frame import OwnFrame
+from jaxevent.blob.search.detection import Scale, clutter_at, clutter_model, larger_variance
+from jaxevent.blob.search.merge import OwnFrame, merge_parts, merge_turning, stitch_paths
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
-from jaxevent.blob.search.scale import ScaleSelection, select_scale
+from jaxevent.blob.search.scale import ScaleSelection, are_evident, select_scale
 from jaxevent.blob.search.scene import (
     find_moving_background,
     has_own_motion,
@@ -114,7 +108,7 @@ class TargetSearchResult:
             text += f", {len(turns)} {verb} in place at {' and '.join(turns)} rad/s"
         if not len(self):
             return text
-        size, speed, rate = (self._quantile(values) for values in self._numbers())
+        size, speed, rate, _ = (self._quantile(values) for values in self._numbers())
         windows = [f"{p.selection.scale.window * 1e3:g}" for p in self.passes if p.targets]
         return (
             f"{text}; size {size:.3g} px, speed {speed:.3g} px/s, {rate:,.0f} events/s each; "
@@ -156,11 +150,12 @@ class TargetSearchResult:
         check_accuracy(accuracy)
         if not len(self):
             return {}
-        sizes, _, rates = self._numbers()
-        windows = np.array([path.window * 1e-6 for path in self.paths])
+        sizes, _, rates, windows = self._numbers()
         largest, smallest = self._quantile(sizes, 0.95), self._quantile(sizes, 0.05)
         W = self._quantile(windows)
-        events, rounded = self._quantile(rates) * self._most_at_once() * W / 32, np.round
+        begin, end = self._lives()
+        at_once = ((begin <= begin[:, None]) & (end > begin[:, None])).sum(1).max()
+        events, rounded = self._quantile(rates) * at_once * W / 32, np.round
         if accuracy is not None:
             events = self._quantile(self._max_events(float(accuracy)), 0.05)
             rounded = np.floor
@@ -187,8 +182,7 @@ class TargetSearchResult:
 
     def _target_values(self) -> dict[str, NDArray[np.float64]]:
         """Values of parameters for each target."""
-        L, v, rate = self._numbers()
-        W = np.array([path.window * 1e-6 for path in self.paths])
+        L, v, rate, W = self._numbers()
         sensor = self.recording.width * self.recording.height
         density = self.background / sensor
         # Within three sizes there may be more clutter than events of the target.
@@ -214,21 +208,20 @@ class TargetSearchResult:
 
     def _max_events(self, accuracy: float) -> NDArray[np.float64]:
         """Events per step that each target allows, of all targets that live as long as it does."""
-        begin, end = (np.array([getattr(p, name) for p in self.paths]) for name in ("begin", "end"))
+        begin, end = self._lives()
         rate = np.array([np.quantile(p.n, 0.25) / (p.window * 1e-6) for p in self.paths])
         along = (begin <= begin[:, None]) & (end >= end[:, None])
         size = np.array([np.median(path.size[:, 1]) for path in self.paths])
         noise = np.array([path.velocity_noise for path in self.paths])
         return max_events_per_step(accuracy, size, rate, noise) * (along @ rate) / rate
 
-    def _numbers(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Size of the longer axis (px), speed (px/s) and rate (events/s) of each target."""
-        paths = self.paths
-        return (
-            np.array([np.median(path.size[:, 0]) for path in paths]),
-            np.array([np.median(np.hypot(*path.v.T)) for path in paths]),
-            np.array([np.median(path.n) / (path.window * 1e-6) for path in paths]),
-        )
+    def _numbers(self) -> NDArray[np.float64]:
+        """Longer size (px), speed (px/s), events/s and window (s) of each target, (4, targets)."""
+        rows = []
+        for path in self.paths:
+            size, speed, window = path.size[:, 0], np.hypot(*path.v.T), path.window * 1e-6
+            rows.append((np.median(size), np.median(speed), np.median(path.n) / window, window))
+        return np.array(rows).T
 
     def _quantile(self, values: NDArray, part: float | int = 0.5) -> float:
         """Compute a quantile of values of targets, weighted by their events."""
@@ -237,11 +230,9 @@ class TargetSearchResult:
         total = np.cumsum(events[order])
         return float(values[order][np.searchsorted(total, part * total[-1])])
 
-    def _most_at_once(self) -> int:
-        """Largest number of targets at a time."""
-        times = np.sort([path.begin for path in self.paths])
-        ends = np.sort([path.end for path in self.paths])
-        return int((np.arange(1, len(times) + 1) - np.searchsorted(ends, times, "right")).max())
+    def _lives(self) -> NDArray[np.int64]:
+        """Beginnings and ends of the targets, us, (2, targets)."""
+        return np.array([(path.begin, path.end) for path in self.paths]).T
 
 
 def check_accuracy(accuracy: float | int | None) -> None:
@@ -375,7 +366,7 @@ def _search_section(
         if number:
             with stage(f"{name}: scale", progress):
                 selection = select_scale(stream, background, later=True)
-        if selection is None or not selection.is_worth_a_pass(background):
+        if not (selection and are_evident(selection.score, selection.nats, background)):
             break
         confirmed = WindowTracker(stream, background, selection.scale).run(name, progress)
         if not confirmed:
@@ -384,12 +375,10 @@ def _search_section(
         with stage(f"{name}: beginnings", progress):
             rest = stream.without(confirmed, gate, max(path.begin for path in confirmed))
             whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
-        at_rest = background.scene is None
-        frame = OwnFrame(stream, background, selection.scale) if at_rest else None
-        whole = merge_parts(whole, frame)
-        near = whole = frame.mark_lone_edges(whole) if frame else whole
-        if background.scene is not None:
-            whole = [one for one in whole if has_own_motion(one, background.scene, stream.start)]
+        frame, scene = OwnFrame(stream, background, selection.scale), background.scene
+        near = whole = merge_parts(whole, None if scene else frame)
+        if scene:
+            whole = [one for one in whole if has_own_motion(one, scene, stream.start)]
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]
         new = stitch_paths(lasting, size, stream.duration / selection.scale.window)
         new = [one for one in new if not _is_duplicate(one, found)]

@@ -87,10 +87,8 @@ class Assignments(NamedTuple):
 
     owner: NDArray[np.int64]  # (events,) track of each event, -1: none
     table: NDArray[np.int64]  # (blobs, tracks) events of a blob in a track's gate
-    counts: NDArray[np.int64]  # (blobs,) events of a blob,
-    free: NDArray[np.int64]  # (blobs,) and those without track
+    counts: NDArray[np.int64]  # (blobs,) events of a blob
     owns: NDArray[np.bool_]  # (blobs, tracks) whether a track may own the rest of a blob
-    owned: NDArray[np.bool_]  # (blobs,) whether a blob has such a track
     in_blobs: Blobs  # residuals of the tracks' events in blobs
     gated: Blobs  # those of all their events, if some track has fewer than two in blobs
 
@@ -162,13 +160,16 @@ class WindowTracker:
             if self.scale.compact or self.background.scene is None:
                 self._split_tracks(events, gates, assignments)
             self.tracks = self.tracks.take(~self._find_ended())
-        free, least = assignments.free, 1 - CONFIG.claimed_share
-        new = (free >= CONFIG.min_blob_events) & (free >= least * assignments.counts)
+        free, least = assignments.owner < 0, 1 - CONFIG.claimed_share
+        n = np.bincount(labels[free], minlength=blobs + 1)[1:]
+        new = (n >= CONFIG.min_blob_events) & (n >= least * assignments.counts)
         if new.any():
-            free = assignments.owner < 0
             rest = WindowEvents(events.t[free], events.x[free], events.y[free])
             moments = measure_blobs(rest, labels[free], blobs)
-            self._start_tracks(t, Blobs._make(value[new] for value in moments))
+            ids = np.arange(self.next_id, self.next_id + new.sum())
+            self.next_id += len(ids)
+            started = Blobs._make(value[new] for value in moments)
+            self._append_tracks(init_tracks(ids, t, started, w), t)
 
     def _update(self, gates: TrackGates, clutter: ClutterModel, assignments: Assignments) -> None:
         """Update all tracks with a window's events, and confirm some."""
@@ -206,8 +207,7 @@ class WindowTracker:
             nats += before.get(key, 0.0)
             if nats > self.log_threshold:
                 part = tracks.take(np.array([i]))
-                for k, one in enumerate((tracks, part)):
-                    at = i if k == 0 else 0
+                for k, (one, at) in enumerate(((tracks, i), (part, 0))):
                     one.p[at], one.C[at], one.n[at] = two.p[k], two.C[k], two.n[k]
                 part.id[0], self.next_id = self.next_id, self.next_id + 1
                 self.confirmed.add(int(part.id[0]))
@@ -228,12 +228,6 @@ class WindowTracker:
         coast = np.minimum(longest, 2 * tracks.hits)
         coast = np.where(tracks.confirmed, coast, CONFIG.still_windows)
         return outside | (tracks.misses > coast)
-
-    def _start_tracks(self, t: float | int, blobs: Blobs) -> None:
-        """Start a track at each blob, at a time (s)."""
-        ids = np.arange(self.next_id, self.next_id + len(blobs.n))
-        self.next_id += len(ids)
-        self._append_tracks(init_tracks(ids, t, blobs, self.scale.window), t)
 
     def _append_tracks(self, new: TrackTable, t: float | int) -> None:
         """Append tracks, and their states at a time (s) to the rows."""
@@ -333,8 +327,7 @@ def assign(gates: TrackGates, events: WindowEvents, labels: NDArray, blobs: int)
     tracks, shared = len(gates.p), np.flatnonzero(gates.shared)
     out = Assignments(
         np.full(len(events), -1), np.zeros((blobs, tracks), np.int64),
-        np.zeros(blobs, np.int64), np.zeros(blobs, np.int64),
-        np.zeros((blobs, tracks), bool), np.zeros(blobs, bool),
+        np.bincount(labels, minlength=blobs + 1)[1:], np.zeros((blobs, tracks), bool),
         Blobs.zeros(tracks), Blobs.zeros(tracks),
     )  # fmt: skip
     _assign(events, labels, gates, (shared, np.zeros(len(shared))), out)
@@ -345,9 +338,6 @@ def assign(gates: TrackGates, events: WindowEvents, labels: NDArray, blobs: int)
 def _assign(events: Any, labels: Any, gates: Any, scratch: Any, out: Any) -> None:
     """Fill in assignments; `scratch` is the tracks that share events, and a number for each."""
     _assign_owners(events, labels, gates, out)
-    for i in range(len(labels)):
-        if labels[i] > 0 and out.owner[i] < 0:
-            out.free[labels[i] - 1] += 1
     _sum_residuals(events, labels, True, gates, scratch, out)
     for k in range(len(gates.p)):
         if out.in_blobs.n[k] < 2:
@@ -370,7 +360,7 @@ def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
 
     A target may grow at once or leave its gate.
     """
-    owner, table, counts, owns, owned = out.owner, out.table, out.counts, out.owns, out.owned
+    owner, table, counts, owns = out.owner, out.table, out.counts, out.owns
     tracks, inverse, gate = len(gates.p), gates.inverse, CONFIG.gate_sigmas
     for i in range(len(labels)):
         least = np.inf
@@ -379,10 +369,8 @@ def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
             distance = squared + inverse[k, 3] + gates.penalty[k]
             if squared < gate * gate and distance < least:
                 least, owner[i] = distance, k
-        if labels[i] > 0:
-            counts[labels[i] - 1] += 1
-            if owner[i] >= 0:
-                table[labels[i] - 1, owner[i]] += 1
+        if labels[i] > 0 and owner[i] >= 0:
+            table[labels[i] - 1, owner[i]] += 1
     for k in range(len(counts)):
         claimed, most = 0, 0
         for j in range(tracks):
@@ -392,10 +380,9 @@ def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
             for j in range(tracks):
                 enough = min((1 - CONFIG.nearly_all) * counts[k], most)
                 owns[k, j] = table[k, j] >= enough and table[k, j] > 0
-                owned[k] |= owns[k, j]
     for i in range(len(labels)):
         blob, k = labels[i] - 1, owner[i]
-        if blob < 0 or not owned[blob]:
+        if blob < 0:
             continue
         if k >= 0 and (owns[blob, k] or gates.penalty[k] == 0):
             continue
