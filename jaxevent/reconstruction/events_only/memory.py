@@ -79,7 +79,16 @@ def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
 
 @njit_noalloc_inlined
 def _add_row(a, b, change, weight, information, eta):
-    """Share out M(b) - M(a) = change among the pixels between, if both ends are in the image."""
+    """Share out M(b) - M(a) = change among the pixels between, if both ends are in the image.
+
+    Args:
+        a: x and y, px, in single precision.
+        b: The same of the other end.
+        change: Change, in double precision, ln I.
+        weight: Weight of the row, in double precision.
+        information: (height, width, 2, 2) output.
+        eta: (height, width, 2) output.
+    """
     height, width = eta.shape[:2]
     for x, y in (a, b):
         if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -103,9 +112,12 @@ def _add_rows(rows, weight, c, information, eta):
     width = rows.shape[1]
     for k in range(len(weight)):
         i, j = rows.corner[k, 0], rows.corner[k, 1]
-        b = i % width + rows.fraction[k, 0, 0], i // width + rows.fraction[k, 0, 1]
-        a = j % width + rows.fraction[k, 1, 0], j // width + rows.fraction[k, 1, 1]
-        _add_row(a, b, c * rows.change[k], weight[k], information, eta)
+        ix, iy, jx, jy = i % width, i // width, j % width, j // width
+        after, before = rows.fraction[k, 0], rows.fraction[k, 1]
+        b = np.float32(ix) + after[0], np.float32(iy) + after[1]
+        a = np.float32(jx) + before[0], np.float32(jy) + before[1]
+        change = np.float64(c * rows.change[k])
+        _add_row(a, b, change, np.float64(weight[k]), information, eta)
 
 
 @njit_noalloc
@@ -125,19 +137,19 @@ def _add_span(events, positions, errors, numbers, information, eta):
         here = at_event[k, 0], at_event[k, 1]
         if previous < 0:
             # In reverse order nothing happens between the event and the span's end.
-            half = 0.5 * change[k] if side > 0 else np.float32(0)
-            w = share[x] * silence / (1 + variance[x] * (ends[0] - time[k]) ** 2)
+            half = 0.5 * change[k] if side > 0 else 0.0
+            w = np.float64(share[x] * silence / (1 + variance[x] * (ends[0] - time[k]) ** 2))
             _add_row((begin[x, 0], begin[x, 1]), here, half, w, information, eta)
         else:
             step = change[k] if side > 0 else change[previous]
             there = at_event[previous, 0], at_event[previous, 1]
-            w = share[x] * weight / (1 + variance[x] * (time[previous] - time[k]) ** 2)
-            _add_row(there, here, step, w, information, eta)
+            w = np.float64(share[x] * weight / (1 + variance[x] * (time[previous] - time[k]) ** 2))
+            _add_row(there, here, np.float64(step), w, information, eta)
     for x in range(len(last)):
         if last[x] < n_before:
             here = np.float32(x % width), np.float32(x // width)
-            w = share[x] * silence / (1 + variance[x] * ends[1] ** 2)
-            _add_row((middle[x, 0], middle[x, 1]), here, np.float32(0), w, information, eta)
+            w = np.float64(share[x] * silence / (1 + variance[x] * ends[1] ** 2))
+            _add_row((middle[x, 0], middle[x, 1]), here, 0.0, w, information, eta)
 
 
 @njit_noalloc

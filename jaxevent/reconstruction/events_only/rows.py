@@ -172,27 +172,35 @@ def _lay_rows(pixel, change, positions, times, last, rows):
     n = 0
     for k in range(len(pixel)):
         x, before = pixel[k], last[pixel[k]]
+        rows.pixel[n] = x
         if before < 0:
             rows.weight[n] = 1 / (1 + doubt[x] * t[k] ** 2)
-            n += _lay_row(n, at_event[k], begin[x], FIRST_SHARE * change[k], FIRST, x, rows)
+            rows.change[n], rows.kind[n] = FIRST_SHARE * change[k], FIRST
+            n += _lay_row(n, at_event[k], begin[x], rows)
         else:
             rows.weight[n] = 1 / (1 + doubt[x] * (t[k] - t[before]) ** 2)
-            n += _lay_row(n, at_event[k], at_event[before], change[k], EVENT, x, rows)
+            rows.change[n], rows.kind[n] = change[k], EVENT
+            n += _lay_row(n, at_event[k], at_event[before], rows)
         last[x] = k
     for x in range(len(last)):
         before = last[x]
+        if before == MUTED:
+            continue
+        rows.pixel[n] = x
         if before == NONE:
             rows.weight[n] = 1 / (1 + doubt[x] * stop**2)
-            n += _lay_row(n, end[x], begin[x], 0.0, SILENT, x, rows)
-        elif before != MUTED:
+            rows.change[n], rows.kind[n] = 0, SILENT
+            n += _lay_row(n, end[x], begin[x], rows)
+        else:
             rows.weight[n] = 1 / (1 + doubt[x] * (stop - t[before]) ** 2)
-            n += _lay_row(n, end[x], at_event[before], LAST_SHARE * change[before], LAST, x, rows)
+            rows.change[n], rows.kind[n] = LAST_SHARE * change[before], LAST
+            n += _lay_row(n, end[x], at_event[before], rows)
     return n
 
 
 @njit_noalloc_inlined
-def _lay_row(n, after, before, change, kind, pixel, rows):
-    """Write row n, and return 1, or 0 if a look-up is outside the image."""
+def _lay_row(n, after, before, rows):
+    """Write the look-ups of row n, and return 1, or 0 if one is outside the image."""
     height, width = rows.shape
     for side in range(2):
         x, y = (after[0], after[1]) if side == 0 else (before[0], before[1])
@@ -202,7 +210,4 @@ def _lay_row(n, after, before, change, kind, pixel, rows):
         rows.corner[n, side] = j * width + i
         rows.fraction[n, side, 0] = x - i
         rows.fraction[n, side, 1] = y - j
-    rows.change[n] = change
-    rows.kind[n] = kind
-    rows.pixel[n] = pixel
     return 1
