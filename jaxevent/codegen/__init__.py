@@ -25,13 +25,11 @@ R = TypeVar("R")
 _COMMON_OPTIONS: dict[str, Any] = {"nogil": True}
 # Counting references to arrays is two thirds of a function that takes many of them.
 _NOALLOC_OPTIONS: dict[str, Any] = {}
-_DISJOINT_OPTIONS: dict[str, Any] = {}
 if support.HAS_INTERNALS:
     from jaxevent.codegen.internals import njit_linked
 
     _COMMON_OPTIONS |= {"no_cfunc_wrapper": True}
     _NOALLOC_OPTIONS |= {"_nrt": False}
-    _DISJOINT_OPTIONS |= {"disjoint": True}
 # Sums in any order, so that several are taken at once.
 _FASTMATH_OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
@@ -65,17 +63,6 @@ def njit_noalloc(function: Callable) -> Any:
 def njit_noalloc_inlined(function: Callable) -> Any:
     """Compile a function that only `njit_noalloc` ones call; Python cannot call it."""
     return _lean_inside(function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS)
-
-
-def njit_disjoint_inlined(function: Callable) -> Any:
-    """Compile as `njit_noalloc_inlined` does a function whose arrays do not overlap.
-
-    Loops over any number of arrays take several numbers at once then. Otherwise they do so over few
-    arrays alone, which are compared first.
-    """
-    return _lean_inside(
-        function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS, **_DISJOINT_OPTIONS
-    )
 
 
 def njit_fastmath(function: Callable) -> Any:

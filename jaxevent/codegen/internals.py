@@ -65,22 +65,12 @@ class _Compiler(Compiler):
         super().__init__(typing, target, library, *rest)
 
 
-class _DisjointCompiler(_Compiler):
-    """Compiler of functions none of whose arrays overlaps another one."""
-
-    def __init__(self, *given: Any):
-        super().__init__(*given)
-        self.state.flags.noalias = True
-
-
-def njit_linked(function: Callable, *, disjoint: bool = False, **options: Any) -> Any:
+def njit_linked(function: Callable, **options: Any) -> Any:
     """Compile by `numba.njit` with these options; called from Python it raises `TypeError`.
 
-    The function may neither make arrays nor print, nor raise with anything but constants. If it is
-    `disjoint`, no array of its arguments that it writes overlaps another one.
+    The function may neither make arrays nor print, nor raise with anything but constants.
     """
-    compiler = _DisjointCompiler if disjoint else _Compiler
-    bare = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": compiler}
+    bare = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _Compiler}
     made: Any = numba.njit(**bare, **options)(inspect.unwrap(function))  # ty: ignore[no-matching-overload]
     made._insert, made._compile_for_args = _ignore, _refuse
     return made

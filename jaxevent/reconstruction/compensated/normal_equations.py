@@ -22,14 +22,7 @@ from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import (
-    njit_disjoint_inlined,
-    njit_noalloc,
-    njit_noalloc_inlined,
-    row_scratch,
-    run_over_rows,
-)
-from jaxevent.codegen.functions import exp32
+from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
 from jaxevent.devices import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -256,42 +249,6 @@ def sample_trajectories(
     return samples
 
 
-@njit_disjoint_inlined
-def _add_instant(shown, scene, s, sums, means):
-    """Add the equations of an instant at `s` to those of the pixels of a row.
-
-    `shown` are log intensity, robust weight and gradient along x and y, `scene` is the mean and its
-    gradient, `sums` N (10) and b (4), and `means` the sums of R and of R J (4), all (w,).
-    """
-    (level, R, gx, gy), (M, mean_gx, mean_gy) = shown, scene
-    N0, N1, N2, N3, N4, N5, N6, N7, N8, N9, b0, b1, b2, b3 = sums
-    total, mean0, mean1, mean2, mean3 = means
-    half = np.float32(0.5)
-    for x in range(len(M)):
-        J0, J1 = (gx[x] + mean_gx[x]) * half * s, (gy[x] + mean_gy[x]) * half * s
-        J2, J3, e = J0 * s, J1 * s, level[x] - M[x]
-        r0, r1, r2, r3 = R[x] * J0, R[x] * J1, R[x] * J2, R[x] * J3
-        total[x] += R[x]
-        mean0[x] += r0
-        mean1[x] += r1
-        mean2[x] += r2
-        mean3[x] += r3
-        b0[x] -= r0 * e
-        b1[x] -= r1 * e
-        b2[x] -= r2 * e
-        b3[x] -= r3 * e
-        N0[x] += r0 * J0
-        N1[x] += r0 * J1
-        N2[x] += r0 * J2
-        N3[x] += r0 * J3
-        N4[x] += r1 * J1
-        N5[x] += r1 * J2
-        N6[x] += r1 * J3
-        N7[x] += r2 * J2
-        N8[x] += r2 * J3
-        N9[x] += r3 * J3
-
-
 @njit_noalloc_inlined
 def _add_product(a, b, out):
     for i in range(len(out)):
@@ -308,18 +265,31 @@ def _add_pixels(points, M, s, grad_M, scratch, sums):
     trajectories and that of the mean, `grad_M` (2, w), are both that of the scene; the mean of the
     two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
     """
-    total, means, r = scratch[0], scratch[1:5], scratch[5]
+    J, total, means, r = scratch[:4], scratch[4], scratch[5:9], scratch[9]
     total[:] = np.float32(0)
     means[:] = np.float32(0)
-    scene = M, grad_M[0], grad_M[1]
-    all_sums = (
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
-        sums[7], sums[8], sums[9], sums[10], sums[11], sums[12], sums[13],
-    )  # fmt: skip
-    all_means = total, means[0], means[1], means[2], means[3]
     for k in range(len(s)):
-        shown = points[0, k], points[1, k], points[2, k], points[3, k]
-        _add_instant(shown, scene, s[k], all_sums, all_means)
+        R = points[1, k]
+        for c in range(2):
+            for i in range(len(M)):
+                J[c, i] = (points[2 + c, k, i] + grad_M[c, i]) * np.float32(0.5) * s[k]
+            for i in range(len(M)):
+                J[2 + c, i] = J[c, i] * s[k]
+        for i in range(len(M)):
+            total[i] += R[i]
+        entry = 0
+        for c in range(4):
+            # LLVM takes several pixels at once only in loops over few arrays, where it can check
+            # quickly that none overlap.
+            for i in range(len(M)):
+                r[i] = R[i] * J[c, i]
+            for i in range(len(M)):
+                means[c, i] += r[i]
+            for i in range(len(M)):
+                sums[10 + c, i] -= r[i] * (points[0, k, i] - M[i])
+            for e in range(c, 4):
+                _add_product(r, J[e], sums[entry])
+                entry += 1
     entry = 0
     for c in range(4):
         for i in range(len(M)):
@@ -329,27 +299,17 @@ def _add_pixels(points, M, s, grad_M, scratch, sums):
             entry += 1
 
 
-@njit_disjoint_inlined
-def _average_pairs(row, factor, out):
-    """Write the means of pairs of neighbours times a factor; the last one may be alone."""
-    half = np.float32(0.5) * factor
-    for j in range(len(row) // 2):
-        out[j] = (row[2 * j] + row[2 * j + 1]) * half
-    if len(row) % 2:
-        out[len(out) - 1] = row[len(row) - 1] * factor
-
-
 @njit_noalloc
 def _linearise(begin, end, inputs, scratch, M, out):
-    """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: 15 images.
+    """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each.
 
     Samples of four rows of pixels are kept: memory does not grow with the image. Rows at the border
     of two threads are sampled by both, so a row of M is written when its means are final.
     """
     h, w = M.shape
     samples, lines, recent = scratch
-    own, grad_M, sums = lines[begin, :6], lines[begin, 6:8], lines[begin, 8:23]
-    means = lines[begin, 23]
+    own, grad_M, sums = lines[begin, :10], lines[begin, 10:12], lines[begin, 12:27]
+    means = lines[begin, 27]
     points, sampled = recent[begin], max(2 * begin - 2, 0)
     for i in range(begin, end):
         sums[:] = np.float32(0)
@@ -365,50 +325,50 @@ def _linearise(begin, end, inputs, scratch, M, out):
                 grad_M[0, x], grad_M[1, x] = gx, gy
                 sums[14, x] += np.sqrt(gx * gx + gy * gy)
             _add_pixels(points[y % 4], M[y], inputs[0].times.s, grad_M, own, sums)
-        for c in range(15):
-            _average_pairs(sums[c], np.float32(1) / np.float32(below - 2 * i), out[c, i])
-
-
-@njit_disjoint_inlined
-def _blur_three(before, here, after, out):
-    for j in range(len(out)):
-        out[j] = (before[j] + np.float32(6) * here[j] + after[j]) * np.float32(0.125)
+        for j in range(out.shape[1]):
+            left, right = 2 * j, min(2 * j + 1, w - 1)
+            both = np.float32(right - left)  # 0 or 1
+            share = np.float32(1) / (np.float32(below - 2 * i) * (np.float32(1) + both))
+            for c in range(15):
+                out[i, j, c] = (sums[c, left] + both * sums[c, right]) * share
 
 
 @njit_noalloc
 def _smooth_nodes(values, row, out):
-    """Blur images of nodes by (1, 6, 1) / 8: by a Gaussian of 1 px; `row` is padded by a node."""
-    channels, rows, columns = out.shape
-    for c in range(channels):
-        for i in range(rows):
-            up, down = values[c, max(i - 1, 0)], values[c, min(i + 1, rows - 1)]
-            _blur_three(up, values[c, i], down, row[1 : columns + 1])
-            row[0], row[columns + 1] = row[1], row[columns]
-            _blur_three(row[:columns], row[1 : columns + 1], row[2:], out[c, i])
-
-
-@njit_disjoint_inlined
-def _weigh_row(own, others, edges, numbers, out):
-    """Write the weights of differences between the nodes of a row and others."""
-    (here, there), (horizon, jump, scale), half = edges, numbers, np.float32(0.5)
-    for j in range(len(out)):
-        dx = (others[j, 0] - own[j, 0]) * horizon
-        dy = (others[j, 1] - own[j, 1]) * horizon
-        weight = jump / np.sqrt(dx * dx + dy * dy + jump * jump)
-        smooth = exp32(-(here[j] + there[j]) * half / scale)
-        out[j] = weight * (np.float32(0.1) + np.float32(0.9) * smooth)
+    """Blur nodes by (1, 6, 1) / 8: by a Gaussian of 1 px."""
+    rows, columns, channels = out.shape
+    for i in range(rows):
+        up, down = max(i - 1, 0), min(i + 1, rows - 1)
+        for j in range(columns):
+            for c in range(channels):
+                row[j, c] = (
+                    values[up, j, c] + np.float32(6) * values[i, j, c] + values[down, j, c]
+                ) / np.float32(8)
+        for j in range(columns):
+            left, right = max(j - 1, 0), min(j + 1, columns - 1)
+            for c in range(channels):
+                out[i, j, c] = (
+                    row[left, c] + np.float32(6) * row[j, c] + row[right, c]
+                ) / np.float32(8)
 
 
 @njit_noalloc
 def _weigh_differences(p, edge, horizon, cost, out):
     """Write the weights of differences between neighbouring nodes, across and down."""
     rows, columns, _ = p.shape
-    numbers, last = (horizon, np.float32(cost.jump), np.float32(cost.edge)), columns - 1
+    jump, scale = np.float32(cost.jump), np.float32(cost.edge)
     for i in range(rows):
-        near = edge[i, :last], edge[i, 1:]
-        _weigh_row(p[i, :last], p[i, 1:], near, numbers, out[0, i, :last])
-        if i < rows - 1:
-            _weigh_row(p[i], p[i + 1], (edge[i], edge[i + 1]), numbers, out[1, i])
+        for j in range(columns):
+            for turn in range(2):
+                i1, j1 = i + (turn == 1), j + (turn == 0)
+                if i1 >= rows or j1 >= columns:
+                    continue
+                dx = (p[i1, j1, 0] - p[i, j, 0]) * horizon
+                dy = (p[i1, j1, 1] - p[i, j, 1]) * horizon
+                weight = jump / np.sqrt(dx * dx + dy * dy + jump * jump)
+                steepness = (edge[i, j] + edge[i1, j1]) * np.float32(0.5)
+                weight *= np.float32(0.1) + np.float32(0.9) * np.exp(-steepness / scale)
+                out[turn, i, j] = weight
 
 
 def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) -> NormalEquations:
@@ -423,178 +383,119 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
         The equations, N as the 10 entries of its upper triangle.
     """
     shape, (count, h, w, _) = p.shape[:2], images.pixels.shape
-    entries, M = np.empty((15, *shape), np.float32), np.empty((h, w), np.float32)
+    entries, M = np.empty((*shape, 15), np.float32), np.empty((h, w), np.float32)
     samples = _SampleScratch.allocate(shape[0], count, w)
-    scratch = samples, row_scratch(shape[0], 8 + 15 + 1, w), row_scratch(shape[0], 4, 4, count, w)
+    scratch = samples, row_scratch(shape[0], 12 + 15 + 1, w), row_scratch(shape[0], 4, 4, count, w)
     run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
-    blurred = np.empty((14, *shape), np.float32)
-    _smooth_nodes(entries, np.empty(shape[1] + 2, np.float32), blurred)
+    blurred = np.empty((*shape, 14), np.float32)
+    _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)
     horizon = max_instant_distance(images.times.s)
     weights = np.zeros((2, *shape), np.float32)
-    _weigh_differences(p, entries[14], horizon, cost, weights)
+    _weigh_differences(p, entries[..., 14], horizon, cost, weights)
     squared = horizon * horizon
     smooth = cost.smooth * squared * np.array([1, 1, squared, squared], np.float32)
     bend, tiny = cost.straight * squared * squared, np.float32(1e-5) * smooth[0]
     ridge = np.array([tiny, tiny, bend, bend], np.float32)
-    N, b = np.moveaxis(blurred[:10], 0, -1), np.moveaxis(blurred[10:], 0, -1)
-    return NormalEquations(N, b, *weights, smooth, ridge)
-
-
-@njit_disjoint_inlined
-def _fill_laplacian(weights, here, beside, beyond, out):
-    """Write the weighted graph Laplacian of a row.
-
-    Args:
-        weights: Of the differences from the nodes to the left and right, above and below.
-        here: The row.
-        beside: The nodes to the left and right.
-        beyond: The rows above and below.
-        out: Output.
-    """
-    (left_weight, right_weight, up_weight, down_weight), (left, right) = weights, beside
-    up, down = beyond
-    for x in range(len(out)):
-        total = left_weight[x] * (here[x] - left[x])
-        total += right_weight[x] * (here[x] - right[x])
-        total += up_weight[x] * (here[x] - up[x])
-        out[x] = total + down_weight[x] * (here[x] - down[x])
+    return NormalEquations(blurred[..., :10], blurred[..., 10:], *weights, smooth, ridge)
 
 
 @njit_noalloc_inlined
-def _laplacian(q, weights, i, out):
-    """Write the Laplacian of a row of nodes that are padded by one."""
-    width = len(out)
-    beside = q[i + 1, :width], q[i + 1, 2 : width + 2]
-    beyond = q[i, 1 : width + 1], q[i + 2, 1 : width + 1]
-    _fill_laplacian(weights, q[i + 1, 1 : width + 1], beside, beyond, out)
+def _add_difference(weight, a, b, out):
+    for x in range(len(out)):
+        out[x] += weight[x] * (a[x] - b[x])
 
 
-@njit_disjoint_inlined
-def _multiply(N, q, rough, numbers, out, sums):
-    """Multiply a row of nodes by the matrix of the equations, and add its products with the result.
-
-    Args:
-        N: (10, columns) entries of the nodes' matrices.
-        q: (4, columns) the row.
-        rough: (4, columns) its Laplacian.
-        numbers: `smooth` and `ridge` of each.
-        out: (4, columns) output.
-        sums: (columns,) output, to which the products of `q` and `out` are added.
-    """
-    N0, N1, N2, N3, N4, N5, N6, N7, N8, N9 = (
-        N[0], N[1], N[2], N[3], N[4], N[5], N[6], N[7], N[8], N[9],
-    )  # fmt: skip
-    q0, q1, q2, q3, (smooth, ridge) = q[0], q[1], q[2], q[3], numbers
-    rough0, rough1, rough2, rough3 = rough[0], rough[1], rough[2], rough[3]
-    out0, out1, out2, out3 = out[0], out[1], out[2], out[3]
-    for x in range(len(sums)):
-        a, b, c, d = q0[x], q1[x], q2[x], q3[x]
-        y0 = N0[x] * a + N1[x] * b + N2[x] * c + N3[x] * d
-        y1 = N1[x] * a + N4[x] * b + N5[x] * c + N6[x] * d
-        y2 = N2[x] * a + N5[x] * b + N7[x] * c + N8[x] * d
-        y3 = N3[x] * a + N6[x] * b + N8[x] * c + N9[x] * d
-        y0 = y0 + smooth[0] * rough0[x] + ridge[0] * a
-        y1 = y1 + smooth[1] * rough1[x] + ridge[1] * b
-        y2 = y2 + smooth[2] * rough2[x] + ridge[2] * c
-        y3 = y3 + smooth[3] * rough3[x] + ridge[3] * d
-        out0[x], out1[x], out2[x], out3[x] = y0, y1, y2, y3
-        sums[x] = sums[x] + a * y0 + b * y1 + c * y2 + d * y3
-
-
-@njit_disjoint_inlined
-def _precondition(P, r, out, sums):
-    """Multiply a row of nodes by symmetric matrices, and add its products with the result."""
-    P0, P1, P2, P3, P4, P5, P6, P7, P8, P9 = (
-        P[0], P[1], P[2], P[3], P[4], P[5], P[6], P[7], P[8], P[9],
-    )  # fmt: skip
-    r0, r1, r2, r3 = r[0], r[1], r[2], r[3]
-    out0, out1, out2, out3 = out[0], out[1], out[2], out[3]
-    for x in range(len(sums)):
-        a, b, c, d = r0[x], r1[x], r2[x], r3[x]
-        y0 = P0[x] * a + P1[x] * b + P2[x] * c + P3[x] * d
-        y1 = P1[x] * a + P4[x] * b + P5[x] * c + P6[x] * d
-        y2 = P2[x] * a + P5[x] * b + P7[x] * c + P8[x] * d
-        y3 = P3[x] * a + P6[x] * b + P8[x] * c + P9[x] * d
-        out0[x], out1[x], out2[x], out3[x] = y0, y1, y2, y3
-        sums[x] = sums[x] + a * y0 + b * y1 + c * y2 + d * y3
-
-
-@njit_disjoint_inlined
+@njit_noalloc_inlined
 def _scale_and_add(factor, a, out):
     """Write factor out + a."""
     for x in range(len(out)):
         out[x] = factor * out[x] + a[x]
 
 
-@njit_disjoint_inlined
+@njit_noalloc_inlined
 def _add_scaled(factor, a, out):
     for x in range(len(out)):
         out[x] += factor * a[x]
 
 
-@njit_disjoint_inlined
-def _invert(N, weights, numbers, out):
-    """Write the inverses (10 entries) of symmetric matrices with the rest of the diagonal added.
-
-    That is the nodes' own part of the Laplacian by `weights`, times `smooth`, and `ridge`.
-    """
-    # By Cholesky's factors C, in double precision: nodes without texture are nearly singular.
-    N0, N1, N2, N3, N4, N5, N6, N7, N8, N9 = (
-        N[0], N[1], N[2], N[3], N[4], N[5], N[6], N[7], N[8], N[9],
-    )  # fmt: skip
-    out0, out1, out2, out3, out4, out5, out6, out7, out8, out9 = out
-    (left, right, up, down), (smooth, ridge), tiny = weights, numbers, 1e-12
-    for x in range(len(left)):
-        degree, least = left[x] + right[x] + up[x] + down[x], np.float32(1e-6)
-        a00 = np.float64(N0[x]) + (smooth[0] * degree + ridge[0] + least)
-        a11 = np.float64(N4[x]) + (smooth[1] * degree + ridge[1] + least)
-        a22 = np.float64(N7[x]) + (smooth[2] * degree + ridge[2] + least)
-        a33 = np.float64(N9[x]) + (smooth[3] * degree + ridge[3] + least)
-        i00 = 1 / np.sqrt(max(a00, tiny))
-        c10, c20, c30 = N1[x] * i00, N2[x] * i00, N3[x] * i00
-        i11 = 1 / np.sqrt(max(a11 - c10 * c10, tiny))
-        c21, c31 = (N5[x] - c20 * c10) * i11, (N6[x] - c30 * c10) * i11
-        i22 = 1 / np.sqrt(max(a22 - c20 * c20 - c21 * c21, tiny))
-        c32 = (N8[x] - c30 * c20 - c31 * c21) * i22
-        i33 = 1 / np.sqrt(max(a33 - c30 * c30 - c31 * c31 - c32 * c32, tiny))
-        i10, i21, i32 = -c10 * i00 * i11, -c21 * i11 * i22, -c32 * i22 * i33  # the inverse of C
-        i20, i31 = -(c20 * i00 + c21 * i10) * i22, -(c31 * i11 + c32 * i21) * i33
-        i30 = -(c30 * i00 + c31 * i10 + c32 * i20) * i33
-        out0[x], out1[x] = i00**2 + i10**2 + i20**2 + i30**2, i10 * i11 + i20 * i21 + i30 * i31
-        out2[x], out3[x], out4[x] = i20 * i22 + i30 * i32, i30 * i33, i11**2 + i21**2 + i31**2
-        out5[x], out6[x], out7[x] = i21 * i22 + i31 * i32, i31 * i33, i22**2 + i32**2
-        out8[x], out9[x] = i32 * i33, i33**2
+@njit_noalloc_inlined
+def _multiply(N, i, q, out):
+    """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors (4, columns)."""
+    for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
+        for x in range(out.shape[1]):
+            out[c, x] = np.float32(0)
+        for e in range(len(out)):
+            low, high = min(c, e), max(c, e)
+            _add_product(N[low * (7 - low) // 2 + high, i], q[e], out[c])
 
 
-class _Equations(NamedTuple):
-    """Normal equations with images of nodes first."""
+@njit_noalloc_inlined
+def _laplacian(q, across, down, i, out):
+    """Write the weighted graph Laplacian (columns,) of a row; all are padded by a node."""
+    width = len(out)
+    here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
+    out[:] = np.float32(0)
+    _add_difference(across[i, :width], here, left, out)
+    _add_difference(across[i, 1:], here, right, out)
+    _add_difference(down[i], here, q[i, 1:-1], out)
+    _add_difference(down[i + 1], here, q[i + 2, 1:-1], out)
 
-    N: NDArray[np.float32]  # (10, rows, columns)
-    b: NDArray[np.float32]  # (4, rows, columns)
-    across: NDArray[np.float32]  # (rows, columns)
-    down: NDArray[np.float32]
-    smooth: NDArray[np.float32]  # (4,)
-    ridge: NDArray[np.float32]
+
+@njit_noalloc_inlined
+def _invert(N, added, scratch, out):
+    """Write the inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
+    # Cholesky, in double precision: nodes without texture are nearly singular.
+    A, C, inverse = scratch[0], scratch[1], scratch[2]
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            A[i, j] = N[entry]
+            A[j, i] = N[entry]
+            entry += 1
+        A[i, i] += added[i]
+    for i in range(4):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= C[i, k] * C[j, k]
+            C[i, j] = np.sqrt(max(total, 1e-12)) if i == j else total / C[j, j]
+    for j in range(4):  # the inverse of C
+        for i in range(j, 4):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= C[i, k] * inverse[k, j]
+            inverse[i, j] = total / C[i, i]
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            total = 0.0
+            for k in range(j, 4):
+                total += inverse[k, i] * inverse[k, j]
+            out[entry] = total
+            entry += 1
 
 
 class _SolverScratch(NamedTuple):
     """Scratch memory of conjugate gradients for rows x columns of nodes."""
 
-    inverse: NDArray[np.float32]  # (rows, 10, columns)
+    blocks: NDArray[np.float32]  # (2, 10, rows, columns), of the equations and their inverses
     beside: NDArray[np.float32]  # (rows, columns + 1), weights of differences, 0 at the ends
     below: NDArray[np.float32]  # (rows + 1, columns), the same between rows
     q: NDArray[np.float32]  # (4, rows + 2, columns + 2), the direction, 0 around the nodes
     vectors: NDArray[np.float32]  # (4, rows, 4, columns)
-    lines: NDArray[np.float32]  # (5, columns)
+    lines: NDArray[np.float32]  # (2, columns)
+    node: NDArray[np.float32]  # (14,)
+    inverse: NDArray[np.float64]  # (3, 4, 4)
 
     @classmethod
     def zeros(cls, rows: int, columns: int) -> "_SolverScratch":
         """Allocate zeros."""
         shapes = (
-            (rows, 10, columns), (rows, columns + 1), (rows + 1, columns),
-            (4, rows + 2, columns + 2), (4, rows, 4, columns), (5, columns),
+            (2, 10, rows, columns), (rows, columns + 1), (rows + 1, columns),
+            (4, rows + 2, columns + 2), (4, rows, 4, columns), (2, columns), (14,),
         )  # fmt: skip
-        return cls._make(np.zeros(shape, np.float32) for shape in shapes)
+        single = [np.zeros(shape, np.float32) for shape in shapes]
+        return cls._make([*single, np.zeros((3, 4, 4))])
 
 
 def solve_normal_equations(
@@ -611,65 +512,75 @@ def solve_normal_equations(
         (rows, columns, 4) the step d, px.
     """
     d = np.empty_like(p)
-    N, b = (np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in eq[:2])
-    _solve(_Equations(N, b, *eq[2:]), p, iterations, _SolverScratch.zeros(*p.shape[:2]), d)
+    _solve(eq, p, iterations, _SolverScratch.zeros(*p.shape[:2]), d)
     return d
-
-
-@njit_noalloc_inlined
-def _total(row):
-    total = 0.0
-    for j in range(len(row)):
-        total += row[j]
-    return total
 
 
 @njit_noalloc
 def _solve(eq, p, iterations, scratch, d):
-    (rows, columns, channels), end = p.shape, p.shape[1] + 1
-    numbers, beside, below, q = (eq.smooth, eq.ridge), scratch.beside, scratch.below, scratch.q
-    vectors, rough, sums, P = scratch.vectors, scratch.lines[:4], scratch.lines[4], scratch.inverse
+    # Channels come first here, and rows of nodes are what loops go over at once.
+    rows, columns, channels = p.shape
+    smooth, ridge, beside, below, q = eq.smooth, eq.ridge, scratch.beside, scratch.below, scratch.q
+    A, P, vectors, node = scratch.blocks[0], scratch.blocks[1], scratch.vectors, scratch.node
     r, found, Aq, z = vectors[0], vectors[1], vectors[2], vectors[3]
+    rough, sums, added, block = scratch.lines[0], scratch.lines[1], node[:4], node[4:]
     for i in range(rows):
         for j in range(columns):
             beside[i, j + 1] = eq.across[i, j] if j < columns - 1 else np.float32(0)
             below[i + 1, j] = eq.down[i, j] if i < rows - 1 else np.float32(0)
             for c in range(channels):
                 q[c, i + 1, j + 1] = p[i, j, c]
-    sums[:] = np.float32(0)
     for i in range(rows):
-        weights = beside[i, :columns], beside[i, 1:end], below[i], below[i + 1]
-        inverse = (
-            P[i, 0], P[i, 1], P[i, 2], P[i, 3], P[i, 4], P[i, 5], P[i, 6], P[i, 7], P[i, 8], P[i, 9]
-        )  # fmt: skip
-        _invert(eq.N[:, i], weights, numbers, inverse)
         for c in range(channels):
-            _laplacian(q[c], weights, i, rough[c])
+            _laplacian(q[c], beside, below, i, rough)
             for j in range(columns):
-                pull = eq.smooth[c] * rough[c, j] + eq.ridge[c] * q[c, i + 1, j + 1]
-                r[i, c, j] = eq.b[c, i, j] - pull
-        _precondition(P[i], r[i], z[i], sums)
-    rz, share = _total(sums), np.float32(0)
-    q[:, 1 : rows + 1, 1:end] = np.float32(0)
-    for _ in range(iterations):
-        for i in range(rows):
+                pull = smooth[c] * rough[j] + ridge[c] * p[i, j, c]
+                r[i, c, j] = eq.b[i, j, c] - pull
+        for j in range(columns):
+            degree = beside[i, j] + beside[i, j + 1] + below[i, j] + below[i + 1, j]
             for c in range(channels):
-                _scale_and_add(share, z[i, c], q[c, i + 1, 1:end])
+                added[c] = smooth[c] * degree + ridge[c] + np.float32(1e-6)
+            _invert(eq.N[i, j], added, scratch.inverse, block)
+            for c in range(10):
+                P[c, i, j] = block[c]
+                A[c, i, j] = eq.N[i, j, c]
+    rz = 0.0
+    for turn in range(iterations + 1):
         sums[:] = np.float32(0)
         for i in range(rows):
-            weights = beside[i, :columns], beside[i, 1:end], below[i], below[i + 1]
+            _multiply(P, i, r[i], z[i])
             for c in range(channels):
-                _laplacian(q[c], weights, i, rough[c])
-            _multiply(eq.N[:, i], q[:, i + 1, 1:end], rough, numbers, Aq[i], sums)
-        step = np.float32(rz / (_total(sums) + 1e-20))
-        sums[:] = np.float32(0)
+                _add_product(r[i, c], z[i, c], sums)
+        following = 0.0
+        for j in range(columns):
+            following += sums[j]
+        share = np.float32(following / (rz + 1e-20)) if turn else np.float32(0)
+        rz = following
+        if turn == iterations:
+            break
         for i in range(rows):
             for c in range(channels):
-                _add_scaled(step, q[c, i + 1, 1:end], found[i, c])
+                if turn == 0:
+                    for j in range(columns):  # a slice would take longer to compile
+                        q[c, i + 1, j + 1] = z[i, c, j]
+                else:
+                    _scale_and_add(share, z[i, c], q[c, i + 1, 1:-1])
+        sums[:] = np.float32(0)
+        for i in range(rows):
+            _multiply(A, i, q[:, i + 1, 1:-1], Aq[i])
+            for c in range(channels):
+                _laplacian(q[c], beside, below, i, rough)
+                _add_scaled(smooth[c], rough, Aq[i, c])
+                _add_scaled(ridge[c], q[c, i + 1, 1:-1], Aq[i, c])
+                _add_product(q[c, i + 1, 1:-1], Aq[i, c], sums)
+        curvature = 0.0
+        for j in range(columns):
+            curvature += sums[j]
+        step = np.float32(rz / (curvature + 1e-20))
+        for i in range(rows):
+            for c in range(channels):
+                _add_scaled(step, q[c, i + 1, 1:-1], found[i, c])
                 _add_scaled(-step, Aq[i, c], r[i, c])
-            _precondition(P[i], r[i], z[i], sums)
-        following = _total(sums)
-        share, rz = np.float32(following / (rz + 1e-20)), following
     for i in range(rows):
         for c in range(channels):
             for j in range(columns):
