@@ -362,6 +362,9 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
     """
     weights = _weights(u, equations, params)
     product = _product(weights, equations, params.leak)
+    # Rows that only fill up have the weight 0, at which the root has no derivative.
+    counts = weights.rows > 0
+    roots = jnp.where(counts, jnp.sqrt(jnp.where(counts, weights.rows, 1)), 0)
 
     def solve(product: Callable[[Array], Array], right: Array) -> Array:
         image = jax.lax.stop_gradient(u)
@@ -371,7 +374,7 @@ def sample_variance(u: Array, equations: WindowEquations, params: Params) -> Arr
 
     def sample(noise: Perturbation) -> Array:
         def spread(v: Array) -> Array:
-            rows = noise.rows * jnp.sqrt(weights.rows)
+            rows = noise.rows * roots
             n = noise.pixels
             total = (rows * look_up(v, equations.corner, equations.fraction)).sum()
             total += (n[0, :, :-1] * jnp.sqrt(weights.across) * jnp.diff(v, axis=1)).sum()
