@@ -28,6 +28,7 @@ from jaxevent.reconstruction.events_only.solve import (
     Energy,
     factor_information,
     find_minimum,
+    pack_prior,
     solve_linear,
 )
 from jaxevent.reconstruction.events_only.windows import SolvedWindow
@@ -237,37 +238,34 @@ def _product(
 
 
 class _Problem(NamedTuple):
-    """Equations with their parameters in place, as `Energy` has them."""
+    """Equations with their parameters in place, from which the host makes an `Energy`."""
 
     corner: Array
     fraction: Array
     weight: Array
     change: Array
-    information: Array
     pull: Array
+    information: Array
     params: SolverParams
 
 
 def _set_parameters(equations: WindowEquations, params: Params) -> _Problem:
-    def pulled(u: Array) -> Array:
-        return jnp.einsum("hwi,hwij,hwj->", _gradient(u), equations.information, equations.pull)
-
-    L = equations.information
     return _Problem(
         equations.corner,
         equations.fraction,
         equations.weight + params.silence * equations.silent,
         _changes(equations, params),
-        jnp.stack([L[..., 0, 0], L[..., 0, 1], L[..., 1, 1]]),
-        jax.grad(pulled)(jnp.zeros_like(equations.start)),
+        equations.pull,
+        equations.information,
         params.solver(),
     )
 
 
 def _make_energy(problem: _Problem) -> Energy:
-    corner, *arrays = (np.asarray(leaf) for leaf in problem[:6])
+    corner, *of_rows, pull, information = (np.asarray(leaf) for leaf in problem[:-1])
     numbers = SolverParams(*(float(value) for value in problem.params))
-    return Energy(corner.astype(np.uint32), *arrays, numbers)
+    prior = pack_prior(pull, information)
+    return Energy(corner.astype(np.uint32), *of_rows, *prior, numbers)
 
 
 def _find_minimum(problem: _Problem, start: Array) -> NDArray:

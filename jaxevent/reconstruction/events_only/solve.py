@@ -165,9 +165,7 @@ def solve(
     pull = np.zeros(rows.shape, np.float32)
     if prior is not None:
         L = (prior.information * c**2).astype(np.float32)
-        information = np.stack([L[..., 0, 0], L[..., 0, 1], L[..., 1, 1]])
-        g = np.einsum("hwij,hwj->hwi", L, prior.gradient / c).astype(np.float32)
-        _add_gradient_transposed(g, pull)
+        information, pull = pack_prior(prior.gradient / c, L)
     energy = Energy(
         rows.corner[order],
         rows.fraction[order],
@@ -185,6 +183,22 @@ def solve(
         V = VARIANCE_FACTOR * c**2 * samples + unseen
     place = np.argsort(order, kind="stable")
     return Solution(u * c, V, unseen, residual[place], system.weight[place], iterations)
+
+
+def pack_prior(gradient: NDArray, information: NDArray) -> tuple[NDArray, NDArray]:
+    """Pack a prior of gradients as `Energy` has it.
+
+    Args:
+        gradient: (height, width, 2) g, thresholds / px.
+        information: (height, width, 2, 2) Lambda, (px / threshold)^2.
+
+    Returns:
+        `information` and `pull` of `Energy`, of the type of `information`.
+    """
+    pull = np.zeros(information.shape[:2], information.dtype)
+    g = np.einsum("hwij,hwj->hwi", information, gradient).astype(information.dtype)
+    _add_gradient_transposed(g, pull)
+    return np.stack([information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1))]), pull
 
 
 class _Minimum(NamedTuple):
