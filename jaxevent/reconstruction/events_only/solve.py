@@ -36,7 +36,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined
+from jaxevent.codegen import njit_fastmath, njit_fastmath_inlined, read_only
 from jaxevent.reconstruction.events_only.prior import GradientPrior, SolverParams
 from jaxevent.reconstruction.events_only.rows import EVENT, Rows
 
@@ -218,10 +218,9 @@ def _minimise(
     preconditioner = _Preconditioner(system)
     system = system._replace(weight=np.empty_like(energy.weight))
     residual, b, before = np.empty_like(energy.weight), np.empty_like(u), np.empty_like(u)
-    data, numbers = (energy.change, energy.weight), _numbers(energy)
     iterations, rho = 0, 0.0
     for n in range(most):
-        _reweight(system, u, data, numbers, residual)
+        _reweight_at(u, energy, system, residual)
         if n < 3 or n % UPDATE_EVERY == 0:
             preconditioner.update(system)
         b[:], before[:] = energy.pull, u
@@ -230,30 +229,36 @@ def _minimise(
         iterations += STEPS
         if np.sqrt(np.mean((u - before) ** 2)) < least_change:
             break
-    _reweight(system, u, data, numbers, residual)
+    _reweight_at(u, energy, system, residual)
     return _Minimum(system, preconditioner, residual, iterations)
 
 
 def _set_up(energy: Energy) -> _System:
-    """Set up the matrix with the weights of rows w_k and none of differences."""
+    """Set up the matrix with the weights of rows w_k and none of differences.
+
+    JAX's arrays are read-only, so all that is only read is: numba compiles for either kind.
+    """
     height, width = energy.pull.shape
     dtype = energy.weight.dtype
     return _System(
-        energy.corner,
-        energy.fraction,
-        energy.weight,
+        read_only(energy.corner),
+        read_only(energy.fraction),
+        read_only(energy.weight),
         *np.zeros((2, height, width), dtype),
-        energy.information,
+        read_only(energy.information),
         np.zeros((0, width), dtype),
-        np.zeros((0, width), dtype),
+        read_only(np.zeros((0, width), dtype)),
         np.zeros((2, width), dtype),
         dtype.type(energy.params.leak),
     )
 
 
-def _numbers(energy: Energy) -> tuple:
+def _reweight_at(u: NDArray, energy: Energy, system: _System, residual: NDArray) -> None:
+    """Write the residuals at the image u, and the weights of rows and differences there."""
     params, convert = energy.params, energy.weight.dtype.type
-    return convert(params.tail), convert(params.gradient), convert(params.edge)
+    data = read_only(energy.change), read_only(energy.weight)
+    numbers = convert(params.tail), convert(params.gradient), convert(params.edge)
+    _reweight(system, read_only(u), data, numbers, residual)
 
 
 def find_minimum(energy: Energy, start: NDArray, least_change: float) -> NDArray:
@@ -292,12 +297,12 @@ def solve_linear(
     preconditioner = _Preconditioner(system)
     system = system._replace(weight=np.empty_like(energy.weight))
     residual = np.empty_like(energy.weight)
-    _reweight(system, u, (energy.change, energy.weight), _numbers(energy), residual)
+    _reweight_at(u, energy, system, residual)
     preconditioner.update(system)
     if exact:
         share = residual**2 / (2 * energy.params.tail**2)
         system.weight[:] = energy.weight * (1 - share) / (1 + share) ** 2
-        system = system._replace(curvature=_bend_cells(u, energy.params), image=u)
+        system = system._replace(curvature=_bend_cells(u, energy.params), image=read_only(u))
     z, rho = np.zeros_like(right), 0.0
     least = tolerance * np.linalg.norm(right)
     for _ in range(MAX_STEPS // SAMPLE_STEPS):
