@@ -113,9 +113,9 @@ def oracle(rec, params, seeds, tracker=blob.moment):
             a = math.exp(-alpha * dt)
             radius = min(max(a * gate + (1 - a) * b * size, low), high)
             predictions.append((state, radius))
-            P, L2 = np.asarray(result.P_p), np.asarray(result.spread)
+            p, v, P, L2 = map(np.asarray, (result.p, result.v, result.P_p, result.spread))
             for place, r in enumerate(step):
-                d = np.array([e.x[r], e.y[r]], float) - (result.p - ages[place] * result.v)
+                d = np.array([e.x[r], e.y[r]], float) - (p - ages[place] * v)
                 if params.gate_shape == "circle":
                     inside = d @ d <= radius**2 + g**2 * np.linalg.eigvalsh(P)[-1]
                 else:

@@ -102,6 +102,13 @@ class TrackProgram(TracedProgram):
     graph: Graph
 
 
+# Several functions below call them: JAX traces them once.
+_predict_and_gate, _update_track, _predict_measurement = (
+    jax.jit(function, static_argnums=0)
+    for function in (predict_and_gate, update_track, predict_measurement)
+)
+
+
 class _TrackSteps(NamedTuple):
     """Functions of one track to be traced: of parameters and of numbers by name."""
 
@@ -115,21 +122,21 @@ class _TrackSteps(NamedTuple):
 
     def predict(self, params: Any, track: Any, limit: Any, events: Any) -> dict[str, Any]:
         events = self._aged(events)
-        return {"prediction": predict_and_gate(self.filter, params, track, limit, events)}
+        return {"prediction": _predict_and_gate(self.filter, params, track, limit, events)}
 
     def update(
         self, params: Any, track: Any, prediction: Any, events: Any, weight: Any
     ) -> dict[str, Any]:
         events = self._aged(events)
-        return {"track": update_track(self.filter, params, track, prediction, events, weight)}
+        return {"track": _update_track(self.filter, params, track, prediction, events, weight)}
 
     def step(self, params: Any, track: Any, limit: Any, events: Any) -> dict[str, Any]:
         events = self._aged(events)
-        prediction = predict_and_gate(self.filter, params, track, limit, events)
+        prediction = _predict_and_gate(self.filter, params, track, limit, events)
         weights = jax.vmap(functools.partial(self.filter.association_weights, params), 1, 1)
         weight = weights(prediction.inside[None], prediction.log_likelihood[None])[0]
         return {
-            "track": update_track(self.filter, params, track, prediction, events, weight),
+            "track": _update_track(self.filter, params, track, prediction, events, weight),
             "prediction.near": prediction.near,
             "touched": (weight > 0).any(),
         }
@@ -138,7 +145,7 @@ class _TrackSteps(NamedTuple):
         return {"limit": coast_limits_us(params, track)}
 
     def measurement(self, params: Any, track: Any, stop: Any) -> dict[str, Any]:
-        predicted = predict_measurement(self.filter, params, track, stop)
+        predicted = _predict_measurement(self.filter, params, track, stop)
         long = predicted.size.max()
         return {"evidence.predicted": predicted, "p": predicted.p, "long": long}
 
