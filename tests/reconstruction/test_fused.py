@@ -71,15 +71,21 @@ def test_kernel_of_edi_equals_loop_over_events(recording, events):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["akf", "cf-augmented"])
 @examples(6)
 @given(
     recording=recordings(fewest_frames=1),
     values=st.sampled_from([PARAMS, DEAD, ALL]),
     events=st.sampled_from([7, 1000]),
 )
-def test_kernel_equals_loop_over_events(name, recording, values, events):
-    check(name, recording, values, window_events=events)
+def test_kernel_of_akf_equals_loop_over_events(recording, values, events):
+    check("akf", recording, values, window_events=events)
+
+
+@pytest.mark.slow
+@examples(12)
+@given(recording=recordings(fewest_frames=1), events=st.sampled_from([7, 1000]))
+def test_kernel_of_cf_augmented_equals_loop_over_events(recording, events):
+    check("cf-augmented", recording, ALL, window_events=events)
 
 
 @pytest.mark.parametrize("name", ["cf", "high-pass", "augmented", "edi"])
