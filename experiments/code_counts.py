@@ -6,6 +6,7 @@ listed. `tests/test_language.py` holds the rules.
 
 import argparse
 import ast
+import functools
 import io
 import re
 import tokenize
@@ -189,7 +190,13 @@ def definitions_of(path: Path) -> Iterator[Definition]:
             elif isinstance(node, ast.If | ast.With | ast.Try):
                 yield from walk(node.body, inside, in_class)
 
-    yield from walk(ast.parse(path.read_text()).body, (), False)
+    yield from walk(parse(path).body, (), False)
+
+
+@functools.cache
+def parse(path: Path) -> ast.Module:
+    """Parse a file, once."""
+    return ast.parse(path.read_text())
 
 
 def public_files() -> dict[Path, set[str] | None]:
@@ -282,13 +289,14 @@ def is_no_noun(name: str) -> bool:
     return words[-1] in NOT_NOUNS or words[-1].endswith("ed") or (words[-1].endswith("ing"))
 
 
+@functools.cache
 def split_text(path: Path) -> tuple[set[str], list[tuple[int, str]]]:
     """Return the words of a file's code, and its comments and docstrings with their lines."""
     words, texts, begins = set[str](), list[tuple[int, str]](), True
     for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
         if token.type == tokenize.COMMENT or (begins and token.type == tokenize.STRING):
             texts.append((token.start[0], token.string))
-        else:
+        elif token.type != tokenize.OP:
             words.update(re.findall(r"\w+", token.string))
         if token.type not in (tokenize.COMMENT, tokenize.NL):
             begins = token.type in (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
@@ -325,8 +333,7 @@ def broken_rules(paths: list[Path]) -> dict[str, list[str]]:
         "text names an unknown constant": unknown_constants(paths),
     }  # fmt: skip
     for path in paths:
-        text = path.read_text()
-        if begins_badly(ast.get_docstring(ast.parse(text)) or ""):
+        if begins_badly(ast.get_docstring(parse(path)) or ""):
             found["docstring begins badly"].append(f"{path.relative_to(ROOT)}:1")
         for one in definitions_of(path):
             if begins_badly(one.docstring):
