@@ -76,6 +76,7 @@ LONGEST = (
     "test_fit_motion.py",
     "test_fused.py",
     "test_gallery.py",
+    "test_own_blob.py",
     "test_readme.py",
     "test_reconstruction.py",
     "test_recovery.py",
