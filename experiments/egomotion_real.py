@@ -19,6 +19,8 @@ themselves, but for those named here:
   where no translation is told.
 - slider: pure translation along the slider, Omega 0. Planar voting: the direction of the image's
   motion, 180 degrees. General motion: heading and |Omega| from window to window.
+- cuts: cuts of 400 ms of the slider's way, each as a recording of its own: heading in the middle,
+  what it tells, and the worst heading of the cut.
 - stop: the end of the slider's way, which slows down, stands still from 3.22 to 3.31 s and goes
   back. How far the heading is from that of the motion there, and what it tells.
 
@@ -43,6 +45,7 @@ from jaxevent.egomotion.motion import is_observable
 
 Rows = list[dict[str, Any]]
 AXIS = np.array([1.0, 0.0088, 0.0]) / np.hypot(1.0, 0.0088)  # of the slider
+CUT_S = 0.4  # s, of the slider's way
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -244,6 +247,30 @@ def slider_rows(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
+def cut_rows(data: Path, frames: bool = True) -> Rows:
+    recording = jaxevent.load(data / "slider_depth.zip")
+    rows: Rows = []
+    for first in np.arange(0.0, 2.8, CUT_S):
+        cut = recording[first : first + CUT_S]
+        motion = fit_general_motion(cut, frames)
+        heading = angle(motion.mean[:, :3], np.broadcast_to(AXIS, (len(motion), 3)))
+        middle = np.abs(motion.t - (cut.start + cut.stop) / 2).argmin()
+        sigma = np.degrees(np.sqrt(np.diag(motion.covariance[middle])[:3]))
+        beside = np.degrees(motion.mean[middle, :3] - AXIS)
+        rows.append(
+            {
+                "recording": f"slider, {first:.1f} to {first + CUT_S:.1f} s",
+                "estimates": len(motion),
+                "heading deg, middle": heading[middle],
+                "ty, tz deg": f"{beside[1]:+.2f} {beside[2]:+.2f}",
+                "their sigmas": f"{sigma[1]:.2f} {sigma[2]:.2f}",
+                "worst": heading.max(),
+                "agreement": motion.agreement[middle] if motion.agreement is not None else np.nan,
+            }
+        )
+    return rows
+
+
 def stop_rows(data: Path, frames: bool = True) -> Rows:
     recording = jaxevent.load(data / "slider_depth.zip")
     motion = fit_general_motion(recording[2.9:], frames)
@@ -263,13 +290,14 @@ def stop_rows(data: Path, frames: bool = True) -> Rows:
     return rows
 
 
-FITTED = "evbench", "slider", "stop"  # by `batch`, which takes frames
+FITTED = "evbench", "slider", "cuts", "stop"  # by `batch`, which takes frames
 PARTS: dict[str, Callable[..., Rows]] = {
     "disk": disk_rows,
     "boxes": lambda data: tubrip_rows(data, "boxes"),
     "shapes": lambda data: tubrip_rows(data, "shapes"),
     "evbench": evbench_rows,
     "slider": slider_rows,
+    "cuts": cut_rows,
     "stop": stop_rows,
 }
 
