@@ -10,6 +10,7 @@ from jaxevent.blob.search.background import Background, SceneMotion, move_places
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.scene import (
     _required_gain,
+    drop_edges,
     has_own_motion,
     measure_moving_background,
     measure_scene_motion,
@@ -17,6 +18,7 @@ from jaxevent.blob.search.scene import (
 )
 from jaxevent.blob.search.stream import Stream
 from jaxevent.recording import Events, Recording
+from jaxevent.simulate import Sensor, motion_scene
 from jaxevent.simulate.blobs import CircularMotion, LinearMotion, Target, simulate_blobs
 
 FRAME, DURATION = (128, 96), 0.8
@@ -190,3 +192,27 @@ def test_stars_side_by_side_are_no_edges():
     for k in range(12, 16):
         rate[10::20, k::24] = 200.0
     assert _required_gain(one) is not None
+
+
+def test_edges_of_a_scene_that_hardly_moves_are_no_targets():
+    """A wall of shapes that goes 4 px: a piece of an edge has one polarity."""
+    recording, _ = motion_scene(
+        "planar", "varying", 555, size=(144, 108), duration=0.1, speed=40.0, texture="shapes",
+        sensor=Sensor(),
+    )  # fmt: skip
+    assert not len(blob.find(recording, progress=False))
+
+
+def test_two_edges_may_be_an_object():
+    """More of both polarities, or a scene about them, make a scene."""
+    t = np.arange(4) * 10_000
+    p = np.stack([np.arange(4.0), np.zeros(4)], 1)
+    round_one, across = np.tile(np.eye(2), (4, 1, 1)), np.tile(np.diag([1.0, 9.0]), (4, 1, 1))
+    star, whole, on, off = (
+        TargetPath(t, p, p, C, np.full(4, 30.0), 10_000, 1.0, balance=balance)
+        for C, balance in ((round_one, 0.95), (across, 0.3), (across, 0.95), (across, -0.95))
+    )
+    for kept in ([star, whole, on, off], [star, on, on, on, whole]):
+        assert drop_edges(kept, covered=False) == kept
+        assert drop_edges(kept, covered=True) == [whole]
+    assert drop_edges([on, star, whole, off, on], covered=False) == [star, whole]

@@ -70,6 +70,11 @@ class TargetPath:
         return bool(along < (1 - CONFIG.considerable) * np.median(self.size[:, 0]) ** 2)
 
     @property
+    def has_one_polarity(self) -> bool:
+        """True if nearly all of its events are known to have one polarity."""
+        return abs(self.balance) > 2 * CONFIG.nearly_all - 1  # the difference of both shares
+
+    @property
     def lone_edge(self) -> bool:
         """True if it seems to be one edge of an object of which no more is seen.
 
@@ -77,8 +82,7 @@ class TargetPath:
         """
         long, wide = np.median(self.size, 0)
         is_long = bool(wide < CONFIG.majority * long) and self.is_across_way
-        # The balance is the difference of both shares.
-        return is_long and abs(self.balance) > 2 * CONFIG.nearly_all - 1
+        return is_long and self.has_one_polarity
 
     def at(self, t: NDArray[np.int64]) -> NDArray[np.float64]:
         """Interpolate positions (times, 2) linearly at times (us)."""

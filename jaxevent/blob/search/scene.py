@@ -197,10 +197,10 @@ def split_at_pauses(background: Background) -> list[tuple[float, float]]:
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
-def find_moving_background(
+def find_scene(
     stream: Stream, background: Background, selection: ScaleSelection
-) -> Background | None:
-    """Measure the background as a map that moves.
+) -> tuple[bool, Background | None]:
+    """Find whether a scene covers the sensor, and measure the background as a map that moves.
 
     Args:
         stream: Events.
@@ -208,11 +208,13 @@ def find_moving_background(
         selection: Scale of its blobs.
 
     Returns:
-        The moving background; None if the camera does not seem to move.
+        Whether a scene seems to move over most of the sensor; and the moving background, which is
+        None if the events do not show that it moves, as where the scene hardly leaves its place.
     """
+    covered = False
     tiles = _count_filled_tiles(stream, background, selection)
     if tiles <= CONFIG.majority * N_TILES_PER_SIDE**2:
-        return None
+        return False, None
     longest = stream.duration / CONFIG.min_windows
     # Blobs may be seen in longer windows than a scene's motion; these are halves of each other.
     usual = selection.scale.window / (2 if selection.scale.window > longest else 1)
@@ -223,11 +225,13 @@ def find_moving_background(
         scene = measure_scene_motion(stream, window)
         moving = measure_moving_background(stream, scene)
         gain = _required_gain(moving)
-        if gain is None:  # whatever the window
-            return None
-        if scene.travel >= CONFIG.min_travel_px and map_gain(stream, moving, window) >= gain:
-            return moving
-    return None
+        if gain is None:
+            break
+        if scene.travel >= CONFIG.min_travel_px:
+            covered = True
+            if map_gain(stream, moving, window) >= gain:
+                return True, moving
+    return covered, None
 
 
 def _required_gain(moving: Background) -> float | None:
@@ -338,6 +342,25 @@ def has_own_motion(path: TargetPath, scene: SceneMotion, start: int) -> bool:
     way = np.cov(np.concatenate([[[0, 0]], np.cumsum(own, 0)]).T)
     ratio = np.linalg.solve(np.median(path.C, 0) + FINE_CELL_PX**2 * np.eye(2), way)
     return bool(np.linalg.eigvals(ratio).real.max() > CONFIG.common_way_sizes**2)
+
+
+def drop_edges(paths: list[TargetPath], covered: bool) -> list[TargetPath]:
+    """Return paths without edges of a scene.
+
+    What goes farther than it is long has events of both polarities. One lone edge may be all that
+    is seen of an object, or two that nothing connects; more, of both polarities, are a scene's.
+
+    Args:
+        paths: Paths of targets, with their balances of polarities.
+        covered: Whether a scene seems to move over most of the sensor: then what has one polarity
+            is an edge of it, whatever its shape.
+    """
+    if covered:
+        return [path for path in paths if not path.has_one_polarity]
+    signs = [path.balance > 0 for path in paths if path.lone_edge]
+    if len(signs) < 3 or len(set(signs)) < 2:
+        return paths
+    return [path for path in paths if not path.lone_edge]
 
 
 def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:

@@ -21,7 +21,8 @@ from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
 from jaxevent.blob.search.scale import ScaleSelection, are_evident, select_scale
 from jaxevent.blob.search.scene import (
-    find_moving_background,
+    drop_edges,
+    find_scene,
     has_own_motion,
     is_dense,
     split_at_pauses,
@@ -322,6 +323,7 @@ class _Section(NamedTuple):
     stream: Stream
     background: Background
     selection: ScaleSelection | None
+    covered: bool  # whether a scene seems to move over most of the sensor
 
 
 def _split_recording(stream: Stream, progress: bool | None) -> list[_Section]:
@@ -345,19 +347,20 @@ def _prepare_section(stream: Stream, background: Background, progress: bool | No
     """Select the scale of a section, and take its scene as background if it moves."""
     with stage("find: scale", progress):
         selection = select_scale(stream, background)
-    if selection is not None:
-        with stage("find: the scene's motion", progress):
-            moving = find_moving_background(stream, background, selection)
-        if moving is not None:
-            background, selection = moving, select_scale(stream, moving)
-    return _Section(stream, background, selection)
+    if selection is None:
+        return _Section(stream, background, None, False)
+    with stage("find: the scene's motion", progress):
+        covered, moving = find_scene(stream, background, selection)
+    if moving is not None:
+        background, selection = moving, select_scale(stream, moving)
+    return _Section(stream, background, selection, covered)
 
 
 def _search_section(
     section: _Section, progress: bool | None
 ) -> tuple[list[TargetPath], list[SearchPass]]:
     """Search a section in passes, of which the first one uses the section's scale."""
-    stream, background, selection = section
+    stream, background, selection, covered = section
     found: list[TargetPath] = []
     passes: list[SearchPass] = []
     size, gate = (stream.width, stream.height), CONFIG.gate_sigmas
@@ -377,6 +380,7 @@ def _search_section(
             whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
         frame, scene = OwnFrame(stream, background, selection.scale), background.scene
         near = whole = merge_parts(whole, None if scene else frame)
+        whole = drop_edges(whole, covered)
         if scene:
             whole = [one for one in whole if has_own_motion(one, scene, stream.start)]
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]
