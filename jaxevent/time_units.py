@@ -36,7 +36,7 @@ from jaxevent.errors import InputError, InputWarning
 
 MIN_EVENTS = 300
 SAMPLE_EVENTS = 1 << 16  # events from which order, unit and signs are inferred
-_JUDGED_EVENTS = 1 << 12  # of a caller's arrays, whose unit is doubted
+JUDGED_EVENTS = 1 << 12  # of arrays and recordings whose unit is doubted
 _MIN_REPETITIONS = 100  # intervals between events of one pixel
 _BURST_FRACTION = (
     0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
@@ -227,7 +227,7 @@ def doubt_given_unit(
     """
     if len(t) < MIN_EVENTS:
         return None
-    rows = np.append(np.arange(min(len(t) - 1, _JUDGED_EVENTS)), len(t) - 1)
+    rows = np.append(np.arange(min(len(t) - 1, JUDGED_EVENTS)), len(t) - 1)
     sample = {name: part[rows] for name, part in (("t", t), ("x", x), ("y", y))}
     least = _WINNING_NATS if unit is None else _CONTRADICTION_NATS
     numbers, unit = _Numbers.from_sample(sample, len(t), size), unit or "us"
@@ -237,6 +237,37 @@ def doubt_given_unit(
     return (
         f"as {UNIT_NAMES[unit]} events are unusual: {found.text}; if this is right, give "
         f"time_unit={found.unit!r}"
+    )
+
+
+def doubt_microseconds(
+    sample: Mapping[str, NDArray], n_events: int, size: tuple[int, int]
+) -> str | None:
+    """Compare a recording that something else makes doubtful with what recordings are like.
+
+    Args:
+        sample: Columns t (us), x and y, (n,) each: the first events, and then the last one.
+        n_events: Number of events in all.
+        size: (width, height) of the sensor in pixels.
+
+    Returns:
+        The unit that the times seem to have and the remedy, for a message; None where
+        microseconds are usual.
+    """
+    if n_events < MIN_EVENTS:
+        return None
+    found = _contradiction(_Numbers.from_sample(sample, n_events, size), "us", _WINNING_NATS)
+    if found is None:
+        return None
+    scale = US_PER_UNIT[found.unit]
+    remedy = (
+        f"multiply the times by {scale:,.0f}"
+        if scale > 1
+        else f"divide the times by {1 / scale:,.0f}"
+    )
+    return (
+        f"the times look like {UNIT_NAMES[found.unit]}, not microseconds: {found.text}; if so, "
+        f"{remedy}"
     )
 
 

@@ -16,7 +16,12 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_methods
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.egomotion.patches import ImageSpeed, describe_windows, measure_image_speed
+from jaxevent.egomotion.patches import (
+    ImageSpeed,
+    describe_unit_doubt,
+    describe_windows,
+    measure_image_speed,
+)
 from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.estimator import Estimate, Estimator
@@ -261,6 +266,7 @@ class MotionEstimator(Estimator[P]):
         if speed is None:
             still = (
                 f"nothing was seen to move {describe_windows(recording)}; windows are as by default"
+                f"{describe_unit_doubt(recording)}"
             )
             return AdaptedParams(params, None, still, "")
         chosen = self.lengths(params, speed)

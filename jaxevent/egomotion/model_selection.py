@@ -29,6 +29,7 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
     FIT_WINDOW_DISPLACEMENT_PX,
     PatchSharpness,
+    describe_unit_doubt,
     describe_windows,
     fit_general,
     fit_planar,
@@ -120,6 +121,7 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
         raise InputError(
             f"{recording.name}: nothing is seen to move {describe_windows(recording)}; this "
             "may be noise; if something moves, name the model of its motion"
+            f"{describe_unit_doubt(recording)}"
         )
     if camera is None:
         line = (

@@ -105,6 +105,30 @@ def test_noise_has_no_speed():
             select_model(recording)
 
 
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (1000, "like nanoseconds, .* as nanoseconds they last 0.4 s.* divide the times by 1,000$"),
+        (0.001, "like milliseconds, .* they last 0.399 s.* multiply the times by 1,000$"),
+    ],
+)
+def test_a_clock_of_another_unit_is_told_where_nothing_moves(scale, words):
+    sound = moving(uniformly([70.0, 20.0]), 0.4, 400)
+    e = sound.events
+    clock = dataclasses.replace(sound, events=Events((e.t * scale).astype(int), e.x, e.y, e.p))
+    with pytest.raises(InputError, match=f"nothing is seen to move .*{words}"):
+        select_model(clock)
+    suited = voting.adapt_params(clock, voting.Params())
+    assert "nothing was seen to move" in suited.message and "the times look like" in suited.message
+    # Where something moves, and of noise at a usual rate, the unit is not doubted.
+    assert "the times look" not in voting.adapt_params(sound, voting.Params()).message
+    rng, n = np.random.default_rng(1), 6000
+    t = np.sort(rng.integers(0, 300_000, n))
+    x, y = (rng.integers(0, size, n) for size in (WIDTH, HEIGHT))
+    with pytest.raises(InputError, match="name the model of its motion$"):
+        select_model(recorded(t, x, y, x % 2 == 0, WIDTH, HEIGHT, CAMERA))
+
+
 def rates(x, T, Omega, rho):
     parallax = np.asarray(A(*x.T, F)) @ T * rho[:, None]
     return parallax + np.asarray(B(*x.T, F)) @ Omega
