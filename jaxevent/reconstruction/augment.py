@@ -623,6 +623,11 @@ class AugmentedFrame(LogIntensityModel):
     Weighted by certainty, the lines of a gap count by (1 - u) / R_k and u / R_{k+1} instead of 1 -
     u and u, R = 1 / (w (I + I0)^2). So a clipped frame does not act against a good one. `tilt` is
     R_k / R_{k+1}. At the ends of the gap the estimate is the same.
+
+    Args:
+        params: Parameters of the augmented frame.
+        frames: Frames of a window, and the events around them.
+        shift: (frames, pixels) ln I, added to the frames' log intensity; 0: none.
     """
 
     Params = AugmentParams
@@ -758,7 +763,13 @@ class NoFrames(LogIntensityModel):
 
 
 class FrameInterpolation(eqx.Module):
-    """A quantity known at mid-exposures: linear in time between them, constant outside."""
+    """A quantity known at mid-exposures: linear in time between them, constant outside.
+
+    Args:
+        params: `clock_offset` and `event_delay`, s.
+        frames: Frames of a window.
+        table: (frames, pixels) values at mid-exposure.
+    """
 
     here: Float[Array, "frames pixels"]
     there: Float[Array, "frames pixels"]

@@ -128,6 +128,13 @@ def _is_beyond(found: ChangeRatio, factor: float) -> bool:
     """Return whether changes by events and by frames differ in size by more than a factor.
 
     Changes of opposite signs do not count.
+
+    Args:
+        found: The ratio of the changes.
+        factor: Factor above 1, either way.
+
+    Returns:
+        Whether they do, by more than the ratio's error.
     """
     reach = CONTRADICTION_SIGMAS * found.sigma
     is_beyond = found.ratio + reach < 1 / factor or found.ratio - reach > factor

@@ -398,6 +398,16 @@ def _step_all(method: Filter, params: Any, at: Any, event: Event) -> Any:
 # for 5 M events (two cores), next to 0.05 s for the states.
 @_filter_lanes.defjvp
 def _filter_lanes_jvp(method: Filter, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    """Differentiate `_filter_lanes` by one linear recursion over the events.
+
+    Args:
+        method: The filter.
+        primals: Arguments of `_filter_lanes`: parameters, events, states of lanes, tiles.
+        tangents: Their tangents.
+
+    Returns:
+        The states after all events, and their tangent.
+    """
     params, events, lanes, block = primals
     d_params, d_events, d_lanes, _ = tangents
 
@@ -461,7 +471,15 @@ def _real_tangents(state: Any, tangent: Any) -> list[Array]:
 
 
 def _as_tangent(state: Any, real: list[Array]) -> Any:
-    """Make a tangent of a state from those of its real leaves; others have none (float0)."""
+    """Make a tangent of a state from those of its real leaves; others have none (float0).
+
+    Args:
+        state: The state, or states.
+        real: Tangents of its real leaves, in order.
+
+    Returns:
+        Pytree of the structure of `state`.
+    """
     leaves, tree = jax.tree.flatten(state)
     following = iter(real)
     return jax.tree.unflatten(

@@ -202,7 +202,16 @@ def interval_rates(breaks_us: NDArray) -> NDArray:
 
 
 def _position(breaks: NDArray, i: NDArray, time: NDArray) -> NDArray:
-    """Return the position of `time` between breaks i and i + 1, 0 outside the first and last."""
+    """Return the position of times in their intervals between breaks.
+
+    Args:
+        breaks: Sorted breaks, us.
+        i: (times,) index of the break before each time.
+        time: (times,) times, us.
+
+    Returns:
+        (times,), 0 to 1; 0 outside the first and last break.
+    """
     inside = (i >= 0) & (i < len(breaks) - 1)
     if not inside.any():
         return np.zeros(len(time))

@@ -29,7 +29,12 @@ MAX_HELD_FRAMES = 32  # before what is settled is dropped
 
 @renamed_methods(dropping="drop_before", grown="append")
 class RecentImages:
-    """An `ImageSource` that holds the last images only."""
+    """An `ImageSource` that holds the last images only.
+
+    Args:
+        images: (n, H, W) frames that are left.
+        dropped: Number of earlier frames that are gone.
+    """
 
     def __init__(self, images: NDArray, dropped: int = 0):
         self.images, self.dropped = images, dropped

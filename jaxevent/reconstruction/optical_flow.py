@@ -202,6 +202,15 @@ class FlowVideo(ImageSequence[Params]):
         return flows
 
     def _image(self, frame: int, share: float) -> NDArray[np.floating]:
+        """Return the image at a position between two frames.
+
+        Args:
+            frame: The frame before.
+            share: Part of the interval to the next frame that is over, 0 to 1.
+
+        Returns:
+            (H, W) intensity.
+        """
         if share == 0:
             return _read_frames(self._images, self._clock, slice(frame, frame + 1)).intensity[0]
         return self._between(frame).at(share)
@@ -214,6 +223,15 @@ class FlowVideo(ImageSequence[Params]):
 
 
 def _locate(clock: FrameClock, times: NDArray[np.int64]) -> ImageTimes:
+    """Locate times among the frames.
+
+    Args:
+        clock: Times of the frames.
+        times: (times,) times, us.
+
+    Returns:
+        Their places.
+    """
     _, frame, _, share = clock.locate(times - clock.origin)
     return ImageTimes(frame, share)
 

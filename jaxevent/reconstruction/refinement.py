@@ -144,6 +144,16 @@ def refine(
     interval = parts[0].interval_s
 
     def move(at: Any, steps: NDArray[np.float64]) -> Any:
+        """Move parameters by steps.
+
+        Args:
+            at: Parameters.
+            steps: Step of each name, in the logarithm of a positive number; in a time of the clock
+                `LOG_STEP` counts as `CLOCK_STEP_FRAMES` intervals between frames.
+
+        Returns:
+            New parameters.
+        """
         values = {}
         for name, step in zip(names, steps.tolist(), strict=True):
             value = float(getattr(at, name))

@@ -61,7 +61,15 @@ def estimate_common_motion(
 
 
 def _search(image: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the whole pixels by which one image best fits another one, (2,) along x and y."""
+    """Find the whole pixels by which one image best fits another one.
+
+    Args:
+        image: (h, w) log intensity.
+        other: (h, w) log intensity.
+
+    Returns:
+        (2,) displacement from `image` to `other` along x and y, px, each at most `SEARCH_REACH`.
+    """
     (h, w), reach = image.shape, SEARCH_REACH
     best, found = np.inf, np.zeros(2)
     for dy, dx in itertools.product(range(-reach, reach + 1), repeat=2):
@@ -82,7 +90,15 @@ def _deviation(displacement: NDArray[np.float64]) -> float:
 def _subtract_parabola(
     steps: Sequence[NDArray[np.float64]], s: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return the course (K, 2) that K - 1 steps sum up to, less the parabola nearest to it."""
+    """Sum steps up to a course, and subtract the parabola of s that is nearest to it.
+
+    Args:
+        steps: K - 1 translations (2,) from each instant to the next, px.
+        s: (K,) times of the instants on the clock of trajectories, -1..1.
+
+    Returns:
+        (K, 2) rest along x and y, px.
+    """
     course = np.cumsum([np.zeros(2), *steps], 0)
     powers = np.stack([np.ones_like(s), s, s**2], 1).astype(float)
     return course - powers @ np.linalg.lstsq(powers, course, rcond=None)[0]
@@ -95,7 +111,18 @@ def _register(
     levels: tuple[int, ...],
     cost: CostParams,
 ) -> NDArray[np.float64]:
-    """Return the translation (2,), px, from image k to the next one, near to a given one."""
+    """Register an image with the next one by a translation.
+
+    Args:
+        pyramid: Images at the instants.
+        k: Index of the first of the two images.
+        moved: (2,) translation to start from, along x and y, px at full resolution.
+        levels: Resolutions, coarse to fine; 0: full.
+        cost: Parameters of the cost.
+
+    Returns:
+        (2,) translation from image k to image k + 1, px at full resolution.
+    """
     times = PathTimes.of(np.array([0, 1], np.float32))
     for level in levels:
         images = PackedImages.of(pyramid[level][k : k + 2], times)

@@ -128,7 +128,16 @@ class PreparedTargets(ShortRepr):
 
 @jax.jit
 def _carry(images: Array, times: PathTimes, paths: Array) -> Array:
-    """Read images (n, h, w, channels) at n times along trajectories."""
+    """Read images along trajectories.
+
+    Args:
+        images: (n, h, w, channels) images at n times.
+        times: The n times.
+        paths: (h, w, 4) paths of the target's points, px.
+
+    Returns:
+        (n, h, w, channels) values at the target's points.
+    """
     Y, X = path_positions(paths, times)
     return jax.vmap(lambda one: sample_bilinear(one, Y, X), -1, -1)(images)
 
@@ -499,7 +508,17 @@ class MotionCompensation(ImageEstimator[Params]):
         layout: InstantLayout,
         p: Array,
     ) -> Array:
-        """Return trajectories that depend on images and parameters."""
+        """Make trajectories depend on images and parameters, for derivatives.
+
+        Args:
+            params: Parameters.
+            images: L, V and clear, each (k, h, w), as of `InstantImages`.
+            layout: The k instants.
+            p: (rows, columns, 4) converged trajectories of nodes, px.
+
+        Returns:
+            p with the derivatives of the fixpoint.
+        """
         L, V, clear = images
         cost = CostParams.of(params, lambda value: jnp.asarray(value, L.dtype))
         variance = V * jnp.where(clear > 0, 1, params.caution)

@@ -116,7 +116,12 @@ class EventNoise:
         return float(self(int(self.locate(np.array([t])).interval[0])).trust)
 
     def inflate(self, times: NDArray[np.int64], V: NDArray[np.float32]) -> None:
-        """Inflate the variances (K, h, w), float32, of images at times (us) in place."""
+        """Inflate the variances of images by the noise of their events, in place.
+
+        Args:
+            times: (K,) times of the images, us.
+            V: (K, h, w) variances, (ln I)^2, float32.
+        """
         for k, (interval, shape) in enumerate(zip(*self.locate(times), strict=True)):
             if shape > 0:
                 noise = self(int(interval))
@@ -147,7 +152,15 @@ class EventNoise:
 
 
 def _share_out(counts: NDArray[np.floating], share: float) -> NDArray[np.floating]:
-    """Share counts (2, h, w) of events out between pixels and their 8 neighbours."""
+    """Share counts of events out between pixels and their 8 neighbours.
+
+    Args:
+        counts: (2, h, w) ON and OFF events.
+        share: Fraction of each event that goes to the neighbours, 0..1.
+
+    Returns:
+        (2, h, w); what would go beyond the border is lost.
+    """
     padded = np.pad(counts, [(0, 0), (1, 1), (1, 1)])
     rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
     around = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:] - counts

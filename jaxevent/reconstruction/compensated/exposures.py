@@ -135,7 +135,15 @@ class FrameExposures:
         self.samples = samples if params.integrate and wanted else None
 
     def __call__(self, t: int, instants: TargetInstants) -> AdjacentExposures:
-        """Return the exposures next to a target at a time (us), whose instants are given."""
+        """Choose the exposures next to a target: before, and after or at its time.
+
+        Args:
+            t: Time of the target, us.
+            instants: Its instants, which define the clock.
+
+        Returns:
+            Two exposures.
+        """
         after = int(np.searchsorted(self.mid, t, "right"))
         here = int(np.searchsorted(self.mid, t, "left"))
         frame, present = np.array([here - 1, after]), np.array([here > 0, after < len(self.mid)])
@@ -230,14 +238,31 @@ def _smear_adjoint(begin, end, error, shares, D, out):
 
 
 def blur_by_motion(L: NDArray, D: NDArray) -> tuple[NDArray, NDArray]:
-    """Average an image over exposures, as `blur_by_motion_jax` does."""
+    """Average an image over exposures, as `blur_by_motion_jax` does.
+
+    Args:
+        L: (h, w) log intensity, float32.
+        D: (n, j, h, w, 2) displacements along x and y at the samples of each exposure, px.
+
+    Returns:
+        B (n, h, w), and the shares (n, j, h, w) of the samples in it.
+    """
     B, shares = np.empty((len(D), *L.shape), np.float32), np.empty(D.shape[:-1], np.float32)
     run_over_rows(_smear, len(L), L, D, B, shares)
     return B, shares
 
 
 def blur_by_motion_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArray:
-    """Bring errors of B back to the points of L, as `blur_by_motion_adjoint_jax` does."""
+    """Bring errors of B back to the points of L, as `blur_by_motion_adjoint_jax` does.
+
+    Args:
+        error: (n, h, w) errors of B.
+        shares: (n, j, h, w) shares of the samples, of `blur_by_motion`.
+        D: (n, j, h, w, 2) displacements along x and y at the samples, px.
+
+    Returns:
+        (h, w).
+    """
     out = np.empty(error.shape[1:], np.float32)
     run_over_rows(_smear_adjoint, len(out), error, shares, D, out)
     return out
@@ -332,7 +357,18 @@ def clipped_variance(params: Params, fused: FusedImage, model: ExposureModel) ->
 def _frame_evidence(
     params: Params, model: ExposureModel, D: Array, B: Array, fused: FusedImage
 ) -> _FrameEvidence:
-    """Return the evidence of frames; B is what they would show of the image."""
+    """Read the evidence of frames at the target's points.
+
+    Args:
+        params: Parameters of `mc`.
+        model: The n frames, and the paths of the image's points.
+        D: (n, j, h, w, 2) displacements at the samples of each exposure, px.
+        B: (n, h, w) log intensity that the frames would show of the image.
+        fused: The image.
+
+    Returns:
+        The evidence, in which weights are 0 where a frame is sharp or does not see the point.
+    """
     exposures, frames, paths = model
     _, h, w = B.shape
     Y, X = path_positions(paths, exposures.path_times)
@@ -368,7 +404,17 @@ def _frame_evidence(
 def _pull_and_information(
     params: Params, evidence: _FrameEvidence, B: Array
 ) -> tuple[Array, Array]:
-    """Return information times error (n, h, w) of B, and the information (h, w)."""
+    """Weigh the errors of blurred images against frames.
+
+    Args:
+        params: Parameters of `mc`.
+        evidence: Evidence of n frames.
+        B: (n, h, w) log intensity that the frames would show of the image.
+
+    Returns:
+        Information times error of B, (n, h, w), 1 / ln I, and the information, summed over frames,
+        (h, w), 1 / (ln I)^2.
+    """
     steepness = jax.vmap(squared_gradient)(B)
     V = evidence.V + params.sigma_place**2 * steepness + params.sigma_between**2
     square = (evidence.level - B) ** 2 / V
@@ -380,7 +426,16 @@ def _pull_and_information(
 
 
 def _squared_blur(evidence: _FrameEvidence, image: Array, B: Array) -> Array:
-    """Return the squared change (h, w) of an image by the blur of exposures."""
+    """Measure how much the blur of exposures changes an image.
+
+    Args:
+        evidence: Evidence of n frames.
+        image: (h, w) log intensity.
+        B: (n, h, w) the same, averaged over the exposures.
+
+    Returns:
+        (h, w) squared change, a weighted mean over frames, blurred, (ln I)^2.
+    """
     total = (evidence.weight * (B - image) ** 2).sum(0)
     return blur_jax(total / jnp.maximum(evidence.weight.sum(0), 1), RESIDUAL_SIGMA_PX)
 
@@ -428,7 +483,17 @@ _compiled_variance = jax.jit(clipped_variance)
 def constrain_image(
     params: Params, fused: FusedImage, model: ExposureModel, samples: int
 ) -> FusedImage:
-    """Fit an image to exposures and clipped pixels, as `constrain_image_jax` does."""
+    """Fit an image to exposures and clipped pixels, as `constrain_image_jax` does.
+
+    Args:
+        params: Parameters of `mc`.
+        fused: The image.
+        model: The frames, and the paths of the image's points.
+        samples: Samples of each exposure.
+
+    Returns:
+        The image with other `L` and `P`.
+    """
     fused = dataclasses.replace(fused, P=_compiled_variance(params, fused, model))
     L, P = _single(fused.L), _single(fused.P)
     D = _single(_compiled_displacements(model.exposures, model.paths, samples))

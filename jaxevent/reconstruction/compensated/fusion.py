@@ -282,7 +282,16 @@ def variance_features(X: Array, in_place: Array, beyond: Array, intervals_away: 
 
 
 def _shift_weight(q: list[Array], part: Array, to: int) -> list[Array]:
-    """Give a part (h, w) of the weights q (h, w) of all candidates to one of them."""
+    """Give a part of the weights of all candidates to one of them.
+
+    Args:
+        q: Weights of the candidates, each (h, w); their sum is 1.
+        part: (h, w), 0..1.
+        to: Index of the candidate that gets it.
+
+    Returns:
+        The new weights, each (h, w); their sum is 1.
+    """
     return [(1 - part) * weight + part * (k == to) for k, weight in enumerate(q)]
 
 

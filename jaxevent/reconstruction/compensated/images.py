@@ -85,6 +85,17 @@ class InstantSmoother(Smoother[Params]):
         return FrameLevels(z, V, measured.clear)
 
     def readout(self, params: Params, state: Gaussian, info: FrameLevels, here: Array) -> Estimate:
+        """Read images at times, of pixels that a frame shows just then from that frame.
+
+        Args:
+            params: Parameters of `mc`.
+            state: (times, pixels) log intensity by the smoother.
+            info: (times, pixels) log intensity by the frame before.
+            here: (times, 1) whether the time is the middle of that frame's exposure.
+
+        Returns:
+            Log intensity, its variance, (ln I)^2, and whether a frame shows the pixel unclipped.
+        """
         L = jnp.log(jnp.maximum(jnp.exp(state.m) - params.I0, 0) + params.I0)
         shown = here & (info.clear > 0.5)
         V = jnp.where(shown, jnp.minimum(state.P, info.V), state.P)
@@ -151,7 +162,15 @@ class InstantImages:
 
 @functools.cache
 def _averages(size: int, sigma: float) -> NDArray[np.float32]:
-    """Return the matrix that blurs an axis; weights at the border are of the pixels inside."""
+    """Make the matrix that blurs an axis; weights at the border are of the pixels inside.
+
+    Args:
+        size: Length of the axis, px.
+        sigma: Standard deviation of the Gaussian, px.
+
+    Returns:
+        (size, size); the sum of each row is 1.
+    """
     at = np.arange(size)
     weights = np.exp(-0.5 * ((at[:, None] - at) / sigma) ** 2)
     return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
@@ -159,7 +178,15 @@ def _averages(size: int, sigma: float) -> NDArray[np.float32]:
 
 @full_precision
 def gaussian_blur(L: Any, sigma_px: float = SMOOTH_PART_SIGMA_PX) -> Any:
-    """Blur images (..., h, w), of NumPy or JAX, by a Gaussian of `sigma_px` px."""
+    """Blur images by a Gaussian.
+
+    Args:
+        L: (..., h, w) images, of NumPy or JAX.
+        sigma_px: Standard deviation of the Gaussian, px.
+
+    Returns:
+        (..., h, w).
+    """
     return _averages(L.shape[-2], sigma_px) @ L @ _averages(L.shape[-1], sigma_px).T
 
 
@@ -233,9 +260,15 @@ class FrameBrightness:
         self._changes: dict[int, float] = {}
 
     def is_steady(self, first_us: int, last_us: int) -> bool:
-        """Return whether all frames between two times (us), included, are equally bright.
+        """Return whether all frames between two times are equally bright.
 
         Changes of a light that fades are small, and add up over the frames.
+        Args:
+            first_us: First time, us; a frame at it counts.
+            last_us: Last time, us, likewise.
+
+        Returns:
+            Whether the brightness stays within `MIN_UNSTEADY_CHANGE`.
         """
         low = int(np.searchsorted(self._mid, first_us, "left"))
         high = int(np.searchsorted(self._mid, last_us, "right"))

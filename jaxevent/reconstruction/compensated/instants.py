@@ -96,7 +96,15 @@ class MotionClock:
         return (1 - self.event_share) * elapsed + self.event_share * self.event_interval * counts
 
     def between(self, begin_us: int, end_us: int) -> "MotionClock":
-        """Return the clock whose weight of events is lower by the share that is missing."""
+        """Return the clock whose weight of events is lower by the share that is missing.
+
+        Args:
+            begin_us: Time from which missing events count, us.
+            end_us: Time up to which they count, us.
+
+        Returns:
+            The clock itself where none are missing.
+        """
         if not self.event_share or self.missed is None:
             return self
         missed = float(np.ptp(self.missed(np.array([begin_us, end_us]))))
@@ -107,7 +115,15 @@ class MotionClock:
         return dataclasses.replace(self, event_share=share)
 
     def relative_event_rate(self, begin_us: int, end_us: int) -> float:
-        """Return the rate of events between two times (us), in units of the mean rate."""
+        """Return the rate of events between two times, relative to the mean rate.
+
+        Args:
+            begin_us: First time, us.
+            end_us: Last time, us.
+
+        Returns:
+            The ratio; 1 where it is not defined.
+        """
         if not (self.event_interval and end_us > begin_us):
             return 1.0
         count = self.count_before(end_us) - self.count_before(begin_us)
@@ -165,7 +181,16 @@ def common_motion_fraction(counts: NDArray[np.floating]) -> float:
 
 
 def _count_parts(recording: Recording, begin: int, length: int) -> NDArray[np.floating]:
-    """Count the events of a segment, (parts, bins)."""
+    """Count the events of a segment by part of the image and time.
+
+    Args:
+        recording: The recording.
+        begin: Begin of the segment, us.
+        length: Length of the segment, us.
+
+    Returns:
+        (parts, bins) numbers of events.
+    """
     source = recording.events
     events = source[source.index(begin) : source.index(begin + length)]
     counts, size = np.zeros((N_PARTS**2, N_BINS)), (recording.height, recording.width)
@@ -195,12 +220,28 @@ class CommonMotion:
     displacement: NDArray[np.float64]
 
     def between(self, start: int, times: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the displacements (n, 2), px, from a time to others (n,), us."""
+        """Return the displacements from one time to others.
+
+        Args:
+            start: Time, us.
+            times: (n,) times, us.
+
+        Returns:
+            (n, 2) along x and y, px.
+        """
         moved = self._interpolate(np.append(times, start))
         return (moved[:-1] - moved[-1]).astype(np.float32)
 
     def velocity(self, time: int, span: int) -> NDArray[np.float32]:
-        """Return the mean velocity (2,), px/s, over `span` us before and after a time (us)."""
+        """Return the mean velocity around a time.
+
+        Args:
+            time: Time, us.
+            span: Time before and after it over which the mean is taken, us.
+
+        Returns:
+            (2,) along x and y, px/s.
+        """
         before, after = self._interpolate(np.array([time - span, time + span]))
         return ((after - before) / (2e-6 * span)).astype(np.float32)
 
@@ -270,7 +311,16 @@ class TargetInstants:
 def _relative_times(
     clock: MotionClock, times: NDArray[np.int64], target: int
 ) -> tuple[NDArray[np.float32], float]:
-    """Return times (us) relative to that of a target, -1..1, and what 1 stands for (s)."""
+    """Convert times to those relative to a target, on a clock.
+
+    Args:
+        clock: The clock.
+        times: (K,) times, us.
+        target: Index of the target's time among them.
+
+    Returns:
+        (K,) relative times, -1..1, and what 1 stands for, s.
+    """
     elapsed = clock(times)
     elapsed -= elapsed[target]
     unit = max(float(np.abs(elapsed).max()), 1.0)
@@ -281,9 +331,9 @@ class InstantSchedule:
     """Chooses the instants of a target: frames around it, and a grid between the nearest two.
 
     Args:
-        frames: (frames,) times of frames, us.
-        span: First and last time with data, us.
-        speed: Speed of the moving points, px/s.
+        frame_times_us: (frames,) times of frames, us.
+        span_us: First and last time with data, us.
+        speed_px_s: Speed of the moving points, px/s.
         clock: Clock of the instants.
     """
 
@@ -383,7 +433,15 @@ def measure_image_speed(
 
 
 def _change_and_steepness(early: NDArray, late: NDArray) -> NDArray:
-    """Return means over blocks: of |dL| |grad L|, |grad L|^2 and |dL|^2, each (h / 4, w / 4)."""
+    """Average changes and gradients of two images over blocks of 4 x 4 pixels.
+
+    Args:
+        early: (h, w) log intensity.
+        late: (h, w) log intensity a little later.
+
+    Returns:
+        (3, h // 4, w // 4) means of |dL| |grad L|, |grad L|^2 and |dL|^2, with gradients per px.
+    """
     mean = np.pad((early + late) / 2, 1, mode="edge")
     gx = (mean[1:-1, 2:] - mean[1:-1, :-2]) / 2
     gy = (mean[2:, 1:-1] - mean[:-2, 1:-1]) / 2

@@ -664,7 +664,15 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
 
 
 def _pull(eq: NormalEquations, q: Array) -> Array:
-    """Return (smooth Laplacian + ridge) q."""
+    """Return (smooth Laplacian + ridge) q.
+
+    Args:
+        eq: Equations of the nodes.
+        q: (rows, columns, 4).
+
+    Returns:
+        (rows, columns, 4).
+    """
     x = eq.across[..., None] * jnp.diff(q, axis=1)
     y = eq.down[..., None] * jnp.diff(q, axis=0)
     rough = jnp.pad(x, [(0, 0), (1, 0), (0, 0)]) - jnp.pad(x, [(0, 0), (0, 1), (0, 0)])
@@ -689,6 +697,15 @@ def normal_equation_residual(p: Array, images: MotionImages, cost: CostParams) -
 
 @full_precision
 def _solve_jax(eq: NormalEquations, right: Array) -> Array:
+    """Solve the normal equations by conjugate gradients, preconditioned node by node.
+
+    Args:
+        eq: Equations of the nodes, with `N` as matrices (4, 4).
+        right: (rows, columns, 4) right-hand side.
+
+    Returns:
+        (rows, columns, 4).
+    """
     degree = jnp.pad(eq.across, [(0, 0), (1, 0)]) + jnp.pad(eq.across, [(0, 0), (0, 1)])
     degree = degree + jnp.pad(eq.down, [(1, 0), (0, 0)]) + jnp.pad(eq.down, [(0, 1), (0, 0)])
     diagonal = eq.smooth * degree[..., None] + eq.ridge + 1e-6
@@ -723,6 +740,15 @@ def implicit_trajectories(p: Array, images: MotionImages, cost: CostParams) -> A
 
 @implicit_trajectories.defjvp
 def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
+    """Differentiate `implicit_trajectories`: with F = 0 at the fixpoint, dF/dp dp = -dF.
+
+    Args:
+        values: Its arguments.
+        changes: Their tangents.
+
+    Returns:
+        p, (rows, columns, 4), px, and its tangent.
+    """
     p, images, cost = values
     _, *changes_of_data = changes
     eq = linearise_jax(p, images, cost)

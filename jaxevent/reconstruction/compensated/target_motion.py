@@ -325,7 +325,15 @@ class TrajectoryEstimator:
         return self.event_noise(int(interval[0])).factor if shape[0] > 0 else 1.0
 
     def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
-        """Return the variances with which motion is estimated."""
+        """Raise variances for the estimation of motion, except of pixels that frames show.
+
+        Args:
+            V: (K, h, w) variances, (ln I)^2.
+            clear: (K, h, w), above 0 where a frame shows the pixel unclipped.
+
+        Returns:
+            (K, h, w), (ln I)^2.
+        """
         cautious = V * np.float32(self._caution)
         for k in np.flatnonzero(clear.max((1, 2)) > 0):
             np.copyto(cautious[k], V[k], where=clear[k] > 0)
@@ -384,6 +392,13 @@ class TrajectoryEstimator:
         """Return the mean squared difference of frames along motion at half resolution.
 
         Images from events have the faults of their clock and course, so that they do not judge it.
+
+        Args:
+            pixels: (K, h / 2, w / 2, 4) packed images at half resolution.
+            motion: Motion of nodes at half resolution.
+
+        Returns:
+            The cost; of images at all instants where at most two are of frames.
         """
         instants, p = motion
         judges = np.isin(instants.t, self.schedule.frames)
@@ -410,7 +425,16 @@ class TrajectoryEstimator:
         return NodeMotion(instants, self._seek(frames, instants.path_times.take(framed), nearest))
 
     def _seek(self, pyramid: ImagePyramid, times: PathTimes, horizon: float) -> NDArray[np.float32]:
-        """Seek trajectories of nodes at half resolution, first within a horizon."""
+        """Seek trajectories from nothing, up to half resolution.
+
+        Args:
+            pyramid: Images at the instants.
+            times: Times of the instants, with common displacements in px at full resolution.
+            horizon: Distance of the instants that are used first, in units of `times.s`.
+
+        Returns:
+            (rows, columns, 4) trajectories of nodes at half resolution, in its pixels.
+        """
         plan = plan_stages(times.s, horizon)
         motion = estimate_trajectories(pyramid, times, plan, self._cost)
         return motion.at_level(1, self.images.image_shape).p
@@ -423,7 +447,16 @@ class TrajectoryEstimator:
     def _refine(
         self, motion: NodeMotion, images: InstantStack, noise: NDArray[np.float32] | float
     ) -> Anchor:
-        """Refine motion at half resolution with the image that it gives."""
+        """Refine motion at half resolution with the image that it gives.
+
+        Args:
+            motion: Motion of nodes at half resolution.
+            images: Images at its instants.
+            noise: (h, w) or (), as of `fusion.ReferenceImages`.
+
+        Returns:
+            The target with the motion at full resolution, and its fused image.
+        """
         (instants, p), (L, V, clear, smooth) = motion, images
         p = NodeTrajectories(p, 1).at_level(0, self.images.image_shape).p
         estimate = TrajectoryEstimate(instants, L, V, clear, p, noise=noise)
@@ -434,7 +467,16 @@ class TrajectoryEstimator:
         return Anchor(NodeMotion(instants, p), image, P, smooth is None)
 
     def _pack(self, target: TrajectoryEstimate, image: NDArray, P: NDArray) -> PackedImages:
-        """Pack the images of a target, its own replaced by one with less noise."""
+        """Pack the images of a target, its own replaced by one with less noise.
+
+        Args:
+            target: The target.
+            image: (h, w) log intensity to put in place of its own.
+            P: (h, w) variance of that, (ln I)^2.
+
+        Returns:
+            The images at full resolution.
+        """
         own, V = target.instants.target, self._cautious(target.V, target.clear)
         pixels = pack_images(target.L, V)
         V = FUSED_VARIANCE_FACTOR * P + self._cost.floor
@@ -442,7 +484,15 @@ class TrajectoryEstimator:
         return PackedImages.of(pixels, target.instants.path_times)
 
     def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> SoughtMotion:
-        """Take a few steps at half resolution on both clocks, and compare how frames agree."""
+        """Take a few steps at half resolution on both clocks, and compare how frames agree.
+
+        Args:
+            pixels: (K, h / 2, w / 2, 4) packed images at half resolution.
+            motion: Motion of nodes at half resolution.
+
+        Returns:
+            The motion on both clocks; twice the same where both clocks are one.
+        """
         instants, p = motion
 
         def improved(clock: TargetInstants, p: NDArray[np.float32]) -> NodeMotion:
@@ -526,7 +576,16 @@ class TrajectoryEstimator:
     def _choose(
         self, images: PackedImages, p: NDArray[np.float32], other: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Choose between trajectories and others at half resolution, where images agree better."""
+        """Choose between two trajectories of each node, by images at half resolution.
+
+        Args:
+            images: Images at full resolution.
+            p: (rows, columns, 4) trajectories of nodes at full resolution, px.
+            other: (rows, columns, 4) trajectories of nodes at half resolution, in its pixels.
+
+        Returns:
+            (rows, columns, 4) trajectories of nodes at full resolution, px.
+        """
         size = self.images.image_shape
         L, V = images.pixels[..., 0], images.pixels[..., 1]
         pyramid = ImagePyramid(L, V, PYRAMID_VARIANCE_FACTOR)
@@ -564,6 +623,18 @@ def _fuse(
     paths: Numeric,
     noise: Numeric | float,
 ) -> FusedImage:
+    """Fuse the images that `fuse_target` hands over.
+
+    Args:
+        params: Parameters of `mc`.
+        mean: Robust mean along the trajectories.
+        images: L and V of these images, each (k, h, w), the images warped, and their instants.
+        paths: (h, w, 4) paths of all pixels, px.
+        noise: (h, w) or (), as of `fusion.ReferenceImages`.
+
+    Returns:
+        The image.
+    """
     reach = squared_reach(paths, images[3].common)
     compared = reference_images(*images, reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, compared))

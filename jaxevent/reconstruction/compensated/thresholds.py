@@ -78,7 +78,15 @@ def regress_deviations(changes: LogChanges, prior_sigma: float) -> ThresholdDevi
 def subtract_local_mean(
     deviations: ThresholdDeviations, image_shape: tuple[int, int]
 ) -> ThresholdDeviations:
-    """Subtract the mean of the pixels around: errors of the scene's motion are common to these."""
+    """Subtract the mean of the pixels around: errors of the scene's motion are common to these.
+
+    Args:
+        deviations: Deviations of all pixels.
+        image_shape: Height and width of the sensor, px.
+
+    Returns:
+        The deviations, less their Gaussian mean.
+    """
     d = deviations.d.reshape(2, *image_shape)
     smooth = gaussian_filter(d, (0, NEIGHBOURHOOD_SIGMA_PX, NEIGHBOURHOOD_SIGMA_PX))
     return deviations._replace(d=(d - smooth).reshape(deviations.d.shape))
@@ -94,7 +102,15 @@ def estimate_deviation_sigma(first: ThresholdDeviations, second: ThresholdDeviat
 
 
 def _change_times(recording: Recording, span: tuple[int, int]) -> list[tuple[int, int]]:
-    """Return begins and ends (us) of changes that do not overlap."""
+    """Choose times between which to measure changes, which do not overlap.
+
+    Args:
+        recording: Events and frames.
+        span: First and last time with data, us.
+
+    Returns:
+        Begin and end of each change, us.
+    """
     first, last = span
     assert recording.frames is not None
     lag = (last - first) // N_IMAGE_PAIRS

@@ -361,7 +361,15 @@ def warp_images(
 
 
 def path_displacements(paths: Array, times: PathTimes) -> Array:
-    """Return the displacements (K, h, w, 2) along x and y (px) of paths (h, w, 4) at K times."""
+    """Return the displacements along paths.
+
+    Args:
+        paths: (h, w, 4) paths, px: along x and y the coefficients of s, then those of s^2.
+        times: K times.
+
+    Returns:
+        (K, h, w, 2) along x and y, px.
+    """
     s, common = (jnp.asarray(part) for part in times)
     s = s[:, None, None, None]
     return (paths[..., :2] + paths[..., 2:] * s) * s + common[:, None, None]
@@ -382,7 +390,15 @@ def squared_reach(paths: Numeric, common: Numeric) -> Numeric:
 
 
 def path_positions(paths: Array, times: PathTimes) -> tuple[Array, Array]:
-    """Return y and x, (K, h, w) each, of the points of paths (h, w, 4) at K times."""
+    """Return the positions of the points of paths.
+
+    Args:
+        paths: (h, w, 4) paths, px.
+        times: K times.
+
+    Returns:
+        y and x, (K, h, w) each, px.
+    """
     height, width, _ = paths.shape
     moved = path_displacements(paths, times)
     return jnp.arange(height)[:, None] + moved[..., 1], jnp.arange(width) + moved[..., 0]
@@ -408,7 +424,17 @@ def sample_bilinear(images: Array, Y: Array, X: Array) -> Array:
 
 
 def _locate_cells(h: int, w: int, Y: Array, X: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the first pixel y, x of the cell around each point, and y and x (0..1) in the cell."""
+    """Find the cell of four pixels around each point.
+
+    Args:
+        h: Height of the images, px.
+        w: Width of the images, px.
+        Y: Positions along y, px, of any shape; those beyond the border are moved to it.
+        X: Positions along x, likewise.
+
+    Returns:
+        y and x of the cell's first pixel, and y and x within the cell, 0..1; of the shape of `Y`.
+    """
     Y, X = jnp.clip(Y, 0, h - 1), jnp.clip(X, 0, w - 1)
     y0 = jnp.minimum(Y.astype(int), max(h - 2, 0))
     x0 = jnp.minimum(X.astype(int), max(w - 2, 0))
@@ -416,9 +442,16 @@ def _locate_cells(h: int, w: int, Y: Array, X: Array) -> tuple[Array, Array, Arr
 
 
 def _take(images: Array, y: Array, x: Array) -> Array:
-    """Read images (K, h, w) at pixels (..., K, h, w) that are in them.
+    """Read images at pixels that are in them.
 
     Checks of their range would make three of four operations, and as many in derivatives.
+    Args:
+        images: (K, h, w).
+        y: (..., K, h, w) rows.
+        x: (..., K, h, w) columns.
+
+    Returns:
+        (..., K, h, w).
     """
     count, h, w = images.shape
     pixel = (jnp.arange(count)[:, None, None] * h + y) * w + x

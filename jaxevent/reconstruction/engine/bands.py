@@ -429,6 +429,16 @@ class PartitionedRecording:
     def _bands_of(
         self, blocks: Iterable[EventColumns], counts: NDArray[np.int64], weight: NDArray
     ) -> EventBands | None:
+        """Divide events among the bands, in the memory of the bands before.
+
+        Args:
+            blocks: The events in order.
+            counts: (`N_ROWS`,) number of events of each y.
+            weight: Events that each one stands for; empty: one.
+
+        Returns:
+            The bands, or None if the events are not in order or not on the sensor.
+        """
         width = self.recording.width
         bands = self.layout.partition(blocks, counts, weight, width, self.origin, self._events)
         if bands is not None:

@@ -155,7 +155,17 @@ def _intervals(breaks: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _uniform_inputs(clock: FrameClock, frame: int, gain: NDArray) -> NDArray:
-    """Return gains and rates of a piece of `frame`: fields of `FrameFeatures` of three frames."""
+    """Return the inputs of a piece's tables that are equal for all pixels, as of three frames.
+
+    Args:
+        clock: Times of the window's frames.
+        frame: Frame of the piece, -1 before the first.
+        gain: (frames,) exposures relative to the common one.
+
+    Returns:
+        Gains of the frames, rates of the pieces (1/s) and rates between frames (1/s), one after
+        another; gains are 1 and rates 0 where there is no frame.
+    """
     first = max(frame - 1, 0)
     used = slice(first, min(len(clock), max(frame, 0) + 2))
 
@@ -309,7 +319,16 @@ class _FrameEntry:
             yield STEP_SUM, row, k
 
     def _count(self, fields: NDArray[np.int64], left: int, right: int) -> Iterator[tuple[int, ...]]:
-        """List the step that counts ON and OFF events with left <= t < right."""
+        """List the step that counts events of a span of time; none where a method needs no counts.
+
+        Args:
+            fields: (2,) places of the counts of ON and OFF events, in strides; -1: not needed.
+            left: First time that counts, us.
+            right: Time from which events no longer count, us.
+
+        Returns:
+            The step and its arguments.
+        """
         if fields[0] >= 0:
             on, off = (fields * self.places.stride).tolist()
             yield STEP_COUNT, on, off, left, right

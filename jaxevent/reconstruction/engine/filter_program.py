@@ -180,6 +180,16 @@ def trace_filter(method: FilterMethod, known: tuple[Any, ...], kind: KernelKind)
         return start(known[0], method.frame_model(known[0], frame_features(v)), v)
 
     def at_point(known: tuple[Any, Any], *, state: Any, **v: Any) -> dict[str, Any]:
+        """Step a pixel's state by an event, and read it out.
+
+        Args:
+            known: Parameters of the method, and arrays that are known.
+            state: State before the event.
+            **v: Other inputs, by name.
+
+        Returns:
+            The state at the window's start and after the event, mean and variance.
+        """
         params, v = known[0], known[1] | v
         frame_model = method.frame_model(params, frame_features(v))
         frame = jax.tree.map(
@@ -276,6 +286,15 @@ class PixelTranslator(JaxprTranslator):
         return super()._apply(eqn, args, kind)
 
     def translate_lookup(self, found: NDArray, kind: str) -> NDArray:
+        """Make nodes "slot" of elements that are looked up at a point, and collect what these hold.
+
+        Args:
+            found: Nodes of the elements, of any shape.
+            kind: Kind of number, as of `Node.kind`.
+
+        Returns:
+            The new nodes, of the same shape.
+        """
         out = np.empty(found.shape, object)
         for place in np.ndindex(*found.shape):
             out[place] = self.graph.node("slot", (len(self.slots),), kind, Level.TABLE)
@@ -861,14 +880,34 @@ def filter_kernel(
 def check_filter_kernel(
     method: FilterMethod, params: Any, fixed: dict[str, NDArray], kind: KernelKind
 ) -> None:
-    """Raise `TranslationError` if `filter_kernel` can make no kernel of these arguments."""
+    """Check that `filter_kernel` can make a kernel of these arguments.
+
+    Args:
+        method: The filter.
+        params: Its parameters.
+        fixed: Further numbers that are known with the parameters.
+        kind: Other properties of the kernel.
+
+    Raises:
+        TranslationError: It can make none.
+    """
     _kernels.find_program(*_request(method, params, fixed, kind))
 
 
 def _request(
     method: FilterMethod, params: Any, fixed: dict[str, NDArray], kind: KernelKind
 ) -> tuple[Any, Any, Callable[[], FilterProgram]]:
-    """Return the arguments of `KernelCache.find_program`."""
+    """Return the arguments of `KernelCache.find_program`.
+
+    Args:
+        method: The filter.
+        params: Its parameters.
+        fixed: Further numbers that are known with the parameters.
+        kind: Other properties of the kernel.
+
+    Returns:
+        The key of the program, the arrays that it is made with, and the function that makes it.
+    """
     exposed, dtype, _, directions = kind
     known = directions.inputs(params, fixed)
 

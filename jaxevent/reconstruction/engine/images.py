@@ -618,7 +618,15 @@ class KernelImages(eqx.Module):
 
 
 def _rebuild(kernel: ImageKernel, rows: NDArray) -> KernelImages:
-    """Return images of a kernel that a pickle or copy holds, which has a number of its own."""
+    """Rebuild images that a pickle or copy holds from their kernel, which has a number of its own.
+
+    Args:
+        kernel: The kernel.
+        rows: (times,) rows of the images among those of the kernel.
+
+    Returns:
+        The images.
+    """
     return KernelImages(np.asarray(kernel.number, np.int32), rows, kernel)
 
 
@@ -674,6 +682,19 @@ def _evaluate(
 def _call_kernel(
     about: tuple[ImageKernel, tuple[str, ...]], number: Any, rows: Any, params: Any, numbers: tuple
 ) -> Any:
+    """Call the kernel of a number from a compiled program.
+
+    Args:
+        about: A kernel of the same kind, and which of "mean" and "variance" have derivatives.
+        number: () number of the kernel that is meant.
+        rows: (times,) rows of the images.
+        params: Parameters.
+        numbers: Leaf and place of each number by which derivatives are taken; none: no derivatives.
+
+    Returns:
+        Mean, variance and valid, each (times, pixels), and with `numbers` the derivatives
+        (times, pixels, images, lanes).
+    """
     kernel, outputs = about
     leaves, tree = jax.tree.flatten(params)
     directions = DerivativeDirections(numbers, outputs if numbers else DerivativeDirections().of)

@@ -146,7 +146,18 @@ class EventsOnly(ImageEstimator[Params]):
         params: Params,
         held_out: Callable[[Rows], NDArray[np.bool_]] | None = None,
     ) -> tuple[WindowEquations, Array]:
-        """Return the equations of solved windows, and 1 for rows that are held out."""
+        """Stack the equations of solved windows.
+
+        Args:
+            windows: The solver of the windows.
+            solved: The solved windows.
+            params: Parameters that their rows were made with.
+            held_out: Chooses rows (booleans) that the solution did not see; None: it saw all.
+
+        Returns:
+            The equations, filled up to the same number of rows, and 1 for rows that are held out,
+            else 0, (windows, rows).
+        """
         count = max(len(one.rows.kind) for one in solved)
         packed = [pack_equations(one, windows.relative, params, count) for one in solved]
         held = np.zeros((len(solved), count), packed[0].fraction.dtype)

@@ -128,13 +128,30 @@ class FrameMeasurements:
 
 
 def _sample(F: NDArray, paths: WindowPaths, t: int) -> NDArray[np.float32]:
-    """Return an image at the end of paths as seen at their time t, NaN where it is unknown."""
+    """Sample a frame at the end of paths.
+
+    Args:
+        F: (height, width) log intensity of a frame, NaN where it is clipped.
+        paths: Paths towards the time of the frame.
+        t: Time at which the pixels are in place, us.
+
+    Returns:
+        (height, width) log intensity at that time, NaN where it is unknown.
+    """
     places = np.moveaxis(carry_pixels(paths, F.shape, t), -1, 0)[::-1]
     return map_coordinates(F, places, order=1, mode="constant", cval=np.nan).astype(np.float32)
 
 
 def _changes(rows: Rows, F: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
-    """Return the change of each pixel between its first and last event, by events and by F."""
+    """Return the change of each pixel between its first and last event, by events and by a frame.
+
+    Args:
+        rows: Equations of a window.
+        F: (height, width) log intensity of a frame at the target time, NaN: unknown.
+
+    Returns:
+        Changes by events and by the frame, each (pixels,), ln I; sums over the rows that F covers.
+    """
     width, flat = F.shape[1], np.pad(F.ravel(), (0, F.shape[1] + 1), mode="edge")
     x, y = rows.fraction[..., 0], rows.fraction[..., 1]
     upper = flat[rows.corner] * (1 - x) + flat[rows.corner + 1] * x

@@ -49,7 +49,15 @@ class Perturbation(NamedTuple):
 
     @classmethod
     def draw(cls, n_rows: int, shape: tuple[int, int]) -> "Perturbation":
-        """Draw the numbers that `solve` draws."""
+        """Draw the numbers that `solve` draws.
+
+        Args:
+            n_rows: Number of rows.
+            shape: Height and width of the image, px.
+
+        Returns:
+            The numbers of all samples, with `pull` not yet times the root of `information`.
+        """
         random = np.random.default_rng(0)
         drawn = [
             [
@@ -181,24 +189,59 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
 
 
 def _residuals(u: Array, equations: WindowEquations, params: Params) -> tuple[Array, Array]:
-    """Return the weights of the rows and their residuals in thresholds."""
+    """Return the weights of rows and their residuals.
+
+    Args:
+        u: (height, width) image, thresholds.
+        equations: Equations of the window.
+        params: Parameters.
+
+    Returns:
+        Weights and residuals, each (rows,), residuals in thresholds.
+    """
     weight = equations.weight + params.silence * equations.silent
     return weight, look_up(u, equations.corner, equations.fraction) - _changes(equations, params)
 
 
 def _changes(equations: WindowEquations, params: Params) -> Array:
-    """Return the changes that rows show, in mean thresholds."""
+    """Return the changes that rows show, in mean thresholds.
+
+    Args:
+        equations: Equations of the window.
+        params: Parameters, with thresholds in ln I.
+
+    Returns:
+        (rows,).
+    """
     c = threshold(equations, params)
     return (params.c_on * equations.on - params.c_off * equations.off) / c
 
 
 def threshold(equations: WindowEquations, params: Params) -> Array:
-    """Return the mean threshold (ln I), in whose multiples the image is solved for."""
+    """Return the mean threshold, in whose multiples the image is solved for.
+
+    Args:
+        equations: Equations of one window, or of several, stacked.
+        params: Parameters, with thresholds in ln I.
+
+    Returns:
+        () or (times,), ln I.
+    """
     mean = equations.relative
     return (params.c_on * mean[..., 0] + params.c_off * mean[..., 1]) / 2
 
 
 def _quadratic(u: Array, equations: WindowEquations, leak: Array) -> Array:
+    """Return the quadratic part of the energy: the prior of gradients, and the leak.
+
+    Args:
+        u: (height, width) image, thresholds.
+        equations: Equations of the window.
+        leak: () weight of u^2.
+
+    Returns:
+        ().
+    """
     g = _gradient(u) - equations.pull
     pulled = jnp.einsum("hwi,hwij,hwj->", g, equations.information, g)
     return (pulled + leak * (u**2).sum()) / 2
@@ -213,6 +256,16 @@ class _Weights(NamedTuple):
 
 
 def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
+    """Return the weights of the reweighted problem at an image.
+
+    Args:
+        u: (height, width) image, thresholds.
+        equations: Equations of the window.
+        params: Parameters.
+
+    Returns:
+        The weights.
+    """
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
     s = numbers.gradient / (2 * (_cells(u) + numbers.edge**2))
@@ -224,7 +277,16 @@ def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
 def _product(
     weights: _Weights, equations: WindowEquations, leak: Array
 ) -> Callable[[Array], Array]:
-    """Return the product with the matrix A of the reweighted problem."""
+    """Return the product with the matrix A of the reweighted problem.
+
+    Args:
+        weights: Weights of the reweighted problem.
+        equations: Equations of the window.
+        leak: () weight of u^2.
+
+    Returns:
+        Function of an image (height, width) that returns A times it.
+    """
 
     def form(v: Array) -> Array:
         total = (weights.rows * look_up(v, equations.corner, equations.fraction) ** 2).sum()
@@ -269,17 +331,47 @@ def _make_energy(problem: _Problem) -> Energy:
 
 
 def _find_minimum(problem: _Problem, start: Array) -> NDArray:
+    """Find the image of least energy on the host.
+
+    Args:
+        problem: The problem.
+        start: (height, width) image to start from, thresholds.
+
+    Returns:
+        (height, width), thresholds.
+    """
     least_change = LEAST_CHANGES[start.dtype.itemsize]
     return find_minimum(_make_energy(problem), np.asarray(start), least_change)
 
 
 def _solve_linear(exact: bool, problem: _Problem, u: Array, right: Array) -> NDArray:
+    """Solve a linear problem at an image on the host.
+
+    Args:
+        exact: Whether with the exact second derivative, else that of the reweighted problem.
+        problem: The problem.
+        u: (height, width) image, thresholds.
+        right: (height, width) right side.
+
+    Returns:
+        (height, width).
+    """
     tolerance, images = TOLERANCES[right.dtype.itemsize], (np.asarray(u), np.asarray(right))
     return solve_linear(_make_energy(problem), *images, tolerance, exact=exact)
 
 
 def _call_solver(solver: Callable, equations: WindowEquations, params: Params, *u: Array) -> Array:
-    """Call a solver on the host with a problem and images."""
+    """Call a solver on the host with a problem and images.
+
+    Args:
+        solver: Function on the host of a `_Problem` and the images.
+        equations: Equations of the window.
+        params: Parameters.
+        *u: (height, width) images.
+
+    Returns:
+        (height, width), without a derivative.
+    """
     equations, params = jax.lax.stop_gradient((equations, params))
     shape = jax.ShapeDtypeStruct(u[0].shape, u[0].dtype)
     problem = _set_parameters(equations, params)
@@ -301,16 +393,45 @@ def solve_equations(equations: WindowEquations, params: Params) -> Array:
 
 
 def _slope(u: Array, equations: WindowEquations, params: Params) -> Array:
+    """Return the derivative of the energy by the image.
+
+    Args:
+        u: (height, width) image, thresholds.
+        equations: Equations of the window.
+        params: Parameters.
+
+    Returns:
+        (height, width), 1 / threshold.
+    """
     return jax.grad(energy)(u, equations, params)
 
 
 @jax.custom_jvp
 def _implicit_solution(u: Array, equations: WindowEquations, params: Params) -> Array:
+    """Make a solution a differentiable function of the parameters.
+
+    Args:
+        u: (height, width) image of least energy, thresholds.
+        equations: Equations of the window.
+        params: Parameters.
+
+    Returns:
+        u as it is.
+    """
     return u
 
 
 @_implicit_solution.defjvp
 def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
+    """Differentiate `_implicit_solution` by the parameters, as a root of the energy's slope.
+
+    Args:
+        values: Its arguments.
+        changes: Their tangents, of which that of the parameters counts.
+
+    Returns:
+        u, (height, width), thresholds, and its tangent.
+    """
     u, equations, params = values
 
     def times(du: Array) -> Array:

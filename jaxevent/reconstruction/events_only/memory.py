@@ -415,6 +415,18 @@ class KeyMemories:
     def _carried(
         self, memory: GradientPrior | None, key: int, at: int, until: int, blur: float = 0.0
     ) -> GradientPrior | None:
+        """Carry the memory at a key to another time.
+
+        Args:
+            memory: The memory; None: there is none.
+            key: Its key.
+            at: Time to carry it to, us.
+            until: Time until which events may be used for the motion, us.
+            blur: Further variance of paths, px^2.
+
+        Returns:
+            The memory at that time, None where there is none.
+        """
         if memory is None:
             return None
         start = self.time(key)

@@ -58,7 +58,16 @@ class Paths(Protocol):
         ...
 
     def carry(self, x: NDArray, y: NDArray, t: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the positions at the target time of what pixels (x, y) see at times t."""
+        """Carry points along their paths to the target time.
+
+        Args:
+            x: (n,) positions along x, px.
+            y: (n,) positions along y, px.
+            t: (n,) times at which points are at these positions, us.
+
+        Returns:
+            x and y at the target time, (n,) each, px.
+        """
         ...
 
 

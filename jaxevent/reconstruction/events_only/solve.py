@@ -213,7 +213,17 @@ class _Minimum(NamedTuple):
 def _minimise(
     energy: Energy, u: NDArray, least_change: float = LEAST_CHANGE, most: int = REWEIGHTINGS
 ) -> _Minimum:
-    """Go from the image u to that of least energy, in place."""
+    """Minimise the energy of an image, in place.
+
+    Args:
+        energy: Energy of a window.
+        u: (height, width) image to start from, thresholds; overwritten by that of least energy.
+        least_change: Root mean square change of the image below which to stop, thresholds.
+        most: Greatest number of reweightings.
+
+    Returns:
+        The reweighted problem at the minimum.
+    """
     system = _set_up(energy)
     preconditioner = _Preconditioner(system)
     system = system._replace(weight=np.empty_like(energy.weight))
@@ -313,7 +323,15 @@ def solve_linear(
 
 
 def _bend_cells(u: NDArray, params: SolverParams) -> NDArray:
-    """Return phi''(q) of the cells of an image."""
+    """Return phi''(q), the second derivative of the prior (2), of the cells of an image.
+
+    Args:
+        u: (height, width) image, thresholds.
+        params: Parameters of the solver.
+
+    Returns:
+        (height - 1, width - 1).
+    """
     across, down = np.diff(u, axis=1) ** 2, np.diff(u, axis=0) ** 2
     q = (across[:-1] + across[1:] + down[:, :-1] + down[:, 1:]) / 2
     return -params.gradient / (2 * (q + params.edge**2) ** 2)

@@ -143,9 +143,15 @@ class WindowSolver:
         return map_ahead(lambda window: window.solve(variance), windows)
 
     def _set_up(self, t: int, held_out: Callable[[Rows], NDArray] | None) -> "_Window":
-        """Set up the equations of the image at a time (us).
+        """Set up the equations of the image at a time.
 
         A window begins at a key of the memory, and ends at one or, where images are causal, at t.
+        Args:
+            t: Time of the image, us.
+            held_out: Chooses rows (booleans) that the solution does not see; None: it sees all.
+
+        Returns:
+            The equations.
         """
         memory, place = self.memory, self.recording.events.index(t)
         ahead = 0 if self.causal else min(self.n_side, len(self.recording.events) - place)
