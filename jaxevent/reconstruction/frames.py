@@ -161,7 +161,15 @@ class FrameClock:
         return (elapsed_us - self.mid[frame]) * 1e-6 if len(self) else np.zeros(len(elapsed_us))
 
     def frames_within(self, start_us: int | None, stop_us: int | None) -> slice:
-        """Return the frames from `start_us` to `stop_us`, and one more on each side."""
+        """Return the frames of a span of time, and one more on each side.
+
+        Args:
+            start_us: Begin of the span, us; None: the first frame.
+            stop_us: End of the span, us; None: the last frame.
+
+        Returns:
+            The range of frames.
+        """
         span = np.array(
             [
                 -np.inf if start_us is None else start_us - self.origin,

@@ -133,7 +133,16 @@ def _levels(
 
 
 def _read_frames(images: FrameImages, clock: FrameClock, used: slice) -> FrameSeries:
-    """Read a range of frames as a series."""
+    """Read a range of frames as a series.
+
+    Args:
+        images: Source of the frames.
+        clock: Times of the frames.
+        used: The range, from `start` to `stop`.
+
+    Returns:
+        The series.
+    """
     recording, n = images.recording, used.stop - used.start
     shape = (n, recording.height, recording.width)
     grey, intensity, _, gain = images.read(used, n)

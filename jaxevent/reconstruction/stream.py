@@ -217,6 +217,15 @@ def count_before_edges(
 
 @njit_noalloc
 def _count_before(stream, weight, edges, counts, out):
+    """Write the ON and OFF events of each pixel that are earlier than each edge.
+
+    Args:
+        stream: `EventStream`.
+        weight: (events,) number of events that each event stands for.
+        edges: (edges,) sorted times, us.
+        counts: (2, pixels) counts before the stream, in place to the last edge.
+        out: (edges, 2, pixels) output.
+    """
     t, x, y, p = stream.t, stream.x, stream.y, stream.p
     i = 0
     for e in range(len(edges)):

@@ -201,6 +201,16 @@ def blur_by_motion_adjoint_jax(error: Array, shares: Array, D: Array) -> Array:
 
 @njit_noalloc
 def _smear(begin, end, L, D, B, shares):
+    """Write the averages of an image over exposures, for some rows.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        L: (h, w) log intensity.
+        D: (n, j, h, w, 2) displacements along x and y at the samples of each exposure, px.
+        B: (n, h, w) output, log intensity.
+        shares: (n, j, h, w) output, shares of the samples in it.
+    """
     n, count, h, w, _ = D.shape
     one = np.float32(1)
     for k in range(n):
@@ -221,6 +231,16 @@ def _smear(begin, end, L, D, B, shares):
 
 @njit_noalloc
 def _smear_adjoint(begin, end, error, shares, D, out):
+    """Write the errors of B, brought back to the points of L, for some rows.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        error: (n, h, w) errors of B.
+        shares: (n, j, h, w) shares of the samples.
+        D: (n, j, h, w, 2) displacements at the samples, px.
+        out: (h, w) output.
+    """
     n, count, h, w, _ = D.shape
     one = np.float32(1)
     for y in range(begin, end):

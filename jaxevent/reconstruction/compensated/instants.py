@@ -200,7 +200,15 @@ def _count_parts(recording: Recording, begin: int, length: int) -> NDArray[np.fl
 
 @njit_noalloc
 def _add_to_cells(events, begin, length, image_shape, counts):
-    """Add events to the counts (parts, bins) of parts of the image and of a span of time."""
+    """Add events to the counts of parts of the image and of a span of time.
+
+    Args:
+        events: t (us), x and y, (n,) each.
+        begin: Begin of the span, us.
+        length: Its length, us.
+        image_shape: Height and width of the sensor, px.
+        counts: (parts, bins) added to.
+    """
     (t, x, y), (height, width) = events, image_shape
     for i in range(len(t)):
         part = np.int64(y[i]) * N_PARTS // height * N_PARTS + np.int64(x[i]) * N_PARTS // width

@@ -168,7 +168,15 @@ def robust_means(values, information, initial_weights, nu, out_means):
 
 @njit_noalloc_inlined
 def _read_channels(image, pixel, part, k, points):
-    """Write an image's channels at points, bilinear: (4, K, points)."""
+    """Write an image's channels at points, bilinear.
+
+    Args:
+        image: (h, w, 4) packed image.
+        pixel: (2, points) x and y of the pixel before each point.
+        part: (2, points) distance from that pixel, px.
+        k: Index of the instant.
+        points: (4, K, points) output, of which that of k is written.
+    """
     h, w, _ = image.shape
     for i in range(pixel.shape[1]):
         x0, y0 = pixel[0, i], pixel[1, i]
@@ -203,7 +211,16 @@ class _SampleScratch(NamedTuple):
 
 @njit_noalloc_inlined
 def _sample_row(y, begin, inputs, scratch, points, means):
-    """Write what images show along the trajectories of a row: (4, K, w), and their means (w,)."""
+    """Sample images along the trajectories of a row of pixels.
+
+    Args:
+        y: The row.
+        begin: First row of the kernel, whose scratch memory is used.
+        inputs: `PackedImages`, trajectories of nodes (rows, columns, 4), px, and `CostParams`.
+        scratch: `_SampleScratch`.
+        points: (4, K, w) output, as of `TrajectorySamples`.
+        means: (w,) output, robust means, ln I.
+    """
     images, p, cost = inputs
     count, h, w, _ = images.pixels.shape
     rows, info = scratch.rows, scratch.information[begin]
@@ -257,13 +274,18 @@ def _add_product(a, b, out):
 
 @njit_noalloc_inlined
 def _add_pixels(points, M, s, grad_M, scratch, sums):
-    """Add the equations of each pixel of a row to sums (14, w): N (10) and b (4).
-
-    `points` are the row's, as of `TrajectorySamples`, and M (w,) are their means.
+    """Add the equations of each pixel of a row to sums.
 
     The derivative of values by a path's four numbers is J = g (s, s^2). The gradient g along
-    trajectories and that of the mean, `grad_M` (2, w), are both that of the scene; the mean of the
-    two has less noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
+    trajectories and that of the mean are both that of the scene; the mean of the two has less
+    noise. M, the mean of the values by R, is eliminated: J is J - sum R J / sum R.
+    Args:
+        points: (4, K, w) samples of the row, as of `TrajectorySamples`.
+        M: (w,) their means, ln I.
+        s: (K,) times relative to the target, -1..1.
+        grad_M: (2, w) gradient of the means along x and y, ln I / px.
+        scratch: (10, w).
+        sums: (14, w) N (10 entries) and b (4), added to.
     """
     J, total, means, r = scratch[:4], scratch[4], scratch[5:9], scratch[9]
     total[:] = np.float32(0)
@@ -301,10 +323,17 @@ def _add_pixels(points, M, s, grad_M, scratch, sums):
 
 @njit_noalloc
 def _linearise(begin, end, inputs, scratch, M, out):
-    """Write N (10 entries) and b (4) of the nodes of some rows, and |grad M|: (15,) each.
+    """Write the equations of the nodes of some rows.
 
     Samples of four rows of pixels are kept: memory does not grow with the image. Rows at the border
     of two threads are sampled by both, so a row of M is written when its means are final.
+    Args:
+        begin: First row of nodes.
+        end: Row after the last one.
+        inputs: As of `_sample_row`.
+        scratch: `_SampleScratch`, lines (rows, 28, w), and samples (rows, 4, 4, K, w).
+        M: (h, w) output, robust means, ln I.
+        out: (rows, columns, 15) output: N (10 entries), b (4), and |grad M|, ln I / px.
     """
     h, w = M.shape
     samples, lines, recent = scratch
@@ -335,7 +364,13 @@ def _linearise(begin, end, inputs, scratch, M, out):
 
 @njit_noalloc
 def _smooth_nodes(values, row, out):
-    """Blur nodes by (1, 6, 1) / 8: by a Gaussian of 1 px."""
+    """Blur nodes by (1, 6, 1) / 8 both ways: by a Gaussian of 1 px.
+
+    Args:
+        values: (rows, columns, at least channels) values of nodes.
+        row: (columns, channels) scratch.
+        out: (rows, columns, channels) output.
+    """
     rows, columns, channels = out.shape
     for i in range(rows):
         up, down = max(i - 1, 0), min(i + 1, rows - 1)
@@ -354,7 +389,15 @@ def _smooth_nodes(values, row, out):
 
 @njit_noalloc
 def _weigh_differences(p, edge, horizon, cost, out):
-    """Write the weights of differences between neighbouring nodes, across and down."""
+    """Write the weights of differences between neighbouring nodes.
+
+    Args:
+        p: (rows, columns, 4) trajectories, px.
+        edge: (rows, columns) |grad M|, ln I / px.
+        horizon: Largest distance of an instant from the target, in units of s.
+        cost: `CostParams`.
+        out: (2, rows, columns) output: with the node to the right, and with that below.
+    """
     rows, columns, _ = p.shape
     jump, scale = np.float32(cost.jump), np.float32(cost.edge)
     for i in range(rows):
@@ -420,7 +463,14 @@ def _add_scaled(factor, a, out):
 
 @njit_noalloc_inlined
 def _multiply(N, i, q, out):
-    """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors (4, columns)."""
+    """Multiply the symmetric 4 x 4 matrices of a row of nodes by vectors.
+
+    Args:
+        N: (10, rows, columns) entries of the matrices' upper triangles.
+        i: The row.
+        q: (4, columns) vectors.
+        out: (4, columns) output.
+    """
     for c in range(len(out)):  # numbers that are not known are not unrolled: less to compile
         for x in range(out.shape[1]):
             out[c, x] = np.float32(0)
@@ -431,7 +481,15 @@ def _multiply(N, i, q, out):
 
 @njit_noalloc_inlined
 def _laplacian(q, across, down, i, out):
-    """Write the weighted graph Laplacian (columns,) of a row; all are padded by a node."""
+    """Write the weighted graph Laplacian of a row of nodes.
+
+    Args:
+        q: (rows + 2, columns + 2) one channel, padded by a node.
+        across: (rows, columns + 1) weights of differences along rows, 0 at the ends.
+        down: (rows + 1, columns) weights of those between rows, 0 at the ends.
+        i: The row.
+        out: (columns,) output.
+    """
     width = len(out)
     here, left, right = q[i + 1, 1:-1], q[i + 1, :width], q[i + 1, 2:]
     out[:] = np.float32(0)
@@ -443,7 +501,14 @@ def _laplacian(q, across, down, i, out):
 
 @njit_noalloc_inlined
 def _invert(N, added, scratch, out):
-    """Write the inverse (10 entries) of a symmetric 4 x 4 matrix with `added` on its diagonal."""
+    """Invert a symmetric positive 4 x 4 matrix.
+
+    Args:
+        N: (10,) its upper triangle.
+        added: (4,) added to its diagonal.
+        scratch: (3, 4, 4) in double precision.
+        out: (10,) output, the upper triangle of the inverse.
+    """
     # Cholesky, in double precision: nodes without texture are nearly singular.
     A, C, inverse = scratch[0], scratch[1], scratch[2]
     entry = 0
@@ -519,6 +584,15 @@ def solve_normal_equations(
 @njit_noalloc
 def _solve(eq, p, iterations, scratch, d):
     # Channels come first here, and rows of nodes are what loops go over at once.
+    """Solve the normal equations by conjugate gradients.
+
+    Args:
+        eq: `NormalEquations`, N as 10 entries.
+        p: (rows, columns, 4) trajectories at which they were set up, px.
+        iterations: Number of iterations.
+        scratch: `_SolverScratch` of zeros.
+        d: (rows, columns, 4) output, the step, px.
+    """
     rows, columns, channels = p.shape
     smooth, ridge, beside, below, q = eq.smooth, eq.ridge, scratch.beside, scratch.below, scratch.q
     A, P, vectors, node = scratch.blocks[0], scratch.blocks[1], scratch.vectors, scratch.node

@@ -333,6 +333,15 @@ class _MeanScratch(NamedTuple):
 
 @njit_noalloc_inlined
 def _fill_variance(inputs, k, y, steepness, out):
+    """Write the variance of an image along trajectories, for a row.
+
+    Args:
+        inputs: `_MeanInputs`.
+        k: Index of the instant.
+        y: The row.
+        steepness: (w,) |grad M|^2, (ln I / px)^2.
+        out: (w,) output, (ln I)^2; with the error of warping, but for the target's own image.
+    """
     V, inside = inputs.warped.V[k, y], inputs.warped.inside[k, y]
     here = k == inputs.layout.target
     for x in range(len(V)):
@@ -343,6 +352,14 @@ def _fill_variance(inputs, k, y, steepness, out):
 
 @njit_noalloc_inlined
 def _fill_visibility(residual, tolerance, most, out):
+    """Write how far points are visible, by residuals around them.
+
+    Args:
+        residual: (w,) blurred squared residuals in units of their variance.
+        tolerance: Residual at which a point counts half.
+        most: Greatest residual; larger ones count as this.
+        out: (w,) output, 0..1.
+    """
     one = np.float32(1)
     for x in range(len(residual)):
         ratio = min(residual[x], most) / tolerance
@@ -351,7 +368,16 @@ def _fill_visibility(residual, tolerance, most, out):
 
 @njit_noalloc
 def _update_mean(begin, end, inputs, scratch, turn, means):
-    """Update the mean M of some rows; `means` holds the image to begin from and that to write."""
+    """Update the mean M of some rows.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        inputs: `_MeanInputs`.
+        scratch: `_MeanScratch`.
+        turn: Number of the update, from 0.
+        means: (h, w) image to begin from, and (h, w) output, ln I.
+    """
     warped, rows, one = inputs.warped, scratch.rows[begin], np.float32(1)
     count, h, w = warped.L.shape
     before, M = means
@@ -382,7 +408,15 @@ def _update_mean(begin, end, inputs, scratch, turn, means):
 
 @njit_noalloc
 def _fill_residuals(begin, end, inputs, scratch, M):
-    """Write squared differences from M in units of their variances, blurred along x."""
+    """Write squared differences from M in units of their variances, blurred along x.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        inputs: `_MeanInputs`.
+        scratch: `_MeanScratch`, whose `residuals` are written.
+        M: (h, w) mean, ln I.
+    """
     count, h, w = inputs.warped.L.shape
     variance, ratio, padded = scratch.rows[begin, 0], scratch.rows[begin, 1], scratch.padded[begin]
     for y in range(begin, end):
@@ -396,7 +430,16 @@ def _fill_residuals(begin, end, inputs, scratch, M):
 
 @njit_noalloc_inlined
 def _add_instant(inputs, k, y, visible, variance, sums):
-    """Add an instant to the sums (9, w) that means are made of."""
+    """Add an instant to the sums that means are made of, for a row.
+
+    Args:
+        inputs: `_MeanInputs`.
+        k: Index of the instant.
+        y: The row.
+        visible: (w,) 0..1.
+        variance: (w,), (ln I)^2.
+        sums: (9, w) added to.
+    """
     one, zero, layout, warped = np.float32(1), np.float32(0), inputs.layout, inputs.warped
     near, framed = layout.near[k], layout.framed[k]
     before = framed if layout.s[k] < 0 else zero
@@ -424,7 +467,16 @@ def _add_instant(inputs, k, y, visible, variance, sums):
 
 @njit_noalloc_inlined
 def _add_excess(inputs, k, y, residual, variance, sums):
-    """Add an instant to the excess of squared differences (w,), and to its weight."""
+    """Add an instant to the excess of squared differences, and to its weight, for a row.
+
+    Args:
+        inputs: `_MeanInputs`.
+        k: Index of the instant.
+        y: The row.
+        residual: (w,) blurred squared residuals in units of their variance.
+        variance: (w,), (ln I)^2.
+        sums: M (w,), excess (w,) and weight (w,), of which the last two are added to.
+    """
     M, excess, weight = sums
     one, tolerance = np.float32(1), np.float32(SCATTER_TOLERANCE)
     L, clear = inputs.warped.L[k, y], inputs.warped.clear[k, y]
@@ -440,7 +492,15 @@ def _add_excess(inputs, k, y, residual, variance, sums):
 
 @njit_noalloc
 def _finish(begin, end, inputs, scratch, out):
-    """Write all but the scatter of some rows, and what the scatter is gathered from."""
+    """Write all but the scatter of some rows, and what the scatter is gathered from.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        inputs: `_MeanInputs`.
+        scratch: `_MeanScratch`, whose `excess` and `weight` are written.
+        out: `RobustMean`, output.
+    """
     layout, warped = inputs.layout, inputs.warped
     count, _, w = warped.L.shape
     rows, zero = scratch.rows[begin], np.float32(0)

@@ -440,7 +440,15 @@ class TrajectoryEstimator:
         return motion.at_level(1, self.images.image_shape).p
 
     def _make_anchor(self, at: int, timed: bool) -> Anchor:
-        """Find the motion of the target at a time (us) on one of its clocks, and fuse its image."""
+        """Find the motion of a target on one of its clocks, and fuse its image.
+
+        Args:
+            at: Time of the target, us.
+            timed: Whether on the clock of time, else on the schedule's.
+
+        Returns:
+            The target.
+        """
         motion = self._sought_motion(at).on(timed)
         return self._refine(motion, self._images(motion.instants), self._noise(at))
 
@@ -511,10 +519,16 @@ class TrajectoryEstimator:
         return SoughtMotion(found, other, evidence)
 
     def _prefers_time(self, t: int, anchors: list[int]) -> bool:
-        """Return whether a target at a time (us) is put on the clock of time.
+        """Return whether a target is put on the clock of time.
 
-        The nearest anchor (us) decides, and halfway between two both do: a step of the schedule
-        away from there the weight of the farther one is 0.
+        The nearest anchor decides, and halfway between two both do: a step of the schedule away
+        from there the weight of the farther one is 0.
+        Args:
+            t: Time of the target, us.
+            anchors: Times of the anchors next to it, us, the nearest first.
+
+        Returns:
+            Whether it is; else it is on the schedule's clock.
         """
         evidence = [self._sought_motion(at).evidence for at in anchors]
         if len(anchors) == 1:
@@ -597,7 +611,15 @@ class TrajectoryEstimator:
     def _carry_image(
         self, anchor: Anchor, target: TrajectoryEstimate
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Carry the image of an anchor to a target: log intensity and variance, each (h, w)."""
+        """Carry the image of an anchor to a target.
+
+        Args:
+            anchor: The anchor.
+            target: The target, whose own image stands in where the anchor does not see a point.
+
+        Returns:
+            Log intensity and its variance, each (h, w).
+        """
         if anchor.is_steady != (target.smooth is None):
             fused = fuse_target(self.params, target)
             return np.asarray(fused.L, np.float32), np.asarray(fused.P, np.float32)

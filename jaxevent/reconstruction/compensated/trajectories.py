@@ -117,6 +117,15 @@ def _pack(begin, end, L, V, out):
 
 @njit_noalloc
 def _halve(begin, end, images, scratch, out):
+    """Write rows of images of half the resolution.
+
+    Args:
+        begin: First row of the output.
+        end: Row after the last one.
+        images: (K, h, w).
+        scratch: (rows, w).
+        out: (K, rows, columns) output, half of h and w, rounded up.
+    """
     count, h, w = images.shape
     column = scratch[begin]
     for k in range(count):
@@ -175,8 +184,12 @@ def _median(a, b, c):
 def _move(p, d, longest, scratch, out):
     """Write p + d, each channel of d cut to `longest`, then the median of 3 x 3 nodes.
 
-    All are (rows, columns * channels); `scratch` holds the moved nodes, and three sorted rows that
-    are longer by a node at both ends.
+    Args:
+        p: (rows, columns * channels) trajectories of nodes, px.
+        d: (rows, columns * channels) step, px.
+        longest: (channels,) px.
+        scratch: (rows, columns * channels), and three rows that are longer by a node at both ends.
+        out: (rows, columns * channels) output, px.
     """
     moved, sorted_rows = scratch
     rows, width = p.shape
@@ -415,6 +428,16 @@ def estimate_trajectories(
 
 @njit_noalloc
 def _advect(begin, end, p, s, common, out):
+    """Write the trajectories of the points that some rows of nodes see at another time.
+
+    Args:
+        begin: First row of nodes.
+        end: Row after the last one.
+        p: (rows, columns, 4) trajectories of the points visible at 0, px.
+        s: The other time.
+        common: (2,) displacement that all points share at s, px.
+        out: (rows, columns, 4) output, on the same clock, px.
+    """
     rows, columns, _ = p.shape
     half = np.float32(0.5)  # nodes per px
     for i in range(begin, end):
@@ -491,7 +514,15 @@ class _SearchInputs(NamedTuple):
 
 @njit_noalloc_inlined
 def _read_levels(image, pixel, part, level, V):
-    """Write log intensity and variance of a packed image at points, bilinear."""
+    """Write log intensity and variance of a packed image at points, bilinear.
+
+    Args:
+        image: (h, w, 4) packed image.
+        pixel: (2, points) x and y of the pixel before each point.
+        part: (2, points) distance from that pixel, px.
+        level: (points,) output, ln I.
+        V: (points,) output, (ln I)^2.
+    """
     h, w, _ = image.shape
     for i in range(len(level)):
         x0, y0 = pixel[0, i], pixel[1, i]
@@ -507,6 +538,12 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
     """Write the robust costs of a row's first points into `scratch.lines[begin, 3]`.
 
     Their paths and places at the target stand in `scratch.rows`.
+    Args:
+        count: Number of points.
+        begin: First row of the kernel, whose scratch memory is used.
+        y: Row of the points at the target, px of the images.
+        inputs: `_SearchInputs`.
+        scratch: `_SearchScratch`.
     """
     images, nu = inputs.images, inputs.cost.robust
     h, w = images.pixels.shape[1:3]
@@ -538,14 +575,32 @@ def _evaluate_cost(count, begin, y, inputs, scratch):
 
 @njit_noalloc_inlined
 def _path_difference(own, other):
-    """Return an upper bound (px) of the difference of two paths at the farthest instant."""
+    """Bound the difference of two paths at the farthest instant.
+
+    Args:
+        own: (4,) path, px.
+        other: (4,) path, px.
+
+    Returns:
+        An upper bound of the larger one of the differences along x and y, px.
+    """
     x = abs(other[0] - own[0]) + abs(other[2] - own[2])
     return max(x, abs(other[1] - own[1]) + abs(other[3] - own[3]))
 
 
 @njit_noalloc_inlined
 def _paths_are_alike(paths, y, x, offsets):
-    """Return whether no path nearby differs from a pixel's own."""
+    """Return whether no path nearby differs from a pixel's own.
+
+    Args:
+        paths: (h, w, 4) paths, px.
+        y: Row of the pixel.
+        x: Its column.
+        offsets: (n, 2) rows and columns to the pixels nearby; the first is the pixel itself.
+
+    Returns:
+        Whether all differ by less than `MIN_PATH_DIFFERENCE_PX`.
+    """
     h, w, _ = paths.shape
     for n in range(1, len(offsets)):
         i = min(max(y + offsets[n, 0], 0), h - 1)
@@ -557,7 +612,18 @@ def _paths_are_alike(paths, y, x, offsets):
 
 @njit_noalloc_inlined
 def _list_pixels(y, n, inputs, begin, scratch):
-    """Write the pixels of a row to compare along the `n`th path, with it; return their number."""
+    """Write the pixels of a row to compare along the path at an offset, with that path.
+
+    Args:
+        y: The row.
+        n: Number of the offset; 0: the pixels' own paths.
+        inputs: `_SearchInputs`.
+        begin: First row of the kernel, whose scratch memory is used.
+        scratch: `_SearchScratch`.
+
+    Returns:
+        Their number.
+    """
     paths, offsets, rows = inputs.paths, inputs.offsets, scratch.rows
     h, w, _ = paths.shape
     own, count = scratch.lines[begin, 4], 0
@@ -580,10 +646,16 @@ def _list_pixels(y, n, inputs, begin, scratch):
 
 @njit_noalloc
 def _evaluate_paths(begin, end, inputs, scratch, out):
-    """Write the costs (n, h, w) of the paths at all offsets, blurred along x; the first is its own.
+    """Write the costs of the paths at all offsets, blurred along x; the first is a pixel's own.
 
     Only differences between them count, so they are 0 where no path differs, and those of the own
     path where another is not compared.
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        inputs: `_SearchInputs`.
+        scratch: `_SearchScratch`.
+        out: (n, h, w) output, costs.
     """
     chosen, found, padded = scratch.chosen[begin], scratch.lines[begin, 3], scratch.padded[begin]
     own, other = scratch.lines[begin, 4], scratch.lines[begin, 5]
@@ -603,7 +675,16 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
 
 @njit_noalloc
 def _select(begin, end, inputs, found, scratch, out):
-    """Write the paths that pixels take, by costs that are blurred along x, and the present ones."""
+    """Write the paths that pixels take.
+
+    Args:
+        begin: First row of the pixels that were compared.
+        end: Row after the last one.
+        inputs: `_SearchInputs`.
+        found: Costs (n, rows, columns), blurred along x, and present paths (h, w), as flat indices.
+        scratch: `_SearchScratch`.
+        out: (h, w) output, flat indices of the pixels whose paths are taken.
+    """
     costs, path_index = found
     h, w = path_index.shape
     lines, spacing = scratch.lines[begin], inputs.spacing

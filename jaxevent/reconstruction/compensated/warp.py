@@ -138,7 +138,15 @@ def bilinear_cell(X, Y, h, w):
 
 @njit_noalloc_inlined
 def bilinear_weights(fx, fy):
-    """Return the weights of the pixels (y0, x0), (y0, x1), (y1, x0) and (y1, x1) of a cell."""
+    """Return the weights of the four pixels of a cell.
+
+    Args:
+        fx: Distance from the first pixel along x, 0..1.
+        fy: Distance along y, 0..1.
+
+    Returns:
+        Those of (y0, x0), (y0, x1), (y1, x0) and (y1, x1).
+    """
     one = np.float32(1)
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
 
@@ -179,6 +187,16 @@ def interpolate_path(p, node_y, node_x, out_path):
 
 @njit_noalloc
 def _resample(begin, end, p, scale, factor, out):
+    """Resample the paths of nodes on a grid of another spacing with the same border.
+
+    Args:
+        begin: First row of the output.
+        end: Row after the last one.
+        p: (rows, columns, 4) paths.
+        scale: Points of the output per node, along each axis.
+        factor: Factor on the paths, for another unit.
+        out: (rows, columns, 4) output.
+    """
     ratio, half = np.float32(1) / scale, np.float32(0.5)
     for i in range(begin, end):
         at_y = (np.float32(i) + half) * ratio - half
@@ -270,7 +288,12 @@ def locate_points(y, times, k, image_shape, n_points, scratch_row):
 
 @njit_noalloc_inlined
 def _cubic_weights(part, out):
-    """Write the weights (4, points) of the four pixels around each point along an axis."""
+    """Write the weights of the four pixels around each point along an axis.
+
+    Args:
+        part: (points,) distance from the second of the four, 0..1.
+        out: (4, points) output.
+    """
     a, one, two, three = np.float32(CUBIC_SLOPE), np.float32(1), np.float32(2), np.float32(3)
     for i in range(len(part)):
         f = part[i]
@@ -284,6 +307,14 @@ def _cubic_weights(part, out):
 
 @njit_noalloc_inlined
 def _read_bilinear(image, pixel, part, out):
+    """Read an image at points, bilinear.
+
+    Args:
+        image: (h, w).
+        pixel: (2, points) x and y of the pixel before each point.
+        part: (2, points) distance from that pixel, px.
+        out: (points,) output.
+    """
     h, w = image.shape
     for i in range(len(out)):
         x0, y0 = pixel[0, i], pixel[1, i]
@@ -295,6 +326,14 @@ def _read_bilinear(image, pixel, part, out):
 
 @njit_noalloc_inlined
 def _read_bicubic(image, pixel, weights, out):
+    """Read an image at points, bicubic; the image's border goes on.
+
+    Args:
+        image: (h, w).
+        pixel: (2, points) x and y of the pixel before each point.
+        weights: (8, points) of four pixels along x, then along y, by `_cubic_weights`.
+        out: (points,) output.
+    """
     h, w = image.shape
     for i in range(len(out)):
         x, y, total = int(pixel[0, i]) - 1, int(pixel[1, i]) - 1, np.float32(0)
@@ -315,6 +354,17 @@ def _read_bicubic(image, pixel, weights, out):
 
 @njit_noalloc
 def _warp(begin, end, inputs, scratch, cubic, out):
+    """Read images along the paths of some rows of pixels.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        inputs: L, V and clear (K, h, w), (K,) whether clear is above 0 anywhere, `PathTimes`, and
+            paths (h, w, 4), px.
+        scratch: `RowScratch`.
+        cubic: (rows, 8, w) scratch for weights.
+        out: `WarpedImages`, output.
+    """
     L, V, clear, shown, times, paths = inputs
     count, h, w = L.shape
     path, pixel, part = scratch.path[begin], scratch.pixel[begin], scratch.part[begin]

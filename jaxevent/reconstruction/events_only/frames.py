@@ -43,7 +43,16 @@ class Windows(Protocol):
     """A source of a recording's paths and equations."""
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
-        """Return the paths between two times (us) towards the time `at`."""
+        """Return the paths through a window of time.
+
+        Args:
+            start: Begin of the window, us.
+            stop: Its end, us.
+            at: Time to which points are carried, us.
+
+        Returns:
+            The paths.
+        """
         ...
 
     def rows_around(self, t: int) -> Rows:

@@ -109,6 +109,15 @@ def _add_row(a, b, change, weight, information, eta):
 
 @njit_noalloc
 def _add_rows(rows, weight, c, information, eta):
+    """Add what rows say of the gradient, each shared out among the pixels between its two look-ups.
+
+    Args:
+        rows: `Rows` of a window.
+        weight: (rows,) weights, 1 / (ln I)^2.
+        c: Threshold, ln I, in single precision.
+        information: (height, width, 2, 2) added to.
+        eta: (height, width, 2) information times gradient, added to.
+    """
     width = rows.shape[1]
     for k in range(len(weight)):
         i, j = rows.corner[k, 0], rows.corner[k, 1]
@@ -154,6 +163,14 @@ def _add_span(events, positions, errors, numbers, information, eta):
 
 @njit_noalloc
 def _solve_gradient(information, eta, least, out):
+    """Solve eta = information gradient at each pixel, with a ridge on the information.
+
+    Args:
+        information: (height, width, 2, 2), (px / ln I)^2.
+        eta: (height, width, 2), px / ln I.
+        least: Ridge that is added to the diagonal, beside one relative to the trace.
+        out: (height, width, 2) output, ln I / px.
+    """
     height, width = out.shape[:2]
     for y in range(height):
         for x in range(width):
@@ -186,6 +203,13 @@ def fuse(one: GradientPrior, other: GradientPrior, threshold: float) -> Gradient
 
 @njit_noalloc
 def _add_products(one, other, out):
+    """Write the sum of information times gradient of two priors.
+
+    Args:
+        one: `GradientPrior`.
+        other: `GradientPrior`.
+        out: (height, width, 2) output.
+    """
     height, width = out.shape[:2]
     for y in range(height):
         for x in range(width):
@@ -219,6 +243,14 @@ def discount(
 
 @njit_noalloc
 def _discount(memory, new, numbers, out):
+    """Write a memory's information, less where a new measurement contradicts it.
+
+    Args:
+        memory: `GradientPrior`.
+        new: `GradientPrior`.
+        numbers: Ridge of the information, (px / ln I)^2, and 1 / tail^2.
+        out: (height, width, 2, 2) output.
+    """
     height, width = out.shape[:2]
     least, scale = np.float32(numbers[0]), np.float32(numbers[1])
     for y in range(height):
@@ -273,6 +305,14 @@ def _cubic(f):
 
 @njit_noalloc
 def _carry(places, memory, noise, out):
+    """Write a memory at the pixels of another time: gradients bicubic, information bilinear (5).
+
+    Args:
+        places: (height, width, 2) x and y of the pixels at the memory's time, px.
+        memory: `GradientPrior`.
+        noise: Variance that gradients gain, (ln I / px)^2, and paths, px^2.
+        out: `GradientPrior`, output; as it is where a place is outside the image.
+    """
     height, width = places.shape[:2]
     g, L = memory.gradient, memory.information
     q, P = noise
@@ -334,7 +374,15 @@ class Windows(Protocol):
     thresholds: NDArray[np.float32]  # (2, height, width) ln I, of ON and OFF events
 
     def events(self, first: int, last: int) -> Events:
-        """Return the events of some rows, without those of hot pixels."""
+        """Return the events of some rows, without those of hot pixels.
+
+        Args:
+            first: First row.
+            last: Row after the last one.
+
+        Returns:
+            The events.
+        """
         ...
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> Paths:
@@ -436,7 +484,15 @@ class KeyMemories:
         return carry(memory, paths, at, noise)
 
     def _at_key(self, key: int, side: int) -> GradientPrior | None:
-        """Return the memory at a key of the windows before (side 1) or after it (side -1)."""
+        """Return the memory at a key of the windows on one side of it.
+
+        Args:
+            key: The key.
+            side: 1: windows before it; -1: windows after it.
+
+        Returns:
+            The memory; None where there are none.
+        """
         block = key // KEYS_PER_BLOCK
         number, memories = self._blocks.get(side, (-1, {}))
         if number != block:
@@ -461,7 +517,16 @@ class KeyMemories:
         return memories[key]
 
     def _extend(self, memory: GradientPrior | None, key: int, side: int) -> GradientPrior:
-        """Return the memory at the next key on the way."""
+        """Extend a memory to the next key on the way.
+
+        Args:
+            memory: Memory at the key; None: there is none.
+            key: The key.
+            side: 1: towards later keys; -1: towards earlier ones.
+
+        Returns:
+            The memory at `key + side`.
+        """
         new = self._measure(key, side)
         carried = self._carried(memory, key, self.time(key + side), self.time(key + side + 2))
         if carried is None:

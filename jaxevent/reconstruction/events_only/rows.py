@@ -176,6 +176,21 @@ def make_rows(
 
 @njit_noalloc
 def _lay_rows(pixel, change, positions, times, last, rows):
+    """Lay the rows of all pixels, from event to event and at the ends of the window.
+
+    Args:
+        pixel: (n,) flat index of the pixel of each event.
+        change: (n,) signed change of each event, thresholds.
+        positions: x and y at the target time, px: of pixels at the begin of the window
+            (pixels, 2), of events (n, 2), and of pixels at its end (pixels, 2).
+        times: (n,) times of events, s since the begin, the end, s, and (pixels,) the
+            doubt of paths, (c / s)^2.
+        last: (pixels,) `NONE` or `MUTED`; overwritten by the number of the last event.
+        rows: `Rows`, output.
+
+    Returns:
+        The number of rows; those that leave the image are left out.
+    """
     begin, at_event, end = positions
     t, stop, doubt = times
     n = 0
@@ -209,7 +224,17 @@ def _lay_rows(pixel, change, positions, times, last, rows):
 
 @njit_noalloc_inlined
 def _lay_row(n, after, before, rows):
-    """Write the look-ups of row n, and return 1, or 0 if one is outside the image."""
+    """Write the look-ups of a row.
+
+    Args:
+        n: The row.
+        after: (2,) x and y of the look-up at t_b, px.
+        before: (2,) x and y of that at t_a, px.
+        rows: `Rows`, output.
+
+    Returns:
+        1, or 0 if a look-up is outside the image.
+    """
     height, width = rows.shape
     for side in range(2):
         x, y = (after[0], after[1]) if side == 0 else (before[0], before[1])

@@ -50,6 +50,15 @@ def explained_share(
 
 @njit_noalloc
 def _compare_colours(pixel, sign, places, votes, sums):
+    """Compare each event with those of pixels of the other colour of a chessboard at its place.
+
+    Args:
+        pixel: (n,) flat index of the pixel of each event.
+        sign: (n,) 1 of ON events, -1 of OFF events.
+        places: (n, 2) x and y of each event in the image, px.
+        votes: (2, 2, height, width) of each colour the sum of signs and the number, 0 at first.
+        sums: (2, height, width) output, at the events' pixels: agreement, and number of the others.
+    """
     height, width = sums.shape[1:]
     for is_second in range(2):
         for k in range(len(pixel)):

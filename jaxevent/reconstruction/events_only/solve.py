@@ -338,7 +338,15 @@ def _bend_cells(u: NDArray, params: SolverParams) -> NDArray:
 
 
 def _unseen_variance(system, of_rows):
-    """Return the variance of pixels that neither rows nor the prior of gradients describe."""
+    """Return the variance of pixels that neither rows nor the prior of gradients describe.
+
+    Args:
+        system: `_System` at the solution.
+        of_rows: (height, width) diagonal of its rows.
+
+    Returns:
+        (height, width), squared thresholds.
+    """
     from scipy.ndimage import gaussian_filter
 
     seen, nothing = of_rows.copy(), np.zeros_like(system.across)
@@ -366,7 +374,17 @@ def factor_information(xx: NDArray, xy: NDArray, yy: NDArray) -> NDArray:
 
 
 def _sample_variance(system, preconditioner, order, rng):
-    """Perturb and solve: with b of covariance A, the solution has the covariance A^-1."""
+    """Perturb and solve: with b of covariance A, the solution has the covariance A^-1.
+
+    Args:
+        system: `_System` at the solution.
+        preconditioner: `_Preconditioner` of it.
+        order: (rows,) number of each row in the order in which perturbations are drawn.
+        rng: Generator of NumPy.
+
+    Returns:
+        (height, width) mean square of the samples, squared thresholds.
+    """
     from scipy.ndimage import gaussian_filter
 
     height, width = system.across.shape
@@ -393,7 +411,16 @@ def _sample_variance(system, preconditioner, order, rng):
 
 @njit_fastmath_inlined
 def _row(system, k):
-    """Return the pixels and the coefficients of row k."""
+    """Return the pixels that a row looks up, and their coefficients.
+
+    Args:
+        system: `_System`.
+        k: The row.
+
+    Returns:
+        Eight flat indices, four of the look-up at t_b before four of that at t_a, and eight
+        coefficients.
+    """
     width = system.across.shape[1]
     right, below = (
         np.uint32(min(width - 1, 1)),
@@ -427,7 +454,16 @@ def _row(system, k):
 
 @njit_fastmath_inlined
 def _look_up(pixels, a, u):
-    """Difference of the two look-ups of a row in the flat image u."""
+    """Return the difference of the two look-ups of a row.
+
+    Args:
+        pixels: Eight flat indices, of `_row`.
+        a: Eight coefficients, of `_row`.
+        u: (pixels,) flat image.
+
+    Returns:
+        The difference.
+    """
     after = a[0] * u[pixels[0]] + a[1] * u[pixels[1]] + a[2] * u[pixels[2]] + a[3] * u[pixels[3]]
     before = a[4] * u[pixels[4]] + a[5] * u[pixels[5]] + a[6] * u[pixels[6]] + a[7] * u[pixels[7]]
     return after + before
@@ -435,7 +471,14 @@ def _look_up(pixels, a, u):
 
 @njit_fastmath_inlined
 def _spread(pixels, a, value, out):
-    """Add the transposed of a row times a value to the flat image `out`."""
+    """Add the transposed of a row times a value to an image.
+
+    Args:
+        pixels: Eight flat indices, of `_row`.
+        a: Eight coefficients, of `_row`.
+        value: The value.
+        out: (pixels,) flat image, added to.
+    """
     out[pixels[0]] += a[0] * value
     out[pixels[1]] += a[1] * value
     out[pixels[2]] += a[2] * value
@@ -448,7 +491,13 @@ def _spread(pixels, a, value, out):
 
 @njit_fastmath
 def _add_transposed(system, values, out):
-    """Add D' values to the image `out`."""
+    """Add D' values to an image, D the matrix of all rows.
+
+    Args:
+        system: `_System`.
+        values: (rows,).
+        out: (height, width) image, added to.
+    """
     flat = out.reshape(-1)
     for k in range(len(values)):
         pixels, a = _row(system, k)
@@ -457,14 +506,27 @@ def _add_transposed(system, values, out):
 
 @njit_fastmath_inlined
 def _neighbours(k, n):
-    """Return the indices before and after k, and the scale of their difference."""
+    """Return the neighbours along an axis between which a central difference is taken.
+
+    Args:
+        k: Index of a pixel.
+        n: Length of the axis, px.
+
+    Returns:
+        Index before, index after, and the reciprocal of their distance, 1/px.
+    """
     before, after = max(k - 1, 0), min(k + 1, n - 1)
     return before, after, np.float32(1) / np.float32(max(after - before, 1))
 
 
 @njit_fastmath
 def _add_gradient_transposed(g, out):
-    """Add the transposed of the gradient times g (height, width, 2) to `out`."""
+    """Add the transposed of the gradient times g to an image.
+
+    Args:
+        g: (height, width, 2) along x and y.
+        out: (height, width) image, added to.
+    """
     height, width = out.shape
     for y in range(height):
         above, below, sy = _neighbours(y, height)
@@ -478,14 +540,32 @@ def _add_gradient_transposed(g, out):
 
 @njit_fastmath_inlined
 def _differences_of_cell(u, y, x):
-    """Return the differences across, above and below, and down, left and right."""
+    """Return the four differences of a cell.
+
+    Args:
+        u: (height, width) image.
+        y: Row of the cell's first pixel.
+        x: Its column.
+
+    Returns:
+        The differences across, above and below, and down, left and right.
+    """
     upper, lower = u[y, x + 1] - u[y, x], u[y + 1, x + 1] - u[y + 1, x]
     return upper, lower, u[y + 1, x] - u[y, x], u[y + 1, x + 1] - u[y, x + 1]
 
 
 @njit_fastmath_inlined
 def _add_cell(image, curvature, u, y, x, out):
-    """Add the part of the second derivative that couples the differences of a cell, times u."""
+    """Add the part of the second derivative that couples the differences of a cell, times u.
+
+    Args:
+        image: (height, width) image at which the derivative is taken.
+        curvature: phi'' of the cell.
+        u: (height, width) image.
+        y: Row of the cell's first pixel.
+        x: Its column.
+        out: (height, width) image, added to.
+    """
     a, b, c, d = _differences_of_cell(image, y, x)
     ua, ub, uc, ud = _differences_of_cell(u, y, x)
     value = curvature * (a * ua + b * ub + c * uc + d * ud)
@@ -497,7 +577,13 @@ def _add_cell(image, curvature, u, y, x, out):
 
 @njit_fastmath
 def _apply(system, u, out):
-    """Write A u to `out`."""
+    """Write A u.
+
+    Args:
+        system: `_System`.
+        u: (height, width) image.
+        out: (height, width) output.
+    """
     height, width = u.shape
     for y in range(height):
         for x in range(width):
@@ -547,7 +633,13 @@ def _apply(system, u, out):
 
 @njit_fastmath
 def _add_row_diagonal(system, diagonal, bend):
-    """Add diag(D' W D) to `diagonal`, and half of w |b - a|^2 to `bend` at both ends of rows."""
+    """Add diag(D' W D) to `diagonal`, and half of w |b - a|^2 to `bend` at both ends of rows.
+
+    Args:
+        system: `_System`.
+        diagonal: (pixels,) flat image, added to.
+        bend: (pixels,) flat image, added to.
+    """
     width = system.across.shape[1]
     reciprocal, half = np.float32(1) / np.float32(width), np.float32(0.5)
     for k in range(len(system.weight)):
@@ -598,14 +690,28 @@ def _add_image_diagonal(system, out):
 
 @njit_fastmath_inlined
 def _coarse_rows(y, n):
-    """Return the nearer and the farther of the n coarse rows around a fine one."""
+    """Return the coarse rows around a fine one.
+
+    Args:
+        y: The fine row.
+        n: Number of coarse rows.
+
+    Returns:
+        The nearer and the farther one.
+    """
     near = y >> 1
     return near, min(max(near + ((y & 1) << 1) - 1, 0), n - 1)
 
 
 @njit_fastmath_inlined
 def _restrict(fine, coarse, line):
-    """Add a grid to one of half its nodes each way, the transpose of `_interpolate`."""
+    """Add a grid to one of half its nodes each way, the transpose of `_interpolate`.
+
+    Args:
+        fine: (height, width) values.
+        coarse: (rows, columns) values, added to; half of each, rounded up.
+        line: Scratch for a coarse row.
+    """
     near, far = np.float32(0.75), np.float32(0.25)
     (height, width), (rows, columns) = fine.shape, coarse.shape
     for y in range(height):
@@ -626,7 +732,13 @@ def _restrict(fine, coarse, line):
 
 @njit_fastmath_inlined
 def _interpolate(coarse, fine, line):
-    """Add a grid to one of twice its nodes each way, bilinear between centres of cells."""
+    """Add a grid to one of twice its nodes each way, bilinear between centres of cells.
+
+    Args:
+        coarse: (rows, columns) values.
+        fine: (height, width) values, added to.
+        line: Scratch for a coarse row.
+    """
     near, far = np.float32(0.75), np.float32(0.25)
     (height, width), (rows, columns) = fine.shape, coarse.shape
     for y in range(height):
@@ -658,7 +770,13 @@ def _fill_grids(scratch, r):
 
 @njit_fastmath
 def _precondition(scratch, r, z):
-    """Write the reciprocal diagonals of pixels and coarser grids, applied to r, to z."""
+    """Precondition a residual by the reciprocal diagonals of pixels and coarser grids.
+
+    Args:
+        scratch: `_ScratchArrays`, with the diagonals.
+        r: (height, width) residual.
+        z: (height, width) output.
+    """
     grids = scratch.grids
     height, width = r.shape
     _fill_grids(scratch, r)
@@ -683,7 +801,15 @@ def _precondition(scratch, r, z):
 
 @njit_fastmath
 def _reweight(system, u, data, numbers, residual):
-    """Write the residuals and weights of the image u, and the weights of its differences."""
+    """Write the residuals of an image, and the weights of its rows and differences.
+
+    Args:
+        system: `_System`, whose `weight`, `across` and `down` are overwritten.
+        u: (height, width) image, thresholds.
+        data: (rows,) changes d_k and weights w_k of the energy.
+        numbers: `tail`, `gradient` and `edge`.
+        residual: (rows,) output, thresholds.
+    """
     change, base = data
     tail, gradient, edge = numbers
     image = u.reshape(-1)
@@ -710,10 +836,18 @@ def _reweight(system, u, data, numbers, residual):
 
 @njit_fastmath
 def _turn(r, before, z, rho, p):
-    """Turn the direction p by the preconditioned residual z; return r' z.
+    """Turn the direction of conjugate gradients by a preconditioned residual.
 
-    `rho` is what the step before returned, or 0. As the matrix changes, directions are those of
-    Polak and Ribiere.
+    As the matrix changes, directions are those of Polak and Ribiere.
+    Args:
+        r: (pixels,) residual.
+        before: (pixels,) residual of the step before.
+        z: (pixels,) preconditioned residual.
+        rho: What the step before returned, or 0.
+        p: (pixels,) direction, in place.
+
+    Returns:
+        r' z.
     """
     new, same = np.float32(0), np.float32(0)
     for k in range(len(r)):
@@ -727,7 +861,18 @@ def _turn(r, before, z, rho, p):
 
 @njit_fastmath
 def _advance(p, Ap, u, r, before):
-    """Go along the direction p to the minimum there; return whether there is one."""
+    """Go along a direction to the minimum there.
+
+    Args:
+        p: (pixels,) direction.
+        Ap: (pixels,) A times the direction.
+        u: (pixels,) image, in place.
+        r: (pixels,) residual, in place.
+        before: (pixels,) output, the residual before the step.
+
+    Returns:
+        Whether there is a minimum; else nothing changes.
+    """
     along, curvature = np.float32(0), np.float32(0)
     for k in range(len(p)):
         along += r[k] * p[k]
@@ -745,7 +890,16 @@ def _advance(p, Ap, u, r, before):
 def _conjugate_gradients(system, b, u, scratch, stage):
     """Take steps towards A u = b, in place; go on with the directions of the call before.
 
-    Weights may have changed since. `stage` has what that call returned, or 0, and how many steps.
+    Weights may have changed since.
+    Args:
+        system: `_System`, with A.
+        b: (height, width) right side.
+        u: (height, width) image, in place.
+        scratch: `_ScratchArrays` of the preconditioner, with the direction of the call before.
+        stage: What that call returned, or 0, and the number of steps.
+
+    Returns:
+        r' z of the last step, for the next call; 0 or less where there is nothing left to do.
     """
     convert = u.dtype.type
     rho, steps = convert(stage[0]), stage[1]

@@ -86,7 +86,17 @@ class WindowSolver:
         return make_rows(events, paths, self.thresholds, self.shape, span, self.muted)
 
     def paths(self, start: int, stop: int, at: int, *, until: int | None = None) -> WindowPaths:
-        """Return the paths of points through a window, see `EventFlow.paths`."""
+        """Return the paths of points through a window, see `EventFlow.paths`.
+
+        Args:
+            start: Begin of the window, us.
+            stop: Its end, us.
+            at: Time to which points are carried, us.
+            until: Time up to which a causal flow may use events, us; None: the latest of the three.
+
+        Returns:
+            The paths.
+        """
         if isinstance(self.flow, EventFlow):
             return self.flow.paths(start, stop, at, until=until)
         low, high = min(start, at), max(stop, at)
