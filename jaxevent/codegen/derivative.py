@@ -101,7 +101,15 @@ def with_derivatives(
 
 
 def derivative_name(name: str, direction: int) -> str:
-    """Return the name of a single number's derivative: "sensitivities['a'].b.2" for "a.b.0"."""
+    """Return the name of a single number's derivative: "sensitivities['a'].b.2" for "a.b.0".
+
+    Args:
+        name: Name of the number.
+        direction: Place among the directions of derivatives.
+
+    Returns:
+        The name.
+    """
     tree, rest = re.split(r"\b", name.removesuffix(".0"), maxsplit=2)[1:]
     return f"sensitivities['{tree}']{rest}.{direction}"
 
@@ -114,6 +122,14 @@ def parse_derivative(name: str) -> tuple[str, int] | None:
 
 def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node, Node]:
     """Return the factor of each change in a sum of products.
+
+    Args:
+        result: The sum.
+        changes: The changes.
+        graph: Maker of nodes.
+
+    Returns:
+        Factors, by change.
 
     Raises:
         TranslationError: The result is no such sum.
@@ -139,7 +155,20 @@ def linear_factors(result: Node, changes: set[Node], graph: Graph) -> dict[Node,
 
 
 def _passed(node: Node, at: Node, moving: set[Node], graph: Graph) -> list[tuple[Node, Node]]:
-    """Return the factors of a node's arguments, from the node's own."""
+    """Return the factors of a node's arguments, from the node's own.
+
+    Args:
+        node: The node.
+        at: Factor of the node itself.
+        moving: Nodes that depend on the changes.
+        graph: Maker of nodes.
+
+    Returns:
+        Pairs of an argument that moves, and its factor.
+
+    Raises:
+        TranslationError: The node is no term of a sum of products.
+    """
     apply, args = graph.apply, node.args
     minus = apply("neg", (at,), "f")
     if node.op in ("add", "sub"):

@@ -123,7 +123,16 @@ class Graph:
         return self._known[key]
 
     def input(self, name: str, kind: str, level: Level) -> Node:
-        """Return the node of an input."""
+        """Return the node of an input.
+
+        Args:
+            name: Name of the input.
+            kind: Kind of number, as of `Node.kind`.
+            level: Time at which it is known.
+
+        Returns:
+            The node.
+        """
         return self.node("input", (name,), kind, level)
 
     def constant(self, value: Any) -> Node:
@@ -156,6 +165,13 @@ class Graph:
         """Return an operation in simpler form, or None.
 
         Tables and parameters are taken to be finite.
+
+        Args:
+            op: Name of the operation.
+            args: Its arguments.
+
+        Returns:
+            The simpler node; None: there is none.
         """
         value = [constant_value(a) for a in args]
         if op in FOLDABLE_FUNCTIONS and all(v is not None for v in value):
@@ -191,7 +207,16 @@ class Graph:
         return None
 
     def _selected(self, which: Node, no: Node, yes: Node) -> Node | None:
-        """Simplify `select_n`: a truth value as a number is known where it chooses."""
+        """Simplify `select_n`: a truth value as a number is known where it chooses.
+
+        Args:
+            which: Truth value.
+            no: Result where it is false.
+            yes: Result where it is true.
+
+        Returns:
+            The simpler node; None: there is none.
+        """
         number = self._number_of(which)
         if number is not None and number in (no, yes):
             no = self.constant(0.0) if no is number else no
@@ -202,7 +227,16 @@ class Graph:
         return no if no is yes else None
 
     def _compared(self, op: str, args: tuple[Any, ...], bound: Any) -> Node | None:
-        """Simplify the comparison of a truth value as a number with a constant."""
+        """Simplify the comparison of a truth value as a number with a constant.
+
+        Args:
+            op: Name of the comparison.
+            args: Its two arguments, of which the first may be such a number.
+            bound: Value of the second one; None: it is no constant.
+
+        Returns:
+            The simpler node; None: there is none.
+        """
         number = args[0]
         if bound is None or number.op != "to_f" or number.args[0].kind != "b":
             return None
@@ -216,7 +250,16 @@ class Graph:
         return self._known.get(("to_f", "f", truth.level, truth.number))
 
     def assume_truth(self, results: dict[str, Node], truth: Node, value: bool) -> dict[str, Node]:
-        """Return the results where a truth value is known."""
+        """Simplify results where a truth value is known.
+
+        Args:
+            results: Results by name.
+            truth: The truth value.
+            value: Its value.
+
+        Returns:
+            The results, by name.
+        """
         found = {truth: self.constant(value)}
         for node in find_dependencies([*results.values()], {truth}):
             if node not in found:
@@ -238,6 +281,13 @@ def find_dependencies(results: list[Node], stop: set[Node] | None = None) -> lis
     """Return the nodes that results depend on, in order of creation.
 
     `stop` ones are followed no further.
+
+    Args:
+        results: The results, which are among the nodes.
+        stop: Nodes whose arguments are not followed; None: there are none.
+
+    Returns:
+        The nodes.
     """
     found: dict[int, Node] = {}
     waiting = list(results)
@@ -470,6 +520,13 @@ def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:
     """Evaluate a scan step by step.
 
     By JAX where the steps take slices, or their results are stacked.
+
+    Args:
+        eqn: Equation of a jaxpr, a scan.
+        values: Its inputs.
+
+    Returns:
+        Its outputs.
     """
     p = eqn.params
     body = p["jaxpr"].jaxpr

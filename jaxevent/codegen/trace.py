@@ -85,7 +85,18 @@ class JaxprTranslator:
         return None
 
     def translate_lookup(self, found: NDArray, kind: str) -> NDArray:
-        """Translate elements that were looked up by a `ConstantArray` at a point."""
+        """Translate elements that were looked up by a `ConstantArray` at a point.
+
+        Args:
+            found: Nodes of the elements, of any shape.
+            kind: Kind of number, as of `Node.kind`.
+
+        Returns:
+            Nodes, of the same shape.
+
+        Raises:
+            TranslationError: The family has no such look-ups.
+        """
         raise TranslationError("a look-up at a place")
 
     def run(self, closed: Any, values: list[Value]) -> list[Value]:
@@ -257,7 +268,15 @@ class JaxprTranslator:
         return array
 
     def _argmax(self, array: NDArray, axis: int) -> NDArray:
-        """Return the index of the largest element along an axis, the first of equal ones."""
+        """Return the index of the largest element along an axis, the first of equal ones.
+
+        Args:
+            array: Array of nodes.
+            axis: The axis.
+
+        Returns:
+            Array of nodes of integers, without the axis.
+        """
         apply, parts = self.graph.apply, np.moveaxis(array, axis, 0)
         out = np.empty(parts.shape[1:], object)
         for place in np.ndindex(*out.shape):
@@ -370,7 +389,16 @@ class JaxprTranslator:
         return out
 
     def _table_row(self, table: ParameterArray, row: int, size: int) -> ParameterArray:
-        """Return a row of a table."""
+        """Cut a row out of a table.
+
+        Args:
+            table: Two-dimensional value of the host.
+            row: Number of the row.
+            size: Length of a row.
+
+        Returns:
+            The row, a further value of the host.
+        """
         out = [types.SimpleNamespace(aval=self.host.values[table.number])]
         cut = {"start_indices": (row, 0), "limit_indices": (row + 1, size), "strides": None}
         number = table.number
@@ -561,7 +589,15 @@ class TracedProgram:
 
 
 def named_leaves(name: str, tree: Any) -> dict[str, Any]:
-    """Return the leaves of a tree of arrays or shapes, by their names in kernels."""
+    """Return the leaves of a tree of arrays or shapes, by their names in kernels.
+
+    Args:
+        name: Name of the tree.
+        tree: The tree.
+
+    Returns:
+        The leaves, by name.
+    """
     found = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {name + jax.tree_util.keystr(path): leaf for path, leaf in found}
 

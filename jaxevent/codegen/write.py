@@ -292,7 +292,15 @@ class ModuleWriter:
         return bool(operands) and node.op in BLOCK_OPERATIONS[operands[0].kind]
 
     def _block(self, nodes: list[Node], results: list[Node]) -> str:
-        """Define the block of some nodes, and write the line that calls it."""
+        """Define the block of some nodes, and write the line that calls it.
+
+        Args:
+            nodes: The nodes.
+            results: Those that are used outside the block.
+
+        Returns:
+            The line.
+        """
         made, given, lines = set(nodes), dict[str, str](), []
         for node in nodes:
             what, address = [node.op], self._address(node)
