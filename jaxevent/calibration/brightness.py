@@ -247,6 +247,16 @@ def _spread(t, k, m, u, v, length):
 
 @njit_noalloc
 def _read(events, path, begin, end, longest, out):
+    """Read interpolated counts at exposures.
+
+    Args:
+        events: `PixelEvents`.
+        path: `Interpolation` of them.
+        begin: (frames,) begins of the exposures, us since `path.origin`.
+        end: (frames,) their ends, likewise.
+        longest: Time between events from which a pixel does not count, s.
+        out: `Positions`, output.
+    """
     _, p, first, _, clear = events
     t, counts, bend, integral, _ = path
     good, gaps, mean, edges, travel, spread = out

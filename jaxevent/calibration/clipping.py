@@ -108,6 +108,15 @@ def _expected_excess(recording: Recording, grey: NDArray, level: float, share: f
 
     If the density of ln I falls exponentially, with mean m, from the band below white on, then the
     band holds exp(BAND / m) - 1 pixels for each one beyond white.
+
+    Args:
+        recording: The recording, for its response.
+        grey: (n,) grey values of sampled pixels, 0 to 1.
+        level: Grey value beyond which pixels are clipped.
+        share: Part of the pixels beyond it.
+
+    Returns:
+        The excess, ln I, within `EXCESS_BOUNDS`.
     """
     intensity = np.asarray(recording.response.intensity(np.append(grey, level)))
     light, white = intensity[:-1], intensity[-1]

@@ -156,6 +156,14 @@ def _sum_by_tile(
 
 @njit_noalloc
 def _add_by_tile(counts, weights, tile, out):
+    """Add up weighted counts by tile.
+
+    Args:
+        counts: (lags, pixels).
+        weights: (pixels, k).
+        tile: (pixels,) number of each pixel's tile.
+        out: (lags, tiles, k) added to.
+    """
     for j in range(counts.shape[0]):
         for i in range(counts.shape[1]):
             for k in range(weights.shape[1]):
@@ -258,7 +266,15 @@ def turn_events(sample: Sample, name: str, inverted: bool) -> Sample:
 
 
 def _pair(segment: SampledSegment, row: int) -> SampledSegment:
-    """Return a segment with two frames."""
+    """Cut two consecutive frames out of a segment.
+
+    Args:
+        segment: The segment.
+        row: Number of the first frame in it.
+
+    Returns:
+        The segment with their intensities and clear pixels; other columns are as they were.
+    """
     two = slice(row, row + 2)
     return segment._replace(intensity=segment.intensity[two], clear=segment.clear[two])
 

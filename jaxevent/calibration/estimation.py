@@ -128,7 +128,17 @@ def _is_significant(sample: Sample) -> bool:
 
 
 def _interval(value: float, error: float, unit: str, note: str = "") -> CalibrationValue:
-    """Return a positive value with the interval of its logarithm."""
+    """Make a value of a positive quantity, with the interval of its logarithm.
+
+    Args:
+        value: The estimate.
+        error: Its standard deviation, in the same unit.
+        unit: The unit.
+        note: A note on it.
+
+    Returns:
+        The value.
+    """
     wide = math.exp(min(CONFIDENCE_Z * error / value, 50.0))
     return CalibrationValue(value, value / wide, value * wide, unit, note)
 
@@ -152,6 +162,11 @@ def _fit_sensor(
 
     Where thresholds are not the same at all intensities, changes lie off the model by more than
     noise, and the clock follows them: the fit is at the dark offset that the frames prefer.
+    Args:
+        sample: Sample of the recording.
+        slope: (2, entries) grey values, and dI/dg there.
+        clock: Clock offsets that were tried.
+        is_unknown: Whether some exposures are not known, so that their length is fitted.
 
     Returns:
         The likelihood at that offset, and its fit; the first ones where too few changes count at
@@ -234,6 +249,15 @@ def _by_whole_events(
 
     Whole events are late, and of small changes they miss a part, so that intervals are wide. The
     clock is that of the sensor: the offset at which whole events fit best, less their lateness.
+    Args:
+        sample: Sample of the recording.
+        I0: Offset inside the logarithm.
+        ratio: c_on / c_off.
+        dead: Dead time, s.
+        clock: Clock offsets that were tried.
+
+    Returns:
+        The values.
     """
     why = "too few pixels change brightness while frames are taken"
     rest = _without_fit(sample, ratio, dead, why, clock)
@@ -315,7 +339,16 @@ def _thresholds(fit: Fit) -> tuple[CalibrationValue, CalibrationValue, Calibrati
 
 
 def _gap(fit: Fit, column: int, power: int) -> float:
-    """Return the mean power of the time (s) between events where they tell of a parameter."""
+    """Return the mean power of the time between events where they tell of a parameter.
+
+    Args:
+        fit: The fit.
+        column: Number of the parameter in theta.
+        power: The power.
+
+    Returns:
+        The mean, s^power.
+    """
     weight = fit.weight * fit.terms.J[:, column] ** 2
     return float(np.average(fit.changes.gap**power, weights=weight + 1e-300))
 
@@ -351,7 +384,15 @@ def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
 
 
 def _anchor(offset: CalibrationValue, exposure: CalibrationValue) -> CalibrationValue:
-    """Say where in the exposure the stamps lie, if the clocks are the same."""
+    """Find where in the exposure the stamps lie, if the clocks are the same.
+
+    Args:
+        offset: Offset of the clock, s.
+        exposure: Length of the exposures, s.
+
+    Returns:
+        The place, in exposures: 0 the begin, 1 the end.
+    """
     if not exposure.is_identifiable or exposure.low <= 0:
         return not_identifiable("exposure", "exposures are not known")
     # Stamps at the begin of exposures are half of one before their middle.

@@ -175,7 +175,15 @@ def _differences(
 
 
 def _estimate_ratio(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> CalibrationValue:
-    """Estimate c_on / c_off from ON and OFF counts (2, height, width)."""
+    """Estimate c_on / c_off from counts of events.
+
+    Args:
+        counts: (2, height, width) ON and OFF events.
+        hot: (height, width) whether a pixel is hot.
+
+    Returns:
+        The ratio.
+    """
     on, off = counts[:, ~hot]
     if min(on.sum(), off.sum()) < MIN_EVENTS:
         return not_identifiable("1", "too few events of one polarity")

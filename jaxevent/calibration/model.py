@@ -180,7 +180,15 @@ class Model:
         return float(np.median(np.concatenate(steps))) * 1e-6
 
     def _lengths(self, segment: SampledSegment, theta: NDArray) -> NDArray[np.float64]:
-        """Return the lengths of exposures, us."""
+        """Return the lengths of exposures.
+
+        Args:
+            segment: A segment of frames.
+            theta: (5,) parameters, as of `Physics`; the last one stands for unknown lengths.
+
+        Returns:
+            (frames,) us, at least `SHORTEST_US`.
+        """
         unknown = 1e6 * np.sqrt(max(theta[4], 0))
         return np.maximum(np.where(segment.exposure > 0, segment.exposure, unknown), SHORTEST_US)
 
@@ -314,7 +322,15 @@ class Model:
         return Fit(new, np.zeros((5, 5)), losses, changes, terms, weight), move
 
     def _bounded(self, theta: NDArray, move: NDArray) -> NDArray[np.float64]:
-        """Return parameters after a move, within their bounds."""
+        """Return parameters after a move, within their bounds.
+
+        Args:
+            theta: (5,) parameters, as of `Physics`.
+            move: (5,) change of them.
+
+        Returns:
+            (5,) new parameters.
+        """
         new = theta + move
         new[:2] = np.clip(new[:2], theta[:2] / 2, theta[:2] * 2)
         new[3] = np.clip(new[3], 0, self.interval_s / 4)
@@ -324,7 +340,15 @@ class Model:
 
 
 def losses_of(residual: NDArray, variance: NDArray) -> NDArray[np.float64]:
-    """Return the negative log likelihood of each change under Student's t, but for a constant."""
+    """Return the negative log likelihood of changes under Student's t, but for a constant.
+
+    Args:
+        residual: (n,) ln I.
+        variance: (n,) its variance, (ln I)^2.
+
+    Returns:
+        (n,).
+    """
     nu = DEGREES_OF_FREEDOM
     return np.log(variance) / 2 + (nu + 1) / 2 * np.log1p(residual**2 / variance / nu)
 

@@ -136,7 +136,15 @@ def hash_content(recording: Recording, what: float | str) -> str:
 
 
 def _spread(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
-    """Return at most `count` evenly spread values, the first and the last among them."""
+    """Choose evenly spread values, the first and the last among them.
+
+    Args:
+        values: (n,) values.
+        count: Most values to choose.
+
+    Returns:
+        (at most count,) values.
+    """
     if len(values) <= count:
         return values
     return values[np.linspace(0, len(values) - 1, count).round().astype(int)]

@@ -72,7 +72,17 @@ MAX_VARIANCE = 1.0  # px^2, along any direction, of what counts as known
 
 @njit_noalloc_inlined
 def _node_cell(u, spacing, x, y):
-    """Return the node before a place and the distance from it, in nodes."""
+    """Find the node before a place and the distance from it.
+
+    Args:
+        u: (rows, columns, ...) values of nodes.
+        spacing: Distance of nodes, px.
+        x: Place along x, px; beyond the outer nodes it is moved to them.
+        y: Place along y, likewise.
+
+    Returns:
+        Column and row of the node, and distances along x and y, in nodes.
+    """
     rows, columns = u.shape[0], u.shape[1]
     a = min(max(x / spacing - 0.5, 0.0), columns - 1.0)
     b = min(max(y / spacing - 0.5, 0.0), rows - 1.0)
@@ -82,7 +92,17 @@ def _node_cell(u, spacing, x, y):
 
 @njit_noalloc_inlined
 def _displacement_at(u, spacing, x, y):
-    """Return the displacement at a place, bilinear between nodes at (k + 1/2) spacing."""
+    """Return the displacement at a place, bilinear between nodes at (k + 1/2) spacing.
+
+    Args:
+        u: (rows, columns, 2) displacement of nodes, px.
+        spacing: Distance of nodes, px.
+        x: Place along x, px.
+        y: Place along y, px.
+
+    Returns:
+        The displacement along x and along y, px.
+    """
     i, j, fx, fy = _node_cell(u, spacing, x, y)
     i2, j2 = min(i + 1, u.shape[1] - 1), min(j + 1, u.shape[0] - 1)
     a, b, c, d = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
@@ -96,7 +116,16 @@ def _displacement_at(u, spacing, x, y):
 def _warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
     """Move events along the displacement and add each to sum, number and mean time of cells.
 
-    `image` (3, rows, columns) has a border of one cell; `warped` (n, 2) gets the places in cells.
+    Args:
+        x: (n,) positions along x, px.
+        y: (n,) positions along y, px.
+        s: (n,) relative times.
+        p: (n,) polarities, as of `WindowEvents`.
+        u: (rows, columns, 2) displacement of nodes, px per unit of s.
+        spacing: Distance of nodes, px.
+        cell: Size of cells, px.
+        warped: (n, 2) output, x and y in cells; x is -1 outside the image.
+        image: (3, rows, columns) output with a border of a cell: sums of p, of 1 and of s.
     """
     rows, columns = image.shape[1], image.shape[2]
     image[:] = 0
@@ -121,7 +150,13 @@ def _warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
 
 @njit_noalloc
 def _blur(image, scratch, passes):
-    """Convolve an image with (1, 2, 1) / 4 along both axes, some times; edges repeat."""
+    """Convolve an image with (1, 2, 1) / 4 along both axes, in place; edges repeat.
+
+    Args:
+        image: (rows, columns), in place.
+        scratch: (rows, columns).
+        passes: How many times.
+    """
     rows, columns = image.shape
     for _ in range(passes):
         for j in range(rows):
@@ -136,7 +171,16 @@ def _blur(image, scratch, passes):
 
 @njit_noalloc_inlined
 def _look_up(image, a, b):
-    """Return gradient, sum, number and mean time of an image's cells at a place; bilinear."""
+    """Look up images of cells at a place, bilinear.
+
+    Args:
+        image: (3, rows, columns) blurred images of `_warp_and_vote`.
+        a: Place along x, in cells.
+        b: Place along y, in cells.
+
+    Returns:
+        Gradient of the sum along x and y, per cell; sum, number, and sum of times.
+    """
     i, j = int(a), int(b)
     fx, fy = a - i, b - j
     gx = gy = value = number = late = 0.0
@@ -213,7 +257,16 @@ def _accumulate(warped, s, p, place, u, spacing, cell, image, normal, clock):
 
 @njit_noalloc
 def _solve_step(u, surface, normal, smoothness, edge, step):
-    """Solve (2) for the step (rows, columns, 2) of the displacement, by Gauss-Seidel."""
+    """Solve (2) for the step of the displacement, by Gauss-Seidel.
+
+    Args:
+        u: (rows, columns, 2) displacement of nodes, px.
+        surface: (rows, columns, 2) surface (3), px.
+        normal: (rows, columns, 6), of `_accumulate`.
+        smoothness: Weight of the second sum.
+        edge: Difference from which neighbours count less, px.
+        step: (rows, columns, 2) output, px.
+    """
     rows, columns = u.shape[0], u.shape[1]
     step[:] = 0
     for _ in range(N_SWEEPS):
@@ -238,17 +291,42 @@ def _solve_step(u, surface, normal, smoothness, edge, step):
 
 
 def _image_shape(shape: tuple[int, int], cell: float) -> tuple[int, int]:
-    """Return rows and columns of an image of cells, with a border of one."""
+    """Return rows and columns of an image of cells, with a border of one.
+
+    Args:
+        shape: Height and width of the sensor, px.
+        cell: Size of cells, px.
+
+    Returns:
+        Rows and columns.
+    """
     return int(np.ceil(shape[0] / cell)) + 2, int(np.ceil(shape[1] / cell)) + 2
 
 
 def _node_shape(shape: tuple[int, int], spacing: float) -> tuple[int, int]:
-    """Return rows and columns of the nodes of a sensor (H, W)."""
+    """Return rows and columns of the nodes of a sensor.
+
+    Args:
+        shape: Height and width of the sensor, px.
+        spacing: Distance of nodes, px.
+
+    Returns:
+        Rows and columns, at least 1 each.
+    """
     return max(int(np.ceil(shape[0] / spacing)), 1), max(int(np.ceil(shape[1] / spacing)), 1)
 
 
 def _fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[np.float32]:
-    """Interpolate values of nodes (rows, columns, ...) bilinearly to all pixels (H, W, ...)."""
+    """Interpolate values of nodes bilinearly to all pixels.
+
+    Args:
+        u: (rows, columns, ...) values of nodes.
+        shape: Height and width of the sensor, px.
+        spacing: Distance of nodes, px.
+
+    Returns:
+        (H, W, ...).
+    """
     for axis in (0, 1):
         a = np.clip((np.arange(shape[axis])) / spacing - 0.5, 0, u.shape[axis] - 1)
         i = np.minimum(a.astype(int), max(u.shape[axis] - 2, 0))
@@ -259,7 +337,15 @@ def _fill_pixels(u: NDArray, shape: tuple[int, int], spacing: float) -> NDArray[
 
 
 def _quadratic_basis(x: NDArray, y: NDArray) -> NDArray[np.float64]:
-    """Return the eight fields of (3) at places (n,), (2, 8, n)."""
+    """Return the eight fields of (3) at some places.
+
+    Args:
+        x: (n,) places along x.
+        y: (n,) places along y.
+
+    Returns:
+        (2, 8, n), along x and y.
+    """
     one, zero = np.ones_like(x), np.zeros_like(x)
     along_x = [one, x, y, zero, zero, zero, x * x, x * y]
     return np.array([along_x, [zero, zero, zero, one, x, y, x * y, y * y]])
@@ -380,18 +466,42 @@ class Displacement(NamedTuple):
 
 
 def _principal(information: NDArray, reach: int) -> tuple[NDArray, NDArray]:
-    """Return eigenvalues and axes of the information of nodes within a Gaussian."""
+    """Return eigenvalues and axes of the information of nodes within a Gaussian.
+
+    Args:
+        information: (rows, columns, 3), xx, xy and yy, 1/px^2.
+        reach: Standard deviation of the Gaussian, in nodes.
+
+    Returns:
+        Eigenvalues (rows, columns, 2), 1/px^2, rising, and axes as columns (rows, columns, 2, 2).
+    """
     pooled = gaussian_filter(information, (reach, reach, 0), mode="constant")
     return np.linalg.eigh(4 * np.pi * reach**2 * pooled[..., [[0, 1], [1, 2]]])
 
 
 def _rotate(axes: NDArray, values: NDArray) -> NDArray:
-    """Return matrices of these axes and eigenvalues."""
+    """Return matrices of these axes and eigenvalues.
+
+    Args:
+        axes: (..., 2, 2) axes as columns.
+        values: (..., 2) eigenvalues.
+
+    Returns:
+        (..., 2, 2).
+    """
     return (axes * values[..., None, :]) @ np.swapaxes(axes, -1, -2)
 
 
 def _mean_square_difference(u: NDArray, reach: int) -> NDArray[np.float64]:
-    """Return the mean square of differences from nodes around, `reach` and twice as far, px^2."""
+    """Return the mean square of differences from nodes around, `reach` and twice as far.
+
+    Args:
+        u: (rows, columns, 2) displacement, px.
+        reach: Distance of these nodes, in nodes.
+
+    Returns:
+        (rows, columns), px^2.
+    """
     far, (rows, columns) = 2 * reach, u.shape[:2]
     near, total = np.pad(u, ((far, far), (far, far), (0, 0)), mode="edge"), np.zeros(u.shape[:2])
     for distance in (reach, far):
@@ -475,7 +585,16 @@ class Alignment:
         return float(length[order[np.searchsorted(total, total[-1] / 2)]])
 
     def _fit_surface(self, u: NDArray, before: NDArray, normal: NDArray) -> NDArray[np.float64]:
-        """Fit (3) to displacements and their steps; outliers from the surface before count less."""
+        """Fit (3) to displacements and their steps; outliers from the surface before count less.
+
+        Args:
+            u: (rows, columns, 2) displacement, px.
+            before: (rows, columns, 2) surface before, px.
+            normal: (rows, columns, 6), of `_accumulate`.
+
+        Returns:
+            (rows, columns, 2) surface, px.
+        """
         B0, B1 = self._basis
         gx, gy, xx, xy, yy = normal.reshape(-1, normal.shape[-1]).T[:5]
         ux, uy = u.reshape(-1, 2).T
@@ -490,7 +609,17 @@ class Alignment:
         return surface
 
     def _turn(self, clock: Clock, at: int, s: NDArray, turns: NDArray) -> NDArray[np.float64]:
-        """Return a clock's s after a step of (1), on the whole as fast as `clock`."""
+        """Move the times of a clock by a step of (1), on the whole as fast as before alignment.
+
+        Args:
+            clock: The K times of the clock, and its s before alignment.
+            at: Time at which s = 0, us.
+            s: (K,) present s.
+            turns: (K, 2) derivative and curvature by s, of `_accumulate`.
+
+        Returns:
+            (K,) new s.
+        """
         step = (turns[:, 0] + CLOCK_INFORMATION * (clock.s - s)) / (turns[:, 1] + CLOCK_INFORMATION)
         s = s + CLOCK_STEP * np.clip(step, -CLOCK_REACH, CLOCK_REACH)
         s = s - np.interp(at, clock.t, s)

@@ -96,7 +96,15 @@ class EventFlow:
         return f"EventFlow({self.recording.name}, {self.shape[1]}x{self.shape[0]}{causal})"
 
     def _events(self, row: int, half: int) -> tuple[int, Events]:
-        """Return the time (us) of an event, and the events around it."""
+        """Read the events around an event.
+
+        Args:
+            row: Number of the event.
+            half: Number of events on either side.
+
+        Returns:
+            Its time, us, and the events.
+        """
         events = self.recording.events[max(row - half, 0) : row + half]
         return int(events.t[min(row, half)]), events
 
@@ -104,6 +112,13 @@ class EventFlow:
         """Find the motion around an event from nothing, in windows that double.
 
         They grow until points are displaced far enough, or to `most` events.
+
+        Args:
+            row: Number of the event.
+            most: Number of events on either side to go to; None: until points move far enough.
+
+        Returns:
+            A chain of this one anchor.
         """
         start, clock, half = None, None, 0
         for level in LEVELS:
@@ -126,7 +141,18 @@ class EventFlow:
         before: Clock | None,
         grow: bool = False,
     ) -> Anchor:
-        """Align the window around an event from displacements that had another clock."""
+        """Align the window around an event from displacements that had another clock.
+
+        Args:
+            row: Number of the event.
+            half: Number of events on either side.
+            start: (rows, columns, 2) displacements to start from, px per unit of s; None: 0.
+            before: Their clock.
+            grow: Whether larger windows follow: coarse cells, and the clock as it is.
+
+        Returns:
+            The flow at the event.
+        """
         at, events = self._events(row, half)
         clock = Clock.of(events, at, half)
         if start is not None and before is not None:
@@ -149,7 +175,15 @@ class EventFlow:
         return self._seek(number * CHAIN_WINDOWS * self._base)
 
     def _make_anchor(self, number: int, k: int) -> Anchor:
-        """Return an anchor of a chain; those before it are estimated first."""
+        """Make an anchor of a chain; those before it are estimated first.
+
+        Args:
+            number: Number of the chain.
+            k: Number of the anchor in the chain.
+
+        Returns:
+            The anchor.
+        """
         first, half = self._chain(number)
         if k == 0:
             return first
@@ -174,9 +208,15 @@ class EventFlow:
         return np.arange(number * length, end, self._chain(number).half)
 
     def _around(self, start: int, stop: int, until: int) -> list[Anchor]:
-        """Return the anchors that determine flow from start to stop (us), of different times.
+        """Return the anchors that determine flow through a span of time.
 
-        A causal flow uses events up to the time `until`.
+        Args:
+            start: Begin of the span, us.
+            stop: End of the span, us.
+            until: Time up to which a causal flow uses events, us.
+
+        Returns:
+            The anchors, of different times, in order.
         """
         events, length = self.recording.events, CHAIN_WINDOWS * self._base
         n = len(events)
@@ -206,7 +246,15 @@ class EventFlow:
     def _fields(
         self, anchors: list[Anchor], knots: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return velocity and covariance of all nodes at some times (us)."""
+        """Return velocity and covariance of all nodes at some times.
+
+        Args:
+            anchors: Anchors around the times, in order; none: no velocity.
+            knots: (K,) times, us.
+
+        Returns:
+            Velocity (K, rows, columns, 2), px/s, and covariance (K, rows, columns, 2, 2), (px/s)^2.
+        """
         if not anchors:
             velocity = np.zeros((len(knots), *self._align.nodes, 2))
             return velocity, np.broadcast_to(UNKNOWN_VARIANCE * np.eye(2), (*velocity.shape, 2))

@@ -12,7 +12,17 @@ BLOCK_POINTS = 64  # that pass through a stretch of time one beside the other
 
 @njit_fastmath_inlined
 def _interpolate(field, place, part, component):
-    """Return a component of a field in the cell that begins at the node `place` (x, y)."""
+    """Interpolate a component of a field in a cell of nodes.
+
+    Args:
+        field: (rows, columns, 2).
+        place: Column and row of the cell's first node.
+        part: Distance from there along x and y, 0..1.
+        component: 0: along x; 1: along y.
+
+    Returns:
+        The component.
+    """
     (x, y), (fx, fy) = place, part
     right, below, one = x + np.uint32(1), y + np.uint32(1), np.float32(1)
     first = field[y, x, component] * (one - fx) + field[y, right, component] * fx
@@ -22,7 +32,17 @@ def _interpolate(field, place, part, component):
 
 @njit_fastmath_inlined
 def _velocity_at(fields, weight, x, y):
-    """Return the velocity at coordinates of nodes, bilinear, between two fields."""
+    """Return the velocity between two fields, bilinear between nodes.
+
+    Args:
+        fields: (rows, columns, 2) before and after.
+        weight: Weight of the one after, 0..1.
+        x: Place along x, in nodes; beyond the outer ones it is moved to them.
+        y: Place along y, likewise.
+
+    Returns:
+        The velocity along x and along y, nodes/s.
+    """
     before, after = fields
     height, width = before.shape[0], before.shape[1]
     zero, one = np.float32(0), np.float32(1)
@@ -39,7 +59,15 @@ def _velocity_at(fields, weight, x, y):
 
 @njit_fastmath_inlined
 def _integrate_block(s, flow, along, x, y):
-    """Take points later (`along` 1) or earlier (-1) to the time 0; others stay in place."""
+    """Take points later or earlier to the time 0; others stay in place.
+
+    Args:
+        s: (n,) times of the points, s.
+        flow: Times (K,), s, and velocities (K, rows, columns, 2), nodes/s.
+        along: 1: later; -1: earlier.
+        x: (n,) positions along x, in nodes, in place.
+        y: (n,) positions along y, in nodes, in place.
+    """
     knots, velocity = flow
     last, half, zero = len(knots) - 1, np.float32(0.5), np.float32(0)
     far = s[0]
@@ -72,7 +100,13 @@ def _integrate_block(s, flow, along, x, y):
 def _integrate_paths(begin, end, s, flow, x, y):
     """Integrate dx/ds = v(x, s) from s to 0, in place, by the midpoint rule between knots.
 
-    Points are in blocks, of which those from `begin` to `end` are taken.
+    Args:
+        begin: First block of `BLOCK_POINTS` points.
+        end: Block after the last one.
+        s: (n,) times of the points, s.
+        flow: Times (K,), s, and velocities (K, rows, columns, 2), nodes/s.
+        x: (n,) positions along x, in nodes, in place.
+        y: (n,) positions along y, in nodes, in place.
     """
     for block in range(begin, end):
         first, last = block * BLOCK_POINTS, min((block + 1) * BLOCK_POINTS, len(s))
