@@ -44,7 +44,15 @@ class InconsistentMotionWarning(InputWarning):
 
 
 def score_times(start: int, stop: int) -> NDArray[np.int64]:
-    """Return times (us) at `SCORE_RATE_HZ` from `start` on, before `stop`."""
+    """Return the times at which errors are scored.
+
+    Args:
+        start: First time, us.
+        stop: Time after the last one, us.
+
+    Returns:
+        (T,) us, at `SCORE_RATE_HZ`.
+    """
     return np.arange(start, stop, round(1e6 / SCORE_RATE_HZ))
 
 
@@ -314,7 +322,18 @@ class MotionEstimator(Estimator[P]):
         params: P,
         seeds: Sequence[int],
     ) -> TrainingRuns:
-        """Prepare the runs of a segment with these seeds; `common` are the fields of all kinds."""
+        """Prepare the runs of a segment.
+
+        Args:
+            common: Fields that runs of all kinds have, the last one the model.
+            recording: The segment.
+            times: (T,) times at which errors count, us.
+            params: Parameters.
+            seeds: A seed for each run.
+
+        Returns:
+            The runs.
+        """
         model = type(common[-1])
         prepared = tuple(
             self.prepare(recording, times, params, model=model, seed=seed) for seed in seeds

@@ -203,7 +203,16 @@ def _required_camera(
 def _age_range(
     params: Params, motion: MotionEstimate, sampler: CandidateSampler
 ) -> tuple[float, float]:
-    """Bound the ages (s) of candidates that any event can need, by the flow at the border."""
+    """Bound the ages of candidates that any event can need, by the flow at the border.
+
+    Args:
+        params: Parameters.
+        motion: The motion.
+        sampler: Sampler of the candidates.
+
+    Returns:
+        Least and greatest age, s.
+    """
     tau_max, b = float(params.tau_max), float(params.baseline)
     mean = np.asarray(motion.mean[motion.valid], float)
     if not len(mean):
@@ -231,7 +240,15 @@ class _Displacements(NamedTuple):
     a: Array  # (K, 2) its direction
 
     def in_baseline(self, params: Params, speed: Array) -> Array:
-        """Return which candidates a flow of this speed (px/s) has moved by b/2 to b."""
+        """Return which candidates a flow of some speed has moved by b/2 to b.
+
+        Args:
+            params: Parameters, with the baseline b, px.
+            speed: Speed, px/s, of a shape that broadcasts with `age`.
+
+        Returns:
+            Truth values, of that shape.
+        """
         distance = self.age * speed
         return (self.age > 0) & (distance >= params.baseline / 2) & (distance <= params.baseline)
 
@@ -243,7 +260,17 @@ def _estimate_flow(
     candidates: Candidates,
     mean: Float[Array | NDArray, "batches K dimension"],
 ) -> tuple[Float[Array, "batches K 2"], Float[Array, "batches K"]]:
-    """Estimate flow and residual of batches of events."""
+    """Estimate flow and residual of batches of events.
+
+    Args:
+        params: Parameters.
+        model: Model of the motion.
+        candidates: Candidates of the events, of all batches.
+        mean: Motion at the times of the events.
+
+    Returns:
+        Flow, px/s, and the distance of the nearest candidate from it, px; infinite where none is.
+    """
     grid = jnp.geomspace(params.slowest, params.fastest, params.speeds)
     grid = jnp.concatenate([jnp.zeros(1, grid.dtype), grid])
 
@@ -423,7 +450,16 @@ def _sum_by_pixel(
 def _map_pixels(
     function: Callable, xi: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Evaluate a function of a position and a motion at every pixel, (height, width, 2)."""
+    """Evaluate a function of a position and a motion at every pixel.
+
+    Args:
+        function: Function of a position (2,), px, and the motion that returns (2,).
+        xi: (height, width, 2) positions of the pixels, px.
+        mean: (dimension,) motion.
+
+    Returns:
+        (height, width, 2).
+    """
     flat = jax.vmap(function, (0, None))(jnp.asarray(xi.reshape(-1, 2)), jnp.asarray(mean))
     return np.asarray(flat, float).reshape(xi.shape)
 

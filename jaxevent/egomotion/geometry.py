@@ -408,11 +408,29 @@ def _rows(*rows: Sequence[Array]) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
+    """Return scalar products along the last axis.
+
+    Args:
+        a: (..., n).
+        b: (..., n).
+
+    Returns:
+        (...).
+    """
     return jnp.sum(a * b, -1)
 
 
 def _apply(matrix: Array, vector: Array | np.ndarray) -> Array:
     # Not matmul, whose result is of lower precision on some devices.
+    """Multiply matrices by vectors.
+
+    Args:
+        matrix: (..., m, n).
+        vector: (..., n).
+
+    Returns:
+        (..., m).
+    """
     return jnp.sum(matrix * _real(vector)[..., None, :], -1)
 
 
@@ -422,6 +440,15 @@ def _cross_matrix(v: Array) -> Array:
 
 
 def _polynomial(t: Array, coefficients: Sequence[float | int]) -> Array:
+    """Evaluate a polynomial.
+
+    Args:
+        t: Arguments, of any shape.
+        coefficients: Coefficients of rising powers.
+
+    Returns:
+        Values, of the shape of `t`.
+    """
     total = jnp.zeros_like(t)
     for c in reversed(coefficients):
         total = total * t + c

@@ -370,7 +370,17 @@ def select_by_z(
 
 
 def _comparison_line(one: str, other: str, z: float, threshold: float) -> str:
-    """Describe which of two models explains events better, significantly beyond a threshold."""
+    """Describe which of two models explains events better, significantly beyond a threshold.
+
+    Args:
+        one: Name of the first model.
+        other: Name of the other one.
+        z: Difference in standard deviations, above 0 where the first one is better.
+        threshold: Significant difference.
+
+    Returns:
+        A sentence without a full stop.
+    """
     than = "better than" if z > threshold else "worse than" if z < -threshold else "as well as"
     return (
         f"{MODELS[one].title} explains events that it was not fitted to {than} "

@@ -610,7 +610,16 @@ def unit_vectors(v: NDArray[np.floating]) -> NDArray[np.float64]:
 def _rotate_rays(
     xi: Numeric, phi: Numeric, f: float | Float[Array, ""]
 ) -> Float[Array, "*points 2"]:
-    """Rotate the rays of positions xi (px) by rotation vectors phi (rad): f (X_x, X_y) / X_z."""
+    """Rotate the rays of positions: f (X_x, X_y) / X_z.
+
+    Args:
+        xi: (*points, 2) positions, px.
+        phi: (*points, 3) rotation vectors, rad.
+        f: Focal length, px.
+
+    Returns:
+        Positions, px; 1e6 for rays behind the camera.
+    """
     R = rotation_exp(phi)
     x, y, z = (
         R[..., k, 0] * xi[..., 0] + R[..., k, 1] * xi[..., 1] + R[..., k, 2] * f for k in range(3)

@@ -537,7 +537,16 @@ class MotionEstimate(HtmlRepr):
         covariance: NDArray[np.floating],
         valid: NDArray[np.bool_],
     ) -> Estimate:
-        """Make an estimate whose mean is NaN where it is lost or not observable."""
+        """Make an estimate whose mean is NaN where it is lost or not observable.
+
+        Args:
+            mean: (T, d) motion.
+            covariance: (T, d, d) its covariance.
+            valid: (T,) false where the motion is lost.
+
+        Returns:
+            The estimate; covariance and `valid` are as given.
+        """
         is_known = valid[:, None] & is_observable(self.model, covariance)
         return Estimate(np.where(is_known, mean, np.nan), covariance, valid)
 

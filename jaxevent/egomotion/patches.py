@@ -196,7 +196,15 @@ def window_durations(recording: Recording) -> NDArray[np.float64]:
 
 
 def _fits(recording: Recording, duration: float) -> bool:
-    """Return whether the recording is at least as long as a window (s)."""
+    """Return whether the recording is at least as long as a window.
+
+    Args:
+        recording: The recording.
+        duration: Length of the window, s.
+
+    Returns:
+        Whether it is.
+    """
     return 2 * round(5e5 * duration) <= recording.stop - recording.start + 1
 
 
@@ -564,7 +572,16 @@ def log_sharpness(
 
 
 def _minimise(loss: Callable[[NDArray], float], starts: list[NDArray], size: float) -> NDArray:
-    """Minimise a loss from several starts by simplexes of a size."""
+    """Minimise a loss from several starts by the method of Nelder and Mead.
+
+    Args:
+        loss: Function of (n,).
+        starts: Arguments to start from, each (n,).
+        size: Size of the first simplexes.
+
+    Returns:
+        (n,) the best argument.
+    """
     from scipy.optimize import minimize
 
     options = {"maxiter": 250, "xatol": 1e-3 * size, "fatol": 1e-3}
@@ -657,7 +674,15 @@ def half_line_displacements(
 
 
 def _translation_basis(xi: NDArray[np.float64], f: float) -> NDArray[np.float64]:
-    """Return `geometry.A` at positions (n, 2), (n, 2, 3)."""
+    """Return `geometry.A` at some positions.
+
+    Args:
+        xi: (n, 2) positions, px.
+        f: Focal length, px.
+
+    Returns:
+        (n, 2, 3).
+    """
     return np.stack([np.asarray(A(x, y, f)) for x, y in xi])
 
 

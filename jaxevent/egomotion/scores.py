@@ -330,7 +330,18 @@ def errors_by_part(
 
 
 def _pair(estimate: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], ...]:
-    """Return the estimate and the truth as arrays, or raise `InputError`."""
+    """Check a motion and its truth, and return both as arrays.
+
+    Args:
+        estimate: (times, components) estimated motion.
+        truth: (times, components) true motion.
+
+    Returns:
+        Both, as given.
+
+    Raises:
+        InputError: Shapes differ or are others, there are no times, or a number is not finite.
+    """
     pair = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     if pair[0].shape != pair[1].shape or pair[0].ndim != 2 or not len(pair[0]):
         raise InputError(
@@ -345,6 +356,15 @@ def _pair(estimate: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], .
 
 
 def _ratio(error: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Divide errors by sizes; where a size is 0, an error is infinite or, if it is 0, 0.
+
+    Args:
+        error: Errors, 0 or more.
+        size: Sizes, of the same shape.
+
+    Returns:
+        Ratios.
+    """
     infinite = np.where(error > 0, np.inf, 0.0)
     return np.where(size > 0, error / np.where(size > 0, size, 1), infinite)
 

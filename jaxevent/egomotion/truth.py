@@ -36,7 +36,16 @@ MAX_GYRO_BIAS_RAD_S = 0.2  # rad/s
 
 
 def _check_known(us: NDArray[np.int64], start: int | np.integer, stop: int | np.integer) -> None:
-    """Raise `InputError` for times (us) at which a motion is unknown."""
+    """Check that a motion is known at some times.
+
+    Args:
+        us: (times,) us.
+        start: First time at which it is known, us.
+        stop: Last time, us.
+
+    Raises:
+        InputError: A time is outside.
+    """
     if len(us) and (us.min() < start or us.max() > stop):
         raise InputError(
             f"the true motion is known from {start} to {stop} us, not at {us.min()} to "
@@ -45,7 +54,16 @@ def _check_known(us: NDArray[np.int64], start: int | np.integer, stop: int | np.
 
 
 def _interpolate(at: NDArray, t: NDArray[np.int64], values: NDArray) -> NDArray[np.float64]:
-    """Interpolate the columns of values (n, components) at times t (n,) linearly."""
+    """Interpolate columns linearly in time.
+
+    Args:
+        at: (times,) times to interpolate to, us.
+        t: (n,) rising times, us.
+        values: (n, components).
+
+    Returns:
+        (times, components).
+    """
     return np.stack([np.interp(at, t, column) for column in values.T], 1)
 
 
@@ -388,7 +406,20 @@ def known_motion(
 def _planar_at_depth(
     recording: Recording, model: type[Model], span: float | int, depth: float
 ) -> KnownMotion:
-    """Return the image velocity of a scene at a depth (m), from poses `span` s apart."""
+    """Make the image velocity of a scene at a depth from poses.
+
+    Args:
+        recording: A recording with poses and a camera.
+        model: The model of planar motion.
+        span: Time between the poses that a velocity is taken from, s.
+        depth: The depth, m.
+
+    Returns:
+        The motion.
+
+    Raises:
+        InputError: The recording holds no poses or no camera.
+    """
     if recording.poses is None or recording.camera is None:
         missing = "poses" if recording.poses is None else "calibration"
         raise InputError(

@@ -265,7 +265,16 @@ _mask_visible = eqx.filter_jit(mask_visible)
 
 
 def _cell_parts(params: Params, window: Window, z: Array) -> Float[Array, " cells"]:
-    """Return each image cell's part of the objective, without that of the mean."""
+    """Return each image cell's part of the objective, without that of the mean.
+
+    Args:
+        params: Parameters.
+        window: The window.
+        z: (dimension,) motion, in px of displacement at the window's end.
+
+    Returns:
+        (cells,) parts, row by row.
+    """
     J = warped_image(params, window, z * jnp.asarray(window.scale)) * window.mask
     rows, columns = (-(-n // INDEPENDENT_CELL_PX) for n in J.shape)
     size = rows * INDEPENDENT_CELL_PX, columns * INDEPENDENT_CELL_PX
@@ -276,7 +285,16 @@ def _cell_parts(params: Params, window: Window, z: Array) -> Float[Array, " cell
 
 @eqx.filter_jit
 def _cell_gradients(params: Params, window: Window, z: Array) -> Float[Array, "cells dimension"]:
-    """Return the gradient of each image cell's part of the objective."""
+    """Return the gradient of each image cell's part of the objective.
+
+    Args:
+        params: Parameters.
+        window: The window.
+        z: (dimension,) motion, in px of displacement at the window's end.
+
+    Returns:
+        Gradients by `z`, 1/px.
+    """
     return jax.jacfwd(lambda z: _cell_parts(params, window, z))(z)
 
 
@@ -284,7 +302,17 @@ def _cell_gradients(params: Params, window: Window, z: Array) -> Float[Array, "c
 def _cell_profile(
     params: Params, window: Window, z: Float[Array, "motions dimension"]
 ) -> Float[Array, "motions cells"]:
-    """Return each image cell's part of the objective, on points that all motions keep in view."""
+    """Return each image cell's part of the objective, on points that all motions keep in view.
+
+    Args:
+        params: Parameters.
+        window: The window.
+        z: Motions along a line, in px of displacement at the window's end; the first and the last
+            determine the points in view.
+
+    Returns:
+        Parts of the cells, for each motion.
+    """
     motions = z * jnp.asarray(window.scale)
     masks = lax.map(lambda motion: mask_visible(window, motion).mask, motions[jnp.array([0, -1])])
     window = dataclasses.replace(window, mask=masks.prod(0))

@@ -67,7 +67,15 @@ class System(NamedTuple):
 
 
 def coarse_shape(rows: int, columns: int) -> tuple[int, int]:
-    """Return rows and columns of coarse nodes over nodes of depth."""
+    """Return the shape of the coarse nodes over nodes of depth.
+
+    Args:
+        rows: Rows of nodes of depth.
+        columns: Columns of nodes of depth.
+
+    Returns:
+        Rows and columns.
+    """
     return (rows - 1) // NODES_PER_COARSE_NODE + 2, (columns - 1) // NODES_PER_COARSE_NODE + 2
 
 
@@ -440,14 +448,28 @@ def _add_combinations(by, a, out):
 
 
 def _inner_products(a: ColumnVectors, b: ColumnVectors) -> NDArray[np.float64]:
-    """Return a' b, (S, S)."""
+    """Return the scalar products of several vectors.
+
+    Args:
+        a: S vectors.
+        b: S vectors.
+
+    Returns:
+        (S, S) a' b.
+    """
     found = a.t @ b.t.T
     add_inner_products(a.rest, b.rest, found)
     return found
 
 
 def _add_scaled(to: ColumnVectors, by: NDArray, direction: ColumnVectors) -> None:
-    """Add `direction` times `by` (S, S), in place."""
+    """Add combinations of vectors, in place.
+
+    Args:
+        to: S vectors, added to.
+        by: (S, S); column k holds the factors of the directions in the sum that vector k gets.
+        direction: S vectors.
+    """
     to.t[:] += by.T @ direction.t
     _add_combinations(by.astype(to.rest.dtype), direction.rest, to.rest)
 

@@ -711,7 +711,15 @@ class HeldOutTest:
         return self.likelier(*fitted), self.least_z(fitted, moving)
 
     def least_z(self, scenes: list[Scene], moving: Scene) -> float:
-        """Return z of the `moving` scene over the scene that it refutes least."""
+        """Return z of a scene over the one that it refutes least.
+
+        Args:
+            scenes: Scenes to refute.
+            moving: The scene.
+
+        Returns:
+            z, above 0 if held-out events cost less under `moving`.
+        """
         return min(self.z(one, moving) for one in scenes)
 
     def likelier(self, one: Scene, other: Scene) -> Scene:
@@ -719,7 +727,15 @@ class HeldOutTest:
         return other if self.z(one, other) > 0 else one
 
     def z(self, one: Scene, other: Scene) -> float:
-        """Return z of `other` over `one`, above 0 if held-out events cost less under `other`."""
+        """Return by how much held-out events prefer one scene to another.
+
+        Args:
+            one: A scene.
+            other: Another one.
+
+        Returns:
+            z, above 0 if they cost less under `other`.
+        """
         (a, on), (b, both) = self._event_costs(one), self._event_costs(other)
         series = self.held_out
         D = np.asarray((a - b) * on * both, np.float64)

@@ -163,7 +163,15 @@ def bspline(m, t):
 
 @njit_fastmath_inlined
 def bspline_derivative(m, t):
-    """Evaluate the derivative (1/px) of a quadratic B-spline; arguments as of `bspline`."""
+    """Evaluate the derivative of a quadratic B-spline.
+
+    Args:
+        m: 0 to 2, the spline before, at and after the middle one.
+        t: Position, -0.5 to 0.5 px from the centre of the middle one.
+
+    Returns:
+        1/px.
+    """
     return -2 * t if m == 1 else (m - 1) * 0.5 + t
 
 
@@ -312,7 +320,15 @@ def sample_map(
 
 
 def residuals(scene: Scene, series: PixelSeries) -> NDArray:
-    """Return L(x_e) - s_e less its mean over the series' events (E,), C; 0 beyond the map."""
+    """Return the residuals of a series: L(x_e) - s_e less its mean over the series' events, C.
+
+    Args:
+        scene: Path and map.
+        series: The events of some pixels.
+
+    Returns:
+        (E,); 0 beyond the map.
+    """
     samples = sample_map(scene, series)
     left = samples.value - series.level - scene.skew * series.count
     left = left.astype(series.x.dtype)

@@ -462,7 +462,16 @@ class Path:
 
 
 def _taylor_powers(tau: NDArray, first: int, number: int) -> NDArray[np.float64]:
-    """Return tau^k / k! for `number` values of k from `first` on, (times, number)."""
+    """Return powers of time over factorials, tau^k / k!.
+
+    Args:
+        tau: (times,).
+        first: First k.
+        number: Number of values of k.
+
+    Returns:
+        (times, number).
+    """
     return np.stack([tau**k / math.factorial(k) for k in range(first, first + number)], 1)
 
 
@@ -567,12 +576,28 @@ def predict_path(path: Path, tau: float, half: float) -> Path:
 
 
 def pack_rows(path: Path, k: int = N_COEFFICIENT_ROWS) -> NDArray[np.float64]:
-    """Return the first k rows of O and of D as one vector (6 k,)."""
+    """Pack the first rows of a path's O and D as one vector.
+
+    Args:
+        path: The path.
+        k: Number of rows of each.
+
+    Returns:
+        (6 k,), O before D.
+    """
     return np.concatenate([path.O[:k], path.D[:k]]).astype(np.float64).ravel()
 
 
 def replace_rows(path: Path, values: NDArray) -> Path:
-    """Return the path with its first rows replaced by a vector as of `pack_rows`."""
+    """Replace the first rows of a path's O and D.
+
+    Args:
+        path: The path.
+        values: (6 k,) rows, as of `pack_rows`.
+
+    Returns:
+        A path with these rows.
+    """
     values = values.reshape(2, -1, 3)
     k, (O, D) = values.shape[1], (np.array(path.O), np.array(path.D))  # noqa: E741
     O[:k], D[:k] = values

@@ -684,7 +684,15 @@ def mean_square_flow(model: Model, xi: NDArray[np.floating]) -> NDArray[np.float
 
 
 def join_reports(model: Model, parts: list[tuple[NDArray, Any, NDArray]]) -> MotionEstimate:
-    """Join the times and reports of chunks to an estimate."""
+    """Join the reports of chunks of batches to an estimate.
+
+    Args:
+        model: Model of the motion.
+        parts: Of each chunk times (n,), us, reports (n, ...), and whether each is reported (n,).
+
+    Returns:
+        The estimate.
+    """
     if not parts:
         return MotionEstimate.empty(type(model))
 
@@ -721,7 +729,15 @@ def _basis_at_corners(model: Model, sampler: CandidateSampler) -> NDArray[np.flo
 
 
 def _basis_at(model: Model, xi: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the model's basis (..., 2, d) at undistorted positions (..., 2) px."""
+    """Return the model's basis at some positions.
+
+    Args:
+        model: Model of the motion.
+        xi: (..., 2) undistorted positions, px.
+
+    Returns:
+        (..., 2, d).
+    """
     return np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
 
 

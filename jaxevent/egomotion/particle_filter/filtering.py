@@ -138,7 +138,15 @@ def init(params: Params, model: Model, noise: RandomNumbers) -> ParticleState:
 
 
 def init_near(params: Params, particles: Float[Array, "N d"]) -> ParticleState:
-    """Start with particles (N, d) near the motion, of equal weights."""
+    """Start with particles near the motion, of equal weights.
+
+    Args:
+        params: Parameters.
+        particles: Motions.
+
+    Returns:
+        The state, which is not searching.
+    """
     N, zero = params.particles, jnp.zeros((), particles.dtype)
     equal = jnp.full(N, -jnp.log(N), particles.dtype)
     return ParticleState(particles, equal, jnp.asarray(False), zero, zero, zero, zero)
@@ -183,7 +191,16 @@ def resample(
 def _systematic_rows(
     weights: Float[Array, " N"], number: int, uniform: Float[Array, ""]
 ) -> Int[Array, " number"]:
-    """Return the particles at equal steps of their summed weights."""
+    """Return the particles at equal steps of their summed weights.
+
+    Args:
+        weights: Weights; their sum need not be 1.
+        number: Number of steps.
+        uniform: Place of the first step, in steps, 0..1.
+
+    Returns:
+        Indices of the particles, rising.
+    """
     edges = jnp.cumsum(weights)
     points = (jnp.arange(number) + uniform) * (edges[-1] / number)
     return jnp.minimum((edges[None, :] <= points[:, None]).sum(1), len(weights) - 1)
@@ -378,6 +395,15 @@ def step(
 
 @full_precision
 def _covariance(deviation: Float[Array, "N d"], weights: Float[Array, " N"]) -> Float[Array, "d d"]:
+    """Return a weighted covariance.
+
+    Args:
+        deviation: Deviations from the mean.
+        weights: Weights, of sum 1.
+
+    Returns:
+        The covariance.
+    """
     return (deviation * weights[:, None]).T @ deviation
 
 

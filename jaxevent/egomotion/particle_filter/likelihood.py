@@ -173,7 +173,17 @@ def vote(
 def log_gain(
     params: Params, S: Float[Array, ""], rate: Float[Array, ""], counts: Bool[Array, ""]
 ) -> Float[Array, ""]:
-    """Return alpha log(1 + S / s0), which a particle gains by S votes for an event that counts."""
+    """Return the gain of a particle's log weight by an event, alpha log(1 + S / s0).
+
+    Args:
+        params: Parameters.
+        S: Votes for the particle's motion.
+        rate: Factor on them, as of `Votes`.
+        counts: Whether the event counts.
+
+    Returns:
+        The gain; 0 where the event does not count.
+    """
     return jnp.where(counts, params.alpha * jnp.log1p(S * rate / params.s0), 0)
 
 
@@ -326,7 +336,15 @@ def event_log_likelihood(
 
 
 def candidate_lag(params: Params, tau: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the lag (s) of candidates up to tau s old: half the mean age."""
+    """Return the lag of candidates: half their mean age.
+
+    Args:
+        params: Parameters.
+        tau: Greatest age, s.
+
+    Returns:
+        The lag, s.
+    """
     return (1 + lax.stop_gradient(params.youngest)) / 4 * tau
 
 
@@ -380,6 +398,14 @@ def _sum_votes(
 
     Candidates fill the entries from the first, so the later blocks of most batches hold none and
     are skipped. The condition is outside of the maps, within which both sides would be computed.
+    Args:
+        params: Parameters.
+        batch: Candidates of K events.
+        votes: Flow of N particles at the events.
+        searching: Whether the motion is searched.
+
+    Returns:
+        S of each event and particle.
     """
     K, C = batch.age.shape
     pad = -C % CANDIDATES_PER_BLOCK
