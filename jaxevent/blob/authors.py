@@ -212,6 +212,15 @@ def update_reference_state(
 def nearest_target(
     p: Float[Array, "targets 2"], alive: Bool[Array, " targets"], xi: Float[Array, " 2"]
 ) -> Int[Array, ""]:
-    """Return the index of the living target whose position (px) is nearest to an event."""
+    """Return the living target that is nearest to an event.
+
+    Args:
+        p: Positions of the targets, px.
+        alive: Whether each target is alive.
+        xi: Position of the event, px.
+
+    Returns:
+        Its index; 0 where none is alive.
+    """
     distance = jax.vmap(jnp.hypot)(xi[0] - p[:, 0], xi[1] - p[:, 1])
     return jnp.argmin(jnp.where(alive, distance, jnp.inf))

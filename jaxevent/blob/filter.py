@@ -46,7 +46,16 @@ class PredictedMeasurement(eqx.Module):
 
 
 def where_tree(condition: Array, new: T, old: T) -> T:
-    """Select `new` where the condition () holds, else `old`, in all leaves."""
+    """Select one pytree or another by a condition.
+
+    Args:
+        condition: () truth value.
+        new: What is selected where it holds.
+        old: What is selected elsewhere, of the same structure.
+
+    Returns:
+        The pytree selected.
+    """
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
@@ -62,7 +71,15 @@ def _determinant(a: Float[Array, "2 2"]) -> Float[Array, ""]:
 
 
 def _squared_distance(e: Float[Array, " 2"], a: Float[Array, "2 2"]) -> Float[Array, ""]:
-    """Return the squared Mahalanobis distance e^T a^-1 e."""
+    """Return the squared Mahalanobis distance e^T a^-1 e.
+
+    Args:
+        e: Residual, px.
+        a: Covariance, px^2.
+
+    Returns:
+        The distance.
+    """
     x, y = e[0], e[1]
     top = a[1, 1] * x**2 - 2 * a[0, 1] * x * y + a[0, 0] * y**2
     return top / _determinant(a)
@@ -71,7 +88,17 @@ def _squared_distance(e: Float[Array, " 2"], a: Float[Array, "2 2"]) -> Float[Ar
 def gate_radius(
     params: TrackerParams, radius: Float[Array, ""], size: Float[Array, ""], dt: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Predict the gate's radius (px) `dt` (s) ahead; it follows the size at `gate_decay`."""
+    """Predict the gate's radius, which follows the size at the rate `gate_decay`.
+
+    Args:
+        params: Parameters of the tracker.
+        radius: Present radius, px.
+        size: Size of the target, px.
+        dt: Time to predict ahead, s.
+
+    Returns:
+        The radius, px.
+    """
     a = jnp.exp(-params.gate_decay * dt)
     radius = a * radius + (1 - a) * params.gate * size
     return jnp.clip(radius, params.gate_min, params.gate_max)
@@ -104,7 +131,16 @@ def is_in_gate(
 def log_likelihood(
     params: TrackerParams, predicted: PredictedMeasurement, e: Float[Array, " 2"]
 ) -> Float[Array, ""]:
-    """Return ln(2 pi p) of an event with residual `e` (px), p = N(e; 0, L L^T + P_p) in 1/px^2."""
+    """Return ln(2 pi p) of an event with a residual e, p = N(e; 0, L L^T + P_p) in 1/px^2.
+
+    Args:
+        params: Parameters of the tracker.
+        predicted: Prediction of the target's events.
+        e: Residual, px.
+
+    Returns:
+        The logarithm.
+    """
     S = predicted.spread + predicted.P_p
     return -0.5 * (_squared_distance(e, S) + jnp.log(_determinant(S)))
 

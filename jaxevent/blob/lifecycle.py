@@ -93,7 +93,15 @@ def init_state(filter: Filter, params: TrackerParams, features: Features) -> Tra
 
 
 def shift_state(state: TrackerState, elapsed: Array) -> TrackerState:
-    """Count times from a moment `elapsed` us later; times that would not fit are limited."""
+    """Count times from a later moment; times that would not fit are limited.
+
+    Args:
+        state: State of the tracker.
+        elapsed: () time from the old moment to the new one, us.
+
+    Returns:
+        The state.
+    """
     grid = state.grid
     if grid is not None:
         grid = ClutterGrid(grid.sums, jnp.maximum(grid.time - elapsed, -2 * MAX_CHUNK_US))
@@ -295,7 +303,18 @@ def decide_track(
 def _decide_tracks(
     filter: Filter, params: TrackerParams, features: Features, stop: Array, tracks: TrackBuffer
 ) -> TrackDecision:
-    """Decide on all tracks at a chunk's end."""
+    """Decide on all tracks at a chunk's end.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: The chunk's segment, for the sensor's size and the number of seeds.
+        stop: () the chunk's end, us since its start.
+        tracks: The tracks.
+
+    Returns:
+        Decisions, one for each entry of the buffer.
+    """
     predicted = jax.vmap(functools.partial(predict_measurement, filter, params), (0, None))(
         tracks, stop
     )

@@ -40,7 +40,18 @@ FIRST_DETECTED_ID = 1 << 20  # serial number of the first detected target; seeds
 def _read_all(
     filter: Filter, params: TrackerParams, tracks: TrackBuffer, time: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Read out all tracks at a time: mean, covariance, s since the last event, and validity."""
+    """Read out all tracks at a time.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        tracks: The tracks.
+        time: () us since the chunk's start.
+
+    Returns:
+        Mean (targets, 8), covariance (targets, 8, 8), time since the last event (targets,), s, and
+        whether the track is alive (targets,).
+    """
     states = jax.vmap(functools.partial(readout, filter, params), (0, None))(tracks, time)
     return *states, is_alive(params, tracks, time)
 

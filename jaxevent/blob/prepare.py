@@ -395,7 +395,15 @@ class _ChunkArrays(NamedTuple):
 
 
 def _discard_open_chunk(state: _PackingState, out: _ChunkArrays) -> _PackingState:
-    """Discard the chunk that is open, and return the state before it."""
+    """Discard the chunk that is open.
+
+    Args:
+        state: State of the packing.
+        out: Arrays of the chunks, of which those of the open one are cleared.
+
+    Returns:
+        The state before it was opened.
+    """
     chunk = state.chunk
     seeded = out.seed == chunk
     out.row[chunk], out.seed[seeded], out.elapsed[chunk] = -1, -1, 0

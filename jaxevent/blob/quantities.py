@@ -127,7 +127,21 @@ def _growth(
     times: Array, mean: Array, covariance: Array, valid: Array, Q: Number,
     Q_lambda: Number | None, *, smooth: bool, smoothed: bool,
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:  # fmt: skip
-    """Compute `growth` of times from 0 on."""
+    """Compute `growth` of times from 0 on.
+
+    Args:
+        times: (times,) s, from 0 on.
+        mean: (times, 8) states of a track.
+        covariance: (times, 8, 8) their covariances.
+        valid: (times,) whether the track is seen.
+        Q: As of `growth`, 1/s^3.
+        Q_lambda: As of `growth`, px^2/s.
+        smooth: Whether all times are used for each, or those up to it.
+        smoothed: Whether the track is smoothed.
+
+    Returns:
+        Inverse time to contact (times,), 1/s, and its variance, 1/s^2.
+    """
     mean = jnp.where(valid[:, None], mean, 1.0)
     covariance = jnp.where(valid[:, None, None], covariance, jnp.eye(8, dtype=mean.dtype))
     logarithm, relative = log_size(mean, covariance)

@@ -342,7 +342,19 @@ def _read_smoothed(
     time: Array,
     entry: Array,
 ) -> tuple[Array, Array, Array]:
-    """Read out smoothed states; see `_read_filtered`."""
+    """Read out smoothed states of a chunk.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        smoothed: Tracks at the chunk's start and after each step, smoothed.
+        step: (times,) steps of the chunk done by each time.
+        time: (times,) us since the chunk's start.
+        entry: (tracks,) entries of the buffer.
+
+    Returns:
+        Mean (times, tracks, 8), covariance, and s since the last event.
+    """
     now = jax.tree.map(lambda a: a[step[:, None], entry], smoothed)
     read = functools.partial(readout_smoothed, filter, params)
     return jax.vmap(jax.vmap(read, (0, 0, None)))(now.tracks, now.info, time)
@@ -357,7 +369,20 @@ def _smooth_chunk(
     chunk: Array,
     following: NextChunk,
 ) -> tuple[SmoothedTracks, BackwardInfo]:
-    """Run a chunk again and smooth it; return the backward information at its start too."""
+    """Run a chunk again and smooth it.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: The chunk's segment.
+        starts: Tracks at the start of each chunk.
+        chunk: () number of the chunk in the segment.
+        following: Backward information at the start of the next chunk.
+
+    Returns:
+        Smoothed tracks at the chunk's start and after each step, and the backward information at
+        its start.
+    """
     path = _replay_chunk(filter, params, features, starts, chunk)
     end = jax.tree.map(lambda a: a[-1], path)
     info = propagate_to_chunk_end(following.info, end, following.elapsed)
@@ -369,7 +394,18 @@ def _smooth_chunk(
 def _replay_chunk(
     filter: Filter, params: TrackerParams, features: Features, starts: TrackBuffer, chunk: Array
 ) -> TrackBuffer:
-    """Run a chunk again; return the tracks (steps + 1, targets) at its start and after steps."""
+    """Run a chunk again.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: The chunk's segment.
+        starts: Tracks at the start of each chunk.
+        chunk: () number of the chunk in the segment.
+
+    Returns:
+        Tracks (steps + 1, targets) at the chunk's start and after each step.
+    """
     f = features
     before = jax.tree.map(lambda a: a[chunk], starts)
     events = f.t[chunk], f.xi[chunk], f.polarity[chunk], f.valid[chunk]

@@ -223,7 +223,17 @@ def _describe_update(
 def _is_static_until_next(
     params: TrackerParams, track: TrackBuffer, info: BackwardInfo, time: Array
 ) -> Array:
-    """Return whether a track stands still at a time: its next update is late enough."""
+    """Return whether a track stands still at a time: its next update is late enough.
+
+    Args:
+        params: Parameters of the tracker.
+        track: A track.
+        info: Its backward information.
+        time: () us since the chunk's start.
+
+    Returns:
+        () whether it does.
+    """
     until = jnp.where(info.known, info.next, time)
     return is_static(params, to_seconds(until - track.last_update, track.gate))
 
@@ -231,7 +241,18 @@ def _is_static_until_next(
 def _transition_to_next(
     filter: Filter, params: TrackerParams, track: TrackBuffer, info: BackwardInfo, time: Array
 ) -> Array:
-    """Return the transition from a time to the track's next update."""
+    """Return the transition from a time to the track's next update.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        track: A track.
+        info: Its backward information.
+        time: () us since the chunk's start.
+
+    Returns:
+        (8, 8).
+    """
     params = track_params(params, track.overrides)
     dt = to_seconds(jnp.maximum(info.next - time, 0), track.gate)
     return _transition(filter, params, dt, _is_static_until_next(params, track, info, time))

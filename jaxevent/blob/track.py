@@ -114,7 +114,15 @@ class TrackStates(Estimate):
 
 
 def to_seconds(us: Any, like: Array) -> Array:
-    """Convert integer us to s in the type of another array."""
+    """Convert integer us to s.
+
+    Args:
+        us: Times, us.
+        like: Array of the type wanted.
+
+    Returns:
+        Times, s.
+    """
     return us.astype(like.dtype) * 1e-6
 
 
@@ -168,14 +176,31 @@ def init_tracks(
 
 
 def initial_gate(params: TrackerParams, size: Array) -> Array:
-    """Return the gate's radius (px) of new tracks of a size (px)."""
+    """Return the gate's radius of new tracks.
+
+    Args:
+        params: Parameters of the tracker.
+        size: Sizes of the tracks, px.
+
+    Returns:
+        Radii, px, of the shape of `size`.
+    """
     if params.association == "authors":
         return jnp.broadcast_to(params.gate_min, size.shape)
     return jnp.clip(params.gate * size, params.gate_min, params.gate_max)
 
 
 def init_reference(params: TrackerParams, time: Array, dtype: Any) -> ReferenceState | None:
-    """Return the association state of tracks that begin at some times (us), if they need one."""
+    """Return the association state of tracks that begin, if they need one.
+
+    Args:
+        params: Parameters of the tracker.
+        time: Begins of the tracks, us since the chunk's start.
+        dtype: Type of real numbers.
+
+    Returns:
+        The state; None unless `association = "authors"`.
+    """
     return ReferenceState.init(time, dtype) if params.association == "authors" else None
 
 
@@ -202,9 +227,15 @@ def init_states(
 
 
 def shift_times(tracks: TrackBuffer, elapsed: Array) -> TrackBuffer:
-    """Count times from the start of a chunk that begins `elapsed` us later.
+    """Count times from the start of a later chunk.
 
     Times that would not fit into int32 stay at the least one.
+    Args:
+        tracks: The tracks.
+        elapsed: () time from the old chunk's start to the new one's, us.
+
+    Returns:
+        The tracks.
     """
 
     def shift(t):
@@ -218,20 +249,45 @@ def shift_times(tracks: TrackBuffer, elapsed: Array) -> TrackBuffer:
 
 
 def coast_limits_us(params: TrackerParams, tracks: TrackBuffer) -> Int[Array, "*targets"]:
-    """Return the longest time without events (us) before each track ends."""
+    """Return the longest time without events before each track ends.
+
+    Args:
+        params: Parameters of the tracker.
+        tracks: The tracks.
+
+    Returns:
+        Times, us.
+    """
     limit = jnp.where(tracks.confirmed, params.t_coast, params.t_tentative)
     us = jnp.minimum(jnp.round(lax.stop_gradient(limit) * 1e6), 2 * MAX_CHUNK_US).astype(jnp.int32)
     return jnp.where(tracks.id >= 0, us, -4 * MAX_CHUNK_US)
 
 
 def is_alive(params: TrackerParams, tracks: TrackBuffer, time: Array) -> Array:
-    """Return which tracks are confirmed and not silent for too long at a time (us)."""
+    """Return which tracks are confirmed and not silent for too long.
+
+    Args:
+        params: Parameters of the tracker.
+        tracks: The tracks.
+        time: Time, us since the chunk's start.
+
+    Returns:
+        (targets,) truth values.
+    """
     is_recent = time - tracks.last_hit < coast_limits_us(params, tracks)
     return (tracks.id >= 0) & tracks.confirmed & is_recent
 
 
 def is_static(params: TrackerParams, dt: Array) -> Array:
-    """Return whether a target without events for `dt` (s) is taken to stand still."""
+    """Return whether a target is taken to stand still.
+
+    Args:
+        params: Parameters of the tracker.
+        dt: Time without events, s.
+
+    Returns:
+        Truth values, of the shape of `dt`.
+    """
     return (params.t_still > 0) & (dt > params.t_still)
 
 
@@ -262,7 +318,17 @@ def predict(
 def positions(
     filter: Filter, params: TrackerParams, tracks: TrackBuffer
 ) -> tuple[Array, Array, Array]:
-    """Return position (px), velocity (px/s) and time (us) of the last update of all tracks."""
+    """Return position, velocity and time of the last update of all tracks.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        tracks: The tracks.
+
+    Returns:
+        Positions (targets, 2), px, velocities (targets, 2), px/s, and times (targets,), us since
+        the chunk's start.
+    """
 
     def measure(track: TrackBuffer) -> Any:
         return filter.predicted_measurement(track_params(params, track.overrides), track.state)
@@ -351,7 +417,18 @@ def _update_nearest_track(
     prediction: TrackPrediction,
     events: StepEvents,
 ) -> tuple[TrackBuffer, TrackPrediction, Array]:
-    """Update all tracks with the one event of a step as `authors` does; return its weights too."""
+    """Update all tracks with the one event of a step as `authors` does.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        tracks: The tracks.
+        prediction: Their predictions at the step's time.
+        events: The one event.
+
+    Returns:
+        The tracks, their predictions, and the weights (targets, 1) of the event.
+    """
     time, batch, valid = events.time, events.batch, events.valid
     p, _, _ = positions(filter, params, lax.stop_gradient(tracks))
     k = nearest_target(p, prediction.alive, batch.xi[0])
@@ -388,7 +465,18 @@ def _update_nearest_track(
 def _update_tracks(
     filter: Filter, params: TrackerParams, tracks: TrackBuffer, limit: Array, events: StepEvents
 ) -> tuple[TrackBuffer, TrackPrediction, Array]:
-    """Predict, gate, associate and update all tracks; return the events' weights too."""
+    """Predict, gate, associate and update all tracks.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        tracks: The tracks.
+        limit: (targets,) longest times without events, us, of `coast_limits_us`.
+        events: The M events of a step.
+
+    Returns:
+        The tracks, their predictions, and the weights (targets, M) of the events.
+    """
     predict = functools.partial(predict_and_gate, filter, params)
     prediction = jax.vmap(predict, (0, 0, None))(tracks, limit, events)
     if params.association == "authors":
@@ -482,7 +570,15 @@ def run_steps(
 def canonical_ellipse(
     mean: Float[Array, " 8"], covariance: Float[Array, "8 8"]
 ) -> tuple[Float[Array, " 8"], Float[Array, "8 8"]]:
-    """Describe an ellipse with lambda1 >= lambda2 and theta in [-pi/2, pi/2)."""
+    """Describe an ellipse with lambda1 >= lambda2 and theta in [-pi/2, pi/2).
+
+    Args:
+        mean: State, as of `TrackStates`.
+        covariance: Its covariance.
+
+    Returns:
+        Both, of the same ellipse.
+    """
     swap = mean[5] > mean[4]
     order = jnp.array([0, 1, 2, 3, 5, 4, 6, 7])
     theta = mean[6] + jnp.where(swap, jnp.pi / 2, 0)

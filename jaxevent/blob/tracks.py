@@ -314,7 +314,19 @@ class Tracks(HtmlRepr):
     def _read_by_segment(
         self, times: Times, ids: Sequence[int] | NDArray[np.integer] | None, extrapolate: bool
     ) -> Iterator[tuple[NDArray[np.int64], TrackStates]]:
-        """Read out states at sorted times, in pieces of one segment each; see `batches`."""
+        """Read out states at sorted times, in pieces of one segment each; see `batches`.
+
+        Args:
+            times: Sorted times, integers in us or floats in s.
+            ids: Numbers of the tracks; None: all.
+            extrapolate: Whether times outside the tracked ones are allowed.
+
+        Yields:
+            Times, us, and states at these.
+
+        Raises:
+            InputError: Times are not sorted, or outside without `extrapolate`.
+        """
         times = np.atleast_1d(microseconds(times))
         if (times[1:] < times[:-1]).any():
             raise InputError("times must be sorted to be read in batches; sort them")
@@ -417,6 +429,15 @@ class Tracks(HtmlRepr):
         return np.array([int(np.flatnonzero(self.id == one)[0]) for one in ids], np.int64)
 
     def _invalid_states(self, times: NDArray[np.int64], chosen: NDArray[np.int64]) -> TrackStates:
+        """Make states that are not valid at any time.
+
+        Args:
+            times: (times,) us.
+            chosen: (tracks,) indices of tracks.
+
+        Returns:
+            The states, all NaN.
+        """
         shape, real = (len(times), len(chosen)), np.dtype(jnp.result_type(float))
         return TrackStates(
             np.full((*shape, 8), np.nan, real),

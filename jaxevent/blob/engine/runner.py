@@ -24,7 +24,16 @@ from jaxevent.codegen.trace import named_leaves, number_names
 
 @functools.lru_cache(maxsize=16)
 def _trace_init(filter: Filter, tree: Any, kinds: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
-    """Trace `lifecycle.init_state`; return its equations and the structure of its result."""
+    """Trace `lifecycle.init_state`.
+
+    Args:
+        filter: Filter of one target.
+        tree: Structure of its other arguments, parameters and features.
+        kinds: Shapes and types of their leaves.
+
+    Returns:
+        Its equations, and the structure of its result.
+    """
     init = functools.partial(init_state, filter)
     closed, shape = jax.make_jaxpr(init, return_shape=True)(*jax.tree.unflatten(tree, kinds))
     return closed, jax.tree.structure(shape)
@@ -206,6 +215,16 @@ class KernelRunner:
         return self._from_kernel(state, kernel_state), out, updates
 
     def _output(self, chunks: ChunkArrays, targets: int, associate: bool) -> KernelOutput:
+        """Allocate the report of a segment.
+
+        Args:
+            chunks: Arrays of the segment.
+            targets: Capacity of the buffer of tracks.
+            associate: Whether it has room for the tracks of events.
+
+        Returns:
+            The report, not yet filled.
+        """
         events = chunks.t.shape if associate else (0, 0, 0)
         kinds = (np.int32, np.int32, bool, np.int32, np.int32)
         return KernelOutput(
@@ -252,7 +271,16 @@ class KernelRunner:
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
     def _tracks(self, like: TrackBuffer, reals: NDArray, integers: NDArray) -> Any:
-        """Return the rows of tracks as a `TrackBuffer`."""
+        """Convert rows of tracks to a `TrackBuffer`.
+
+        Args:
+            like: Tracks of the same filter.
+            reals: (..., columns) real numbers of the rows.
+            integers: (..., columns) their integers.
+
+        Returns:
+            The tracks, of the rows' shape.
+        """
         leaves = []
         for real, columns, shape, kind in self._columns:
             part = (reals if real else integers)[..., columns].astype(kind)

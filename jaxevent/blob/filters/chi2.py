@@ -132,6 +132,17 @@ class Chi2State(eqx.Module):
 
 
 def _init(params: WindowParams, position: Array, size: Array, logarithmic: bool) -> Chi2State:
+    """Return the state of a round blob at rest.
+
+    Args:
+        params: Parameters.
+        position: (2,) centre, px.
+        size: () size, px.
+        logarithmic: Whether the state holds log sizes.
+
+    Returns:
+        The state.
+    """
     none = jnp.zeros_like(position)
     P_size = params.P0_lambda / params.lambda0**2 if logarithmic else params.P0_lambda
     blocks = [position, none, (jnp.log(size) if logarithmic else size) + none, none]
@@ -146,6 +157,17 @@ def _init(params: WindowParams, position: Array, size: Array, logarithmic: bool)
 
 
 def _predict(params: WindowParams, state: Chi2State, dt: Array, authors: bool) -> Chi2State:
+    """Predict a state without events.
+
+    Args:
+        params: Parameters.
+        state: The state.
+        dt: () time to predict ahead, s.
+        authors: Whether process noise is the authors', which enters each component alone.
+
+    Returns:
+        The state then.
+    """
     x, P = state.x, state.P
     to_theta, to_q, tt, tq, qq = turn_transition(params, dt)
     pp, pv, vv = params.Q_p * dt, params.Q_v * dt**2 / 2, params.Q_v * dt
@@ -207,6 +229,17 @@ class _WindowStep(NamedTuple):
 def _rotate_residuals(
     params: WindowParams, state: Chi2State, batch: EventBatch, weight: Array
 ) -> _Residuals:
+    """Rotate the residuals of a step's events to the blob's axes.
+
+    Args:
+        params: Parameters.
+        state: State at the step's time.
+        batch: The M events.
+        weight: (M,) their weights, 0 to 1.
+
+    Returns:
+        Their mean and their sums of squares.
+    """
     x = state.x
     m = weight.sum()
     share = weight / jnp.where(m > 0, m, 1)
@@ -306,7 +339,15 @@ def _update_scalars(x: Array, P: Array, measurements: list[_Measurement]) -> tup
 
 
 def _clip_state(params: WindowParams, x: Array) -> Array:
-    """Clip log sizes to their limits, and wrap the angle to [-pi, pi]."""
+    """Clip log sizes to their limits, and wrap the angle to [-pi, pi].
+
+    Args:
+        params: Parameters.
+        x: (d,) state with log sizes.
+
+    Returns:
+        (d,).
+    """
     low, high = jnp.log(params.lambda_min), jnp.log(params.lambda_max)
     return jnp.concatenate([x[:4], jnp.clip(x[4:6], low, high), wrap_angle(x[6])[None], x[7:]])
 

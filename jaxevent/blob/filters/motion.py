@@ -27,6 +27,15 @@ def _inverse(a: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
 
 
 def _weighted_sum(factors: list, terms: list[Array]) -> Array:
+    """Sum arrays by factors.
+
+    Args:
+        factors: Factors.
+        terms: Arrays of one shape, one for each factor.
+
+    Returns:
+        The sum.
+    """
     total = factors[0] * terms[0]
     for factor, term in zip(factors[1:], terms[1:], strict=True):
         total = total + factor * term
@@ -44,7 +53,15 @@ class LinearMotion(eqx.Module):
 
     @classmethod
     def init(cls, params: TrackerParams, position: Array) -> "LinearMotion":
-        """Return the state at rest at a position (2,) in px."""
+        """Return the state at rest at a position.
+
+        Args:
+            params: Parameters of the tracker.
+            position: (2,) px.
+
+        Returns:
+            The state.
+        """
         variances = [params.P0_p, params.P0_v] + [params.P0_d] * params.polarity_offset
         none = jnp.zeros_like(position)
         eye = jnp.eye(2, dtype=position.dtype)
@@ -56,7 +73,15 @@ class LinearMotion(eqx.Module):
         return self.P[j * (j + 1) // 2 + i] if i <= j else self.P[i * (i + 1) // 2 + j].T
 
     def predict(self, params: TrackerParams, dt: Array) -> "LinearMotion":
-        """Predict the state `dt` seconds ahead, exactly over any gap."""
+        """Predict the state without events, exactly over any gap.
+
+        Args:
+            params: Parameters of the tracker.
+            dt: () time to predict ahead, s.
+
+        Returns:
+            The state then.
+        """
         p, v, *offset = self.x
         pp, pv, vv, *rest = self.P
         eye = jnp.eye(2, dtype=p.dtype)
@@ -89,8 +114,7 @@ class LinearMotion(eqx.Module):
 
         Returns:
             Residuals (M, 2) and their mean (2,), px, and the factors of position, velocity and
-                offset in
-            the mean.
+            offset in the mean.
         """
         total = weight.sum()
         share = weight / jnp.where(total > 0, total, 1)
@@ -110,10 +134,18 @@ class LinearMotion(eqx.Module):
         return B, _weighted_sum(factors, B)
 
     def update(self, mean: Array, factors: list, R: Array, m: Array) -> "LinearMotion":
-        """Update by the mean residual (2,) of `m` events, each with the covariance R (2, 2).
+        """Update by the mean residual of events.
 
         The rows of the position come from those of z, whose covariance afterwards is R S^-1 times
         that before: a difference would lose R of 100 px^2 behind P of 1e14 px^2 after a pause.
+        Args:
+            mean: (2,) mean residual, px.
+            factors: Factors of position, velocity and offset in the mean, of `residuals`.
+            R: (2, 2) covariance of one event, px^2.
+            m: () number of events, by weight.
+
+        Returns:
+            The state after them.
         """
         B, own = self.covariances(factors)
         inverse = _inverse(own * m + R)
@@ -134,7 +166,16 @@ class LinearMotion(eqx.Module):
 
 
 def predicted_ellipse(motion: LinearMotion, theta: Array, size: Array) -> PredictedMeasurement:
-    """Return the predicted events of an ellipse with orientation (rad) and sizes (2,) in px."""
+    """Predict the events of an ellipse.
+
+    Args:
+        motion: Motion of its centre.
+        theta: () orientation, rad.
+        size: (2,) sizes along its axes, px.
+
+    Returns:
+        The prediction.
+    """
     spread = ellipse_covariance(theta, size)
     return PredictedMeasurement(motion.x[0], motion.x[1], spread, motion.P[0], size)
 
@@ -161,10 +202,13 @@ def join_blocks(
 
 
 def turn_transition(params: TrackerParams, dt: Array) -> tuple[Array, ...]:
-    """Return the transition of (theta, q) over `dt` seconds: dq = -g q dt + dW, g = 1 / tau_q.
+    """Return the transition of (theta, q) without events: dq = -g q dt + dW, g = 1 / tau_q.
 
     With a = g dt the variance of theta is that of W times dt^3 (a - 2 (1 - exp(-a)) +
     (1 - exp(-2 a)) / 2) / a^3, which cancels for small a; there its series serves.
+    Args:
+        params: Parameters of the tracker.
+        dt: () time, s.
 
     Returns:
         Factors of q in theta and in q, and the process noise: variance of theta, covariance,
@@ -194,7 +238,16 @@ def turn_transition(params: TrackerParams, dt: Array) -> tuple[Array, ...]:
 
 
 def transition(params: TrackerParams, dt: Array, static: Array) -> Float[Array, "8 8"]:
-    """Return the transition matrix of the common state over `dt` (s), at rest where `static`."""
+    """Return the transition matrix of the common state without events.
+
+    Args:
+        params: Parameters of the tracker.
+        dt: () time, s.
+        static: () whether the target stands still: velocity and turn rate are 0.
+
+    Returns:
+        The matrix.
+    """
     to_theta, to_q, *_ = turn_transition(params, dt)
     pairs = jnp.array([0, 1, 6, 7]), jnp.array([2, 3, 7, 7])
     F = jnp.eye(8, dtype=dt.dtype).at[pairs].set(jnp.stack([dt, dt, to_theta, to_q]))
@@ -204,7 +257,15 @@ def transition(params: TrackerParams, dt: Array, static: Array) -> Float[Array, 
 
 
 def ellipse_covariance(theta: Array, size: Float[Array, " 2"]) -> Float[Array, "2 2"]:
-    """Return L L^T = R diag(size^2) R^T, px^2."""
+    """Return the covariance of an ellipse's events, L L^T = R diag(size^2) R^T.
+
+    Args:
+        theta: () orientation, rad.
+        size: Sizes along its axes, px.
+
+    Returns:
+        The covariance, px^2.
+    """
     c, s = jnp.cos(theta), jnp.sin(theta)
     a, b = size[0] ** 2, size[1] ** 2
     xy = (a - b) * c * s
