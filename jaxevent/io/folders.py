@@ -412,7 +412,16 @@ def _open_images(path: Path) -> tuple[NDArray | None, dict[str, str]]:
 def _split_channels(
     images: NDArray, source: str, notes: list[str]
 ) -> tuple[DecodedImages, dict[str, Any]]:
-    """Return images in grey, and in colour by the name in `extra`, left in their file."""
+    """Split images into grey and colour, left in their file.
+
+    Args:
+        images: (n, H, W) or (n, H, W, 1 or 3), the latter blue, green, red.
+        source: Name of the folder, for messages.
+        notes: Notes of the reading, to which is added how colours are taken.
+
+    Returns:
+        Grey images (n, H, W), and colour images (n, H, W, 3), if any, by their name in `extra`.
+    """
 
     def left(convert: Callable[[NDArray], NDArray], *channels: int) -> DecodedImages:
         return DecodedImages(

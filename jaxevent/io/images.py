@@ -216,6 +216,21 @@ def _make_series(
     files: tuple[Path, ...],
     scale: Scale,
 ) -> Series:
+    """Make a series of images with times.
+
+    Args:
+        stamps: (n,) times and (n,) exposures, us.
+        stored: Function of the row that reads an image as it is stored.
+        source: Name of the series, for messages.
+        files: Files that it is read from.
+        scale: Scale from stored values to intensity.
+
+    Returns:
+        The series.
+
+    Raises:
+        InputError: There are no images, or times are not in order.
+    """
     t, exposure = stamps
     if not len(t):
         raise InputError(f"{source}: holds no images; give those of the recording")
@@ -529,7 +544,18 @@ def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.in
 def _inside(
     path: Path, words: Sequence[str], remedy: str, times: NDArray[np.int64], span: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Return times in their usual unit, or in the only one that puts them in the recording."""
+    """Parse times in their usual unit, or in the only one that puts them in the recording.
+
+    Args:
+        path: The file, for messages.
+        words: Texts of the times.
+        remedy: Advice for texts that are no times, for messages.
+        times: (n,) times in the usual unit, us.
+        span: Start and stop of the recording, us.
+
+    Returns:
+        (n,) times, us.
+    """
 
     def share(t: NDArray[np.int64]) -> float:
         return float(np.mean((t >= span[0]) & (t <= span[1])))

@@ -336,7 +336,18 @@ def _vector(value: NDArray) -> NDArray:
 
 
 def _checked_images(path: Path, images: NDArray) -> NDArray | None:
-    """Check images and return them as [frame, y, x]; None of none."""
+    """Check images and put frames first.
+
+    Args:
+        path: The file, for messages.
+        images: [y, x] or [y, x, frame].
+
+    Returns:
+        [frame, y, x]; None of no images.
+
+    Raises:
+        InputError: Floats exceed 1, or the shape is another.
+    """
     if images.size == 0:
         return None
     if images.dtype.kind == "f" and images.max() > 1:
@@ -367,14 +378,37 @@ def _frames(
 
 
 def _frames_first(images: NDArray, source: str) -> NDArray:
-    """Turn [y, x, frame] into contiguous [frame, y, x]; [y, x] stays as it is."""
+    """Put the axis of frames first.
+
+    Args:
+        images: [y, x, frame], or [y, x], which stays as it is.
+        source: Name of the array, for messages.
+
+    Returns:
+        Contiguous [frame, y, x], or [y, x].
+
+    Raises:
+        InputError: It has other dimensions.
+    """
     if images.ndim not in (2, 3):
         raise InputError(f"{source} has shape {images.shape}; store grey images as H x W x K")
     return np.ascontiguousarray(np.moveaxis(images, 2, 0) if images.ndim == 3 else images)
 
 
 def _reference(images: NDArray, frames: int, source: str) -> NDArray:
-    """Turn HDR_mat into grey [frame, y, x] or [y, x]."""
+    """Convert `HDR_mat` to grey.
+
+    Args:
+        images: [y, x[, frame]] or in colour [y, x, 3[, frame]].
+        frames: Number of frames; of 3, three images are not taken for colours.
+        source: Name of the array, for messages.
+
+    Returns:
+        [frame, y, x] or [y, x].
+
+    Raises:
+        InputError: It has another shape.
+    """
     colour = images.ndim == 4 or (images.ndim == 3 and images.shape[2] == 3 and frames != 3)
     if colour and images.shape[2] != 3:
         raise InputError(

@@ -353,7 +353,16 @@ def _read_image(bag: Bag, topic: str, message: Any) -> NDArray:
 
 
 def _decompress(bag: Bag, topic: str, data: NDArray[np.uint8]) -> NDArray:
-    """Read a compressed image by Pillow: grey (height, width), else (height, width, 3)."""
+    """Read a compressed image by Pillow.
+
+    Args:
+        bag: The bag.
+        topic: Topic of the image, for messages.
+        data: (bytes,) the compressed image.
+
+    Returns:
+        Grey (height, width), else (height, width, 3).
+    """
     from PIL import Image
 
     source = f"{bag.path}: an image of {topic}"
@@ -365,7 +374,15 @@ def _decompress(bag: Bag, topic: str, data: NDArray[np.uint8]) -> NDArray:
 
 
 def _interpolate_colours(image: NDArray, encoding: str) -> NDArray:
-    """Interpolate the colours of the mosaic of a Bayer pattern; other images stay as they are."""
+    """Interpolate the colours of the mosaic of a Bayer pattern.
+
+    Args:
+        image: (height, width[, 3]).
+        encoding: Encoding, as ROS names it.
+
+    Returns:
+        (height, width, 3); images of other encodings as they are.
+    """
     pattern = encoding.removeprefix("bayer_")[:4].upper()
     if not encoding.startswith("bayer_") or pattern not in BAYER_PATTERNS:
         return image

@@ -182,7 +182,21 @@ def _open_images_dsec(
     parts: tuple[int, ...],
     value: Callable[[NDArray[np.float32]], NDArray[np.float32]],
 ) -> DecodedImages | None:
-    """Open the images of a folder beside their times, (n, *parts, H, W); None if it has none."""
+    """Open the images of a folder beside their times.
+
+    Args:
+        stamps: File of the times.
+        name: Name of the folder.
+        t: (n,) times, us, or (n, 2) with `parts`.
+        parts: Axes of channels before those of pixels; none: grey.
+        value: Function of stored images (H, W[, 3]) that returns values (*parts, H, W).
+
+    Returns:
+        (n, *parts, H, W); None if the folder has no images.
+
+    Raises:
+        InputError: There are not as many times as images.
+    """
     from PIL import Image
 
     folder = stamps.parent / name

@@ -77,6 +77,14 @@ def _draw_correlations(axis: Any, calibration: Calibration) -> None:
 
 
 def _draw_counts(axis: Any, calibration: Calibration, recording: Recording, I0: float) -> None:
+    """Draw the net events of pixels over their change of log intensity, and the thresholds.
+
+    Args:
+        axis: Axis of matplotlib.
+        calibration: Thresholds to draw as lines.
+        recording: Events and frames.
+        I0: Offset inside the logarithm.
+    """
     change, net = _changes(recording, calibration, I0)
     axis.set(xlabel=f"change of ln(I + {I0:g}) between frames", ylabel="ON minus OFF events")
     if not len(net):
@@ -105,7 +113,16 @@ def _draw_counts(axis: Any, calibration: Calibration, recording: Recording, I0: 
 def _changes(
     recording: Recording, calibration: Calibration, I0: float
 ) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-    """Return changes of log intensity and ON minus OFF events of pixels between frames."""
+    """Measure changes of log intensity between frames, and count the events meanwhile.
+
+    Args:
+        recording: Events and frames.
+        calibration: Offset of the clock, and hot pixels.
+        I0: Offset inside the logarithm.
+
+    Returns:
+        Changes, ln I, and ON minus OFF events, (n,) each, of pixels with events in a few intervals.
+    """
     frames = recording.frames
     late = (
         round(1e6 * calibration.clock_offset.value)

@@ -138,7 +138,22 @@ def save_video(
 def write_hdf5(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
-    """Write exact images as HDF5, see `writer`."""
+    """Write exact images as HDF5, see `writer`.
+
+    Args:
+        video: The images.
+        times: (T,) us.
+        out: File to write.
+        tone: Not used: intensity is linear.
+        name: Name of the recording.
+        colours: Function that makes colour images of times; None: images are grey.
+
+    Returns:
+        The end of a sentence about the file: "".
+
+    Raises:
+        InputError: No image holds a finite number.
+    """
     shape = (len(times), video.recording.height, video.recording.width)
     what = "linear intensity" if colours is None else "linear Rec. 709 red, green, blue"
     units = {"image": f"{what}: 0 is the frames' black, 1 their white"}
@@ -194,7 +209,19 @@ def _store(compressed: list[tuple[h5py.Dataset, int, Future[bytes]]]) -> None:
 def _write_video(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
-    """Write images for the display as MP4, see `writer`."""
+    """Write images for the display as MP4, see `writer`.
+
+    Args:
+        video: The images.
+        times: (T,) us.
+        out: File to write.
+        tone: Tone curve, as of `tone_map`.
+        name: Not used.
+        colours: Function that makes colour images of times; None: images are grey.
+
+    Returns:
+        The end of a sentence about the file.
+    """
     rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
     fps = min(rate, 60.0)
     range_used = RangeCounter(tone)
@@ -208,7 +235,19 @@ def _write_video(
 def _write_images(
     video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
 ) -> str:
-    """Write images for the display as PNG files, see `writer`."""
+    """Write images for the display as PNG files, see `writer`.
+
+    Args:
+        video: The images.
+        times: (T,) us.
+        out: Folder to write.
+        tone: Tone curve, as of `tone_map`.
+        name: Not used.
+        colours: Function that makes colour images of times; None: images are grey.
+
+    Returns:
+        The end of a sentence about the file.
+    """
     range_used = RangeCounter(tone)
     with complete(out, directory=True) as partial:
         lines = []
@@ -303,7 +342,16 @@ def _spread(count: int) -> NDArray[np.int64]:
 def _batches(
     video: ImageSequence, times: NDArray, colours: Colours
 ) -> Iterator[tuple[NDArray, dict[str, NDArray]]]:
-    """Yield times and images in batches, by their names in HDF5."""
+    """Read images in batches.
+
+    Args:
+        video: The images.
+        times: (T,) us.
+        colours: Function that makes colour images of times; None: images are grey.
+
+    Yields:
+        Times of a batch, us, and arrays (times, H, W[, 3]) by their names in HDF5.
+    """
     if colours is None:
         for batch, estimate in video.batches(times):
             yield batch, {"image": estimate.mean, "variance": estimate.covariance}

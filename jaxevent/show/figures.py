@@ -411,7 +411,18 @@ def _image_figure(width: int, height: int) -> tuple[Any, Any]:
 
 
 def _sensor(part: Events | Recording, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return width and height of the sensor, px."""
+    """Return the size of the sensor.
+
+    Args:
+        part: Events, or a recording, which knows it.
+        size: Width and height, px, for events.
+
+    Returns:
+        Width and height, px.
+
+    Raises:
+        InputError: It is not known.
+    """
     if isinstance(part, Recording):
         return part.width, part.height
     if size is None:
@@ -424,7 +435,16 @@ def _sensor(part: Events | Recording, size: tuple[int, int] | None) -> tuple[int
 def _middle(
     part: Events | Recording, count: int | None, size: tuple[int, int] | None = None
 ) -> Events:
-    """Return so many events from the middle."""
+    """Return events from the middle.
+
+    Args:
+        part: Events, or a recording.
+        count: Number of events; None: one for each four pixels.
+        size: Width and height of the sensor, px, for events.
+
+    Returns:
+        The events.
+    """
     width, height = _sensor(part, size)
     source: EventSource = part.events if isinstance(part, Recording) else part
     count = width * height // 4 if count is None else count
@@ -451,7 +471,15 @@ def _title(part: Events | Recording, events: Events) -> str:
 
 
 def _bright(values: NDArray, least: float) -> float:
-    """Return the 99.5 % quantile of finite values, at least `least`."""
+    """Return the 99.5 % quantile of finite values.
+
+    Args:
+        values: Values of any shape.
+        least: Least result.
+
+    Returns:
+        The quantile, or `least`.
+    """
     known = values[np.isfinite(values)]
     return max(least, float(np.percentile(known, 99.5))) if len(known) else least
 

@@ -150,14 +150,30 @@ def _clip_infinite(images: ArrayLike) -> NDArray[np.floating]:
 
 
 def _to_tone_scale(intensity: NDArray[np.floating], tone: str) -> NDArray[np.floating]:
-    """Return the quantity that a tone shows linearly."""
+    """Return the quantity that a tone shows linearly.
+
+    Args:
+        intensity: Intensity, of any shape.
+        tone: Tone curve, as of `tone_map`.
+
+    Returns:
+        The quantity, of the same shape; with logarithmic tones in octaves.
+    """
     if tone == "changes":
         return np.log1p(np.maximum(intensity, 2.0**-MAX_OCTAVES - 1))
     return np.log2(intensity) if _is_logarithmic(tone) else intensity
 
 
 def _fill_unknown(variance: ArrayLike | None, images: NDArray) -> NDArray[np.floating]:
-    """Return variances with 0 for those that are not estimated, None or NaN."""
+    """Put 0 in place of variances that are not estimated.
+
+    Args:
+        variance: Variance, (ln I)^2, that broadcasts with `images`; None: not estimated.
+        images: (..., H, W) images.
+
+    Returns:
+        Variances of the shape of `images`.
+    """
     given = np.asarray(np.nan if variance is None else variance, np.float64)
     return np.where(np.isnan(given), 0.0, np.broadcast_to(given, images.shape))
 
@@ -285,7 +301,15 @@ def video_writer(
 
 
 def _check_displayable(path: str | Path, image: NDArray) -> None:
-    """Raise `InputError` for an array that is no grey or colour image of uint8."""
+    """Check that an array is a grey or colour image of uint8.
+
+    Args:
+        path: File that it is for.
+        image: The array.
+
+    Raises:
+        InputError: It is none.
+    """
     grey_or_colour = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     if image.dtype != np.uint8 or not grey_or_colour or not image.size:
         raise InputError(

@@ -144,7 +144,14 @@ def _plot_component(
 
 
 def _plot_extra(axis: Any, seconds: NDArray, label: str, series: NDArray) -> None:
-    """Plot an error or a contrast over time, from 0 up."""
+    """Plot an error or a contrast over time, from 0 up.
+
+    Args:
+        axis: Axis of matplotlib.
+        seconds: (T,) times, s.
+        label: Label of the axis.
+        series: (T,) values, 0 or more; NaN: none.
+    """
     axis.plot(seconds, series, color=_ESTIMATE, lw=1.1)
     axis.set_ylabel(label)
     good = series[np.isfinite(series)]
@@ -155,7 +162,17 @@ def _plot_extra(axis: Any, seconds: NDArray, label: str, series: NDArray) -> Non
 def _errors(
     model: type[Model], times: NDArray[np.int64], estimated: Estimate, truth: KnownMotion | None
 ) -> list[tuple[str, NDArray[np.float64]]]:
-    """Compute errors over time, with the labels of their axes."""
+    """Compute errors over time.
+
+    Args:
+        model: Model of the motion.
+        times: (T,) us.
+        estimated: Motion at these times.
+        truth: The true motion; None: it is not known.
+
+    Returns:
+        Labels of axes, each with (T,) errors, NaN where motion or truth are not known.
+    """
     if truth is None:
         return []
     inside = truth.covers(times) & estimated.valid
@@ -183,7 +200,15 @@ def _errors(
 def _contrasts(
     motion: MotionEstimate, times: NDArray[np.int64]
 ) -> list[tuple[str, NDArray[np.float64]]]:
-    """Return the contrast of the events or the share explained, where there is no truth."""
+    """Interpolate the contrast of the events or the share explained, where there is no truth.
+
+    Args:
+        motion: The motion.
+        times: (T,) us.
+
+    Returns:
+        At most one label of an axis, with (T,) values.
+    """
     for label, values in (("contrast", motion.contrast), ("events explained", motion.agreement)):
         if values is not None and np.isfinite(values).any():
             return [(label, np.interp(times, motion.t, values))]
@@ -211,7 +236,13 @@ def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool | No
 
 
 def _mark_unobservable(axis: Any, seconds: NDArray, rows: NDArray[np.bool_]) -> None:
-    """Mark the times at which a direction is not observable."""
+    """Mark the times at which a direction is not observable.
+
+    Args:
+        axis: Axis of matplotlib.
+        seconds: (T,) times, s.
+        rows: (T,) whether it is not observable.
+    """
     for begin, end in _spans(seconds, rows):
         axis.axvspan(begin, end, fc="none", ec=_LOST, hatch="///", lw=0)
     if rows.any():
@@ -220,7 +251,15 @@ def _mark_unobservable(axis: Any, seconds: NDArray, rows: NDArray[np.bool_]) -> 
 
 
 def _spans(seconds: NDArray, rows: NDArray[np.bool_]) -> Iterator[tuple[float, float]]:
-    """Yield begin and end (s) of consecutive rows."""
+    """List spans of time in which a condition holds.
+
+    Args:
+        seconds: (T,) times, s.
+        rows: (T,) whether it holds.
+
+    Yields:
+        Begin and end of each span, s.
+    """
     edges = np.flatnonzero(np.diff(np.r_[False, rows, False].astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         yield seconds[begin], seconds[min(end, len(seconds) - 1)]
@@ -397,7 +436,16 @@ def _padded(array: NDArray) -> NDArray:
 
 @functools.partial(jax.jit, static_argnums=2)
 def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Sum weights at places (n, 2) px in an image; return it and its contrast."""
+    """Sum weights at places in an image.
+
+    Args:
+        xy: (n, 2) places, px.
+        weight: (n,) weights.
+        shape: Height and width of the image, px.
+
+    Returns:
+        The image, and its contrast, ().
+    """
     image = splat(xy, weight, shape)
     return image, image_variance(blur(image, 1))
 

@@ -166,7 +166,16 @@ def track_colour(track_id: int) -> tuple[int, int, int]:
 def _event_images(
     recording: Recording, times: NDArray[np.int64], window: int
 ) -> Iterator[NDArray[np.uint8]]:
-    """Draw the events of (t - window, t] for each t, the last one of a pixel on top."""
+    """Draw the events of windows that end at some times, the last one of a pixel on top.
+
+    Args:
+        recording: The recording.
+        times: (T,) ends of the windows, us; each one counts.
+        window: Length of the windows, us.
+
+    Yields:
+        (H, W, 3) images.
+    """
     for t in times:
         image = np.full((recording.height, recording.width, 3), _BACKGROUND, np.uint8)
         first, last = (recording.events.index(int(at)) for at in (t - window + 1, t + 1))
@@ -176,7 +185,15 @@ def _event_images(
 
 
 def outline(ellipse_state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
-    """Return points (49, 2) px of a state's ellipse of `sigmas` standard deviations."""
+    """Return points on the outline of a state's ellipse.
+
+    Args:
+        ellipse_state: (8,) state, as of `TrackStates`.
+        sigmas: Half axes of the outline, in standard deviations.
+
+    Returns:
+        (49, 2) x and y, px, the last point the first one.
+    """
     angle = np.linspace(0, 2 * np.pi, 49)
     u, v = sigmas * ellipse_state[4] * np.cos(angle), sigmas * ellipse_state[5] * np.sin(angle)
     c, s = np.cos(ellipse_state[6]), np.sin(ellipse_state[6])
@@ -184,7 +201,15 @@ def outline(ellipse_state: NDArray, sigmas: float | int) -> NDArray[np.float64]:
 
 
 def _large(points: NDArray, scale: int) -> tuple[float, ...]:
-    """Return places in an enlarged image, x and y by turns."""
+    """Convert points to places in an enlarged image, as Pillow takes them.
+
+    Args:
+        points: (n, 2) x and y, px.
+        scale: Factor of enlargement.
+
+    Returns:
+        x and y by turns, px of the enlarged image.
+    """
     return tuple(((points + 0.5) * scale - 0.5).clip(-1e5, 1e5).ravel().tolist())
 
 
@@ -314,7 +339,15 @@ def _draw_states(
 
 
 def _choose_longest(valid: NDArray[np.bool_], also: Sequence[int]) -> NDArray[np.bool_]:
-    """Choose the tracks that are seen at the most times, and some others."""
+    """Choose the tracks that are seen at the most times, and some others.
+
+    Args:
+        valid: (times, tracks) whether a track is seen.
+        also: Indices of the others.
+
+    Returns:
+        (tracks,) whether a track is chosen.
+    """
     shown = np.zeros(valid.shape[1], bool)
     shown[np.argsort(-valid.sum(0), kind="stable")[:_MAX_CURVES]] = True
     shown[list(also)] = True

@@ -202,7 +202,12 @@ def quantity_writer(
 
 
 def _append_rows(file: h5py.File, columns: Iterable[tuple[str, NDArray]]) -> None:
-    """Append rows of arrays to data sets, which are made if they are missing."""
+    """Append rows of arrays to data sets, which are made if they are missing.
+
+    Args:
+        file: The file.
+        columns: Names and arrays (rows, ...).
+    """
     for name, array in columns:
         if name not in file:
             file.create_dataset(

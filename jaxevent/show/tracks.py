@@ -226,7 +226,14 @@ class Output:
         times: "_Times",
         states: Iterator[tuple[NDArray, NDArray]],
     ) -> None:
-        """Write a video of the states at the pictures' times."""
+        """Write a video of the states at the pictures' times.
+
+        Args:
+            path: File to write.
+            tracks: The tracks.
+            times: Times of the output, with those of pictures.
+            states: States (N, 8) of the tracks, and whether each is valid (N,), for each picture.
+        """
         recording, pictures = tracks.recording, times.pictures
         behind = _high_pass(recording, pictures) if self.background != "events" else None
         with video_writer(path, min(times.per_second, _MAX_FPS)) as show:
@@ -494,7 +501,15 @@ def _within(t: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def _high_pass(recording: Recording, times: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-    """Yield images from the events alone, grey where nothing happens."""
+    """Make images from the events alone, grey where nothing happens.
+
+    Args:
+        recording: The recording.
+        times: (T,) us.
+
+    Returns:
+        Images (H, W), one for each time.
+    """
     from jaxevent.reconstruction import high_pass
     from jaxevent.show.export import display_images
 

@@ -145,6 +145,11 @@ class _Sender:
 
         White is the brightest 0.5 % of the first image of all sequences, so that these compare, and
         of brighter images that follow.
+
+        Args:
+            name: Name of the sequence.
+            t: (n,) times, us.
+            image: Function of the row that returns (H, W) intensity.
         """
         self._pictures.append(f"/{name}")
         for row, time in enumerate(t.tolist()):
@@ -155,7 +160,12 @@ class _Sender:
             self._image(name, time, tone_map(np.nan_to_num(values), "display", limits))
 
     def toned_images(self, name: str, images: Iterable[tuple[int, NDArray[np.uint8]]]) -> None:
-        """Send times (us) and images for the display."""
+        """Send images for the display.
+
+        Args:
+            name: Name of the sequence.
+            images: Times, us, with images (H, W[, 3]).
+        """
         self._pictures.append(f"/{name}")
         for time, image in images:
             self._image(name, time, image)
