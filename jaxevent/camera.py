@@ -353,7 +353,18 @@ def estimate_response(
 
 
 def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
-    """Check the images and exposure times of a stack."""
+    """Check the images and exposure times of a stack.
+
+    Args:
+        images: (images, height, width) uint8.
+        exposures: (images,) exposure times, s.
+
+    Returns:
+        Both as arrays.
+
+    Raises:
+        InputError: They are not.
+    """
     stack, times = np.asarray(images), np.asarray(exposures, float)
     if stack.dtype != np.uint8 or stack.ndim != 3:
         raise InputError(
@@ -614,7 +625,15 @@ def _turn_equidistant(k: Coefficients) -> float:
 def _radius(
     angle: NDArray[np.float64], k: Coefficients
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the radius at which angles from the axis are imaged, and its derivative."""
+    """Return the radius at which angles from the axis are imaged, and its derivative.
+
+    Args:
+        angle: Angles, rad, of any shape.
+        k: Coefficients k1 to k4 of the equidistant model.
+
+    Returns:
+        Radius, in focal lengths, and its derivative by the angle, of that shape.
+    """
     k1, k2, k3, k4 = k
     a2 = angle * angle
     radius = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))

@@ -309,7 +309,15 @@ class _Sample:
 
 
 def _rescale_weights(weights: NDArray, whole: float) -> NDArray:
-    """Scale the weights of parts so that their sum is the weight of the batch."""
+    """Scale the weights of parts so that their sum is the weight of the batch.
+
+    Args:
+        weights: (parts,) weights.
+        whole: Weight of the batch.
+
+    Returns:
+        (parts,).
+    """
     return weights * (whole / max(float(weights.sum()), 1e-300))
 
 
@@ -436,7 +444,13 @@ def _smoothed_ends(
 def _widths(sample: _Sample, scales: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """Compute half widths by curvature, Newton steps and curvatures, in unit steps.
 
-    Infinite if undetermined.
+    Args:
+        sample: Sample of the loss.
+        scales: (p,) length of a unit step of each parameter.
+
+    Returns:
+        Half widths, Newton steps and curvatures, (p,) each; widths and steps are infinite where
+        they are not determined.
     """
     p = len(scales)
     rows = []

@@ -135,7 +135,16 @@ def _log_pair(
 def _mean(
     values: NDArray[np.float64], where: ArrayLike | None, truth: ArrayLike
 ) -> NDArray[np.float64]:
-    """Average each image's `values` over the pixels of the mask `where`; NaN over none."""
+    """Average values over the pixels of each image.
+
+    Args:
+        values: (..., H, W).
+        where: Mask of pixels, (..., H, W) or (H, W); None: all.
+        truth: (..., H, W), whose shape the mask must have.
+
+    Returns:
+        (...), NaN over no pixels.
+    """
     if where is None:
         return np.asarray(np.mean(values, axis=(-2, -1)))
     mask = _mask(where, np.shape(truth))
@@ -530,7 +539,16 @@ def _vgg(layers: list[dict[str, Array]], x: Array) -> list[Array]:
 def _distance(
     net: str, weights: list[dict[str, Array]], pair: Float[Array, "2 height width 3"]
 ) -> Float[Array, ""]:
-    """Average squared differences of unit features, weighted by channel (equation 1)."""
+    """Average squared differences of unit features, weighted by channel (equation 1).
+
+    Args:
+        net: Name of the network, "alex" or "vgg".
+        weights: Weights of its layers, and of the five weighted sums.
+        pair: Two images, 0 to 1.
+
+    Returns:
+        The distance.
+    """
     # The networks' inputs: [-1, 1] less the mean and over the deviation of ImageNet.
     x = (2 * jnp.asarray(pair) - 1 - jnp.array([-0.030, -0.088, -0.188], jnp.float32)) / jnp.array(
         [0.458, 0.448, 0.450], jnp.float32

@@ -663,7 +663,15 @@ def phrase(value: Any) -> str:
 
 
 def _format_leaf(value: Array | np.ndarray, number: Number) -> str:
-    """Format a number or its stored one; a traced or mapped one by type or shape."""
+    """Format a number or its stored one; a traced or mapped one by type or shape.
+
+    Args:
+        value: The value.
+        number: The parameter, whose default tells how many numbers it has.
+
+    Returns:
+        The text.
+    """
     if isinstance(value, Tracer):
         return value.aval.str_short()
     ndim = isinstance(number.default, tuple)

@@ -112,7 +112,15 @@ def _span(what: str, number: int, t: Any) -> str:
 
 
 def _doubt_times(events: NDArray[np.int64], frames: "Frames") -> str | None:
-    """Return what shows that frames have another unit of time than events (us), or None."""
+    """Return what shows that frames have another unit of time than events, or None.
+
+    Args:
+        events: (n,) times of events, us.
+        frames: The frames.
+
+    Returns:
+        A clause for a message; None: nothing.
+    """
     t = frames.t
     if len(events) and len(t):
         gap = max(t[0] - events[-1], events[0] - t[-1])
@@ -386,7 +394,19 @@ def _is_source(events: Any) -> bool:
 
 
 def _checked_source(events: Any, size: tuple[int, int], name: str) -> EventSource:
-    """Check the events of a recording, or have them checked when they are read."""
+    """Check the events of a recording, or have them checked when they are read.
+
+    Args:
+        events: Events, or a source of events.
+        size: Width and height of the sensor, px.
+        name: Name of the recording, for messages.
+
+    Returns:
+        A source that gives valid events alone.
+
+    Raises:
+        InputError: They are no events, or not on the sensor.
+    """
     if isinstance(events, Events):
         events.check_places(*size, name)
         return events
@@ -659,7 +679,20 @@ def _columns_given(t: Any, x: Any, y: Any, p: Any) -> dict[str, Any]:
 def _events_of_columns(
     t: NDArray[np.int64], given: Mapping[str, Any], size: tuple[int, int], name: str
 ) -> Events:
-    """Check columns of a caller on a sensor (width, height), and make events of times (us)."""
+    """Check columns of a caller, and make events of them.
+
+    Args:
+        t: (n,) times, us.
+        given: Columns x, y and p by name.
+        size: Width and height of the sensor, px.
+        name: Name of the recording, for messages.
+
+    Returns:
+        The events.
+
+    Raises:
+        InputError: A column is not valid, or times are not in order.
+    """
     x, y, p = (arrays.as_column(given[field], field) for field in "xyp")
     arrays.check_lengths(t, x, y, p, name)
     events = Events.of_checked(

@@ -568,7 +568,15 @@ class Clock(NamedTuple):
         return not inside or self._overlap(values, unit) > _MIN_OVERLAP
 
     def _overlap(self, values: NDArray, unit: str) -> float:
-        """Return the intersection of the spans over their union."""
+        """Return the intersection of the spans of two series over their union.
+
+        Args:
+            values: (n,) times of a series.
+            unit: Its unit.
+
+        Returns:
+            The ratio, 0 to 1.
+        """
         first, last = _ends(values, unit)
         common = min(last, self.last) - max(first, self.first)
         return max(common, 0.0) / max(max(last, self.last) - min(first, self.first), 1.0)

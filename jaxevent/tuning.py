@@ -460,7 +460,17 @@ def evaluate_loss(loss: Loss, params: Parameters, batch: Any) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
-    """Compute the loss of each start, (starts,); infinite where a parameter is out of bounds."""
+    """Compute the loss of each start.
+
+    Args:
+        loss: The loss.
+        params: Parameters, in which those of the starts are put.
+        raw: Raw values of the parameters that vary, (starts, ...).
+        batch: Batch of the loss.
+
+    Returns:
+        (starts,), infinite where a parameter is out of bounds.
+    """
 
     def value(one: dict[str, Array]) -> Array:
         stepped = params.with_raw(one)
@@ -862,11 +872,19 @@ def _search_smoothed(objective: Callable[[float], float]) -> float:
 def _search_minimum(
     objective: Callable[[float], float], interval: Interval, value: float, turn: int
 ) -> float:
-    """Search one number for the least loss; `value` is among the candidates.
+    """Search one number for the least loss.
 
     Every turn evaluates all points of the interval, as the best one may change once the other
     parameters have moved. The first turn adds the vertex of the parabola through the best point and
     its neighbours; later turns approach the minimum around the best by Brent's method.
+    Args:
+        objective: The loss of a value.
+        interval: Lowest and highest value, and the number of points.
+        value: Present value, which is among the candidates.
+        turn: Number of the turn, from 0.
+
+    Returns:
+        The best value.
     """
     low, high, count = interval
     step = (high - low) / (count - 1)

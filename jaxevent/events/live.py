@@ -130,7 +130,19 @@ def _time_scale(text: bytes) -> float:
 
 
 def _parse(text: bytes, scale: float, place: str) -> Events:
-    """Make events of lines."""
+    """Parse lines of text as events.
+
+    Args:
+        text: Lines of t, x, y and p.
+        scale: Length of the unit of t, us.
+        place: Name of the source, for messages.
+
+    Returns:
+        The events.
+
+    Raises:
+        InputError: A line is no event.
+    """
     lines = [row for row in map(bytes.split, text.splitlines()) if row]
     try:
         columns = np.array(lines, np.float64)

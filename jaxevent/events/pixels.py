@@ -247,7 +247,15 @@ def undistort(recording: Recording) -> Recording:
 
 
 def _interpolate(images: NDArray, at: NDArray[np.float64]) -> NDArray:
-    """Interpolate images (n, H, W[, 3]) linearly at points (H, W, 2), px; 0 outside."""
+    """Interpolate images linearly at points.
+
+    Args:
+        images: (n, H, W[, 3]).
+        at: (h, w, 2) x and y, px.
+
+    Returns:
+        (n, h, w[, 3]) of the type of `images`, 0 outside.
+    """
     height, width = images.shape[1:3]
     inside = np.all((at >= 0) & (at <= (width - 1, height - 1)), axis=-1)
     at = np.where(inside[..., None], at, 0)

@@ -116,7 +116,17 @@ def _check_request(
     offset: float | int | None,
     search: float | int | None,
 ) -> None:
-    """Raise `InputError` if there is nothing to register, or for times that make no sense."""
+    """Check that there is something to register, and that times make sense.
+
+    Args:
+        recording: Events.
+        other: Frames.
+        offset: Offset of the clocks, s; None: it is estimated.
+        search: Largest offset to try, s; None: the default.
+
+    Raises:
+        InputError: Something is missing, or not possible.
+    """
     check_recording(recording, "register.estimate")
     check_recording(other, "register.estimate")
     frames = other.frames

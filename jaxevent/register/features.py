@@ -47,7 +47,15 @@ def _detect(sift: Any, image: NDArray, scale: float = 1.0) -> tuple[NDArray, NDA
 
 
 def _match(one: NDArray, two: NDArray) -> list[tuple[int, int]]:
-    """Match descriptors by Lowe's ratio test; return pairs of rows."""
+    """Match descriptors by Lowe's ratio test.
+
+    Args:
+        one: (n, d) descriptors of one image.
+        two: (m, d) descriptors of another.
+
+    Returns:
+        Pairs of a row of `one` and a row of `two`.
+    """
     if not len(one) or not len(two):
         return []
     cv2 = require("cv2", "vision")
@@ -289,7 +297,17 @@ def _resample_to_frames(
     homographies: list[NDArray[np.float64] | None],
     rows: list[int],
 ) -> NDArray[np.float32]:
-    """Return the image as each frame sees it, NaN where it is not known."""
+    """Resample a still image as frames see it.
+
+    Args:
+        recording: A recording with frames.
+        still: The image, as the only frame of a recording.
+        homographies: (3, 3) from each frame's pixels to the image's, px; None: not matched.
+        rows: Rows of the frames wanted, which are matched.
+
+    Returns:
+        (rows, H, W) 0 or more, NaN where it is not known.
+    """
     assert still.frames is not None
     images = np.empty((len(rows), recording.height, recording.width), np.float32)
     for place, row in enumerate(rows):
@@ -301,7 +319,19 @@ def _resample_to_frames(
 
 
 def _estimate_scale(recording: Recording, images: NDArray[np.float32], rows: list[int]) -> float:
-    """Return the median ratio of the frames' unclipped pixels to the image."""
+    """Estimate the factor from an image to intensity.
+
+    Args:
+        recording: A recording with frames.
+        images: (rows, H, W) the image as the frames see it.
+        rows: Rows of these frames.
+
+    Returns:
+        The median ratio of the frames' unclipped pixels to the image.
+
+    Raises:
+        InputError: The frames show nothing unclipped of it.
+    """
     assert recording.frames is not None
     ratios = []
     for image, row in zip(images, rows, strict=True):

@@ -86,7 +86,20 @@ def read_frames(
 def _read_image_series(
     path: Path, exposure: float | int | None, white: float | int | None, reference: bool
 ) -> Recording:
-    """Read a folder or file of images with time stamps."""
+    """Read a folder or file of images with time stamps.
+
+    Args:
+        path: The folder or file.
+        exposure: Length of the exposures, s; None: that of the time stamps.
+        white: Value of intensity 1; None: as of `Scale`.
+        reference: Whether the images are a reference: without colours, and with any intensity.
+
+    Returns:
+        A recording of frames alone.
+
+    Raises:
+        InputError: A number is not possible, or images differ in size.
+    """
     if exposure is not None and not 0 < exposure < math.inf:
         raise InputError(f"{path}: an exposure of {exposure} s is not possible; give seconds")
     if white is not None and not 0 < white < math.inf:
@@ -339,7 +352,18 @@ def apply_registration(
 
 
 def _crop(recording: Recording, covered: NDArray[np.bool_]) -> Recording:
-    """Crop a recording to its largest rectangle of covered pixels."""
+    """Crop a recording to its largest rectangle of covered pixels.
+
+    Args:
+        recording: A recording with frames.
+        covered: (H, W) whether the other camera sees a pixel.
+
+    Returns:
+        The recording of these pixels.
+
+    Raises:
+        InputError: No event lies on them.
+    """
     left, top, right, bottom = largest_rectangle(covered)
     events = recording.events[0 : len(recording.events)]
     inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)

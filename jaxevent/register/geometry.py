@@ -115,7 +115,16 @@ def coverage(grid: Grid) -> float:
 
 
 def recording_grid(recording: Recording, other: Recording, homography: NDArray[np.float64]) -> Grid:
-    """Return the grid of a homography between the cameras of two recordings."""
+    """Return the grid of a homography between the cameras of two recordings.
+
+    Args:
+        recording: Recording whose pixels the grid is of.
+        other: Recording whose positions it holds.
+        homography: (3, 3) from undistorted pixels of the first to those of the other, px.
+
+    Returns:
+        (H, W, 2) positions, px, NaN outside the other image.
+    """
     size, seen = (recording.width, recording.height), (other.width, other.height)
     return homography_grid(homography, size, seen, recording.camera, other.camera)
 
@@ -132,14 +141,30 @@ def check_homography(values: ArrayLike) -> NDArray[np.float64]:
 
 
 def apply_homography(H: NDArray[np.float64], points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Map positions (n, 2), px, by a homography, NaN behind its horizon."""
+    """Map positions by a homography.
+
+    Args:
+        H: (3, 3) the homography.
+        points_px: (n, 2) x and y, px.
+
+    Returns:
+        (n, 2), px, NaN behind its horizon.
+    """
     seen = points_px @ H[:, :2].T + H[:, 2]
     w = seen[:, 2:] * np.sign(H[2, 2] if H[2, 2] else 1)
     return seen[:, :2] / np.where(w > 1e-9, seen[:, 2:], np.nan)
 
 
 def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions (n, 2), px, without the distortion."""
+    """Remove the distortion of a camera from positions.
+
+    Args:
+        camera: The camera; None: there is no distortion.
+        at: (n, 2) x and y, px.
+
+    Returns:
+        (n, 2), px.
+    """
     if camera is None or not camera.is_distorted:
         return at.astype(np.float64)
     from jaxevent.egomotion.geometry import undistort
@@ -151,26 +176,58 @@ def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[
 def undistorted_pixels(
     camera: PinholeCamera | None, sensor_size: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return the undistorted positions (height * width, 2), px, of a camera's pixels."""
+    """Return the undistorted positions of a camera's pixels.
+
+    Args:
+        camera: The camera; None: there is no distortion.
+        sensor_size: Width and height, px.
+
+    Returns:
+        (height * width, 2) x and y, px, row by row.
+    """
     y, x = np.mgrid[: sensor_size[1], : sensor_size[0]].astype(np.float64)
     return undistort(camera, np.stack([x.ravel(), y.ravel()], 1))
 
 
 def pixel_rays(camera: PinholeCamera, sensor_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return rays (height * width, 3) of depth 1 through a camera's pixels."""
+    """Return rays through a camera's pixels.
+
+    Args:
+        camera: The camera.
+        sensor_size: Width and height, px.
+
+    Returns:
+        (height * width, 3) rays of depth 1, row by row.
+    """
     at = (undistorted_pixels(camera, sensor_size) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return np.concatenate([at, np.ones((len(at), 1))], 1)
 
 
 def distort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions (n, 2), px, with the distortion; NaN where its radial part turns back."""
+    """Distort positions as a camera does.
+
+    Args:
+        camera: The camera; None: there is no distortion.
+        at: (n, 2) x and y, px.
+
+    Returns:
+        (n, 2), px, NaN where the radial part of the distortion turns back.
+    """
     if camera is None or not camera.is_distorted:
         return at
     return camera.distort((at - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
 
 
 def project(camera: PinholeCamera, points_3d: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Project points (n, 3) to (n, 2), px; NaN behind the camera."""
+    """Project points to a camera's image.
+
+    Args:
+        camera: The camera.
+        points_3d: (n, 3) x, y and depth in the camera's axes.
+
+    Returns:
+        (n, 2), px, NaN behind the camera.
+    """
     Z = np.where(points_3d[:, 2:] > 1e-9, points_3d[:, 2:], np.nan)
     straight = points_3d[:, :2] / Z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return distort(camera, straight)
@@ -179,7 +236,15 @@ def project(camera: PinholeCamera, points_3d: NDArray[np.float64]) -> NDArray[np
 def mask_outside(
     points_px: NDArray[np.float64], image_size: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Set positions (n, 2) outside an image to NaN; its outermost pixels' centres are its edge."""
+    """Set positions outside an image to NaN; its outermost pixels' centres are its edge.
+
+    Args:
+        points_px: (n, 2) x and y, px.
+        image_size: Width and height of the image, px.
+
+    Returns:
+        (n, 2).
+    """
     seen = (points_px >= -1e-6) & (points_px <= np.array(image_size) - 1 + 1e-6)
     return np.where(seen.all(1, keepdims=True), points_px, np.nan)
 

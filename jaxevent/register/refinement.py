@@ -420,7 +420,16 @@ def _least_squares(
 def _correlate_weighted(
     a: NDArray[np.float64], b: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> float:
-    """Return Pearson's correlation of two vectors under weights."""
+    """Return Pearson's correlation of two vectors under weights.
+
+    Args:
+        a: (n,).
+        b: (n,).
+        weight: (n,), 0 or more.
+
+    Returns:
+        The correlation; 0 where one of them is constant.
+    """
     total = weight.sum()
     a, b = (one - (weight * one).sum() / total for one in (a, b))
     size = math.sqrt(float((weight * a * a).sum() * (weight * b * b).sum()))

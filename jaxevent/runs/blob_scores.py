@@ -402,9 +402,14 @@ def _track(
 
 
 def _states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-    """Return means (times, tracks, 8) and covariances (times, tracks, 8, 8).
+    """Read the states of tracks.
 
-    NaN where not valid.
+    Args:
+        tracks: The tracks.
+        t: (times,) sorted, us.
+
+    Returns:
+        Means (times, tracks, 8) and covariances (times, tracks, 8, 8), NaN where not valid.
     """
     parts = [states for _, states in tracks.batches(t)]
     mean, covariance, valid = (
@@ -442,7 +447,16 @@ def _rms(error: NDArray) -> float | None:
 def _of_function(
     recording: Recording, method: MethodFunction, times: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return states that a function estimates, and their covariances; NaN where unknown."""
+    """Estimate states by a user's function.
+
+    Args:
+        recording: The recording.
+        method: The function.
+        times: (T,) us.
+
+    Returns:
+        States (T, tracks, 8) and covariances (T, tracks, 8, 8), NaN where unknown.
+    """
     mean, covariance, _ = method.estimate(recording, times, [(-1, 2), (-1, 8)])
     states = np.full((*mean.shape[:2], 8), np.nan)
     states[..., : mean.shape[2]] = mean

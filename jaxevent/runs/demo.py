@@ -180,7 +180,14 @@ def _toned(estimate: Estimate, tone: str) -> NDArray[np.uint8]:
 def _figure_of_events(
     name: str, toned: Sequence[NDArray[np.uint8]], doubt: NDArray[np.floating], path: Path
 ) -> None:
-    """Draw one of the images of events alone, its uncertainty, and the frame."""
+    """Draw one of the images of events alone, its uncertainty, and the frame.
+
+    Args:
+        name: Title.
+        toned: (T, H, W) images for the display: high-pass filter, `events-only`, frames.
+        doubt: (T, H, W) standard deviation of ln I of `events-only`.
+        path: File to write.
+    """
     middle = len(doubt) // 2
     labels = "high-pass filter of the events", "events-only", "the frame, which no method was given"
     panels: list[tuple[str, Any, Kind]] = [
@@ -191,7 +198,16 @@ def _figure_of_events(
 
 
 def _video_of_events(toned: Sequence[NDArray[np.uint8]], t: NDArray[np.int64], path: Path) -> float:
-    """Write the high-pass filter, `events-only` and frames side by side; return the slow-down."""
+    """Write the high-pass filter, `events-only` and frames side by side.
+
+    Args:
+        toned: (T, H, W) images for the display of each.
+        t: (T,) times, us.
+        path: File to write.
+
+    Returns:
+        By how much the video is slower than real time.
+    """
     rate, fps = (len(t) - 1) * 1e6 / (t[-1] - t[0]), 6.0
     with video_writer(path, fps) as write:
         for images in zip(*toned, strict=True):

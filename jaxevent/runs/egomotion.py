@@ -262,7 +262,20 @@ def _settings(
     options: Mapping[str, Any],
     bias: NDArray[np.float64],
 ) -> dict[str, Any]:
-    """Return the settings of the protocol that the method's `estimate` takes."""
+    """Choose the settings of the protocol that a method's `estimate` takes.
+
+    Args:
+        recording: The recording.
+        method: The method.
+        options: Settings of the protocol.
+        bias: (3,) bias of the gyroscope, rad/s.
+
+    Returns:
+        Settings, by name.
+
+    Raises:
+        InputError: The gyroscope is wanted, but there is no IMU.
+    """
     settings: dict[str, Any] = {}
     if "smooth" in options and "smooth" in method.options:
         settings["smooth"] = options["smooth"]
@@ -286,7 +299,17 @@ class SampledMotion(MotionEstimate):
 def _of_function(
     recording: Recording, method: MethodFunction, times: NDArray[np.int64], model: type[Model]
 ) -> MotionEstimate:
-    """Return the motion that a function estimates at `times` (us); lost where it is NaN."""
+    """Estimate motion by a user's function.
+
+    Args:
+        recording: The recording.
+        method: The function.
+        times: (T,) us.
+        model: Model of the motion.
+
+    Returns:
+        The motion at these times, lost where it is NaN.
+    """
     d = len(model.components)
     mean, covariance, _ = method.estimate(recording, times, [(d,)])
     if covariance is None or covariance.shape != (len(times), d, d):

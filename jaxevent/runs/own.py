@@ -60,9 +60,19 @@ class Metric:
         return None if given is None else bool(given)
 
     def __call__(self, estimate: NDArray, truth: NDArray, recording: str) -> float:
-        """Compute the metric; raise `InputError` naming metric and recording if it gives no number.
+        """Compute the metric.
 
         The function gets copies, so that it cannot change the input of other metrics.
+        Args:
+            estimate: The estimate.
+            truth: The truth that it is compared with.
+            recording: Name of the recording, for messages.
+
+        Returns:
+            A finite number.
+
+        Raises:
+            InputError: The function fails, or gives no finite number.
         """
         where = f"{recording}: the metric {self.name!r}"
         try:

@@ -376,7 +376,15 @@ class Problem:
         return found
 
     def _weigh(self, part: RecordingWindow, truth: NDArray) -> NDArray:
-        """Return 1 for each image, or a weight for each pixel; 0 where there is no truth."""
+        """Weigh the pixels of images.
+
+        Args:
+            part: The window of the images.
+            truth: (images, pixels) intensity, NaN where there is no truth.
+
+        Returns:
+            (images, 1) of 1, or (images, pixels) weights by region, 0 where there is no truth.
+        """
         if not isinstance(part.truth, Reference):
             return np.ones((len(truth), 1), truth.dtype)
         low, high = part.truth.clip

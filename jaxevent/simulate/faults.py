@@ -36,7 +36,15 @@ def _frames_of(recording: Recording) -> Frames:
 
 
 def _with_images(recording: Recording, change: Callable[[NDArray], NDArray]) -> Recording:
-    """Change the grey values (frames, height, width) in [0, 1], which are rounded and clipped."""
+    """Change the grey values of frames, which are then rounded and clipped.
+
+    Args:
+        recording: A recording with frames.
+        change: Function of grey values (frames, height, width) in [0, 1] that returns new ones.
+
+    Returns:
+        The recording with these frames.
+    """
     frames = _frames_of(recording)
     kind = frames.images.dtype
     grey = np.clip(change(frames.intensity), 0, 1)

@@ -315,7 +315,14 @@ class BoxWorld:
     def _draw_patch(
         patch: FlatPatch, rays: _Rays, level: NDArray[np.float64], depth: NDArray[np.float64]
     ) -> None:
-        """Draw a patch over `level` and `depth` (n,)."""
+        """Draw a patch over level and depth.
+
+        Args:
+            patch: The patch.
+            rays: n rays of a view.
+            level: (n,) ln intensity, in place.
+            depth: (n,) m, in place.
+        """
         centre, ray, length, pixel = rays
         across, down, normal = Rotation.from_rotvec(patch.turn).as_matrix().T
         towards = np.asarray(patch.centre) - centre

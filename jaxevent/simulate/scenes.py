@@ -89,7 +89,13 @@ class _Canvas:
     ) -> NDArray:
         """Draw periodic noise of unit variance; its amplitude falls as frequency^-slope.
 
-        Waves longer than `longest` are damped; `stretch` > 1 draws it out horizontally.
+        Args:
+            slope: The exponent.
+            longest: Wavelength above which waves are damped, in units of the canvas.
+            stretch: Factor by which noise is drawn out horizontally.
+
+        Returns:
+            (height, width).
         """
         fy = np.fft.fftfreq(self.height)[:, None] * self.unit
         fx = np.fft.rfftfreq(self.width) * self.unit * stretch
@@ -101,34 +107,81 @@ class _Canvas:
         return noise / noise.std()
 
     def away(self, x: float | int, y: float | int) -> tuple[NDArray, NDArray]:
-        """Return the offsets of every pixel from a point, the short way round."""
+        """Return the offsets of every pixel from a point, the short way round.
+
+        Args:
+            x: Place of the point along x, in units of the canvas.
+            y: Place along y, likewise.
+
+        Returns:
+            Offsets along x (height, width) and y (height, width), in units of the canvas.
+        """
         return (self.x - x + self.columns / 2) % self.columns - self.columns / 2, self.y - y
 
     def skyline(self, at: float | int, rough: float | int) -> NDArray:
-        """Draw a periodic curve y(x) about `at` with deviation `rough`."""
+        """Draw a periodic curve y(x).
+
+        Args:
+            at: Mean of the curve, in units of the canvas.
+            rough: Its standard deviation, likewise.
+
+        Returns:
+            (width,) y, in units of the canvas.
+        """
         wave = np.cumsum(self.noise(1.2, 300)[0])
         wave = wave - np.linspace(0, wave[-1], len(wave))
         return at + rough * (wave - wave.mean()) / wave.std()
 
     def paint(self, where: NDArray, level: float | NDArray) -> None:
-        """Set the level of some pixels."""
+        """Set the level of some pixels.
+
+        Args:
+            where: Mask that broadcasts with the canvas.
+            level: ln intensity there.
+        """
         self.level = np.where(where, level, self.level)
 
     def box(
         self, x: float | int, y: float | int, width: float | int, height: float | int
     ) -> NDArray:
-        """Return the mask of a box about a point."""
+        """Return the mask of a box.
+
+        Args:
+            x: Place of its middle along x, in units of the canvas.
+            y: Place along y, likewise.
+            width: Its width, likewise.
+            height: Its height, likewise.
+
+        Returns:
+            (height, width) of the canvas.
+        """
         dx, dy = self.away(x, y)
         return (abs(dx) < width / 2) & (abs(dy) < height / 2)
 
     def glow(self, x: float | int, y: float | int, radius: float | int, level: float | int) -> None:
-        """Add a lamp: a disc of ln intensity `level` in a halo that falls as 1 / r^2."""
+        """Add a lamp: a disc in a halo that falls as 1 / r^2.
+
+        Args:
+            x: Place of its middle along x, in units of the canvas.
+            y: Place along y, likewise.
+            radius: Radius of the disc, likewise.
+            level: ln intensity of the disc.
+        """
         dx, dy = self.away(x, y)
         r = np.hypot(dx, dy) / radius
         self.level = np.logaddexp(self.level, level - 2 * np.log(np.maximum(r, 1)) * (1 + r / 12))
 
     def places(self, count: int, low: float | int = 0.0, high: float | int = 512.0):
-        """Draw points spread over the width, between two heights."""
+        """Draw points spread over the width.
+
+        Args:
+            count: Number of points.
+            low: Least y, in units of the canvas.
+            high: Greatest y, likewise.
+
+        Returns:
+            x and y of each point, likewise.
+        """
         x = (np.arange(count) + self.rng.uniform(0.28, 0.72, count)) * self.columns / count
         return list(zip(x.tolist(), self.rng.uniform(low, high, count).tolist(), strict=True))
 
