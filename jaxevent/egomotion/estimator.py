@@ -452,7 +452,16 @@ class HostEstimator(MotionEstimator[P]):
         return motion
 
     def _solve(self, recording: Recording, params: P | None, **options: Any) -> MotionEstimate:
-        """Estimate the motion, and say nothing if it is lost."""
+        """Estimate the motion, and say nothing if it is lost.
+
+        Args:
+            recording: The recording.
+            params: Parameters; None: those adapted to the recording.
+            **options: Options of `estimate`.
+
+        Returns:
+            The motion.
+        """
         inputs, _ = self.prepare(recording, np.zeros(0, np.int64), params, **options)
         if params is None:
             start = self.initial_params(inputs.model)

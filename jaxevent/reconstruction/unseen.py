@@ -53,7 +53,7 @@ def measure_flicker(images: FrameImages, clock: FrameClock) -> float:
     """Measure the variance of a frame's brightness about that of its neighbours.
 
     Args:
-        recording: Events and frames.
+        images: Source of the frames.
         clock: Times of the frames.
 
     Returns:

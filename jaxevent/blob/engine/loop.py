@@ -211,7 +211,13 @@ def _begin_chunk(context, chunk):
 
 @njit_noalloc_inlined
 def _init_track(context, k, new):
-    """Begin a track in an entry of the buffer."""
+    """Begin a track in an entry of the buffer.
+
+    Args:
+        context: `_Context`.
+        k: The entry.
+        new: `_NewTrack`.
+    """
     reals, integers = context.state.reals, context.state.integers
     reals[k, XI], reals[k, XI + 1], reals[k, SIZE] = new.x, new.y, new.size
     context.functions.init(*context.pointers, k, 0, 0, 1)
@@ -223,7 +229,12 @@ def _init_track(context, k, new):
 
 @njit_noalloc_inlined
 def _run_steps(context, chunk):
-    """Run the steps of a chunk; the grid counts the events that are near no track."""
+    """Run the steps of a chunk; the grid counts the events that are near no track.
+
+    Args:
+        context: `_Context`.
+        chunk: Number of the chunk.
+    """
     chunks, functions, scratch = context.chunks, context.functions, context.scratch
     reals, integers = context.state.reals, context.state.integers
     births, pointers = context.config.births, context.pointers
@@ -390,7 +401,12 @@ def _accumulate_clutter(context, t, stop, alive, faded):
 
 @njit_noalloc_inlined
 def _fade(sums, factor):
-    """Multiply the grid by a factor."""
+    """Multiply the grid by a factor.
+
+    Args:
+        sums: (3, rows, columns) number of events and sums of x and y, in place.
+        factor: The factor, 0 to 1.
+    """
     for kind in range(sums.shape[0]):
         for row in range(sums.shape[1]):
             for column in range(sums.shape[2]):
@@ -477,7 +493,16 @@ def _begin_tracks(context, stop):
 
 @njit_noalloc_inlined
 def _sum_near(counts, row, column):
-    """Sum over the 3x3 cells around one."""
+    """Sum over the 3x3 cells around one.
+
+    Args:
+        counts: (rows, columns).
+        row: Row of the cell.
+        column: Its column.
+
+    Returns:
+        The sum over those that exist.
+    """
     rows, columns = counts.shape
     total = counts.dtype.type(0)
     for r in range(max(row - 1, 0), min(row + 2, rows)):

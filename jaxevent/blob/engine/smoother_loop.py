@@ -136,7 +136,16 @@ def _propagate_to_chunk_end(integers, info, elapsed):
 
 @njit_noalloc_inlined
 def _pointers(context, dt, silence):
-    """Return the first arguments of a function of a row; `dt` and `silence` in us."""
+    """Return the first arguments of a function of a row.
+
+    Args:
+        context: `_Context`.
+        dt: Time over which to predict, us; written to the scratch memory in s.
+        silence: Time without events in all, us, likewise.
+
+    Returns:
+        Pointers to reals, integers, scratch memory, owners and numbers.
+    """
     work, updates = context.scratch.work, context.updates
     micro = work.dtype.type(1e-6)
     work[DT], work[SILENCE] = work.dtype.type(dt) * micro, work.dtype.type(silence) * micro
@@ -148,7 +157,14 @@ def _pointers(context, dt, silence):
 
 @njit_noalloc_inlined
 def _predict(context, row, dt, silence):
-    """Predict X and P of a row's track; times in us."""
+    """Predict X and P of a row's track into the scratch memory.
+
+    Args:
+        context: `_Context`.
+        row: Recorded row of the track.
+        dt: Time over which to predict, us.
+        silence: Time without events in all, us.
+    """
     context.kernel.functions.predict(*_pointers(context, dt, silence), row, 0, 0, 1)
 
 
@@ -267,6 +283,14 @@ def _smooth_update(members, smallest, info, scratch):
 
 @njit_noalloc_inlined
 def _multiply(members, a, b, out):
+    """Multiply two matrices, of components that depend on each other.
+
+    Args:
+        members: Indices of these components; others are left alone.
+        a: (8, 8).
+        b: (8, 8).
+        out: (8, 8) output, another array.
+    """
     for i in members:
         for j in members:
             total = 0.0

@@ -325,7 +325,13 @@ def _score_event(context, b, e, blocks):
 
 @njit_inlined
 def _report(context, b, out):
-    """Report a batch, before resampling."""
+    """Report a batch, before resampling.
+
+    Args:
+        context: `Context`.
+        b: Number of the batch.
+        out: Reports of the batches, output.
+    """
     rows, cells, work = context.rows, context.cells, context.work
     d, is_finite = out.mean.shape[1], cells[IS_FINITE] != 0
     source = rows.mean if is_finite else rows.widest
@@ -346,7 +352,12 @@ def _report(context, b, out):
 
 @njit_inlined
 def _resample(context, uniform):
-    """Write the particles of the state, and their weights."""
+    """Write the particles of the state, and their weights.
+
+    Args:
+        context: `Context`.
+        uniform: Number in 0..1, the place of the first step of systematic resampling.
+    """
     rows, cells, work = context.rows, context.cells, context.work
     count = context.batches.normal.shape[1]
     equal = cells.dtype.type(-np.log(count))
@@ -368,7 +379,13 @@ def _resample(context, uniform):
 
 @njit_inlined
 def _copy(source, out, count):
-    """Copy numbers; numba takes over a second to compile a copy of slices."""
+    """Copy numbers; numba takes over a second to compile a copy of slices.
+
+    Args:
+        source: (count or more,).
+        out: (count or more,) output.
+        count: How many.
+    """
     for i in range(count):
         out[i] = source[i]
 
@@ -517,7 +534,15 @@ def _interpolate(nodes, work, rows, lanes, count):
 
 @njit_inlined
 def _chebyshev(k, j):
-    """Return node j of the k Chebyshev nodes on [-1, 1]."""
+    """Return a Chebyshev node on [-1, 1].
+
+    Args:
+        k: Number of nodes.
+        j: The node, from 0.
+
+    Returns:
+        Its place.
+    """
     return np.cos((2 * j + 1) * np.pi / (2 * k))
 
 
@@ -568,6 +593,16 @@ def _fill_product(nodes, j, d):
 
 @njit_fastmath_inlined
 def _dot(one, other, count):
+    """Return the scalar product of the first numbers of two vectors.
+
+    Args:
+        one: (count or more,).
+        other: (count or more,).
+        count: How many.
+
+    Returns:
+        The product, in the type of `one`.
+    """
     total = one.dtype.type(0)
     for i in range(count):
         total += one[i] * other[i]
@@ -576,5 +611,13 @@ def _dot(one, other, count):
 
 @njit_fastmath_inlined
 def _add_product(out, product, value, count):
+    """Add a multiple of a vector to another one.
+
+    Args:
+        out: (count or more,), in place.
+        product: (count or more,).
+        value: The factor.
+        count: How many.
+    """
     for i in range(count):
         out[i] += product[i] * value
