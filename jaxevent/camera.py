@@ -544,7 +544,15 @@ def find_model(name: str) -> str | None:
 
 
 def _distort_rational(xy: Places, k: Coefficients) -> tuple[Places, NDArray[np.float64]]:
-    """Apply Brown-Conrady distortion, its radial part N / D; return also its Jacobian."""
+    """Apply Brown-Conrady distortion, its radial part N / D.
+
+    Args:
+        xy: (n, 2) straight places x / z and y / z.
+        k: Coefficients k1, k2, p1, p2, k3, k4, k5, k6; missing ones are 0.
+
+    Returns:
+        Distorted places (n, 2), and their Jacobian (n, 2, 2).
+    """
     k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *(0.0,) * (8 - len(k)))
     x, y = xy.T
     r2 = x * x + y * y
@@ -568,7 +576,15 @@ def _distort_rational(xy: Places, k: Coefficients) -> tuple[Places, NDArray[np.f
 
 
 def _undistort_rational(seen: Places, k: Coefficients) -> Places:
-    """Invert the distortion by Newton's method, where the Jacobian is positive definite."""
+    """Invert the distortion by Newton's method, where the Jacobian is positive definite.
+
+    Args:
+        seen: (n, 2) distorted places.
+        k: Coefficients, as of `_distort_rational`.
+
+    Returns:
+        (n, 2) straight places.
+    """
     straight = seen.copy()
     if not any(k):
         return straight
@@ -592,6 +608,15 @@ def _turn_rational(k: Coefficients) -> float:
 
 
 def _distort_equidistant(xy: Places, k: Coefficients) -> tuple[Places, NDArray[np.float64]]:
+    """Apply the distortion of a fisheye lens.
+
+    Args:
+        xy: (n, 2) straight places x / z and y / z.
+        k: Coefficients k1 to k4, as of `_radius`.
+
+    Returns:
+        Distorted places (n, 2), and their Jacobian (n, 2, 2).
+    """
     r = np.hypot(*xy.T)
     radius, slope = _radius(np.arctan(r), k)
     far = r > 1e-9
@@ -604,7 +629,15 @@ def _distort_equidistant(xy: Places, k: Coefficients) -> tuple[Places, NDArray[n
 
 
 def _undistort_equidistant(seen: Places, k: Coefficients) -> Places:
-    """Invert the distortion by Newton's method, up to the angle at which the radius turns."""
+    """Invert the distortion by Newton's method, up to the angle at which the radius turns.
+
+    Args:
+        seen: (n, 2) distorted places.
+        k: Coefficients k1 to k4, as of `_radius`.
+
+    Returns:
+        (n, 2) straight places.
+    """
     radius = np.hypot(*seen.T)
     most = min(_widest(k), np.arctan(_MAX_TAN_ANGLE))
     angle = np.minimum(radius, most)

@@ -114,6 +114,18 @@ def checked(images: ArrayLike, what: str) -> NDArray[np.floating]:
 
 
 def _pair(image: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Check images and their truth, and convert both to float64.
+
+    Args:
+        image: (..., H, W).
+        truth: (..., H, W).
+
+    Returns:
+        Both.
+
+    Raises:
+        InputError: They are no images, or differ in shape.
+    """
     pair = checked(image, "image"), checked(truth, "truth")
     if pair[0].shape != pair[1].shape:
         raise InputError(
@@ -126,6 +138,19 @@ def _pair(image: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], NDAr
 def _log_pair(
     image: ArrayLike, truth: ArrayLike, offset: float | int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the logarithms of images and their truth.
+
+    Args:
+        image: (..., H, W) intensity; negative counts as 0.
+        truth: (..., H, W), likewise.
+        offset: Offset inside the logarithm.
+
+    Returns:
+        Both, ln(I + offset).
+
+    Raises:
+        InputError: The offset is not positive, or they are no images of one shape.
+    """
     if not 0 < offset < np.inf:
         raise InputError(f"the offset inside the logarithm is {offset}; give a positive number")
     image, truth = _pair(image, truth)
@@ -154,6 +179,18 @@ def _mean(
 
 
 def _mask(where: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Check a mask of pixels.
+
+    Args:
+        where: Truth values, (..., H, W) or (H, W).
+        shape: (..., H, W) of the images.
+
+    Returns:
+        The mask, of that shape.
+
+    Raises:
+        InputError: It has another shape or type.
+    """
     mask = np.asarray(where)
     if mask.dtype != np.bool_ or mask.shape not in (shape, shape[-2:]):
         raise InputError(
@@ -501,6 +538,17 @@ class _Arrays(pickle.Unpickler):
 
 
 def _conv(image: Array, layer: dict[str, Array], stride: int, pad: int) -> Array:
+    """Convolve an image by a layer, and cut negative values off.
+
+    Args:
+        image: (n, height, width, channels).
+        layer: "kernel" (rows, columns, channels, outputs) and "bias" (outputs,).
+        stride: Step between the outputs, px.
+        pad: Zeros that are added on each side, px.
+
+    Returns:
+        (n, height, width, outputs) of the smaller image.
+    """
     out = lax.conv_general_dilated(
         image,
         layer["kernel"],
@@ -513,11 +561,29 @@ def _conv(image: Array, layer: dict[str, Array], stride: int, pad: int) -> Array
 
 
 def _pool(image: Array, size: int) -> Array:
+    """Take the maximum over windows that are 2 px apart.
+
+    Args:
+        image: (n, height, width, channels).
+        size: Side of the windows, px.
+
+    Returns:
+        (n, height, width, channels) of the smaller image.
+    """
     window = (1, size, size, 1)
     return lax.reduce_window(image, -jnp.inf, lax.max, window, (1, 2, 2, 1), "VALID")
 
 
 def _alex(layers: list[dict[str, Array]], x: Array) -> list[Array]:
+    """Return the features of AlexNet.
+
+    Args:
+        layers: Its five layers, as of `_conv`.
+        x: (n, height, width, 3) normalised images.
+
+    Returns:
+        Five features, each (n, height, width, channels) of its own size.
+    """
     one = _conv(x, layers[0], 4, 2)
     two = _conv(_pool(one, 3), layers[1], 1, 2)
     three = _conv(_pool(two, 3), layers[2], 1, 1)
@@ -526,6 +592,15 @@ def _alex(layers: list[dict[str, Array]], x: Array) -> list[Array]:
 
 
 def _vgg(layers: list[dict[str, Array]], x: Array) -> list[Array]:
+    """Return the features of VGG16.
+
+    Args:
+        layers: Its thirteen layers, as of `_conv`.
+        x: (n, height, width, 3) normalised images.
+
+    Returns:
+        Five features, each (n, height, width, channels) of its own size.
+    """
     features, blocks = [], (2, 2, 3, 3, 3)
     for block, count in enumerate(blocks):
         x = _pool(x, 2) if block else x

@@ -574,7 +574,18 @@ class Frames:
 
 
 def _integer_times(values: Any, what: str) -> NDArray[np.int64]:
-    """Return times (n,) of any integer type as plain int64 us, or raise `InputError`."""
+    """Convert times of any integer type to int64.
+
+    Args:
+        values: (n,) times, us.
+        what: What they are the times of, for messages.
+
+    Returns:
+        (n,) us.
+
+    Raises:
+        InputError: They are no integers.
+    """
     t = arrays.as_column(values, what)
     if t.dtype.kind == "f" and len(t):
         raise InputError(

@@ -422,6 +422,16 @@ class _Numbers(NamedTuple):
 
 
 def _normal(value: float, mean: float, deviation: float) -> float:
+    """Return the logarithm of a Gaussian, 0 at its mean.
+
+    Args:
+        value: The argument.
+        mean: Its mean.
+        deviation: Its standard deviation.
+
+    Returns:
+        The logarithm, at least -30.
+    """
     return max(-0.5 * ((value - mean) / deviation) ** 2, -30.0)
 
 
@@ -559,6 +569,15 @@ class Clock(NamedTuple):
         return to_microseconds(values, best, source, what)
 
     def _fits(self, values: NDArray, unit: str) -> bool:
+        """Return whether times of a series fit the events' clock.
+
+        Args:
+            values: (n,) rising times of the series, n > 1.
+            unit: Their unit.
+
+        Returns:
+            Whether their intervals are plausible, and they go with the events.
+        """
         if not self._has_plausible_intervals(values, unit):
             return False
         first, last = _ends(values, unit)
@@ -589,4 +608,13 @@ class Clock(NamedTuple):
 
 
 def _ends(values: NDArray, unit: str) -> tuple[float, float]:
+    """Return the least and the greatest of some times.
+
+    Args:
+        values: (n,) times.
+        unit: Their unit.
+
+    Returns:
+        Both, us.
+    """
     return float(values.min()) * US_PER_UNIT[unit], float(values.max()) * US_PER_UNIT[unit]

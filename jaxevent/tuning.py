@@ -515,6 +515,16 @@ def loss_and_grad(
 
 @jax.jit
 def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
+    """Make a step of Adam from each start.
+
+    Args:
+        position: Parameters of all starts.
+        slope: Gradient by the raw values, each (starts, ...).
+        rate: Learning rate.
+
+    Returns:
+        The new position.
+    """
     update: Any = jax.vmap(ADAM_TRANSFORM.update)
     direction, memory = update(slope, position.optimiser)
     raw = {name: leaf - rate * direction[name] for name, leaf in position.raw.items()}

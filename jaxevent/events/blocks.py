@@ -72,7 +72,16 @@ def parse_duration(length: int | float, what: str, least: int = 1) -> int:
 
 
 def read_blocks(source: EventSource, start: int = 0, stop: int | None = None) -> Iterator[Events]:
-    """Yield the events of a range of rows, block by block."""
+    """Read a range of rows block by block.
+
+    Args:
+        source: The events.
+        start: First row.
+        stop: Row after the last one; None: all.
+
+    Yields:
+        Events, in order.
+    """
     stop = len(source) if stop is None else stop
     for row in bar(range(start, stop, BLOCK_EVENTS), desc="read events", unit="M events"):
         yield source[row : min(row + BLOCK_EVENTS, stop)]

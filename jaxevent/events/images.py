@@ -285,7 +285,16 @@ def _sign(e: Any, xp: Any) -> Any:
 
 
 def _ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
-    """Return two times (us), where they are None those of the first and the last event."""
+    """Fill in the ends of a span of time.
+
+    Args:
+        part: Events.
+        start: First time, us; None: that of the first event.
+        stop: Last time, us; None: that of the last event.
+
+    Returns:
+        Both, us.
+    """
     if isinstance(part, DeviceEvents):
         limits = jnp.iinfo(part.t.dtype)
         first = jnp.where(part.valid, part.t, limits.max).min() if start is None else start

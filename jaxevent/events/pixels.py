@@ -270,7 +270,15 @@ def _interpolate(images: NDArray, at: NDArray[np.float64]) -> NDArray:
 
 
 def _cast(values: NDArray[np.floating], kind: np.dtype) -> NDArray:
-    """Convert to the type of images, rounded to integers where these are."""
+    """Convert values to the type of images, rounded where these are integers.
+
+    Args:
+        values: Values, of any shape.
+        kind: The type.
+
+    Returns:
+        The values, of that shape.
+    """
     return (values if kind.kind == "f" else np.rint(values)).astype(kind)
 
 

@@ -416,7 +416,18 @@ class DecodedEvents(EventsInFile):
 
 
 def slice_bounds(rows: slice, count: int) -> tuple[int, int]:
-    """Return the first row and the one after the last of a slice of `count` events, step 1."""
+    """Return the bounds of a slice of events.
+
+    Args:
+        rows: The slice, of step 1.
+        count: Number of events.
+
+    Returns:
+        First row, and the row after the last one.
+
+    Raises:
+        ValueError: The step is another.
+    """
     start, stop, step = rows.indices(count)
     if step != 1:
         raise ValueError("events in a file are read as a range of rows, events[i:j], step 1")

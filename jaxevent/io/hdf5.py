@@ -207,7 +207,15 @@ class StoredEvents(EventsInFile):
         return self._t.shape[0]
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
-        """Read the times of a range of rows, us, without the offset."""
+        """Read the times of a range of rows, without the offset.
+
+        Args:
+            start: First row.
+            stop: Row after the last one.
+
+        Returns:
+            (rows,) us.
+        """
         stored = np.asarray(self._t[start:stop])
         return to_microseconds(stored, self._format.unit.name, self._source, "event", start)
 

@@ -130,7 +130,15 @@ def _read_image_series(
 
 
 def log_image(other: Recording, row: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return ln(I + 0.05) of a frame (height, width), and whether pixels are not clipped."""
+    """Return the log intensity of a frame.
+
+    Args:
+        other: A recording with frames.
+        row: Row of the frame.
+
+    Returns:
+        ln(I + 0.05) (height, width), and whether pixels are not clipped (height, width).
+    """
     assert other.frames is not None
     grey = other.frames[row : row + 1].intensity[0].astype(np.float64)
     if other.frames.images.dtype.kind == "f" and np.nanmax(grey) > 1:
@@ -230,10 +238,16 @@ class ResampledImages:
 
 
 def _resampling_matrix(grid: Grid, shape: tuple[int, int]) -> tuple[Any, NDArray[np.bool_]]:
-    """Return the matrix (pixels, other pixels) of cubic convolution, and which pixels are seen.
+    """Make the matrix of cubic convolution that resamples images.
 
     Keys, "Cubic convolution interpolation for digital image processing", 1981, a = -1/2. If the
     grid's steps are s > 1 px, ceil(s)^2 samples are averaged over each pixel.
+    Args:
+        grid: (height, width, 2) x and y in the other camera's images, px, NaN outside.
+        shape: Height and width of these images, px.
+
+    Returns:
+        The matrix (pixels, other pixels), sparse, and which pixels are seen (height, width).
     """
     height, width = grid.shape[:2]
     covered = ~np.isnan(grid[..., 0])

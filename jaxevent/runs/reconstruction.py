@@ -191,6 +191,12 @@ class Objective:
         grows with its logarithm from there on, with the same slope at white; and where the truth
         itself is clipped, what lies beyond is no error. The result is never smaller than the
         evaluated error, equals it for images in [0, white], and has a slope wherever it is not 0.
+        Args:
+            image: (times, pixels) intensity.
+            batch: The true images, and their white.
+
+        Returns:
+            (times, pixels) intensity, or ln I.
         """
         white, truth = batch.white, batch.truth
         over = image > white
@@ -396,7 +402,15 @@ class Problem:
 
 
 def _intensity(truth: Frames, rows: NDArray[np.int64]) -> NDArray:
-    """Return some of the images, (images, pixels), NaN where there is no truth."""
+    """Read some of the true images.
+
+    Args:
+        truth: The true images.
+        rows: (images,) rows of those wanted.
+
+    Returns:
+        (images, pixels) intensity, NaN where there is no truth.
+    """
     if isinstance(truth, Reference):
         return np.stack([truth.truth(int(row)).ravel() for row in rows])
     return truth[rows].intensity.reshape(len(rows), -1)

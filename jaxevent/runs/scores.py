@@ -100,7 +100,16 @@ class Measures(NamedTuple):
         return cls(tuple(dict.fromkeys(names)), tuple(own))
 
     def of_own(self, image: NDArray, truth: NDArray, recording: str) -> dict[str, float]:
-        """Compute the user's own metrics."""
+        """Compute the user's own metrics.
+
+        Args:
+            image: (H, W) intensity.
+            truth: (H, W) intensity.
+            recording: Name of the recording, for messages.
+
+        Returns:
+            Numbers, by the metrics' names.
+        """
         return {metric.name: metric(image, truth, recording) for metric in self.own}
 
 
@@ -199,6 +208,16 @@ def _standardised(
 
 
 def _mean_over(values: NDArray, mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
+    """Average values over a mask.
+
+    Args:
+        values: Values of any shape.
+        mask: Truth values of that shape.
+        mean: Function of (n,) values that returns their average.
+
+    Returns:
+        The average; NaN over an empty mask.
+    """
     return float(mean(values[mask])) if mask.any() else math.nan
 
 
@@ -363,7 +382,15 @@ class Sample:
 
 
 def _frame_before(given: Recording, t: int) -> NDArray[np.float32] | None:
-    """Return the last given frame up to a time (us, as stamped); None if there is none."""
+    """Return the last given frame up to a time.
+
+    Args:
+        given: The recording.
+        t: Time, us, as frames are stamped.
+
+    Returns:
+        (H, W) intensity; None if there is no such frame.
+    """
     if given.frames is None:
         return None
     row = int(np.searchsorted(given.frames.t, t, "right")) - 1
@@ -608,7 +635,16 @@ def _calibrate(
 
 
 def moving_pixels(given_recording: Recording, frame_row: int, gap_frames: int) -> NDArray[np.bool_]:
-    """Return a mask of pixels in which the given frames around a hidden one differ."""
+    """Find the pixels in which the given frames around a hidden one differ.
+
+    Args:
+        given_recording: A recording with all its frames.
+        frame_row: Row of the hidden frame.
+        gap_frames: As of `frames_around`.
+
+    Returns:
+        (H, W) mask; false where no given frame follows.
+    """
     assert given_recording.frames is not None
     around = frames_around(given_recording.frames, frame_row, gap_frames)
     if around is None:

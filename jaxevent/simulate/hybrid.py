@@ -238,6 +238,17 @@ def expose(
 def _truth_times(
     duration: float | int, sensor: Sensor, stamps: NDArray[np.int64], rng: np.random.Generator
 ) -> NDArray[np.int64]:
+    """Draw the times of true images, spread over a recording but beside the frames.
+
+    Args:
+        duration: Length of the recording, s.
+        sensor: Sensor, with the rate of true images.
+        stamps: (frames,) times of the frames, us.
+        rng: Generator of random numbers.
+
+    Returns:
+        (n,) us.
+    """
     begin = min(_FIRST_TRUTH_S, duration / 2)
     count = max(1, int((duration - begin) * sensor.truth_rate + 1e-9))
     cell = (duration - begin) / count

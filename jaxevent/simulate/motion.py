@@ -481,7 +481,16 @@ _GRAIN_M = 0.012  # 1 px at 2.4 m and f = 200 px
 
 
 def _room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
-    """Return corners and texture of a room whose front wall is at a depth (m)."""
+    """Describe a room.
+
+    Args:
+        kind: Kind of texture.
+        depth: Depth of its front wall, m.
+        seed: Seed of the texture.
+
+    Returns:
+        Lower and upper corner, m, and texture.
+    """
     lower: Three = (-3.5, -3.5, -3.0)
     return lower, (3.5, 3.5, depth), make_texture(kind, _GRAIN_M, seed)
 

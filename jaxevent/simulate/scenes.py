@@ -444,23 +444,73 @@ _MARGIN_PX = 2  # around an object, in which it is drawn
 
 
 def _disc(x: NDArray, y: NDArray, r: float) -> NDArray:
+    """Return the signed distance from a disc, negative inside.
+
+    Args:
+        x: Offsets from its middle along x, of any shape.
+        y: Offsets along y, likewise.
+        r: Its radius, in the same unit.
+
+    Returns:
+        Distances, of that shape.
+    """
     return np.hypot(x, y) - r
 
 
 def _box(x: NDArray, y: NDArray, r: float) -> NDArray:
+    """Return about the signed distance from a box, negative inside.
+
+    Args:
+        x: Offsets from its middle along x, of any shape.
+        y: Offsets along y, likewise.
+        r: Half of its width, in the same unit; its height is 0.6 of the width.
+
+    Returns:
+        Distances, of that shape.
+    """
     return np.maximum(abs(x) - r, abs(y) - 0.6 * r)
 
 
 def _triangle(x: NDArray, y: NDArray, r: float) -> NDArray:
     # An equilateral one, its corners r from the middle and its edges r / 2.
+    """Return about the signed distance from an equilateral triangle, negative inside.
+
+    Args:
+        x: Offsets from its middle along x, of any shape.
+        y: Offsets along y, likewise.
+        r: Distance of its corners from the middle, in the same unit.
+
+    Returns:
+        Distances, of that shape.
+    """
     return np.maximum(np.sqrt(0.75) * abs(x) + y / 2, -y) - r / 2
 
 
 def _diamond(x: NDArray, y: NDArray, r: float) -> NDArray:
+    """Return about the signed distance from a square on its corner, negative inside.
+
+    Args:
+        x: Offsets from its middle along x, of any shape.
+        y: Offsets along y, likewise.
+        r: Distance of its corners from the middle, in the same unit.
+
+    Returns:
+        Distances, of that shape.
+    """
     return (abs(x) + abs(y) - r) / np.sqrt(2)
 
 
 def _cross(x: NDArray, y: NDArray, r: float) -> NDArray:
+    """Return about the signed distance from an upright cross, negative inside.
+
+    Args:
+        x: Offsets from its middle along x, of any shape.
+        y: Offsets along y, likewise.
+        r: Half of its width, in the same unit; its bars are a third as wide.
+
+    Returns:
+        Distances, of that shape.
+    """
     bar, post = (np.maximum(abs(a) - r, abs(b) - r / 3) for a, b in ((x, y), (y, x)))
     return np.minimum(bar, post)
 
