@@ -114,7 +114,7 @@ def _displacement_at(u, spacing, x, y):
 
 @njit_noalloc
 def _warp_and_vote(x, y, s, p, u, spacing, cell, warped, image):
-    """Move events along the displacement and add each to sum, number and mean time of cells.
+    """Move events along the displacement and add each to sum, number and times of cells.
 
     Args:
         x: (n,) positions along x, px.

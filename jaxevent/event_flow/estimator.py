@@ -118,7 +118,7 @@ class EventFlow:
             most: Number of events on either side to go to; None: until points move far enough.
 
         Returns:
-            A chain of this one anchor.
+            The chain that starts with the anchor there.
         """
         start, clock, half = None, None, 0
         for level in LEVELS:
