@@ -319,7 +319,16 @@ class LiveTracks:
 
 
 def _truncate(f: Features, chunk: int, done: int) -> Features:
-    """Remove the events after so many steps of a chunk."""
+    """Remove the events after some steps of a chunk, and what later chunks hold.
+
+    Args:
+        f: Chunks of a segment.
+        chunk: Number of the chunk.
+        done: Number of its steps that are kept.
+
+    Returns:
+        The segment without them.
+    """
     valid, elapsed, cycle, seed = (np.array(p) for p in (f.valid, f.elapsed, f.cycle, f.seed))
     valid[chunk, done:], valid[chunk + 1 :] = False, False
     elapsed[chunk + 1 :] = 0

@@ -301,10 +301,16 @@ class ChunkPacker:
         check_times(times, start, stop, self.recording.name)
 
     def _prefilter(self, events, row: int) -> NDArray[np.bool_]:
-        """Return which events pass the background-activity prefilter; `row` is the first one's.
+        """Return which events pass the background-activity prefilter.
 
         Only events at most `prefilter_time` older matter. So they are read again for every segment
         and no image of times is kept between segments.
+        Args:
+            events: Consecutive events.
+            row: Row of the first one in the recording.
+
+        Returns:
+            (events,) truth values.
         """
         if not self.prefilter or not len(events):
             return np.ones(len(events), bool)

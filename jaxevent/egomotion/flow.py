@@ -194,7 +194,19 @@ def iterate_flow(
 def _required_camera(
     recording: Recording, motion: MotionEstimate, camera: PinholeCamera | None
 ) -> PinholeCamera | None:
-    """Return the camera, by default the recording's; `InputError` if it is needed and missing."""
+    """Return the camera, by default the recording's.
+
+    Args:
+        recording: The recording.
+        motion: The motion, whose model may need a camera.
+        camera: The camera; None: the recording's.
+
+    Returns:
+        The camera; None where there is none and none is needed.
+
+    Raises:
+        InputError: It is needed and missing.
+    """
     if motion.model.needs_camera:
         return recording.require_camera(camera, f"the flow of {motion.model.title}")
     return camera or recording.camera

@@ -85,7 +85,15 @@ def encode(image: NDArray[np.uint16]) -> bytes:
 
 @njit
 def _without_filters(rows, step):
-    """Return the bytes (height, n) of filtered rows (height, 1 + n), of `step` bytes a pixel."""
+    """Undo the filters of rows.
+
+    Args:
+        rows: (height, 1 + n) kind of filter of each row, and its filtered bytes.
+        step: Bytes of a pixel.
+
+    Returns:
+        (height, n) bytes.
+    """
     height, n = rows.shape[0], rows.shape[1] - 1
     out = np.zeros((height, n), np.uint8)
     for y in range(height):

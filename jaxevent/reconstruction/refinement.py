@@ -70,7 +70,15 @@ class HiddenFrames:
 
 
 def _busiest_band(recording: Recording, events: Any) -> tuple[int, int]:
-    """Return the first row and the height of the band of rows with most events."""
+    """Find the band of rows with most events.
+
+    Args:
+        recording: The recording.
+        events: Some of its events.
+
+    Returns:
+        First row and height, px.
+    """
     height = min(max(MAX_PIXELS // recording.width, 16), recording.height)
     rows = np.bincount(events.y, minlength=recording.height)
     total = np.concatenate([[0], np.cumsum(rows)])
@@ -119,7 +127,16 @@ def choose_parts(
 
 
 def _all_errors(parts: list[HiddenFrames], method: Any, params: Any) -> NDArray[np.float64]:
-    """Return the errors of all predicted frames of some parts."""
+    """Predict the hidden frames of some parts, and return the errors.
+
+    Args:
+        parts: The parts.
+        method: Method of reconstruction.
+        params: Its parameters.
+
+    Returns:
+        (n,) errors of all pixels, one part after another.
+    """
     return np.concatenate([part.errors(method, params) for part in parts])
 
 

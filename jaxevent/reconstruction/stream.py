@@ -31,7 +31,15 @@ class EventStream(NamedTuple):
         return cls(events.t, events.x, events.y, events.p, width)
 
     def slice_rows(self, begin_row: int, end_row: int) -> "EventStream":
-        """Return the events of the rows [begin, end)."""
+        """Return the events of a range of rows.
+
+        Args:
+            begin_row: First row.
+            end_row: Row after the last one.
+
+        Returns:
+            Views of the columns.
+        """
         rows = slice(begin_row, end_row)
         return EventStream(self.t[rows], self.x[rows], self.y[rows], self.p[rows], self.width)
 
@@ -189,6 +197,14 @@ def count_polarities(
 
 @njit_noalloc
 def _event_weights(stream, last, dead, out):
+    """Write the number of events that each event stands for.
+
+    Args:
+        stream: `EventStream`.
+        last: (pixels,) time of each pixel's last event before the stream, us, in place.
+        dead: `DeadTime`.
+        out: (events,) output.
+    """
     t, x, y = stream.t, stream.x, stream.y
     for i in range(len(t)):
         pixel = np.int64(y[i]) * stream.width + x[i]

@@ -72,6 +72,14 @@ def _common_error(images: FrameImages, clock: FrameClock, part: slice) -> float:
     """Return the error that pixels share where the frames around predict the middle one.
 
     Of two frames the first predicts the second.
+
+    Args:
+        images: Source of the frames.
+        clock: Times of the frames.
+        part: Rows of two or three frames.
+
+    Returns:
+        The error of intensity; 0 where it is small, or few pixels are quiet.
     """
     intensity = images.sample(part, STEP_PX)
     if len(intensity) == 2:
@@ -88,7 +96,16 @@ def _common_error(images: FrameImages, clock: FrameClock, part: slice) -> float:
 
 
 def _quiet_pixels(recording: Recording, clock: FrameClock, part: slice) -> NDArray[np.bool_]:
-    """Return which of the pixels have no event in the 3x3 pixels around between frames."""
+    """Find the pixels without events between frames, in the 3x3 pixels around.
+
+    Args:
+        recording: Events and frames.
+        clock: Times of the frames.
+        part: Rows of the frames.
+
+    Returns:
+        (rows, columns) whether it is quiet, of every `STEP_PX`-th pixel.
+    """
     from scipy.ndimage import maximum_filter
 
     source, mids = recording.events, clock.mid[part] + clock.origin

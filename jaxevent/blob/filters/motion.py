@@ -69,7 +69,15 @@ class LinearMotion(eqx.Module):
         return cls((position, *(none for _ in variances[1:])), tuple(P))
 
     def block(self, i: int, j: int) -> Float[Array, "2 2"]:
-        """Return the covariance of components i and j (0 position, 1 velocity, 2 offset)."""
+        """Return the covariance of two components: 0 position, 1 velocity, 2 offset.
+
+        Args:
+            i: One component.
+            j: The other one.
+
+        Returns:
+            The covariance, in products of px and px/s.
+        """
         return self.P[j * (j + 1) // 2 + i] if i <= j else self.P[i * (i + 1) // 2 + j].T
 
     def predict(self, params: TrackerParams, dt: Array) -> "LinearMotion":

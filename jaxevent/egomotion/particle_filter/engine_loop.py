@@ -415,7 +415,15 @@ def _draw(log_weights, drawn, uniform, count):
 
 @njit_inlined
 def _count_lanes(nodes, dimension):
-    """Return the number of nodes and checks together."""
+    """Return the number of motions to score: nodes and checks, filled up to whole blocks.
+
+    Args:
+        nodes: `Interpolation`.
+        dimension: Number of components of a motion.
+
+    Returns:
+        The number.
+    """
     number = nodes.counters[NODES_COUNTER] ** dimension
     return (
         (number + MIN_CHECKED_PARTICLES + MOTIONS_PER_BLOCK - 1)

@@ -264,7 +264,15 @@ def _has_own_ranges(
 
 
 def vote_sigma(params: Params, searching: Bool[Array, ""] | bool) -> Float[Array, ""]:
-    """Return the spread of a candidate (px), which is larger in a search."""
+    """Return the spread of a candidate, which is larger in a search.
+
+    Args:
+        params: Parameters.
+        searching: Whether the motion is searched.
+
+    Returns:
+        The standard deviation, px.
+    """
     return params.sigma_x * jnp.where(searching, SEARCH_SIGMA_FACTOR, 1.0)
 
 

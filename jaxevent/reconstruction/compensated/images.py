@@ -350,7 +350,16 @@ class FrameBrightness:
 
 @njit_noalloc_inlined
 def _is_quiet(counts, y, x):
-    """Return whether a pixel and those around it have no events."""
+    """Return whether a pixel and those around it have no events.
+
+    Args:
+        counts: (h, w) events of pixels.
+        y: Row of the pixel.
+        x: Its column.
+
+    Returns:
+        Whether they have none.
+    """
     if counts[y, x] != 0:
         return False
     h, w = counts.shape

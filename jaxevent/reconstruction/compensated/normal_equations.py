@@ -241,6 +241,15 @@ def _sample_row(y, begin, inputs, scratch, points, means):
 
 @njit_noalloc
 def _sample(begin, end, inputs, scratch, out):
+    """Read packed images along the trajectories of some rows of pixels.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        inputs: As of `_sample_row`.
+        scratch: `_SampleScratch`.
+        out: `TrajectorySamples`, output.
+    """
     for y in range(begin, end):
         _sample_row(y, begin, inputs, scratch, out.points[y], out.M[y])
 
@@ -268,6 +277,13 @@ def sample_trajectories(
 
 @njit_noalloc_inlined
 def _add_product(a, b, out):
+    """Add products, element by element.
+
+    Args:
+        a: (n,).
+        b: (n,).
+        out: (n,) added to.
+    """
     for i in range(len(out)):
         out[i] += a[i] * b[i]
 
@@ -444,19 +460,40 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
 
 @njit_noalloc_inlined
 def _add_difference(weight, a, b, out):
+    """Add weighted differences.
+
+    Args:
+        weight: (n,) weights.
+        a: (n,).
+        b: (n,), subtracted from `a`.
+        out: (n,) added to.
+    """
     for x in range(len(out)):
         out[x] += weight[x] * (a[x] - b[x])
 
 
 @njit_noalloc_inlined
 def _scale_and_add(factor, a, out):
-    """Write factor out + a."""
+    """Write factor out + a.
+
+    Args:
+        factor: The factor.
+        a: (n,).
+        out: (n,), in place.
+    """
     for x in range(len(out)):
         out[x] = factor * out[x] + a[x]
 
 
 @njit_noalloc_inlined
 def _add_scaled(factor, a, out):
+    """Add a multiple of a row.
+
+    Args:
+        factor: The factor.
+        a: (n,).
+        out: (n,) added to.
+    """
     for x in range(len(out)):
         out[x] += factor * a[x]
 

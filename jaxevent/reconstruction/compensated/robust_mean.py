@@ -275,12 +275,31 @@ def blur_along_y(image, y, taps, out_row):
 
 @njit_noalloc
 def _blur_across(begin, end, image, taps, scratch, out):
+    """Blur some rows of an image along x.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        image: (h, w).
+        taps: (n,) the filter, n odd.
+        scratch: (rows, w + n).
+        out: (h, w) output.
+    """
     for y in range(begin, end):
         blur_along_x(image[y], taps, scratch[begin], out[y])
 
 
 @njit_noalloc
 def _blur_down(begin, end, image, taps, out):
+    """Blur an image along y, for some of its rows.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        image: (h, w).
+        taps: (n,) the filter, n odd.
+        out: (h, w) output.
+    """
     for y in range(begin, end):
         blur_along_y(image, y, taps, out[y])
 

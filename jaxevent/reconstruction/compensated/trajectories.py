@@ -106,6 +106,15 @@ def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
 
 @njit_noalloc
 def _pack(begin, end, L, V, out):
+    """Pack some rows of images with their gradients.
+
+    Args:
+        begin: First row.
+        end: Row after the last one.
+        L: (K, h, w) log intensity.
+        V: (K, h, w) its variance, (ln I)^2.
+        out: (K, h, w, 4) output, as of `pack_images`.
+    """
     count, h, w = L.shape
     for k in range(count):
         for y in range(begin, end):

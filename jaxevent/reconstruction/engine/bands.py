@@ -233,6 +233,12 @@ class _Rows(NamedTuple):
 
 @njit_noalloc
 def _count_rows(y, counts):
+    """Count events by row.
+
+    Args:
+        y: (n,) rows of events.
+        counts: (rows,) added to.
+    """
     for i in range(len(y)):
         counts[y[i]] += 1
 
@@ -480,7 +486,14 @@ def copy_field(cells, out_begin, in_begin, count):
 
 @njit_noalloc_inlined
 def fill_field(cells, out_begin, count, value):
-    """Set some numbers to one value."""
+    """Set some numbers to one value.
+
+    Args:
+        cells: (numbers,) numbers of a band's pixels.
+        out_begin: First number to set.
+        count: How many.
+        value: The value.
+    """
     out = cells[out_begin : out_begin + count]
     for z in range(len(out)):
         out[z] = value

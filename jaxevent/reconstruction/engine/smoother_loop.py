@@ -144,7 +144,15 @@ def _fill_spread_rates(bands, reach, ahead, rates):
 
 @njit_noalloc_inlined
 def _init_last(scratch, band):
-    """Return scratch memory of a band for pixels' last events, without any event."""
+    """Forget the last events of a band's pixels.
+
+    Args:
+        scratch: `SegmentScratch`.
+        band: The band's place in it.
+
+    Returns:
+        `LastEvents` without any event, in the scratch memory.
+    """
     times = scratch.times[band]
     for z in range(times.shape[1]):
         times[1, z] = times[2, z] = 0
@@ -525,7 +533,16 @@ def _places(program: SmootherProgram, stride: int, exposed: bool) -> SmootherPla
 
 
 def _neighbour_fractions(layout: BandLayout, width: int, height: int) -> NDArray:
-    """Return the fraction of each pixel's eight neighbours on the sensor, [bands, stride]."""
+    """Return the fraction of each pixel's eight neighbours that are on the sensor.
+
+    Args:
+        layout: Division into bands.
+        width: Width of the sensor, px.
+        height: Its height, px.
+
+    Returns:
+        [bands, stride].
+    """
     inside = np.pad(np.ones((height, width)), 2)
     around = sum(
         np.roll(inside, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx

@@ -131,7 +131,20 @@ def _add_rows(rows, weight, c, information, eta):
 
 @njit_noalloc
 def _add_span(events, positions, errors, numbers, information, eta):
-    """Add the rows of a span; events are in order of time, or in reverse order for the side -1."""
+    """Add the rows of a span; events are in order of time, or in reverse order for the side -1.
+
+    Args:
+        events: (n,) flat index of the pixel, (n,) signed change, ln I, and (pixels,) -1,
+            overwritten by the number of the pixel's last event.
+        positions: x and y at the target time, px: of pixels at the key before and at the key,
+            (pixels, 2) each, and of events (n, 2).
+        errors: Variance of pixels' paths, 1/s^2, and share of their events that motion explains,
+            (pixels,) each; distances from the target time: of events (n,) and of both keys, s.
+        numbers: Number of events before the key, side, and weights of rows with an event at both
+            ends and at one, 1 / (ln I)^2.
+        information: (height, width, 2, 2) added to.
+        eta: (height, width, 2) information times gradient, added to.
+    """
     pixel, change, last = events
     begin, middle, at_event = positions
     variance, share, time, ends = errors
@@ -539,6 +552,12 @@ class KeyMemories:
         A pixel's first row begins at its last event before the key, if it has one since the key
         before: otherwise windows of few events would find gradients too small. Silence after a
         pixel's last event is left to the next window.
+        Args:
+            key: The key.
+            side: 1: towards later keys; -1: towards earlier ones.
+
+        Returns:
+            The gradient at `key + side`.
         """
         keys = min(max(key - side, 0), self.last), key, key + side
         rows, times = [self.row(k) for k in keys], [self.time(k) for k in keys]

@@ -666,7 +666,12 @@ def _add_row_diagonal(system, diagonal, bend):
 
 @njit_fastmath
 def _add_image_diagonal(system, out):
-    """Add the diagonal of A without its rows to `out`."""
+    """Add the diagonal of A without its rows to an image.
+
+    Args:
+        system: `_System`.
+        out: (height, width) image, added to.
+    """
     height, width = out.shape
     for y in range(height):
         for x in range(width):
@@ -755,7 +760,12 @@ def _interpolate(coarse, fine, line):
 
 @njit_fastmath_inlined
 def _fill_grids(scratch, r):
-    """Restrict an image to all coarser grids."""
+    """Restrict an image to all coarser grids.
+
+    Args:
+        scratch: `_ScratchArrays`, whose `grids` are written.
+        r: (height, width) image.
+    """
     grids = scratch.grids
     begin, end, fine = 0, 0, r
     for k in range(len(grids)):
