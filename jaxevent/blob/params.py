@@ -1,5 +1,9 @@
 """Parameters common to all trackers of blobs; a filter's own `Params` adds others."""
 
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxevent.errors import InputError
 from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterval
 
 
@@ -150,3 +154,35 @@ class TrackerParams(Parameters):
         # lambda sqrt(Q_v / rate), here 0.4, would make its time constant sqrt(Q_p / Q_v).
         "ttc": {"Q_p": 0.01, "Q_v": 300.0},
     }  # fmt: skip
+
+
+def check_accuracy(accuracy: float | int | None) -> None:
+    """Raise `InputError` for an accuracy that is not a share, above 0 and at most 1."""
+    if accuracy is not None and not 0 < accuracy <= 1:
+        raise InputError(
+            f"an accuracy of {accuracy:g} is not possible; give a share above 0, at most 1"
+        )
+
+
+def max_events_per_step(
+    accuracy: float, size: NDArray, rate: NDArray, noise: NDArray
+) -> NDArray[np.float64]:
+    """Compute the largest number of events per step that keeps positions accurate.
+
+    In its steady state a filter of constant velocity has the variances sqrt(2) q s^3 of position
+    and sqrt(2) q s of velocity and their covariance q s^2, with q the velocity noise and
+    s = (size^2 / rate / q)^(1/4) its time constant. Before the next step, x s later, the variance
+    of position is 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)) times as large.
+
+    Args:
+        accuracy: Share by which the standard deviation of positions may grow.
+        size: (targets,) px, sizes.
+        rate: (targets,) events/s.
+        noise: (targets,) px^2/s^3, velocity noises.
+
+    Returns:
+        (targets,) events per step.
+    """
+    roots = np.roots([1 / (3 * 2**0.5), 1, 2**0.5, 1 - (1 + accuracy) ** 2])
+    x = float(roots[abs(roots.imag) < 1e-9].real.max())
+    return x * rate * (size**2 / rate / noise) ** 0.25

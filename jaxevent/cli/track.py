@@ -138,7 +138,7 @@ def run(
 ) -> None:
     from jaxevent import methods
     from jaxevent.blob import find
-    from jaxevent.blob.search.search import check_accuracy
+    from jaxevent.blob.params import check_accuracy
     from jaxevent.io import toml
     from jaxevent.show.tracks import Output
 

@@ -13,6 +13,7 @@ from scipy import stats
 from jaxevent import blob
 from jaxevent.blob.filter import EventBatch
 from jaxevent.blob.owners import NO_OWNER_INDEX, owner_candidates
+from jaxevent.blob.params import max_events_per_step
 from jaxevent.blob.search.background import (
     clutter_evidence,
     find_hot_lines,
@@ -28,11 +29,7 @@ from jaxevent.blob.search.paths import (
     tabulate_paths,
 )
 from jaxevent.blob.search.polarity import drop_lamps
-from jaxevent.blob.search.search import (
-    TargetSearchResult,
-    _is_persistent,
-    max_events_per_step,
-)
+from jaxevent.blob.search.search import TargetSearchResult, _is_persistent
 from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.track import StepEvents, TrackBuffer, predict_and_gate
 from jaxevent.errors import InputError, InputWarning

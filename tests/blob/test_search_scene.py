@@ -200,7 +200,8 @@ def test_edges_of_a_scene_that_hardly_moves_are_no_targets():
         "planar", "varying", 555, size=(144, 108), duration=0.1, speed=40.0, texture="shapes",
         sensor=Sensor(),
     )  # fmt: skip
-    assert not len(blob.find(recording, progress=False))
+    found = blob.find(recording, progress=False)
+    assert not len(found) and found.full
 
 
 def test_two_edges_may_be_an_object():

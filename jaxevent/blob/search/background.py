@@ -178,6 +178,11 @@ class Background:
         return float((self.rate * visible).sum() / visible.sum())
 
     @property
+    def is_dense(self) -> bool:
+        """True if most of the sensor has events in a full slice."""
+        return float(np.quantile(self.level, CONFIG.nearly_all)) > CONFIG.considerable
+
+    @property
     def max_window(self) -> float:
         """Longest window (s) in which the scene moves no farther than a fine cell."""
         return np.inf if self.scene is None else FINE_CELL_PX / max(self.scene.speed, 1e-9)

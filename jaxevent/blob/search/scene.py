@@ -177,11 +177,6 @@ def _interpolate(image: Any, y: float, x: float) -> float:
     return (1 - v) * top + v * ((1 - u) * image[row + 1, column] + u * image[row + 1, column + 1])
 
 
-def is_dense(background: Background) -> bool:
-    """Return whether most of the sensor has events in a full slice."""
-    return float(np.quantile(background.level, CONFIG.nearly_all)) > CONFIG.considerable
-
-
 def split_at_pauses(background: Background) -> list[tuple[float, float]]:
     """Split the recording into spans (s) in which most of a scene is quiet, and those between.
 
@@ -192,7 +187,7 @@ def split_at_pauses(background: Background) -> list[tuple[float, float]]:
     long = np.ones(CONFIG.min_windows)
     quiet = ndimage.binary_opening(background.level < CONFIG.considerable * full, long)
     moves = ndimage.binary_opening(~quiet, long)
-    first = np.flatnonzero(np.diff(moves)) + 1 if is_dense(background) else []
+    first = np.flatnonzero(np.diff(moves)) + 1 if background.is_dense else []
     edges = np.array([0, *first, N_TIME_SLICES]) / N_TIME_SLICES * background.duration
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 

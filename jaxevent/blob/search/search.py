@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.blob.params import TrackerParams
+from jaxevent.blob.params import TrackerParams, check_accuracy, max_events_per_step
 from jaxevent.blob.search.background import Background, clutter_evidence, measure_background
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.detection import Scale, clutter_at, clutter_model, larger_variance
@@ -20,19 +20,12 @@ from jaxevent.blob.search.merge import OwnFrame, merge_parts, merge_turning, sti
 from jaxevent.blob.search.paths import TargetPath
 from jaxevent.blob.search.polarity import drop_lamps, prefer_sharper
 from jaxevent.blob.search.scale import ScaleSelection, are_evident, select_scale
-from jaxevent.blob.search.scene import (
-    drop_edges,
-    find_scene,
-    has_own_motion,
-    is_dense,
-    split_at_pauses,
-)
+from jaxevent.blob.search.scene import drop_edges, find_scene, has_own_motion, split_at_pauses
 from jaxevent.blob.search.stream import Stream
 from jaxevent.blob.search.window_tracker import WindowTracker
 from jaxevent.blob.seeds import tracking_span
 from jaxevent.deprecated import RenamedAttribute
 from jaxevent.display import plural
-from jaxevent.errors import InputError
 from jaxevent.progress import stage
 from jaxevent.recording import Recording, check_recording
 
@@ -61,7 +54,8 @@ class TargetSearchResult:
         recording: The recording.
         camera_moves: Whether the background is a scene that moves past the camera.
         lamps: Number of lamps on the mains, which are left out.
-        full: Whether most of the sensor has events most of the time, of whatever source.
+        full: Whether most of the sensor has events most of the time, of whatever source, or a scene
+            seems to move over it.
     """
 
     paths: tuple[TargetPath, ...]
@@ -236,38 +230,6 @@ class TargetSearchResult:
         return np.array([(path.begin, path.end) for path in self.paths]).T
 
 
-def check_accuracy(accuracy: float | int | None) -> None:
-    """Raise `InputError` for an accuracy that is not a share, above 0 and at most 1."""
-    if accuracy is not None and not 0 < accuracy <= 1:
-        raise InputError(
-            f"an accuracy of {accuracy:g} is not possible; give a share above 0, at most 1"
-        )
-
-
-def max_events_per_step(
-    accuracy: float, size: NDArray, rate: NDArray, noise: NDArray
-) -> NDArray[np.float64]:
-    """Compute the largest number of events per step that keeps positions accurate.
-
-    In its steady state a filter of constant velocity has the variances sqrt(2) q s^3 of position
-    and sqrt(2) q s of velocity and their covariance q s^2, with q the velocity noise and
-    s = (size^2 / rate / q)^(1/4) its time constant. Before the next step, x s later, the variance
-    of position is 1 + sqrt(2) x + x^2 + x^3 / (3 sqrt(2)) times as large.
-
-    Args:
-        accuracy: Share by which the standard deviation of positions may grow.
-        size: (targets,) px, sizes.
-        rate: (targets,) events/s.
-        noise: (targets,) px^2/s^3, velocity noises.
-
-    Returns:
-        (targets,) events per step.
-    """
-    roots = np.roots([1 / (3 * 2**0.5), 1, 2**0.5, 1 - (1 + accuracy) ** 2])
-    x = float(roots[abs(roots.imag) < 1e-9].real.max())
-    return x * rate * (size**2 / rate / noise) ** 0.25
-
-
 def find(
     recording: Recording,
     start: int | float | None = None,
@@ -313,7 +275,7 @@ def find(
     moves = any(one.scene is not None for one in backgrounds)
     return TargetSearchResult(
         tuple(found), tuple(passes), int(hot.sum()), events / stream.duration, recording, moves,
-        lamps, any(map(is_dense, backgrounds)),
+        lamps, any(one.covered or one.background.is_dense for one in sections),
     )  # fmt: skip
 
 

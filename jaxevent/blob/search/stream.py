@@ -107,7 +107,7 @@ class Stream:
         """
         stream = copy.copy(self)
         if until is not None:
-            stream._last = self._index(until)
+            stream._last = self._events.index(until)
         table = tabulate_paths(paths)
         stream._leave_out(
             (row, owner_candidates(part, table, sigmas)[:, 0] != NO_OWNER_INDEX)
@@ -209,12 +209,8 @@ class Stream:
     def _span(self, begin: float | int, end: float | int) -> tuple[int, int]:
         """Return the rows of a span (s), first and end."""
         us = [self.start + round(1e6 * t) for t in (begin, end)]
-        first, last = (self._index(min(max(t, self.start), self.stop)) for t in us)
+        first, last = (self._events.index(min(max(t, self.start), self.stop)) for t in us)
         return first, last
-
-    def _index(self, us: int) -> int:
-        """Return the first row that is not before a time."""
-        return self._events.index(us)
 
     def _read(self, first: int, last: int) -> Events:
         """Return those of a range of rows that are not left out."""
