@@ -12,6 +12,7 @@ from jaxevent.blob.search.scene import (
     _required_gain,
     drop_edges,
     has_own_motion,
+    map_gain,
     measure_moving_background,
     measure_scene_motion,
     split_at_pauses,
@@ -104,6 +105,29 @@ def test_a_moving_map_holds_the_rates_of_places():
     y, x = np.mgrid[42:54, 2:126]
     for time in np.linspace(0, 0.79, 5):
         assert background.rate_at(x, y, time).mean() == pytest.approx(true, rel=0.1)
+
+
+def test_what_moves_two_ways_is_no_scene():
+    """A map that goes as one half of the sensor does gains there, and loses in the other."""
+
+    def back(t):
+        return maps(-t)
+
+    one, other = (
+        seen_by_a_moving_camera(before_noise([])[0], rate=4e5, maps=way).events[:]
+        for way in (maps, back)
+    )
+    parts = one[one.x < 64], other[other.x >= 64]
+    columns = [np.concatenate([getattr(part, k) for part in parts]) for k in "txyp"]
+    order = np.argsort(columns[0], kind="stable")
+    halves = Events(*(column[order] for column in columns))
+    gains = []
+    for events in (one, halves):
+        stream = Stream(Recording("moving", *FRAME, events), 0, 300_000)
+        t = np.linspace(0, 0.3, 31)
+        moving = measure_moving_background(stream, SceneMotion(t, maps(t)))
+        gains.append(map_gain(stream, moving, 0.01))
+    assert gains[0] > 0 and gains[1] == -np.inf
 
 
 def test_what_another_depth_does_is_no_own_way():

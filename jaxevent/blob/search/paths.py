@@ -136,10 +136,8 @@ def interpolate_path(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:
 
 def tabulate_paths(paths: Sequence[TargetPath]) -> PathTable:
     """Concatenate the rows of paths."""
-    S = [
-        path.C * (1 + 2 / np.maximum(path.n, 1))[:, None, None] + 0.1 * np.eye(2) for path in paths
-    ]
-    S = np.concatenate(S)
+    C, n = (np.concatenate([getattr(path, k) for path in paths]) for k in "Cn")
+    S = C * (1 + 2 / np.maximum(n, 1))[:, None, None] + 0.1 * np.eye(2)
     return PathTable(
         np.cumsum([0, *(len(path.t) for path in paths)]),
         np.array([path.window for path in paths]),

@@ -249,23 +249,29 @@ def _required_gain(moving: Background) -> float | None:
 def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
     """Compute what a map gains by moving, in most windows.
 
+    Things that move differently are no scene: where they are, some places gain, and others lose.
+
     Args:
         stream: Events.
         moving: The background whose map moves.
         w: Length of the windows, s.
 
     Returns:
-        Nats per event.
+        Nats per event; minus infinity unless nearly all that places gain or lose is gain.
     """
     scene = moving.scene
     assert scene is not None
     rest = dataclasses.replace(scene, maps=np.broadcast_to(np.eye(2, 3), scene.maps.shape))
     still, gains = measure_moving_background(stream, rest), []
+    tiles, area = np.zeros((N_TILES_PER_SIDE,) * 2), [(0, stream.height), (0, stream.width)]
     for t in np.maximum(stream.quantile_times(CONFIG.scale_trials), w):
         part = stream.window(t - w, t)
         one, other = (b.rate_at(part.x, part.y, part.t) for b in (moving, still))
-        gains.append(float(np.log(one / other).mean()) if len(part) else 0.0)
-    return float(np.quantile(gains, 1 - CONFIG.nearly_all))
+        nats = np.log(one / other)
+        gains.append(float(nats.mean()) if len(part) else 0.0)
+        tiles += np.histogram2d(part.y, part.x, N_TILES_PER_SIDE, area, weights=nats)[0]
+    agree = np.maximum(tiles, 0).sum() >= CONFIG.nearly_all * abs(tiles).sum()
+    return float(np.quantile(gains, 1 - CONFIG.nearly_all)) if agree else -np.inf
 
 
 def _count_filled_tiles(stream: Stream, background: Background, selection: ScaleSelection) -> float:
@@ -284,8 +290,8 @@ def _count_filled_tiles(stream: Stream, background: Background, selection: Scale
         clutter = clutter_model(background, selection.scale, stream.shape, t)
         labels, _ = detect(part, clutter, stream.shape)
         y, x = part.y[labels > 0], part.x[labels > 0]
-        place = y * N_TILES_PER_SIDE // rows * N_TILES_PER_SIDE + x * N_TILES_PER_SIDE // columns
-        tiles.append((np.bincount(place, minlength=N_TILES_PER_SIDE**2) >= few).sum())
+        filled, *_ = np.histogram2d(y, x, N_TILES_PER_SIDE, [(0, rows), (0, columns)])
+        tiles.append((filled >= few).sum())
         edges = (x, columns), (columns - 1 - x, columns), (y, rows), (rows - 1 - y, rows)
         strips = [width * v < n for v, n in edges]
         sides.append(sum(strip.sum() >= few for strip in strips))
