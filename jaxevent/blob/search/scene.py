@@ -206,11 +206,10 @@ def find_scene(
         Whether a scene seems to move over most of the sensor; and the moving background, which is
         None if the events do not show that it moves, as where the scene hardly leaves its place.
     """
-    covered = False
     tiles = _count_filled_tiles(stream, background, selection)
     if tiles <= CONFIG.majority * N_TILES_PER_SIDE**2:
         return False, None
-    longest = stream.duration / CONFIG.min_windows
+    covered, longest = False, stream.duration / CONFIG.min_windows
     # Blobs may be seen in longer windows than a scene's motion; these are halves of each other.
     usual = selection.scale.window / (2 if selection.scale.window > longest else 1)
     for ratio in TRIED_WINDOW_RATIOS:

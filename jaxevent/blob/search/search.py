@@ -342,9 +342,10 @@ def _search_section(
             whole = [_extend_backwards(one, rest, background, selection.scale) for one in confirmed]
         frame, scene = OwnFrame(stream, background, selection.scale), background.scene
         near = whole = merge_parts(whole, None if scene else frame)
-        whole = drop_edges(whole, covered)
         if scene:
             whole = [one for one in whole if has_own_motion(one, scene, stream.start)]
+        else:
+            whole = drop_edges(whole, covered)
         lasting = [one for one in whole if _is_persistent(one, stream.duration)]
         new = stitch_paths(lasting, size, stream.duration / selection.scale.window)
         new = [one for one in new if not _is_duplicate(one, found)]
