@@ -1,4 +1,4 @@
-.PHONY: demo test suite quick lint docs bench versions gpu clean
+.PHONY: demo test suite quick lint docs bench versions clean
 .DELETE_ON_ERROR:
 
 # Python keeps the bytecode of what is imported, whatever the environment says: nothing else is
@@ -56,13 +56,6 @@ versions: .venv/made.stamp
 	@$(pip) uv
 	$(bin)/python experiments/versions.py
 
-# All tests, then the table of speed, with an NVIDIA GPU.
-gpu: .venv/gpu.stamp
-	@JAX_PLATFORMS=cuda $(bin)/python -c 'import jax; jax.devices()' 2>/dev/null || \
-	    { echo "JAX finds no NVIDIA GPU here: look at what nvidia-smi says" >&2; exit 1; }
-	$(suite)
-	$(bin)/python experiments/bench.py gpu
-
 clean:
 	rm -rf .venv build dist site jaxevent-demo .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -71,8 +64,7 @@ clean:
 .venv/test.stamp: extras := test
 .venv/docs.stamp: extras := docs
 .venv/bench.stamp: extras := bench,plot,video
-.venv/gpu.stamp: extras := test,gpu
-.venv/demo.stamp .venv/test.stamp .venv/docs.stamp .venv/bench.stamp .venv/gpu.stamp: \
+.venv/demo.stamp .venv/test.stamp .venv/docs.stamp .venv/bench.stamp: \
     pyproject.toml constraints.txt | .venv/made.stamp
 	$(install)
 	@touch $@

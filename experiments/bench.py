@@ -9,8 +9,7 @@ reconstruct`, one picture of `mc` and help in fresh processes), scaling (scaling
 all but motion, which takes minutes.
 CPU seconds of this process are compared, so other programs on the machine change little: `--gate`
 compares the ratios with bench_baseline.json and exits with 1 if one is worse than its tolerance;
-`--bless` writes those of the parts that ran. One part has no gate: `gpu` times a GPU against the
-CPU's kernels, by the clock.
+`--bless` writes those of the parts that ran.
 """
 
 import importlib
@@ -83,19 +82,18 @@ PARTS = {
     "start": "bench_images.start_bench",
     "scaling": "scaling.scaling_bench",
 }
-TABLES = {"gpu": "bench_images.gpu_bench"}  # no gate
 USUAL = [name for name in PARTS if name != "motion"]
 
 
 def run_part(name: str) -> Any:
     """Import the module of a part and run it."""
-    module, _, function = (PARTS | TABLES)[name].partition(".")
+    module, _, function = PARTS[name].partition(".")
     return getattr(importlib.import_module(module), function)()
 
 
 def main() -> int:
     parser = command_line(__doc__)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join([*PARTS, *TABLES])}")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}")
     parser.add_argument(
         "--gate", action="store_true", help="exit with 1 if worse than the baseline"
     )
@@ -103,9 +101,6 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write all numbers")
     arguments = parser.parse_args()
     parts = arguments.parts or USUAL
-    if len(parts) == 1 and parts[0] in TABLES:
-        print(f"{machine()}\n\n{run_part(parts[0])}")
-        return 0
     if unknown := set(parts) - set(PARTS):
         parser.error(f"there are no parts {', '.join(sorted(unknown))}")
     speed, ratio = {}, {}

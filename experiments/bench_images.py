@@ -1,6 +1,6 @@
 """Speed of images, as part of `bench.py`: filters, smoother, files, losses and gradients.
 
-    python experiments/bench.py images xla calibration smoother gpu start
+    python experiments/bench.py images xla calibration smoother start
 
 A stream of 5 M events at 346x260 (gamma-distributed pixel rates, 2 s, 25 frames per second) is
 read, filtered and shown. Beside it run, on one core: the whole filter as a plain numba program
@@ -14,7 +14,6 @@ import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,7 @@ import numpy as np
 from common import cpu_seconds, least_cpu
 
 import jaxevent
-from jaxevent.blob import moment
 from jaxevent.calibration import storage
-from jaxevent.egomotion import voting
 from jaxevent.io import load, save
 from jaxevent.io.hdf5_files import search_heaps
 from jaxevent.reconstruction.filtering import (
@@ -41,7 +38,6 @@ from jaxevent.reconstruction.filtering import (
 from jaxevent.reconstruction.windows import WindowedRecording
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.runs.demo import RECORDING_FILE
-from jaxevent.simulate import LinearMotion, Target, motion_scene, simulate_blobs
 
 WIDTH, HEIGHT = 346, 260
 NUMBERS = (0.1, 5e-4, 0.03, 0.01, 0.01, 7e5, 0.09)  # of the filter, as the programs take them
@@ -630,66 +626,6 @@ def motion_compensated_bench() -> tuple[dict[str, float], dict[str, float]]:
         / least["single"]
         / pixels,
     }
-
-
-GPU_REPEAT = 3  # of which the first compiles
-GPU_EVENTS = 5_000_000
-
-
-def crossing_blobs() -> tuple[Any, list[tuple[float, float, float]]]:
-    """Return 64 blobs that cross an image of 1280x720, and their beginnings."""
-    places = [(100.0 + 140 * (k % 8), 60.0 + 80 * (k // 8)) for k in range(64)]
-    lines = [LinearMotion(at, (60.0, 20.0), size=(6.0, 6.0)) for at in places]
-    recording, _ = simulate_blobs([Target(line, 1e4) for line in lines], (1280, 720), 1.0, 0.0)
-    return recording, [(x, y, 12.0) for x, y in places]
-
-
-def gpu_tasks(events: int) -> dict[str, tuple[int, Callable[[str], object]]]:
-    """Return the number of events and the task, a function of the compiler, by name."""
-    recording = stream(events, 2.0, 0)
-    of_losses = losses(recording)
-    many, seeds = crossing_blobs()
-    scene, _ = motion_scene("rotation", "constant", 200, size=(160, 120), duration=0.1)
-
-    def made(method: Any) -> Callable[[str], object]:
-        return functools.partial(images, recording, rate=100, method=method)
-
-    def track(compiler: str) -> None:
-        params = moment.Params(events_per_step=32)
-        moment.estimate(many, params, seeds=seeds, compiler=compiler, progress=False)
-
-    def vote(compiler: str) -> None:
-        voting.estimate(scene, model="rotation", compiler=compiler, progress=False)
-
-    return {
-        "akf, 100 Hz images": (events, made(jaxevent.akf)),
-        "aks, 100 Hz images": (events, made(jaxevent.aks)),
-        "akf, loss and 8 gradients": (events, lambda compiler: of_losses[f"{compiler} gradient"]()),
-        "moment, 64 targets": (len(many.events), track),
-        "voting, rotation": (len(scene.events), vote),
-    }
-
-
-def gpu_bench(events: int = GPU_EVENTS) -> str:
-    """Compare images, a loss, a tracker and voting by XLA on JAX's device with the CPU's kernels.
-
-    Returns a table in M events per second by the clock, from memory.
-    """
-    device, host = jax.devices()[0], jax.devices("cpu")[0]
-    rows = [f"| M events/s | {device.device_kind} | kernel, CPU |", "|---|---:|---:|"]
-    for name, (count, task) in gpu_tasks(events).items():
-        speeds = []
-        for compiler, where in (("xla", device), ("numba", host)):
-            with jax.default_device(where):
-                seconds = []
-                for _ in range(GPU_REPEAT):
-                    start = time.perf_counter()
-                    task(compiler)
-                    seconds.append(time.perf_counter() - start)
-            speeds.append(count / 1e6 / min(seconds[1:]))
-        rows.append(f"| {name} | {speeds[0]:.2f} | {speeds[1]:.2f} |")
-        print(rows[-1], flush=True)
-    return "\n".join(rows)
 
 
 CROP = Path(jaxevent.__file__).parent / "data" / "slider_depth_crop.h5"

@@ -46,7 +46,7 @@ from jaxevent.tuning import (
     Batches,
     Interval,
     Loss,
-    PreparedBatches,
+    batches_by_params,
     evaluate_loss,
     gradient_skill,
     loss_and_grad,
@@ -165,7 +165,7 @@ def confidence_intervals(
     Returns:
         One interval for each number that was fitted or searched.
     """
-    prepared = PreparedBatches.of(batches, (), None)
+    prepared = batches_by_params(batches)
     given = _Sample(loss, found, names, forward, prepared(found)[0])
     findings = _intervals_of_fitted(given, start)
     for name, interval in (search or {}).items():

@@ -120,6 +120,7 @@ RENAMED: dict[str, str] = {
 }
 # Modules that have another name or are part of another one.
 MOVED_MODULES: dict[str, str] = {
+    "jaxevent.devices": "jaxevent.processes",
     "jaxevent.lenses": "jaxevent.camera",
     "jaxevent.runs.published": "jaxevent.runs.external",
     "jaxevent.simulate.objects": "jaxevent.simulate.scenes",

@@ -148,10 +148,6 @@ OPTIONAL_ROWS = OptionKind(
     lambda v: v is None or (isinstance(v, Sequence) and not isinstance(v, str)) or np.ndim(v) > 0,
     "a list with an entry for each, or None",
 )
-DEVICE_LIST = OptionKind(
-    lambda v: isinstance(v, Sequence) and all(isinstance(one, jax.Device) for one in v),
-    "a list of devices of JAX",
-)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -178,7 +174,6 @@ class Estimator(abc.ABC, Generic[P]):
         "camera": option_of_class(PinholeCamera),
         "cloud": whole(0),
         "detect": OPTIONAL_FLAG,
-        "devices": DEVICE_LIST,
         "model": OptionKind(
             lambda v: v is None or isinstance(v, str | type), "a name or class of a motion model"
         ),

@@ -123,8 +123,7 @@ def check_platform_available() -> None:
         reason = " ".join(str(error).split()).partition(" (set JAX_PLATFORMS")[0].rstrip(".")[:200]
         raise InputError(
             f"JAX_PLATFORMS is {requested!r}, and JAX finds no such device here"
-            f"{f' ({reason})' if reason else ''}; unset it, or set JAX_PLATFORMS=cpu, or for an "
-            "NVIDIA GPU look at what nvidia-smi says and install the extra gpu of jaxevent"
+            f"{f' ({reason})' if reason else ''}; unset it, or set JAX_PLATFORMS=cpu"
         ) from None
 
 

@@ -3,7 +3,7 @@
     fitted = jaxevent.optimise(loss, params, ["c_on", "c_off"], batches)
 
 `loss(params, batch)` is a scalar, the mean over what a batch holds; nothing else is known of the
-estimator. All local devices are used, and several processes fit together: `jaxevent.devices`.
+estimator. Several processes fit together: `jaxevent.processes`.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from jaxevent import devices
+from jaxevent import processes
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.parameters import (
@@ -340,8 +340,8 @@ def optimise(
         batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
             that much in means over batches. Or a function `prepare(params)` that gives batches to
             fit to and batches to validate on, for parameters that act when batches are made. Of
-            several processes (`devices.join`) all give the same list and each computes its share;
-            a function gives `devices.REMOTE_BATCH` in place of what other processes compute.
+            several processes (`processes.join`) all give the same list and each computes its share;
+            a function gives `processes.REMOTE_BATCH` in place of what other processes compute.
         validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
         settings: See `Settings`.
         search: By name, (from, to, number of points): parameters searched without gradients, one
@@ -358,7 +358,7 @@ def optimise(
     Raises:
         InputError: A name does not exist, or the loss is not finite at the start.
     """
-    prepare = PreparedBatches.of(batches, validation, settings.batch)
+    prepare = batches_by_params(batches, validation)
     fresh = run is None
     run = begin(params, names, settings, search) if run is None else run
     loop = _Loop(
@@ -571,17 +571,17 @@ def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[
 
     Args:
         function: A function of a batch that gives a pytree of arrays.
-        batches: All batches, those of other processes as `devices.REMOTE_BATCH`.
+        batches: All batches, those of other processes as `processes.REMOTE_BATCH`.
 
     Returns:
         For each batch its weight and the function's value.
     """
-    if devices.is_single_device():
+    if processes.is_single():
         return [(_weight(batch), function(batch)) for batch in batches]
-    own = ((k, batch) for k, batch in enumerate(batches) if batch is not devices.REMOTE_BATCH)
+    own = ((k, batch) for k, batch in enumerate(batches) if batch is not processes.REMOTE_BATCH)
     mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
     said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
-    gathered = {k: v for some in devices.allgather(said) for k, v in some.items()}
+    gathered = {k: v for some in processes.allgather(said) for k, v in some.items()}
     values = (gathered[k] for k in range(len(batches)))
     return [(weight, jax.tree.map(jnp.asarray, value)) for weight, value in values]
 
@@ -589,7 +589,7 @@ def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[
 def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
     """Compute the mean of a function of batches (a pytree), weighted by the batches' `weight`.
 
-    On several devices or in several processes the results are added in the same order as on one.
+    In several processes the results are added in the same order as on one.
     """
     found = map_batches(function, batches)
     if len(batches) == 1:
@@ -606,46 +606,24 @@ def _weight(batch: Any) -> float:
     return float(batch.weight) if isinstance(batch, WeightedBatch) else 1.0
 
 
-class PreparedBatches:
-    """The batches to fit to and to validate on, on the devices that compute with them.
+def batches_by_params(
+    batches: Sequence[Any] | Callable[[Any], Batches], validation: Sequence[Any] = ()
+) -> Callable[[Any], Batches]:
+    """Return the batches of this process as a function of parameters.
 
     Args:
-        prepare: A function from parameters to batches, see `optimise`.
-        batch: Number of batches in a step; None takes all.
+        batches: Batches to fit to, or a function `prepare(params)`; see `optimise`.
+        validation: Batches to validate on, if `batches` is a list.
+
+    Returns:
+        A function from parameters to the batches to fit to and to validate on, which raises on all
+        processes the `InputError` of one.
     """
-
-    def __init__(self, prepare: Callable[[Any], Batches], batch: int | None):
-        self._prepare = prepare
-        self._places = devices.BatchPlacement(batch), devices.BatchPlacement(None)
-
-    @classmethod
-    def of(
-        cls,
-        batches: Sequence[Any] | Callable[[Any], Batches],
-        validation: Sequence[Any],
-        batch: int | None,
-    ) -> "PreparedBatches":
-        """Make the batches from the arguments of `optimise`.
-
-        Args:
-            batches: Batches to fit to, or a function `prepare(params)`.
-            validation: Batches to validate on, if `batches` is a list.
-            batch: Number of batches in a step; None takes all.
-
-        Returns:
-            A function from parameters to the batches to fit to and to validate on.
-        """
-        if callable(batches):
-            return cls(batches, batch)  # ty: ignore[invalid-argument-type]
-        shares = devices.partition_batches(batches), devices.partition_batches(validation)
-        return cls(lambda _: shares, batch)
-
-    def __call__(self, params: Any) -> Batches:
-        if devices.is_single_device():
-            return self._prepare(params)
-        with devices.on_host():
-            fit, validation = devices.on_all_processes(lambda: self._prepare(params))
-        return self._places[0](fit), self._places[1](validation)
+    if callable(batches):
+        prepare: Callable[[Any], Batches] = batches  # ty: ignore[invalid-assignment]
+        return lambda params: processes.on_all_processes(lambda: prepare(params))
+    shares = processes.partition_batches(batches), processes.partition_batches(validation)
+    return lambda _: shares
 
 
 class _Loop:
@@ -657,7 +635,7 @@ class _Loop:
         self,
         loss: Loss,
         params: Parameters,
-        prepare: PreparedBatches,
+        prepare: Callable[[Any], Batches],
         *,
         settings: Settings,
         intervals: Mapping[str, Interval],

@@ -11,14 +11,12 @@ import platformdirs
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # The older code generator of XLA, not in jaxlib 0.11, takes a fifth less of the time again: 42 s in
 # place of 52. Programs in parts for several cores take more to compile, and all cores have tests
-# of their own. GPUs add in whichever order comes, unless they are told not to.
+# of their own.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_cpu_parallel_codegen_split_count=1 --xla_gpu_deterministic_ops=true"
+    "--xla_cpu_parallel_codegen_split_count=1"
     + " --xla_cpu_use_fusion_emitters=false" * metadata.version("jaxlib").startswith("0.10."),
 )
-# By default each process takes three quarters of a GPU's memory for itself.
-os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 # What one test, worker or command has compiled, the others take from the user's cache folder, and
 # so does the next run. The environment reaches the commands that tests start.
 os.environ.setdefault(
@@ -60,7 +58,7 @@ LONGEST = (
     "test_blob_tracker.py",
     "test_cli_motion.py",
     "test_compensated.py",
-    "test_devices.py",
+    "test_processes.py",
     "test_docs.py",
     "test_egomotion_batch.py",
     "test_egomotion_flow.py",

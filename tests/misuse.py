@@ -545,7 +545,7 @@ def estimates() -> Iterator[Case]:
     others = {akf: moment, moment: voting, voting: akf}
     sizes = {"text": "many", "list": [1], "nan": float("nan"), "-1": -1, "dictionary": {}}
     options = {
-        akf: ("window_events", "compiler", "devices"),
+        akf: ("window_events", "compiler"),
         moment: ("seeds", "start", "stop", "detect", "smooth", "compiler", "found"),
         voting: ("model", "camera", "seed", "smooth", "cloud", "compiler"),
     }

@@ -56,3 +56,19 @@ def test_a_command_says_so_in_a_line(tmp_path):
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("jaxevent: JAX_PLATFORMS is 'abacus'")
     assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("given", "kept"), [({}, "cpu"), ({"JAX_PLATFORMS": "cuda"}, "cuda")])
+def test_commands_compute_on_the_cpu_unless_told(given, kept):
+    program = """
+import atexit, os, sys
+from jaxevent.cli import main
+atexit.register(lambda: print(os.environ["JAX_PLATFORMS"], file=sys.stderr))
+sys.argv = ["jaxevent", "--version"]
+main()
+"""
+    others = {k: v for k, v in os.environ.items() if k != "JAX_PLATFORMS"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=others | given, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr.strip()) == (0, kept)

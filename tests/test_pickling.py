@@ -158,9 +158,6 @@ def test_streams_say_what_to_keep(again):
     for live in lives:
         with pytest.raises(InputError, match=r"keep .* live\(times\)"):
             again(live)
-    devices = {"compiler": "xla", "devices": jax.devices()[:1]}
-    with pytest.raises(InputError, match="estimate again"):
-        again(jaxevent.akf.estimate(texture.moving(), **devices))
 
 
 def test_recordings_in_memory(again):

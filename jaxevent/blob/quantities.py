@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxevent.devices import full_precision
+from jaxevent.precision import full_precision
 
 # lambda1 of the events of a disc over the disc's diameter: of an even rim (a disc that grows or
 # flickers), of the leading and trailing edges of one that moves, of an evenly filled one.

@@ -31,7 +31,7 @@ from jaxevent.blob.track import (
     track_params,
     wrap_angle,
 )
-from jaxevent.devices import full_precision
+from jaxevent.precision import full_precision
 
 
 class BackwardInfo(eqx.Module):

@@ -54,6 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     pipelines (`set -o pipefail`) take it as they take others.
     """
     _mend_streams()
+    if argv is None:
+        # No result comes sooner from a GPU, of whose memory JAX would take three quarters.
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
     try:
         with _terminable(), _seldom_collected(ends=argv is None):
             try:

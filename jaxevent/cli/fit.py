@@ -68,8 +68,8 @@ def run(
     distributed: bool,
     force: bool,
 ) -> None:
-    from jaxevent import devices
     from jaxevent.errors import install_command
+    from jaxevent.processes import is_process_zero, join
 
     parts = (coordinator, processes, process)
     if distributed and parts != (None, None, None):
@@ -77,13 +77,13 @@ def run(
             "--distributed finds the coordinator and the processes itself; give one or the other"
         )
     if distributed or parts != (None, None, None):
-        devices.join(*parts)
+        join(*parts)
 
     from jaxevent.runs.fit import RESULT_FILES, fit
 
     use = None if calibrate else False
     rows = fit(config, out, recordings, resume, show_progress(), replace=force, calibrate=use)
-    if not devices.is_process_zero():
+    if not is_process_zero():
         return
     print((out / "results.md").read_text(encoding="utf-8"), end="")
     files = [name for name in RESULT_FILES if (out / name).exists()]

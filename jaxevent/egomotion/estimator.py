@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -126,10 +125,6 @@ class TrainingRuns(eqx.Module):
     def estimates(self, params: Any) -> tuple[Float[Array, "runs T d"], Float[Array, "runs T"]]:
         """Return the means of every run, and their lags (s); differentiable."""
         raise NotImplementedError
-
-    def over(self, devices: Sequence[Any]) -> "TrainingRuns":
-        """Put the runs on devices; on the first one, where they cannot be distributed."""
-        return jax.device_put(self, devices[0])
 
 
 @renamed_methods(

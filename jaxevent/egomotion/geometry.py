@@ -31,8 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
-from jaxevent.devices import full_precision
 from jaxevent.errors import InputError
+from jaxevent.precision import full_precision
 
 Scalars = Float[Array | np.ndarray, "..."] | float | int
 

@@ -35,11 +35,11 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from jaxevent.deprecated import renamed_methods
-from jaxevent.devices import full_precision
 from jaxevent.egomotion.geometry import A, rotation_basis, rotation_exp, unit
 from jaxevent.errors import InputError
 from jaxevent.estimator import import_object
 from jaxevent.parameters import check_choice
+from jaxevent.precision import full_precision
 
 if TYPE_CHECKING:
     from jaxevent.egomotion.truth import Twists

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from jaxevent.calibration import CalibratedValues, recall_calibration, recall_numbers
 from jaxevent.calibration.clipping import find_clipping
 from jaxevent.calibration.sampling import Sample
-from jaxevent.devices import full_precision
 from jaxevent.parameters import THRESHOLDS, Choice, Number, Parameters, Positive
+from jaxevent.precision import full_precision
 from jaxevent.reconstruction.consistency import (
     events_contradict_frames,
     thresholds_are_doubtful,

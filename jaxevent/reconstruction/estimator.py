@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -38,10 +38,6 @@ class PreparedImages(Protocol):
         """Choose the images at some of the times, in the order of `rows`."""
         ...
 
-    def over(self, devices: Sequence[Any]) -> "PreparedImages":
-        """Put the images on several devices, pixels sharded."""
-        ...
-
 
 class ScannedImages(eqx.Module):
     """`PreparedImages` by a method's `run` and `read`."""
@@ -57,10 +53,6 @@ class ScannedImages(eqx.Module):
     def take(self, rows: NDArray) -> "ScannedImages":
         """Choose some of the images; see `PreparedImages.take`."""
         return ScannedImages(self.features, self.out.take(rows), self.method)
-
-    def over(self, devices: Sequence[Any]) -> "ScannedImages":
-        """Put the images on several devices; see `PreparedImages.over`."""
-        return ScannedImages(self.features.over(devices), self.out.over(devices), self.method)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -246,9 +238,7 @@ class ImageEstimator(Estimator[P]):
 class PixelEstimator(ImageEstimator[P]):
     """A reconstruction method that takes each pixel on its own, in windows of events."""
 
-    options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices"}), kw_only=True
-    )
+    options: frozenset[str] = dataclasses.field(default=frozenset({"window_events"}), kw_only=True)
 
     @property
     @abc.abstractmethod
@@ -380,7 +370,7 @@ class KernelEstimator(PixelEstimator[P]):
     kernel_video: ClassVar[Any]  # class of its images, see `engine.images`
     kernel_images: ClassVar[Any]  # class of its kernels for prepared images
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices", "compiler"}), kw_only=True
+        default=frozenset({"window_events", "compiler"}), kw_only=True
     )
 
     def estimate(
@@ -395,7 +385,7 @@ class KernelEstimator(PixelEstimator[P]):
 
         In single precision they come from a kernel that numba compiles from the method's own
         functions (`engine`) for the CPU. `run` and `read`, compiled by XLA, serve where a function
-        has no translation, in double precision and on several devices.
+        has no translation, and in double precision.
 
         Args:
             recording: Events and frames.
@@ -426,10 +416,10 @@ class KernelEstimator(PixelEstimator[P]):
     ) -> PreparedImages:
         """Prepare the images at sorted times as a function of parameters, for losses.
 
-        On CPUs, in single precision, a kernel makes images and their derivatives by all parameters
-        in one pass over the events. `run` and `read` serve where a function has no translation, in
-        double precision, on other devices and on several, for derivatives by the dead time
-        `rho_ref`, and where JAX computed before jaxevent was imported (`jaxevent.threads`).
+        In single precision a kernel makes images and their derivatives by all parameters in one
+        pass over the events, on the CPU. `run` and `read` serve where a function has no
+        translation, in double precision, for derivatives by the dead time `rho_ref`, and where JAX
+        computed before jaxevent was imported (`jaxevent.threads`).
 
         Args:
             recording: Events and frames.

@@ -7,26 +7,20 @@ the pixel and of its neighbourhood, polarity, and the position of the event amon
 The frames cut time into *pieces*: before the first exposure, within exposure f, in the gap after
 it. In each piece the augmented frame is a blend of two integrals of events (`augment`). Event
 counts of a piece start at the left edge of its exposure.
-
-On several devices (`Features.over`) each device has an equal part of the lanes of every block of
-`MIN_TILE_LANES`. All kinds of tile consist of such blocks, so no device waits for another.
 """
 
 import abc
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from jaxevent.devices import DEVICE_AXIS, make_mesh, shard
 from jaxevent.estimator import ShortRepr
 
 TILE_SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks and lanes of the three kinds of tile
@@ -109,11 +103,7 @@ class ImagePoints(Points):
 
 
 class EventTiles(ShortRepr):
-    """Events of a window; slots without an event have polarity 0 and change nothing.
-
-    On several devices the last axis of the arrays is cut into blocks of `MIN_TILE_LANES`. The
-    positions in a block become the last axis, which is sharded.
-    """
+    """Events of a window; slots without an event have polarity 0 and change nothing."""
 
     pixel: Int[Numeric, "*lanes"]  # the pixel of each lane
     kind: Int[Numeric, " tiles"]  # index in `TILE_SHAPES`; len(SHAPES): the tile is not used
@@ -122,62 +112,6 @@ class EventTiles(ShortRepr):
     since: Float[Numeric, "tiles *slots"]  # s since the pixel's previous event
     near: Float[Numeric, "tiles *slots"]  # s since the 3x3 neighbourhood's previous event
     polarity: Int[Numeric, "tiles *slots"]  # +1, -1, or 0 where there is no event
-    mesh: Mesh | None = eqx.field(static=True, default=None)
-
-    def over(self, mesh: Mesh) -> "EventTiles":
-        """Shard the lanes over a mesh whose size divides `MIN_TILE_LANES`."""
-
-        def put(leaf: Any, spec: PartitionSpec) -> Any:
-            if len(spec):
-                leaf = leaf.reshape(*leaf.shape[:-1], -1, MIN_TILE_LANES)
-            return jax.device_put(leaf, NamedSharding(mesh, spec))
-
-        placed = jax.tree.map(put, self, self._specs())
-        return dataclasses.replace(placed, mesh=mesh)
-
-    def _specs(self) -> Any:
-        """Return the partition of every array; empty: whole on every device."""
-        slots = PartitionSpec(None, None, DEVICE_AXIS)
-        others = {
-            "kind": PartitionSpec(),
-            "lane": PartitionSpec(),
-            "pixel": PartitionSpec(None, DEVICE_AXIS),
-        }
-        return jax.tree_util.tree_map_with_path(
-            lambda path, _: others.get(path[0].name, slots), self
-        )
-
-    def map_shards(self, function: Callable[..., Any], *replicated: Any) -> Any:
-        """Call `function(tiles, *replicated)` on every device with its part of the lanes.
-
-        Nothing passes between devices but, backwards, the sum of derivatives by `replicated`.
-
-        Args:
-            function: Function of `EventTiles` and other pytrees that returns arrays (tiles, slots).
-            *replicated: Further arguments, whole on every device.
-
-        Returns:
-            The results, sharded as the slots are.
-        """
-        if self.mesh is None:
-            return function(self, *replicated)
-
-        def run_shard(tiles: EventTiles, *replicated: Any) -> Any:
-            def flatten(leaf: Array, spec: PartitionSpec) -> Array:
-                return leaf.reshape(*leaf.shape[:-2], -1) if len(spec) else leaf
-
-            flat = jax.tree.map(flatten, tiles, tiles._specs())
-            out = function(dataclasses.replace(flat, mesh=None), *replicated)
-            return jax.tree.map(lambda v: v.reshape(*v.shape[:-1], -1, lanes), out)
-
-        lanes = MIN_TILE_LANES // self.mesh.size
-        return jax.shard_map(
-            run_shard,
-            mesh=self.mesh,
-            in_specs=(self._specs(), *[PartitionSpec()] * len(replicated)),
-            out_specs=PartitionSpec(None, None, DEVICE_AXIS),
-            check_vma=False,  # branches that skip a tile give zeros, which are the same everywhere
-        )(self, *replicated)
 
 
 class ExposureSegments(eqx.Module):
@@ -289,24 +223,6 @@ class Features(EventCounts):
         exposed = [] if cell is None else [by_frame, by_frame, factors[0][cell], factors[1][cell]]
         return self._scale([by_frame, factors, *exposed])
 
-    def over(self, devices: Sequence[Any]) -> "Features":
-        """Put the features on several devices: lanes of tiles and pixels of images are sharded."""
-        mesh = make_pixel_mesh(devices)
-        if mesh is None:
-            return self
-        rest = (self.frames, self.start, self.last)
-        frames, start, last = shard_over_pixels(rest, mesh, self.last.shape[0])
-        tiles = None if self.tiles is None else self.tiles.over(mesh)
-        placed = Features(frames, tiles, start, last)
-        if self.derivative is None:
-            return placed
-        counts = [
-            jax.device_put(derivative.reshape(count.shape), count.sharding)
-            for derivative, count in zip(self.derivative.counts, placed.counts(), strict=True)
-        ]
-        derivative = DeadTimeDerivative(counts, shard(mesh, self.derivative.rho_ref))
-        return dataclasses.replace(placed, derivative=derivative)
-
 
 class ReadOut(EventCounts):
     """Times of images to read, with the last event of every pixel before each."""
@@ -327,34 +243,6 @@ class ReadOut(EventCounts):
     def scale_counts(self, factors: Float[Numeric, "2 pixels"]) -> "ReadOut":
         """Multiply the ON and OFF events of every pixel by its factors."""
         return self._scale(list(factors))
-
-    def over(self, devices: Sequence[Any]) -> "ReadOut":
-        """Put the read-out on several devices, pixels sharded."""
-        mesh = make_pixel_mesh(devices)
-        return self if mesh is None else shard_over_pixels(self, mesh, self.slot.shape[1])
-
-
-def make_pixel_mesh(devices: Sequence[Any]) -> Mesh | None:
-    """Make the mesh over which pixels are sharded, or return None for a single device."""
-    return make_mesh(devices, MIN_TILE_LANES)
-
-
-def shard_over_pixels(tree: Any, mesh: Mesh, n_pixels: int) -> Any:
-    """Shard arrays [..., n_pixels] along their last axis; put all others whole on every device.
-
-    Args:
-        tree: Pytree of arrays.
-        mesh: Mesh of devices.
-        n_pixels: Number of pixels.
-
-    Returns:
-        The tree on the devices.
-    """
-
-    def put(leaf: Any) -> Any:
-        return shard(mesh, leaf, -1 if np.shape(leaf)[-1:] == (n_pixels,) else None)
-
-    return jax.tree.map(put, tree)
 
 
 _count_arrays = itertools.count()

@@ -19,13 +19,11 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
-from jaxevent.devices import loop_unroll
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.engine.images import FilterImages, FilterVideo
 from jaxevent.reconstruction.estimator import KernelEstimator, P
 from jaxevent.reconstruction.features import (
-    N_TILE_SLOTS,
     TILE_SHAPES,
     EventTiles,
     Features,
@@ -34,8 +32,6 @@ from jaxevent.reconstruction.features import (
     Points,
     ReadOut,
 )
-
-UNROLLED_RANKS = 8  # of a tile, that a GPU passes over at once
 
 
 class PixelState(eqx.Module):
@@ -281,28 +277,14 @@ class Filter(KernelEstimator[P]):
         Returns:
             The states after every event, (slots,).
         """
-        path = tiles.map_shards(self._scan, params, frame_model, state)
-        return jax.tree.map(jnp.ravel, path)
-
-    def _scan(self, tiles: EventTiles, params: P, frame_model: FrameModel, state: Any) -> Any:
-        """Filter the events of one device's tiles.
-
-        Args:
-            tiles: The events.
-            params: Parameters.
-            frame_model: Model of the window's frames.
-            state: (pixels,) state before the window.
-
-        Returns:
-            (tiles, slots) states after every event.
-        """
         frame = frame_model(tiles.points)
         events = Event(
             jnp.asarray(tiles.since), jnp.asarray(tiles.near), jnp.asarray(tiles.polarity), frame
         )
         block = LaneBlock(jnp.asarray(tiles.kind), jnp.asarray(tiles.lane))
         lanes = jax.tree.map(lambda s: s[tiles.pixel], state)
-        return _filter_lanes(self, params, events, lanes, block)
+        path = _filter_lanes(self, params, events, lanes, block)
+        return jax.tree.map(jnp.ravel, path)
 
     def read(self, params: P, trajectory: FilteredTrajectory, out: ReadOut) -> Estimate:
         out = out.at_dead_time(params.rho_ref)
@@ -319,8 +301,6 @@ class Filter(KernelEstimator[P]):
 def _scan_tiles(step: Callable, lanes: Any, block: LaneBlock, slots: Any) -> Any:
     """Scan the tiles in order, and in each its ranks.
 
-    On several devices each has an equal part of the lanes of every block of `MIN_TILE_LANES`.
-
     Args:
         step: Function of lanes and slots that returns new lanes and an output for each slot.
         lanes: Arrays (lanes,).
@@ -330,31 +310,29 @@ def _scan_tiles(step: Callable, lanes: Any, block: LaneBlock, slots: Any) -> Any
     Returns:
         The outputs, (tiles, slots).
     """
-    share = N_TILE_SLOTS // jax.tree.leaves(slots)[0].shape[1]
-    shapes = [(ranks, width // share) for ranks, width in TILE_SHAPES]
-    widest = max(width for _, width in shapes)
+    widest = max(width for _, width in TILE_SHAPES)
 
     def use(ranks: int, width: int, lanes: Any, tile: Any) -> tuple[Any, Any]:
         tile = jax.tree.map(lambda v: v.reshape(ranks, width), tile)
         mine = jax.tree.map(lambda s: s[:width], lanes)
-        end, out = lax.scan(step, mine, tile, unroll=loop_unroll(UNROLLED_RANKS))
+        end, out = lax.scan(step, mine, tile)
         lanes = jax.tree.map(lambda s, e: jnp.concatenate([e, s[width:]]), lanes, end)
         return lanes, jax.tree.map(jnp.ravel, out)
 
     def skip(lanes: Any, tile: Any) -> tuple[Any, Any]:
-        out = jax.eval_shape(lambda: use(*shapes[0], lanes, tile)[1])
+        out = jax.eval_shape(lambda: use(*TILE_SHAPES[0], lanes, tile)[1])
         return lanes, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), out)
 
-    kinds = [functools.partial(use, *shape) for shape in shapes]
+    kinds = [functools.partial(use, *shape) for shape in TILE_SHAPES]
 
     # Branches see a tile's lanes, not all: XLA copies what goes through a branch. With all lanes
     # the filter took 22 ms for a million events, with a tile's 9 ms.
     def body(lanes: Any, tile: tuple[LaneBlock, Any]) -> tuple[Any, Any]:
         where, slots = tile
-        lane = where.lane if share == 1 else where.lane // share
-        mine = jax.tree.map(lambda s: lax.dynamic_slice(s, (lane,), (widest,)), lanes)
+        mine = jax.tree.map(lambda s: lax.dynamic_slice(s, (where.lane,), (widest,)), lanes)
         end, out = lax.switch(where.kind, [*kinds, skip], mine, slots)
-        lanes = jax.tree.map(lambda s, e: lax.dynamic_update_slice(s, e, (lane,)), lanes, end)
+        put = functools.partial(lax.dynamic_update_slice, start_indices=(where.lane,))
+        lanes = jax.tree.map(put, lanes, end)
         return lanes, out
 
     return lax.scan(body, lanes, (block, slots))[1]

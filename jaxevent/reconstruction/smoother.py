@@ -660,7 +660,7 @@ class Smoother(KernelEstimator[AnyParams]):
     kernel_video: ClassVar[Any] = SmootherVideo
     kernel_images: ClassVar[Any] = SmootherImages
     options: frozenset[str] = dataclasses.field(
-        default=frozenset({"window_events", "devices", "compiler", "factors"}), kw_only=True
+        default=frozenset({"window_events", "compiler", "factors"}), kw_only=True
     )
 
     @property

@@ -5,7 +5,7 @@ import functools
 import itertools
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from jaxevent import threads
 from jaxevent.deprecated import renamed_methods
-from jaxevent.devices import has_accelerator
 from jaxevent.display import HtmlRepr, format_span
 from jaxevent.errors import InputError, InputWarning, require
 from jaxevent.estimator import Estimate
@@ -22,7 +21,7 @@ from jaxevent.events.blocks import read_blocks
 from jaxevent.progress import bar
 from jaxevent.reconstruction.augment import FrameParams
 from jaxevent.reconstruction.consistency import events_contradict_frames
-from jaxevent.reconstruction.features import Features, ReadOut, make_pixel_mesh, shard_over_pixels
+from jaxevent.reconstruction.features import Features, ReadOut
 from jaxevent.reconstruction.frames import EventTiming, time_span
 from jaxevent.reconstruction.stream import StreamState
 from jaxevent.reconstruction.windows import (
@@ -32,7 +31,7 @@ from jaxevent.reconstruction.windows import (
     WindowedRecording,
 )
 from jaxevent.recording import Events, Recording, Times, microseconds
-from jaxevent.threads import TurnLock, refuse_to_pickle
+from jaxevent.threads import TurnLock
 
 P = TypeVar("P", bound=FrameParams)
 S = TypeVar("S", bound="ImageSequence")
@@ -40,7 +39,6 @@ S = TypeVar("S", bound="ImageSequence")
 MAX_WINDOW_STARTS = 32  # windows from which filtering can be taken up again
 NEVER_US = np.iinfo(np.int64).max  # us
 N_BATCH_IMAGES = 8  # images read per call; 8 x 90,000 pixels stay in the second-level cache
-N_DEVICE_BATCH_IMAGES = 32  # on a GPU, where each call costs as much as several images
 
 
 @runtime_checkable
@@ -427,7 +425,6 @@ class Video(ImageSequence[P]):
         params: Its parameters.
         window_events: Greatest number of events of a window.
         progress: Show a progress bar; None: if it takes long.
-        devices: Devices of this process over which pixels are sharded.
         factors: (2, pixels) factors on the ON and OFF thresholds of single pixels, for methods that
             do not pass over single events.
         first_events: (H, W) times of each pixel's first event, us, of a live recording, which
@@ -444,16 +441,13 @@ class Video(ImageSequence[P]):
         *,
         window_events: int = MAX_WINDOW_EVENTS,
         progress: bool | None = None,
-        devices: Sequence[Any] = (),
         factors: NDArray[np.floating] | None = None,
         first_events: NDArray[np.int64] | None = None,
     ):
         super().__init__(estimator, recording, params, progress=progress)
         if first_events is not None:
             self._first_events, self._is_live = first_events, True
-        self._devices, self._factors = devices, factors
-        self._mesh = make_pixel_mesh(devices)
-        self._batch = N_DEVICE_BATCH_IMAGES if has_accelerator() else N_BATCH_IMAGES
+        self._factors = factors
         self._windows = WindowedRecording(
             recording,
             EventTiming.of(params),
@@ -466,11 +460,6 @@ class Video(ImageSequence[P]):
         # The last reading and its images.
         self._pending: tuple[object, Any] = (None, None)
         self._future: dict[int | None, Any] | None = None  # by the start of the window
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        if self._devices:
-            refuse_to_pickle("images on chosen devices", "estimate again where they are needed")
-        return super().__reduce__()
 
     @property
     def dtype(self) -> np.dtype:
@@ -492,12 +481,12 @@ class Video(ImageSequence[P]):
             window, reader, trajectory = self._window_of(int(times[done]))
             stop = window.stop
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
-            for first in range(done, end, self._batch):
-                batch = times[first : min(first + self._batch, end)]
+            for first in range(done, end, N_BATCH_IMAGES):
+                batch = times[first : min(first + N_BATCH_IMAGES, end)]
                 reading, images_before = self._pending
                 if reading is not mine:  # two readings of this one fit into the reader
                     jax.block_until_ready(images_before)
-                out = self._put(reader(batch))
+                out = self._scale(reader(batch))
                 images = _read(self.estimator, self.params, trajectory, out)
                 self._pending = mine, images
                 for leaf in images:
@@ -505,18 +494,9 @@ class Video(ImageSequence[P]):
                 yield batch, images
             done = end
 
-    def _put(self, part: Any) -> Any:
-        """Scale the counts of features or a read-out, and put them on the devices."""
-        part = part if self._factors is None else part.scale_counts(self._factors)
-        return part if self._mesh is None else part.over(self._devices)
-
-    def _put_state(self, state: Any) -> Any:
-        """Put a state or message on the devices; else every change of place is compiled."""
-        return (
-            state
-            if self._mesh is None
-            else shard_over_pixels(state, self._mesh, self._windows.pixels)
-        )
+    def _scale(self, part: Any) -> Any:
+        """Scale the counts of features or a read-out."""
+        return part if self._factors is None else part.scale_counts(self._factors)
 
     def _window_of(self, time: int) -> FilteredWindow:
         """Return the filtered window that contains `time`; those before it are filtered first."""
@@ -588,12 +568,11 @@ class Video(ImageSequence[P]):
         """Prepare and filter the window that begins there; return it and the start of the next."""
         threads.check_not_forked()
         window, features = self._windows.prepare(begin.start, begin.before)
-        features = self._put(features)
+        features = self._scale(features)
         state = begin.state
         if state is None:
             state = _start(self.estimator, self.params, features)
         future = None if self._future is None else self._future[begin.start]
-        state, future = self._put_state((state, future))
         trajectory, end = _run(self.estimator, self.params, features, state, future)
         jax.block_until_ready(trajectory)  # before the next window's tiles overwrite these
         following = WindowStart(window.stop, window.after, end)
@@ -601,4 +580,4 @@ class Video(ImageSequence[P]):
             self._starts = sorted([*self._starts, following], key=lambda b: b.time)
             if len(self._starts) > MAX_WINDOW_STARTS:  # first, last, half of the others
                 self._starts = [self._starts[0], *self._starts[1:-1][::2], self._starts[-1]]
-        return FilteredWindow(window, window.reader(self._batch), trajectory), following
+        return FilteredWindow(window, window.reader(N_BATCH_IMAGES), trajectory), following

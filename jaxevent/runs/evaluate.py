@@ -76,13 +76,13 @@ from typing import Any, NamedTuple, overload
 import jax.numpy as jnp
 
 import jaxevent
-from jaxevent.devices import double_precision
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator
 from jaxevent.io import toml
 from jaxevent.io.checks import companions
 from jaxevent.io.output import values_of
 from jaxevent.parameters import Parameters, read_toml
+from jaxevent.precision import double_precision
 from jaxevent.recording import Recording
 from jaxevent.runs.calls import (
     CALL_HEADER,

@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.devices import partition_batches
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimator, import_object
 from jaxevent.parameters import Parameters, check_choice, suggest_name
+from jaxevent.processes import partition_batches
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Check
 from jaxevent.tuning import Batches, Loss

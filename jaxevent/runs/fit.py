@@ -42,8 +42,8 @@ each candidate of a search is prepared anew. Values omitted are those above, exc
 say otherwise, and no prior.
 
 The settings from `loss` on are those of reconstruction; `jaxevent.runs.blob` and
-`jaxevent.runs.egomotion` tell those of the other families. All local devices are used, and several
-processes fit together: `jaxevent.devices`.
+`jaxevent.runs.egomotion` tell those of the other families. Several processes fit together:
+`jaxevent.processes`.
 """
 
 import contextlib
@@ -60,7 +60,7 @@ from typing import Any, overload
 
 import jax
 
-from jaxevent import devices
+from jaxevent import processes
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning, MissingExtra
 from jaxevent.io import load, toml
@@ -148,8 +148,8 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
     then every number that was fitted with its start and its interval (`jaxevent.confidence`), what
     ran to a bound or away, and the gain. While it runs, `out` holds a checkpoint at most a few
     seconds old, by which an interrupted run goes on and ends with the same parameters, to the bit.
-    Of several processes (`devices.join`) all read the recordings and return the rows, and the first
-    reads and writes `out`.
+    Of several processes (`processes.join`) all read the recordings and return the rows, and the
+    first reads and writes `out`.
 
     Args:
         config: The TOML file.
@@ -206,7 +206,7 @@ def _fit_file(
 ) -> Fits:
     if out is None:
         raise InputError(f"{config}: out is missing; give the folder of the results")
-    plan = devices.on_all_processes(lambda: read_plan(Path(config), recordings, calibrate))
+    plan = processes.on_all_processes(lambda: read_plan(Path(config), recordings, calibrate))
     return _fit(plan, Path(out), resume, progress, replace)
 
 
@@ -236,7 +236,7 @@ def _fit_objects(
     if resume and out is None:
         raise InputError("resume goes on from the checkpoint in out; give out")
     text = CALL_HEADER + toml.dump(table_with_names(table))
-    plan = devices.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
+    plan = processes.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
     if out is None:
         return _fit(plan, None, resume, progress, replace)
     # By these lines `resume` knows the recordings of a run that had ended.
@@ -256,18 +256,18 @@ METHOD_SETTINGS = ("fit", "search", "params", "label", "prior")
 
 def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
     """Fit the methods of a plan; see `fit`."""
-    progress = progress if devices.is_process_zero() else False
+    progress = progress if processes.is_process_zero() else False
     with contextlib.ExitStack() as held:
         if out is not None:
-            rows = devices.on_process_zero(lambda: _ended_rows(out, plan, resume, replace, held))
+            rows = processes.on_process_zero(lambda: _ended_rows(out, plan, resume, replace, held))
             if rows is not None:
                 return _read_finished(rows, out, plan)
-        data = devices.on_all_processes(lambda: _load_all(plan, progress))
-        plan = devices.on_all_processes(lambda: calibrated_plan(plan, data))
+        data = processes.on_all_processes(lambda: _load_all(plan, progress))
+        plan = processes.on_all_processes(lambda: calibrated_plan(plan, data))
         key = ""
         if out is not None or jax.process_count() > 1:
-            key = devices.on_all_processes(plan.digest)
-        if len(set(devices.allgather(key))) > 1:
+            key = processes.on_all_processes(plan.digest)
+        if len(set(processes.allgather(key))) > 1:
             raise InputError(
                 f"{plan.where()}the processes see different configurations or recordings; give all "
                 "the same"
@@ -280,7 +280,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
         params = {t.label: one.params for t, one in zip(plan.tasks, done, strict=True)}
         gained = compute_gains(plan.tasks, rows_outside_fit(rows))
         fits = Fits(rows, params, found, gained, _format_report(plan.tasks, rows, found, gained))
-        if out is None or not devices.is_process_zero():
+        if out is None or not processes.is_process_zero():
             return fits
         write("config.toml", plan.text)
         write("loss.csv", _format_losses(plan.tasks, done).encode())
@@ -411,7 +411,7 @@ def _fit_tasks(
             return content
 
         if out is not None:
-            content = devices.on_process_zero(lambda: open_folder(out))
+            content = processes.on_process_zero(lambda: open_folder(out))
             if content is not None:
                 done, run = restore_checkpoint(content, out / CHECKPOINT_FILE, key, plan)
 
@@ -419,7 +419,7 @@ def _fit_tasks(
             nonlocal saved
             if out is None:
                 return
-            if devices.is_process_zero() and (
+            if processes.is_process_zero() and (
                 certain or time.monotonic() - saved > CHECKPOINT_PERIOD_S
             ):
                 save_checkpoint(out / CHECKPOINT_FILE, key, done, run)
@@ -461,8 +461,8 @@ def _score(
         rows = task.goal.score(data, params, progress)
         return [{**row, "method": label, **warning} for row in rows]
 
-    found = devices.on_all_processes(lambda: {k: score(*scored[k]) for k in mine})
-    gathered = {k: some for each in devices.allgather(found) for k, some in each.items()}
+    found = processes.on_all_processes(lambda: {k: score(*scored[k]) for k in mine})
+    gathered = {k: some for each in processes.allgather(found) for k, some in each.items()}
     return [row for k in range(len(scored)) for row in gathered[k]]
 
 

@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.devices import REMOTE_BATCH
 from jaxevent.errors import InputError
 from jaxevent.parameters import Parameters, check_choice
+from jaxevent.processes import REMOTE_BATCH
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
-from jaxevent.reconstruction.features import Numeric, make_pixel_mesh, shard_over_pixels
+from jaxevent.reconstruction.features import Numeric
 from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import (
@@ -60,25 +60,12 @@ class ImageBatch(eqx.Module):
     white: Float[Numeric, ""]  # the brightest intensity that the truth can show
     weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
 
-    def over(self, devices: Sequence[Any]) -> "ImageBatch":
-        """Partition the batch over devices along pixels."""
-        mesh = make_pixel_mesh(devices)
-        if mesh is None:
-            return self
-        rest = (self.truth, self.weights, self.white, self.weight)
-        placed = shard_over_pixels(rest, mesh, self.truth.shape[1])
-        return ImageBatch(self.prepared.over(devices), *placed)
-
 
 class LikelihoodBatch(eqx.Module):
     """A batch for the likelihood: features, and the number of measured frame pixels."""
 
     features: Any
     weight: Float[Numeric, ""]
-
-    def over(self, devices: Sequence[Any]) -> "LikelihoodBatch":
-        """Partition the batch over devices along pixels."""
-        return LikelihoodBatch(self.features.over(devices), self.weight)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,7 +291,7 @@ class Problem:
     """The batches of a method's fit and of its validation: `problem(params)`.
 
     Of several processes each prepares its own parts; in place of the others' batches are
-    `devices.REMOTE_BATCH`.
+    `processes.REMOTE_BATCH`.
 
     They are prepared when first asked for and again for params that differ in what preparation
     fixes (`clock.EventTiming`). `weights` are those of dark, well exposed and bright pixels of HDR

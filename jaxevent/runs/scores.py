@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxevent.devices import local_devices
 from jaxevent.errors import InputError, require
 from jaxevent.io.output import finite, values_of
 from jaxevent.metrics import (
@@ -664,8 +663,7 @@ def _estimates(
     params: FrameParams,
     progress: bool | None,
 ) -> Estimates:
-    options = {"devices": local_devices()} if "devices" in method.options else {}
-    video = method.estimate(given, params, progress=progress, **options)
+    video = method.estimate(given, params, progress=progress)
     first = 0
     for times, estimate in video.batches(frame_times(hidden, params), extrapolate=True):
         yield first, estimate.mean, estimate.covariance

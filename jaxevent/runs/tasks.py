@@ -16,22 +16,16 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import pickle
-import queue
 import signal
 import socket
 import threading
 import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from jaxevent import cache
 from jaxevent.codegen import N_THREADS
-from jaxevent.devices import double_precision, local_devices
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.progress import bar
@@ -80,9 +74,6 @@ class Outcome:
 @dataclasses.dataclass(frozen=True)
 class ComputeResources:
     """Processes or machines that run tasks: this process, `workers` processes, or a Dask cluster.
-
-    With several devices in this process, each runs one task at a time; with too few tasks for that,
-    each task may use all. Worker processes take one device each, in turn.
 
     `cluster` is the address of its scheduler, a `distributed.Client` or a cluster object;
     `scheduler_file` is the file that holds the address. Raises `InputError` if more than one is
@@ -170,8 +161,6 @@ def run(
         done = _in_processes(work, place.workers)
     elif place.remote:
         done = _on_cluster(work, place)
-    elif len(todo) >= len(devices := local_devices()) > 1:
-        done = _on_devices(work, devices)
     else:
         done = ((number, work.try_task(task)) for number, task in enumerate(todo))
     with (
@@ -295,30 +284,6 @@ class _Work(NamedTuple):
         return record
 
 
-def _on_devices(work: _Work, devices: Sequence[Any]) -> Records:
-    """Run tasks on a thread for each device, which is JAX's default device there."""
-    idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    for device in devices:
-        idle.put(device)
-    double = jnp.result_type(float) == jnp.float64  # as the default device, a thread's own
-
-    def compute(task: Task) -> dict[str, Any]:
-        device = idle.get()
-        try:
-            with jax.default_device(device), double_precision(double):
-                return work.try_task(task)
-        finally:
-            idle.put(device)
-
-    with ThreadPoolExecutor(len(devices)) as pool:
-        numbers = {pool.submit(compute, task): number for number, task in enumerate(work.tasks)}
-        try:
-            for future in as_completed(numbers):
-                yield numbers[future], future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
 def _in_processes(work: _Work, workers: int) -> Records:
     """Run tasks in worker processes, one at a time each, so that a death has one task to blame.
 
@@ -335,8 +300,7 @@ def _in_processes(work: _Work, workers: int) -> Records:
 
     def start() -> tuple[Any, Any]:
         ours, theirs = context.Pipe()
-        number = len(idle) + len(busy)
-        process = context.Process(target=_serve, args=(theirs, threads, number), daemon=True)
+        process = context.Process(target=_serve, args=(theirs, threads), daemon=True)
         process.start()
         theirs.close()  # else the end of the process would not end the pipe
         return ours, process
@@ -377,7 +341,7 @@ def _in_processes(work: _Work, workers: int) -> Records:
             process.join()
 
 
-def _serve(connection: multiprocessing.connection.Connection, threads: int, number: int) -> None:
+def _serve(connection: multiprocessing.connection.Connection, threads: int) -> None:
     """Run a worker process: answer tasks by (record, whether to try again)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
     os.environ["NPROC"] = str(threads)  # of XLA on the CPU, when it starts
@@ -389,9 +353,6 @@ def _serve(connection: multiprocessing.connection.Connection, threads: int, numb
             os._exit(1)
 
     threading.Thread(target=leave, daemon=True).start()
-    devices = local_devices()
-    if len(devices) > 1:
-        jax.config.update("jax_default_device", devices[number % len(devices)])
     while True:
         try:
             function, task, folder = connection.recv()

@@ -31,8 +31,8 @@ from jaxevent.blob.filters.motion import (
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.track import wrap_angle
 from jaxevent.blob.tracker import Tracker
-from jaxevent.devices import full_precision
 from jaxevent.parameters import Choice, Count, Positive
+from jaxevent.precision import full_precision
 
 MAX_POSITION_VARIANCE_PX2 = 1e6  # px^2; in single precision a longer pause would leave nothing of R
 

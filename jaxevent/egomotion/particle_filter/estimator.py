@@ -16,7 +16,6 @@ from jaxevent import threads
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen.module import make_kernel
 from jaxevent.deprecated import renamed_methods
-from jaxevent.devices import make_mesh, shard
 from jaxevent.egomotion.candidates import Candidates, CandidateSampler, ExpectedFlow
 from jaxevent.egomotion.estimator import (
     COMMON_OPTIONS,
@@ -616,25 +615,6 @@ class WarmStartedRuns(TrainingRuns):
         state = filtering.init_near(params, jnp.concatenate(particles, 1))
         _, info = filtering.run(params, self.model, self.candidates, noise, state)
         return info.mean, info.lag
-
-    def over(self, devices: Sequence[Any]) -> "WarmStartedRuns":
-        # Runs are distributed, or particles if runs are too few.
-        runs, particles = self.noise.normal.shape[0], self.start.shape[0]
-        chosen = make_mesh(devices, runs)
-        by_run = chosen is not None and chosen.size == len(devices)
-        if not by_run:
-            chosen = make_mesh(devices, particles)
-        if chosen is None:
-            return jax.device_put(self, devices[0])
-        noise = self.noise
-        axes = (0, 0, 0, None) if by_run else (2, None, 1, 0)
-        arrays = (noise.normal, noise.uniform, noise.cloud, self.start)
-        placed = [shard(chosen, v, axis) for v, axis in zip(arrays, axes, strict=True)]
-        return eqx.tree_at(
-            lambda b: (b.noise.normal, b.noise.uniform, b.noise.cloud, b.start),
-            shard(chosen, self),
-            placed,
-        )
 
 
 def calibrate(

@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from jaxevent.devices import full_precision
 from jaxevent.egomotion.candidates import Candidates
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter.likelihood import score_batch
 from jaxevent.egomotion.particle_filter.params import Params
+from jaxevent.precision import full_precision
 
 CONTRAST_TIME_CONSTANT_MEMORIES = 5.0  # time constant of the mean contrast, in `Params.memory`
 SEARCH_NOISE_SIGMAS = 0.1  # noise of a search, per batch, in standard deviations of the particles

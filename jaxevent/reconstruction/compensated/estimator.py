@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from jaxevent import codegen, threads
 from jaxevent.codegen import map_ahead
 from jaxevent.deprecated import RenamedAttribute, renamed_names
-from jaxevent.devices import with_own_settings
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
+from jaxevent.precision import with_own_settings
 from jaxevent.reconstruction.compensated.event_noise import (
     IntervalNoise,
     inflate_variances,
@@ -120,10 +120,6 @@ class PreparedTargets(ShortRepr):
         """Choose some of the images, in the order of `rows`."""
         chosen = jax.tree.map(lambda leaf: leaf[rows], self.targets)
         return PreparedTargets(self.instants, chosen, self.noise, self.samples)
-
-    def over(self, devices: Sequence[Any]) -> "PreparedTargets":
-        """Return the targets as they are: pixels read each other and are not shared out."""
-        return self
 
 
 @jax.jit

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxevent.devices import full_precision
 from jaxevent.estimator import ShortRepr
+from jaxevent.precision import full_precision
 from jaxevent.reconstruction.compensated.images import gaussian_blur
 from jaxevent.reconstruction.compensated.params import FALLBACK_SOURCES, FEATURE_NAMES, Params
 from jaxevent.reconstruction.compensated.robust_mean import (

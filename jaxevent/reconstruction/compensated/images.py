@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration.light import common_change
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
-from jaxevent.devices import full_precision
 from jaxevent.estimator import Estimate
+from jaxevent.precision import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.reconstruction.compensated.warp import PathTimes, path_positions, sample_bilinear

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
-from jaxevent.devices import full_precision
+from jaxevent.precision import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     PathTimes,

@@ -12,7 +12,7 @@ import itertools
 import math
 import queue
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -26,9 +26,9 @@ from jaxevent import threads
 from jaxevent.codegen import run_over_rows
 from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.module import choose_backend, make_kernel
-from jaxevent.devices import full_precision, has_accelerator
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
+from jaxevent.precision import full_precision
 from jaxevent.progress import bar
 from jaxevent.reconstruction.engine.bands import (
     NEVER_US,
@@ -335,9 +335,9 @@ class SmootherVideo(ImageSequence[P]):
         self._smooth(last, given)
 
 
-def _serves(devices: Sequence[Any]) -> bool:
-    """Return whether kernels are the faster way to images: in single precision, on one device."""
-    return jnp.result_type(float) == np.float32 and len(devices) < 2
+def _is_single_precision() -> bool:
+    """Return true in single precision, where kernels are the faster way to images."""
+    return jnp.result_type(float) == np.float32
 
 
 def make_kernel_video(
@@ -364,10 +364,9 @@ def make_kernel_video(
     Raises:
         InputError: The user names numba, and there is no kernel.
     """
-    own = {name: value for name, value in options.items() if name != "devices"}
-    serves = _serves(options.get("devices", ()))
+    serves = _is_single_precision()
     return make_kernel(
-        method.name, compiler, serves, lambda: kind(method, recording, params, **own)
+        method.name, compiler, serves, lambda: kind(method, recording, params, **options)
     )
 
 
@@ -612,10 +611,6 @@ class KernelImages(eqx.Module):
         """Return the images at some of the times."""
         return KernelImages(self.number, np.asarray(self.rows)[rows], self.kernel)
 
-    def over(self, devices: Sequence[Any]) -> "KernelImages":
-        """Return the images themselves: kernels make them on the host."""
-        return self
-
 
 def _rebuild(kernel: ImageKernel, rows: NDArray) -> KernelImages:
     """Rebuild images that a pickle or copy holds from their kernel, which has a number of its own.
@@ -657,7 +652,7 @@ def make_kernel_images(
     Raises:
         InputError: The user names numba, and there is no kernel.
     """
-    serves = _serves(jax.local_devices()) and not has_accelerator()
+    serves = _is_single_precision()
     backend = choose_backend(compiler, serves)
     if backend == "xla" or not IS_SYNCHRONOUS or "rho_ref" in params.followed:
         return None

@@ -45,20 +45,12 @@ class WindowFeatures(ShortRepr):
 
     equations: WindowEquations  # stacked
 
-    def over(self, devices: Any) -> "WindowFeatures":
-        """Return the windows as they are: pixels depend on each other and are not shared out."""
-        return self
-
 
 class HeldOutEvents(ShortRepr):
     """Windows of events, of which some events are to be predicted by the others."""
 
     equations: WindowEquations  # stacked
     held: Float[Numeric, "times rows"]  # 1 for an event to predict, else 0
-
-    def over(self, devices: Any) -> "HeldOutEvents":
-        """Return the windows as they are, see `WindowFeatures`."""
-        return self
 
     @property
     def count(self) -> int:
@@ -82,10 +74,6 @@ class PreparedTimes(ShortRepr):
     def take(self, rows: Any) -> "PreparedTimes":
         """Choose some of the images, in the order of `rows`."""
         return PreparedTimes(self.rows[rows], IntensityScale(*(v[rows] for v in self.scale)))
-
-    def over(self, devices: Any) -> "PreparedTimes":
-        """Return the times as they are: pixels depend on each other and are not shared out."""
-        return self
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

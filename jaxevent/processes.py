@@ -1,11 +1,4 @@
-"""Several devices and processes: partition of the work, and combination of the results.
-
-On several devices of a process `jaxevent fit` and `jaxevent evaluate` need no option: they compute
-along the one axis of a `jax.sharding.Mesh` of all local devices. With at least as many windows (of
-a fit) or recordings (of an evaluation) as devices, each device has its own. With fewer, the pixels
-of every window are partitioned, or for egomotion the runs or particles. Pixels are independent, so
-images are bit-equal; sums over pixels are added in another order. To try it without a GPU:
-XLA_FLAGS=--xla_force_host_platform_device_count=4.
+"""Several processes that fit together: partition of the batches, and exchange of the results.
 
 Several processes, on one machine or many, fit together if each is started with the same arguments
 and its number:
@@ -18,7 +11,7 @@ knows, `srun jaxevent fit fit.toml --out fitted --distributed` finds all three. 
 prepares and computes its windows, number p, p + N, p + 2 N, ... of N processes, so there should be
 at least as many windows as processes (`window` in the configuration). Losses and gradients of all
 windows are exchanged and added in the order of the windows by every process: the parameters are
-those of one process, to the bit where the devices are alike. Process 0 writes.
+those of one process, to the bit where the processors are alike. Process 0 writes.
 
 The channel between processes protects nothing: no password, no encryption. Whoever reaches its
 ports can read, replace or end the exchange, so use it in a network that you trust. Messages are
@@ -27,25 +20,18 @@ address of the machine (--distributed: where JAX has it listen, on all). On CPUs
 listens at the address of its host's name, for the exchange itself.
 """
 
-import contextlib
-import functools
 import io
 import json
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxevent.errors import InputError
-from jaxevent.threads import check_platform_available
 
-DEVICE_AXIS = "devices"
 JOIN_TIMEOUT_S = 300  # s that processes wait for each other at the start
 
-Q = ParamSpec("Q")
 T = TypeVar("T")
 
 
@@ -56,121 +42,14 @@ class RemoteBatch:
 REMOTE_BATCH = RemoteBatch()
 
 
-def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
-    """Make a function multiply matrices in full precision, where GPUs round factors to 11 bits."""
-
-    @functools.wraps(function)
-    def precise(*args: Q.args, **kwargs: Q.kwargs) -> T:
-        with jax.default_matmul_precision("highest"):
-            return function(*args, **kwargs)
-
-    return precise
-
-
-def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:
-    """Compute in double precision within a `with` block, or in single precision."""
-    if hasattr(jax, "enable_x64"):  # since JAX 0.8
-        return jax.enable_x64(enabled)
-    from jax.experimental import enable_x64  # ty: ignore[missing-module-member]
-
-    return enable_x64(enabled)
-
-
-def with_own_settings(function: Callable[Q, T]) -> Callable[Q, T]:
-    """Make a function compute with this thread's precision and device on other threads, too.
-
-    JAX keeps for each thread what `with` blocks set.
-    """
-    double, device = jax.config.jax_enable_x64, jax.config.jax_default_device  # ty: ignore[missing-attribute]
-
-    @functools.wraps(function)
-    def called(*args: Q.args, **kwargs: Q.kwargs) -> T:
-        with double_precision(double), jax.default_device(device):
-            return function(*args, **kwargs)
-
-    return called
-
-
-def has_accelerator() -> bool:
-    """Return true if JAX computes on a GPU, or another device than the CPU, by default."""
-    check_platform_available()
-    return jax.default_backend() != "cpu"
-
-
-def loop_unroll(steps: int) -> int:
-    """Return how many steps of a loop to compile into one.
-
-    GPUs launch programs anew for each step.
-    """
-    return steps if has_accelerator() else 1
-
-
-def local_devices() -> list[Any]:
-    """Return the devices to compute on: JAX's default device if set, else all of this process.
-
-    `jax.default_device` thereby confines computations to one device.
-    """
-    check_platform_available()
-    chosen = jax.config.jax_default_device  # ty: ignore[missing-attribute]
-    if chosen is None:
-        return list(jax.local_devices())
-    return jax.local_devices(backend=chosen)[:1] if isinstance(chosen, str) else [chosen]
-
-
 def is_process_zero() -> bool:
     """Return true in process number 0, the one that writes."""
     return jax.process_index() == 0
 
 
-def is_single_device() -> bool:
-    """Return true if one process computes on one device."""
-    return jax.process_count() == 1 and len(local_devices()) == 1
-
-
-def on_host() -> contextlib.AbstractContextManager[Any]:
-    """Return a context that keeps prepared data on the host if several devices share them."""
-    if len(local_devices()) == 1:
-        return contextlib.nullcontext()
-    try:
-        return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:  # JAX was told not to use the CPU
-        return contextlib.nullcontext()
-
-
-def make_mesh(devices: Sequence[Any], divisor: int) -> Mesh | None:
-    """Make a mesh of as many devices as divide `divisor`.
-
-    Args:
-        devices: Devices to take, the first ones first.
-        divisor: Length of the axis that the mesh partitions.
-
-    Returns:
-        A mesh with the axis `DEVICE_AXIS`, or None if it would hold one device.
-    """
-    count = max((n for n in range(1, len(devices) + 1) if divisor % n == 0), default=1)
-    return Mesh(np.array(devices[:count]), (DEVICE_AXIS,)) if count > 1 else None
-
-
-def shard(mesh: Mesh, tree: Any, axis: int | None = None) -> Any:
-    """Partition arrays along an axis over a mesh.
-
-    Args:
-        mesh: Mesh with the axis `DEVICE_AXIS`.
-        tree: Pytree of arrays.
-        axis: Axis to partition; None, or an axis that the mesh does not divide, puts whole arrays
-            on every device.
-
-    Returns:
-        The pytree, on the devices.
-    """
-
-    def put(leaf: Any) -> Any:
-        spec: list[str | None] = [None] * np.ndim(leaf)
-        if axis is not None and np.shape(leaf)[axis] % mesh.size == 0:
-            spec[axis] = DEVICE_AXIS
-        return jax.device_put(leaf, NamedSharding(mesh, PartitionSpec(*spec)))
-
-    return jax.tree.map(put, tree)
+def is_single() -> bool:
+    """Return true if no other process computes with this one."""
+    return jax.process_count() == 1
 
 
 def join(
@@ -327,41 +206,3 @@ def on_all_processes(compute: Callable[[], T]) -> T:
         if other is not None:
             raise InputError(other)
     return value
-
-
-class BatchPlacement:
-    """Placement of the batches of a fit on devices, made once, when they are first used.
-
-    With at least as many batches per step as devices, batch k is on device k mod n of n; with
-    fewer, every batch that can be (by its method `over(devices)`) is partitioned over all devices.
-    """
-
-    def __init__(self, per_step: int | None):
-        self.per_step = per_step
-        self._given: Sequence[Any] | None = None
-        self._placed: list[Any] = []
-
-    def __call__(self, batches: Sequence[Any]) -> Sequence[Any]:
-        """Return the batches on their devices; remote ones stay as they are."""
-        devices = local_devices()
-        if len(devices) == 1:
-            return batches
-        if self._given is not batches:
-            self._given, self._placed = None, []  # so that two are never held at once
-            mine = [b for b in batches if b is not REMOTE_BATCH]
-            share = len(mine) / max(len(batches), 1)
-            step = len(mine) if self.per_step is None else math.ceil(self.per_step * share)
-            apart, number = min(step, len(mine)) >= len(devices), 0
-            for batch in batches:
-                if batch is not REMOTE_BATCH:
-                    batch = _put(batch, devices, number, apart)
-                    number += 1
-                self._placed.append(batch)
-            self._given = batches
-        return self._placed
-
-
-def _put(batch: Any, devices: Sequence[Any], number: int, apart: bool) -> Any:
-    if not apart and hasattr(batch, "over"):
-        return batch.over(devices)
-    return jax.device_put(batch, devices[number % len(devices)])
