@@ -9,11 +9,15 @@ There JAX's programs are refused; kernels work.
 """
 
 import functools
+import importlib.abc
+import importlib.machinery
+import importlib.util
 import os
 import sys
 import threading
+import types
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NoReturn, ParamSpec, TypeVar
 
 from jaxevent.errors import InputError
@@ -90,13 +94,14 @@ def refuse_to_pickle(what: str, instead: str) -> NoReturn:
 
 
 def use_synchronous_dispatch() -> bool:
-    """Make JAX finish each program before it begins the next, once JAX is imported.
+    """Make JAX finish each program before it begins the next, now or when it is imported.
 
     Returns false if JAX has already begun to compute otherwise, or does not tell.
     """
     jax = sys.modules.get("jax")
     if jax is None:
-        return False
+        sys.meta_path.insert(0, _JaxFinder())
+        return True
     setting = "jax_cpu_enable_async_dispatch"
     try:
         from jax._src.xla_bridge import backends_are_initialized
@@ -106,6 +111,32 @@ def use_synchronous_dispatch() -> bool:
         return jax.config.values.get(setting) is False
     except (ImportError, AttributeError):  # private: another JAX may have no such names
         return False
+
+
+class _JaxFinder(importlib.abc.MetaPathFinder):
+    """Finder that has JAX dispatch synchronously as soon as it is imported.
+
+    No variable of the environment says so, and whoever imports it may compute at once.
+    """
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """See `importlib.abc.MetaPathFinder.find_spec`."""
+        if fullname != "jax":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(fullname)
+        loader: Any = None if spec is None else spec.loader
+        if loader is not None:
+            execute = loader.exec_module
+
+            def exec_module(module: types.ModuleType) -> None:
+                execute(module)
+                use_synchronous_dispatch()
+
+            loader.exec_module = exec_module
+        return spec
 
 
 @functools.cache

@@ -11,6 +11,7 @@ import functools
 import itertools
 import math
 import queue
+import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
@@ -26,7 +27,7 @@ from jaxevent import threads
 from jaxevent.codegen import run_over_rows
 from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.module import choose_backend, make_kernel
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.estimator import Estimate
 from jaxevent.precision import full_precision
 from jaxevent.progress import bar
@@ -654,7 +655,14 @@ def make_kernel_images(
     """
     serves = _is_single_precision()
     backend = choose_backend(compiler, serves)
-    if backend == "xla" or not IS_SYNCHRONOUS or "rho_ref" in params.followed:
+    if backend == "xla" or "rho_ref" in params.followed:
+        return None
+    if not IS_SYNCHRONOUS:
+        reason = "JAX computed before jaxevent was imported; import jaxevent first"
+        if compiler == "numba":
+            raise InputError(f"no program may call the kernel of {method.name!r}, as {reason}")
+        slow = f"a fit of {method.name!r} takes several times as long without a kernel"
+        warnings.warn(f"{slow}: {reason}", InputWarning, stacklevel=3)
         return None
     times = sorted_times(times)
     _, event_times = method.check_request(recording, times, params, extrapolate)
