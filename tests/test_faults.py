@@ -274,6 +274,20 @@ def test_few_pixels_that_make_many_of_the_events_are_told(sound):
     assert told.limit < told.statistic < 0.15 and "of the events" in told.text
 
 
+@pytest.mark.parametrize(("scale", "unit", "remedy"), [
+    (1000, "nanoseconds", "divide the times by 1,000"),
+    (1 / 1000, "milliseconds", "multiply the times by 1,000"),
+])  # fmt: skip
+def test_a_clock_of_another_unit_is_told(sound, scale, unit, remedy):
+    e = sound.events
+    t = (e.t * scale).astype(np.int64)
+    fast = dataclasses.replace(sound, events=dataclasses.replace(e, t=t), frames=None)
+    (told,) = (one for one in jaxevent.check_consistency(fast) if one.name == "unusual clock")
+    assert f"like {unit}, not microseconds: they last" in told.text and remedy in told.remedy
+    assert told.statistic > told.limit
+    assert str(told) in dict(describe(fast)).values()
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.data())
 def test_odd_recordings_are_checked_without_errors(data):

@@ -27,6 +27,7 @@ from jaxevent.calibration.sampling import Sample, count_between, log_changes, ta
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording, check_recording
+from jaxevent.time_units import WINNING_NATS, doubt_microseconds
 
 MAX_HOT_SHARE = 0.01  # of the pixels
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
@@ -49,7 +50,7 @@ MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 # Faults of the events alone, whether frames revealed them or not.
 EVENT_FAULTS = (
-    *("hot pixels", "missing events", "event bursts"),
+    *("hot pixels", "unusual clock", "missing events", "event bursts"),
     *("lost polarity", "inverted polarity", "flipped or swapped axes"),
 )
 
@@ -98,6 +99,7 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
         fault
         for found in (
             _check_hot_pixels(sample),
+            _check_unit(recording),
             _check_times(recording, sample),
             _check_both(recording, sample),
             _check_white(recording),
@@ -125,6 +127,16 @@ def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
         "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
         "calibrate(recording).hot_pixels",
     )  # fmt: skip
+
+
+def _check_unit(recording: Recording) -> Iterator[Fault]:
+    """Check whether the times of events are as usual as microseconds."""
+    doubt = doubt_microseconds(recording.events, (recording.width, recording.height))
+    if doubt is not None:
+        yield Fault(
+            "unusual clock", doubt.nats, WINNING_NATS, doubt.text,
+            f"if so, {doubt.remedy}, or read the file with --time-unit",
+        )  # fmt: skip
 
 
 def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:

@@ -38,7 +38,7 @@ from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Imu, Recording
-from jaxevent.time_units import JUDGED_EVENTS, doubt_microseconds
+from jaxevent.time_units import doubt_microseconds
 
 PATCH_PX = 24
 MAX_GRID_DISPLACEMENT_PX = 7  # of the grid, in x and y
@@ -175,11 +175,8 @@ def describe_unit_doubt(recording: Recording) -> str:
 
     Where nothing is seen to move, a clock that runs too fast or too slowly may be the cause.
     """
-    events, last = recording.events, max(len(recording.events) - 1, 0)
-    ends = events[: min(last, JUDGED_EVENTS)], events[last:]
-    sample = {name: np.concatenate([getattr(end, name) for end in ends]) for name in "txy"}
-    doubt = doubt_microseconds(sample, len(events), (recording.width, recording.height))
-    return "" if doubt is None else f"; {doubt}"
+    doubt = doubt_microseconds(recording.events, (recording.width, recording.height))
+    return "" if doubt is None else f"; {doubt.text}; if so, {doubt.remedy}"
 
 
 def window_durations(recording: Recording) -> NDArray[np.float64]:
