@@ -75,9 +75,10 @@ def run(
     recording.refuse_empty(str(path))
     recording.refuse_one_time(str(path))
     if times is not None:
-        wanted = read_times(times, (recording.start, recording.stop))
+        wanted = read_times(times, recording.event_span())
     else:
-        wanted = image_times(recording, rate, start)
+        spanned = dataclasses.replace(recording, frames=None, name=str(path))
+        wanted = image_times(spanned, rate, start, stop)
     chosen = within(wanted, start, stop, str(path))
     arguments.warn_of_faults(dataclasses.replace(recording, name=str(path)), frames=False)
     clock = time.perf_counter()

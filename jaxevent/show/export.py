@@ -19,9 +19,14 @@ from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 from jaxevent.show.images import Tone, display_limits, tone_map, video_writer, write_png
 
+MAX_IMAGES = 10_000_000  # times of one command: 80 MB, a day of 100 per second
+
 
 def image_times(
-    recording: Recording, rate: float | int, start: float | int | None = None
+    recording: Recording,
+    rate: float | int,
+    start: float | int | None = None,
+    stop: float | int | None = None,
 ) -> NDArray[np.int64]:
     """Return the times of evenly spaced images of a recording.
 
@@ -29,12 +34,13 @@ def image_times(
         recording: The recording.
         rate: Times per second.
         start: First time, s; None for the recording's start.
+        stop: Last time, s; None for the recording's stop.
 
     Returns:
         (T,) us, up to the recording's stop.
 
     Raises:
-        InputError: The rate is not possible.
+        InputError: The rate is not possible, or the times are too many.
     """
     if not 0 < rate <= 1e6:
         raise InputError(
@@ -44,7 +50,16 @@ def image_times(
     first = recording.start
     if start is not None:
         first = max(first, int(microseconds(float(start), "--start")))
-    count = max(0, math.floor((recording.stop - first) * rate / 1e6 + 1e-9) + 1)
+    last = recording.stop
+    if stop is not None:
+        last = min(last, int(microseconds(float(stop), "--stop")))
+    count = max(0, math.floor((last - first) * rate / 1e6 + 1e-9) + 1)
+    if count > MAX_IMAGES:
+        raise InputError(
+            f"{recording.name}: from {format_span((first, last))} there are {count:,} times at a "
+            f"rate of {rate:g} per second; give a part of it, --start and --stop, or a lower "
+            "--rate; jaxevent info tells gaps and wrong clocks"
+        )
     return first + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
 
 
