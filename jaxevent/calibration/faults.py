@@ -34,6 +34,8 @@ MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
 MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
 MAX_BURST_SHARE = 0.05  # of the events
+MAX_REPEATED_EVENTS_SHARE = 0.05  # of the events
+MAX_CLOCK_STEP_US = 100  # within a coarser step a pixel may well fire twice
 MAX_POLARITY_SHARE, MIN_POLARITIES = 0.95, 1_000
 MIN_ADVANTAGE = 2.0  # of a correlation over that of the recording as it is
 MIN_BUSY = 100  # pixels with several events between frames, which determine clock and exposure
@@ -50,7 +52,7 @@ MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 # Faults of the events alone, whether frames revealed them or not.
 EVENT_FAULTS = (
-    *("hot pixels", "unusual clock", "missing events", "event bursts"),
+    *("hot pixels", "unusual clock", "missing events", "event bursts", "repeated events"),
     *("lost polarity", "inverted polarity", "flipped or swapped axes"),
 )
 
@@ -101,6 +103,7 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
             _check_hot_pixels(sample),
             _check_unit(recording),
             _check_times(recording, sample),
+            _check_repeated_events(sample),
             _check_both(recording, sample),
             _check_white(recording),
         )
@@ -187,6 +190,23 @@ def _count_bursts(t: NDArray[np.int64]) -> int:
     around = np.maximum(before, after) / BURST_BINS + 1
     inner = (bins >= BURST_BINS) & (bins <= bins[-1] - BURST_BINS)
     return int(counts[inner & (counts > BURST_RATIO * around)].sum())
+
+
+def _check_repeated_events(sample: Sample) -> Iterator[Fault]:
+    """Check the share of events that are in the recording more than once."""
+    total, different = 0, 0
+    for t, pixel, p, *_ in sample.segments:
+        steps = np.diff(t)
+        if not steps.any() or steps[steps > 0].min() > MAX_CLOCK_STEP_US:
+            continue
+        total += len(t)
+        different += len(np.unique(((t - t[0]) * len(sample.places) + pixel) * 2 + p))
+    share = 1 - different / max(total, 1)
+    yield Fault(
+        "repeated events", share if total else 0.0, MAX_REPEATED_EVENTS_SHARE,
+        f"{100 * share:.3g} % of the events repeat the time, pixel and polarity of another one",
+        "look for parts that were stored twice; jaxevent filter --refractory 1 keeps one of each",
+    )  # fmt: skip
 
 
 def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
