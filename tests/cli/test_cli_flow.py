@@ -14,6 +14,7 @@ import jaxevent
 from jaxevent import cli
 from jaxevent.event_flow import FlowParams, flow_from_events
 from jaxevent.io import png
+from jaxevent.recording import Events
 from jaxevent.show.flow import decode_flow, encode_flow, flow_colours, write_flow_hdf5
 from jaxevent.simulate import motion_scene
 
@@ -190,10 +191,12 @@ def test_times_are_those_of_the_events(stored, tmp_path, capsys):
     first, last = recording.event_span()
     with h5py.File(tmp_path / "flow.h5") as file:
         assert file["t"][0] == first and last - 50_000 < file["t"][-1] <= last
+    jaxevent.save(dataclasses.replace(recording, events=Events.empty()), tmp_path / "none.h5")
+    capsys.readouterr()
+    fails(capsys, f"flow {tmp_path}/none.h5 --out {tmp_path}/n".split(), "none.h5: holds no events")
     t = recording.events.t.copy()
     t[-1] += 10**15
     broken = dataclasses.replace(recording.events[:], t=t)
     jaxevent.save(dataclasses.replace(recording, events=broken), tmp_path / "broken.h5")
     argv = f"flow {tmp_path}/broken.h5 --out {tmp_path}/broken"
-    capsys.readouterr()
     fails(capsys, argv.split(), "broken.h5", "to 1000000000", "--stop", "--rate")
