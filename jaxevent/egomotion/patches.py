@@ -404,7 +404,8 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
 
     Returns:
         The median over some frames, or None. It is None where nothing is seen to move, and where no
-        frame has events before and after it while it moves by `FRAME_WINDOW_DISPLACEMENT_PX`.
+        frame has edges, and events before and after it while it moves by
+        `FRAME_WINDOW_DISPLACEMENT_PX`.
     """
     frames, events = recording.frames, recording.events
     if frames and speed is None:
@@ -422,18 +423,20 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
     fractions = []
     for at, image in zip(frames.t[rows].tolist(), frames[rows].intensity, strict=True):
         edges = _find_edges(image)
+        if not edges.any():
+            continue
         part = events[events.index(at - half) : events.index(at + half)]
         active = np.zeros(edges.shape, bool)
         active[part.y, part.x] = True
         fractions.append(maximum_filter(active, 3)[edges].mean())
-    return float(np.median(fractions))
+    return float(np.median(fractions)) if fractions else None
 
 
 def _find_edges(image: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Find the pixels of a frame (intensity) where log intensity is steepest."""
     smooth = gaussian_filter(np.log(image + DARK_GREY_OFFSET), 1.0)
     slope = np.hypot(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
-    return slope >= np.quantile(slope, 1 - EDGE_PIXEL_FRACTION)
+    return (slope > 0) & (slope >= np.quantile(slope, 1 - EDGE_PIXEL_FRACTION))
 
 
 @renamed_fields(both="both_directions")
