@@ -1,6 +1,7 @@
 """Files of a reconstruction: HDF5 of exact values, a video, or a folder of images."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import N_THREADS
 from jaxevent.display import format_span
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
@@ -365,11 +366,21 @@ def _batches(
         colours: Function that makes colour images of times; None: images are grey.
 
     Yields:
-        Times of a batch, us, and arrays (times, H, W[, 3]) by their names in HDF5.
+        Times of a batch, us, and arrays (times, H, W[, 3]) by their names in HDF5. An
+        `InputWarning` tells at the end that grey images are valid nowhere.
     """
     if colours is None:
+        is_valid = False
         for batch, estimate in video.batches(times):
+            is_valid = is_valid or bool(np.any(estimate.valid))
             yield batch, {"image": estimate.mean, "variance": estimate.covariance}
+        if not is_valid:
+            warnings.warn(
+                f"{video.recording.name}: no pixel of the images rests on data, they show what is "
+                "assumed without any; choose other times, or see jaxevent info",
+                InputWarning,
+                stacklevel=2,
+            )
         return
     rows = range(0, len(times), N_BATCH_IMAGES)
     for row in bar(rows, desc="images", unit="batch", progress=video.progress):
