@@ -278,6 +278,9 @@ class _ParameterArrays(_Module):
     point: Array
 
 
+_FIELDS = frozenset({"raw", "chosen", "followed", "point"})
+
+
 class Parameters(_ParameterArrays):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
@@ -331,10 +334,18 @@ class Parameters(_ParameterArrays):
 
     def __init__(self, *, preset: str | None = None, **values: Any):
         check_platform_available()  # the first arrays that JAX makes
+        # `dataclasses.replace` gives the stored fields with the values that change.
+        fields = {name: values.pop(name) for name in _FIELDS} if _FIELDS <= values.keys() else {}
         _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
             check_choice(preset, "preset", self.presets)
             values = {**self.presets[preset], **values}
+        if fields:
+            self.raw, self.chosen = fields["raw"], fields["chosen"]
+            self.followed, self.point = fields["followed"], fields["point"]
+            changed = self.replace(**values)
+            self.raw, self.chosen = changed.raw, changed.chosen
+            return
         self.raw = {
             name: _stored(number, values.get(name, number.default))
             for name, number in self.numbers.items()

@@ -928,7 +928,7 @@ class Recording(HtmlRepr):
         there is none. Raises `InputError` for gains that are not one positive number per frame.
         """
         number = 0 if self.frames is None else len(self.frames)
-        if "gain" not in self.extra:
+        if not number or "gain" not in self.extra:
             return np.ones(number)
         gain = np.asarray(self.extra["gain"])
         if gain.dtype.kind not in "iuf" or gain.shape != (number,) or not (gain > 0).all():
@@ -990,8 +990,10 @@ class Recording(HtmlRepr):
             **cuts,
         )
         if not len(part.events) and part.frames is None:
+            ends = [] if span.start is None else [f"from {t0}"]
+            ends += [] if span.stop is None else [f"to {t1}"]
             raise InputError(
-                f"{self.name}: no event and no frame between {t0} and {t1} us; the recording "
+                f"{self.name}: no event and no frame {' '.join(ends)} us; the recording "
                 f"reaches from {self.start} to {self.stop} us"
             )
         return part

@@ -26,13 +26,16 @@ mends both. Of numbers of the same kind as the event times, the unit of these co
 import re
 import warnings
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.arrays import UNIT_NAMES, US_PER_UNIT, check_resolution, time_step, to_microseconds
 from jaxevent.errors import InputError, InputWarning
+
+if TYPE_CHECKING:
+    from jaxevent.recording import EventSource
 
 MIN_EVENTS = 300
 SAMPLE_EVENTS = 1 << 16  # events from which order, unit and signs are inferred
@@ -42,7 +45,7 @@ _BURST_FRACTION = (
     0.01  # of the mean interval, or of the sample; of independent events it is 0.025 or more
 )
 _CERTAIN_NATS = 2.7  # nats by which an undoubted unit exceeds the next
-_WINNING_NATS = 1.0  # nats by which a unit must exceed the usual one
+WINNING_NATS = 1.0  # nats by which a unit must exceed the usual one
 _CONTRADICTION_NATS = 8.0  # nats by which another unit must exceed a stated one for a warning
 _MAX_DECIMAL_SPAN_US = 1e12  # of a recording with times that have decimals: 11.6 days
 _GAP_RATIO = 1000.0  # times the sum of all other steps that a gap lasts
@@ -187,7 +190,7 @@ def infer_unit(
             notes.append(f"event times are taken as {UNIT_NAMES[unit]}, by their magnitude")
             doubt = _doubt(source, numbers, unit, expected)
     else:
-        unit = best if scores[best] > scores[expected] + _WINNING_NATS else expected
+        unit = best if scores[best] > scores[expected] + WINNING_NATS else expected
         after = max((u for u in scores if u != unit), key=lambda u: scores[u])
         is_doubtful = scores[unit] < scores[after] + _CERTAIN_NATS
         if unit != expected or is_doubtful:
@@ -229,7 +232,7 @@ def doubt_given_unit(
         return None
     rows = np.append(np.arange(min(len(t) - 1, JUDGED_EVENTS)), len(t) - 1)
     sample = {name: part[rows] for name, part in (("t", t), ("x", x), ("y", y))}
-    least = _WINNING_NATS if unit is None else _CONTRADICTION_NATS
+    least = WINNING_NATS if unit is None else _CONTRADICTION_NATS
     numbers, unit = _Numbers.from_sample(sample, len(t), size), unit or "us"
     found = _contradiction(numbers, unit, least)
     if found is None:
@@ -240,35 +243,44 @@ def doubt_given_unit(
     )
 
 
-def doubt_microseconds(
-    sample: Mapping[str, NDArray], n_events: int, size: tuple[int, int]
-) -> str | None:
-    """Compare a recording that something else makes doubtful with what recordings are like.
+class ClockDoubt(NamedTuple):
+    """A unit that fits the times of a recording better than microseconds.
+
+    Attributes:
+        nats: Log likelihood ratio of that unit over microseconds.
+        text: The unit, and the recording as it would be under both.
+        remedy: Words that begin with a verb.
+    """
+
+    nats: float
+    text: str
+    remedy: str
+
+
+def doubt_microseconds(events: "EventSource", size: tuple[int, int]) -> ClockDoubt | None:
+    """Compare a recording with what recordings are like under other units.
 
     Args:
-        sample: Columns t (us), x and y, (n,) each: the first events, and then the last one.
-        n_events: Number of events in all.
+        events: Its events, of which the first ones and the last one are read.
         size: (width, height) of the sensor in pixels.
 
     Returns:
-        The unit that the times seem to have and the remedy, for a message; None where
-        microseconds are usual.
+        The unit that the times seem to have; None where microseconds are as usual.
     """
-    if n_events < MIN_EVENTS:
+    count = len(events)
+    if count < MIN_EVENTS:
         return None
-    found = _contradiction(_Numbers.from_sample(sample, n_events, size), "us", _WINNING_NATS)
+    ends = events[: min(count - 1, JUDGED_EVENTS)], events[count - 1 :]
+    sample = {name: np.concatenate([getattr(end, name) for end in ends]) for name in "txy"}
+    found = _contradiction(_Numbers.from_sample(sample, count, size), "us", WINNING_NATS)
     if found is None:
         return None
     scale = US_PER_UNIT[found.unit]
-    remedy = (
-        f"multiply the times by {scale:,.0f}"
-        if scale > 1
-        else f"divide the times by {1 / scale:,.0f}"
-    )
-    return (
-        f"the times look like {UNIT_NAMES[found.unit]}, not microseconds: {found.text}; if so, "
-        f"{remedy}"
-    )
+    remedy = f"multiply the times by {scale:,.0f}"
+    if scale < 1:
+        remedy = f"divide the times by {1 / scale:,.0f}"
+    text = f"the times look like {UNIT_NAMES[found.unit]}, not microseconds: {found.text}"
+    return ClockDoubt(found.nats, text, remedy)
 
 
 class _Contradiction(NamedTuple):
@@ -276,6 +288,7 @@ class _Contradiction(NamedTuple):
 
     unit: str
     text: str
+    nats: float
 
 
 def _contradiction(
@@ -298,7 +311,7 @@ def _contradiction(
     if not known or scores[best] <= scores[unit] + least:
         return None
     text = f"{numbers.describe(unit)}; as {UNIT_NAMES[best]} {numbers.describe(best)}"
-    return _Contradiction(best, text)
+    return _Contradiction(best, text, scores[best] - scores[unit])
 
 
 def _warn(text: str) -> None:

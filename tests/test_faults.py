@@ -15,6 +15,7 @@ from jaxevent.calibration.correspondence import TRANSFORMS
 from jaxevent.calibration.hot import find_hot_pixels
 from jaxevent.calibration.light import common_change
 from jaxevent.calibration.sampling import count_between, take_sample
+from jaxevent.events import filter_refractory
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.show.describe import describe
 from jaxevent.simulate import faults
@@ -272,6 +273,32 @@ def test_few_pixels_that_make_many_of_the_events_are_told(sound):
     few = faults.add_hot_pixels(sound, 1, share=0.002, rate=50 * len(sound.events) / SIDE**2)
     (told,) = (one for one in jaxevent.check_consistency(few) if one.name == "hot pixels")
     assert told.limit < told.statistic < 0.15 and "of the events" in told.text
+
+
+def test_events_stored_twice_are_told(sound):
+    e = sound.events
+    twice = Events(*(np.repeat(getattr(e, name), 2) for name in "txyp"))
+    (told,) = jaxevent.check_consistency(dataclasses.replace(sound, events=twice))
+    assert told.name == "repeated events" and told.statistic == pytest.approx(0.5, abs=0.01)
+    once = filter_refractory(twice, 1, size=(SIDE, SIDE))
+    assert names_of(dataclasses.replace(sound, events=once)) == []
+    # A simulator whose clock has the frames' steps has events of one pixel at one time.
+    coarse = dataclasses.replace(twice, t=twice.t // 1000 * 1000)
+    assert "repeated events" not in names_of(dataclasses.replace(sound, events=coarse))
+
+
+@pytest.mark.parametrize(("scale", "unit", "remedy"), [
+    (1000, "nanoseconds", "divide the times by 1,000"),
+    (1 / 1000, "milliseconds", "multiply the times by 1,000"),
+])  # fmt: skip
+def test_a_clock_of_another_unit_is_told(sound, scale, unit, remedy):
+    e = sound.events
+    t = (e.t * scale).astype(np.int64)
+    fast = dataclasses.replace(sound, events=dataclasses.replace(e, t=t), frames=None)
+    (told,) = (one for one in jaxevent.check_consistency(fast) if one.name == "unusual clock")
+    assert f"like {unit}, not microseconds: they last" in told.text and remedy in told.remedy
+    assert told.statistic > told.limit
+    assert str(told) in dict(describe(fast)).values()
 
 
 @settings(max_examples=20, deadline=None)

@@ -1,5 +1,7 @@
 """Kinds of numbers: their domains, what is stored, and where derivatives go."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,6 +67,18 @@ def test_derivatives_stop_at_what_is_prepared():
     followed = params.with_derivatives("late")
     assert float(jax.grad(total)(followed).raw["late"]) == pytest.approx(3 * 0.2)
     assert float(total(followed)) == float(total(params))
+
+
+def test_dataclasses_replace_is_the_method():
+    params = Given(sigma=2.0).with_derivatives("late")
+    changed = dataclasses.replace(params, offset=3.0, cells=5)
+    assert type(changed) is Given and changed.followed == {"late"}
+    assert changed.values() == Given(sigma=2.0, offset=3.0, cells=5).values()
+    assert jax.tree.structure(changed) == jax.tree.structure(params.replace(cells=5))
+    with pytest.raises(InputError, match="no parameter 'sigmas'; did you mean 'sigma'"):
+        dataclasses.replace(params, sigmas=1.0)
+    gradient = jax.grad(lambda p: dataclasses.replace(p, sigma=p.sigma * 2).sigma)(params)
+    assert gradient.per_unit(params)["sigma"] == pytest.approx(2)
 
 
 def test_values_travel_through_jit_and_vmap():

@@ -188,7 +188,7 @@ class LiveTracks:
     def _start_tracking(self, start: int) -> None:
         self._packer = packer = ChunkPacker(
             self._recording, self.params, [], start, NEVER_US - 1, self._detect,
-            steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN, as_stored=True,
+            steps=STEPS_PER_CHUNK, chunks=CHUNKS_PER_RUN, as_stored=True, live=True,
         )  # fmt: skip
         self._cursor = packer.first
         self._state = self._empty_state()

@@ -26,7 +26,7 @@ from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.estimator import ShortRepr
 from jaxevent.events.filters import supported
-from jaxevent.recording import Recording, Times, check_times
+from jaxevent.recording import Recording, Times, check_times, microseconds
 
 STEPS_PER_CHUNK_CHOICES = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
 STEPS_PER_SEGMENT = 8192
@@ -115,6 +115,7 @@ class ChunkPacker:
         chunks: Chunks of a segment; None: chosen by the steps.
         events_per_segment: At least this many events fit into a segment of default length.
         as_stored: Whether events of one time are taken as they are stored, and not spread.
+        live: Whether events are still to come, so that the span may go beyond those of now.
 
     Raises:
         InputError: A seed is outside the sensor or the time, there is no time to track, or events
@@ -135,13 +136,14 @@ class ChunkPacker:
         chunks: int | None = None,
         events_per_segment: int = 0,
         as_stored: bool = False,
+        live: bool = False,
     ):
         if params.association == "authors" and params.events_per_step > 1:
             raise InputError(
                 f'{recording.name}: association = "authors" takes one event after the other, but '
                 f"events_per_step is {params.events_per_step}; omit it"
             )
-        begin, end = tracking_span(recording, start, stop)
+        begin, end = tracking_span(recording, start, stop, live=live)
         if found is not None:
             if seeds is not None or detect:
                 raise InputError(
@@ -162,7 +164,8 @@ class ChunkPacker:
             )
             self.found_edges = [path.lone_edge for path in found.paths]
             self.overrides |= found.per_target_values(params)
-        self.seeds = read_seeds(recording, seeds, begin, end)
+        earliest = None if start is None else int(microseconds(start, "the start"))
+        self.seeds = read_seeds(recording, seeds, begin, end, earliest)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))
         self.rows = recording.events.index(begin), recording.events.index(end)

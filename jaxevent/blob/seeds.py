@@ -23,7 +23,11 @@ class Seeds:
 
 
 def read_seeds(
-    recording: Recording, seeds: Sequence[Any] | np.ndarray | None, start: int, stop: int
+    recording: Recording,
+    seeds: Sequence[Any] | np.ndarray | None,
+    start: int,
+    stop: int,
+    earliest: int | None = None,
 ) -> Seeds:
     """Read the user's seeds, and sort them by time.
 
@@ -32,6 +36,7 @@ def read_seeds(
         seeds: One (x, y, size) or (x, y, size, t) for each, in px and us or s; None: none.
         start: Start of tracking, us.
         stop: Its end, us.
+        earliest: Earliest time of a seed, us; those before `start` begin there. None: `start`.
 
     Returns:
         The seeds.
@@ -58,12 +63,12 @@ def read_seeds(
                 "sensor; give pixel coordinates from 0"
             )
         at = int(microseconds(time[0], f"the time of seed {number}")) if time else start
-        if not start <= at < stop:
+        if not (start if earliest is None else earliest) <= at < stop:
             raise InputError(
                 f"{name} begins at {at} us, but events are used from {start} to {stop - 1} us; "
                 "integers are microseconds, floats seconds, both on the recording's clock"
             )
-        times.append(at)
+        times.append(max(at, start))
         positions.append((x, y))
         sizes.append(size)
     index = np.argsort(times, kind="stable").astype(np.int64)
@@ -74,14 +79,22 @@ def read_seeds(
 
 
 def tracking_span(
-    recording: Recording, start: int | float | None, stop: int | float | None
+    recording: Recording,
+    start: int | float | None,
+    stop: int | float | None,
+    *,
+    live: bool = False,
 ) -> tuple[int, int]:
     """Return the span [begin, end) in us in which events are used.
+
+    It lies between the first and the last event: beyond them nothing was recorded, which is not a
+    time in which nothing happened.
 
     Args:
         recording: The recording; without events its frames set the default.
         start: Begin, int us or float s; None: the first event.
         stop: End, int us or float s; None: after the last event.
+        live: Whether events are still to come, so that the span may go beyond those of now.
 
     Returns:
         Begin and end, us.
@@ -94,14 +107,17 @@ def tracking_span(
         if recording.frames is not None:
             first, last = int(recording.frames.t[0]), int(recording.frames.t[-1]) + 1
     else:
-        first, last = int(recording.events[:1].t[0]), len(recording.events)
-        last = int(recording.events[last - 1 : last].t[0]) + 1
+        first, last = recording.event_span()
+        last += 1
     begin = first if start is None else int(microseconds(start, "the start"))
     end = last if stop is None else int(microseconds(stop, "the stop"))
-    if end <= begin:
+    used = begin, end
+    if len(recording.events) and not live:
+        used = max(begin, first), min(end, last)
+    if used[1] <= used[0]:
         limits = [f"from {begin} us"] * (start is not None) + [f"to {end} us"] * (stop is not None)
         raise InputError(
             f"{recording.name}: nothing to track {' '.join(limits)}; the events reach "
             f"from {first} to {last - 1} us, integers are microseconds, floats seconds"
         )
-    return begin, end
+    return used

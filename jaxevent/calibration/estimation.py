@@ -103,7 +103,8 @@ def find_offset(sample: Sample, I0: float) -> Clock:
     far = found[known & (np.abs(tried - tried[top]) > 2 * max(interval, OFFSET_STEP_US))]
     others = float(np.quantile(np.abs(far), 0.9)) if len(far) else 0.0
     why = ""
-    if found[top] < max(MIN_CORRELATION, MIN_CORRELATION_SIGMAS / math.sqrt(number[top])):
+    chance = np.maximum(MIN_CORRELATION, MIN_CORRELATION_SIGMAS / np.sqrt(np.maximum(number, 1)))
+    if found[top] < chance[top]:
         why = f"events and frames agree at no offset (correlation {found[top]:.2f})"
     elif found[top] < MIN_PEAK_RATIO * others:
         # What moves periodically agrees after every period. Stamps are rarely off by more than an
@@ -116,8 +117,9 @@ def find_offset(sample: Sample, I0: float) -> Clock:
                 f"events and frames agree nearly as well at far offsets (correlation {others:.2f}) "
                 f"as at {1e-6 * tried[top]:.3g} s ({found[top]:.2f})"
             )
-    if -np.nanmin(found) > found[top]:
-        why = f"events show the opposite of frames (correlation {np.nanmin(found):.2f})"
+    low = int(np.nanargmin(found))
+    if -found[low] > found[top] and (not why or -found[low] >= chance[low]):
+        why = f"events show the opposite of frames (correlation {found[low]:.2f})"
     return Clock(tried * 1e-6, found, math.nan if why else float(tried[top]) * 1e-6, why)
 
 

@@ -27,12 +27,15 @@ from jaxevent.calibration.sampling import Sample, count_between, log_changes, ta
 from jaxevent.display import plural
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording, check_recording
+from jaxevent.time_units import WINNING_NATS, doubt_microseconds
 
 MAX_HOT_SHARE = 0.01  # of the pixels
 MAX_PAUSE_US = 10_000  # lights on mains of 50 Hz pause for less
 MAX_MISSED_SHARE = 0.05  # of the events, in gaps up to 10 ms
 BURST_US, BURST_RATIO, BURST_BINS = 1_000, 10, 10  # a burst is 10 times what is around it
 MAX_BURST_SHARE = 0.05  # of the events
+MAX_REPEATED_EVENTS_SHARE = 0.05  # of the events
+MAX_CLOCK_STEP_US = 100  # within a coarser step a pixel may well fire twice
 MAX_POLARITY_SHARE, MIN_POLARITIES = 0.95, 1_000
 MIN_ADVANTAGE = 2.0  # of a correlation over that of the recording as it is
 MIN_BUSY = 100  # pixels with several events between frames, which determine clock and exposure
@@ -49,7 +52,7 @@ MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 # Faults of the events alone, whether frames revealed them or not.
 EVENT_FAULTS = (
-    *("hot pixels", "missing events", "event bursts"),
+    *("hot pixels", "unusual clock", "missing events", "event bursts", "repeated events"),
     *("lost polarity", "inverted polarity", "flipped or swapped axes"),
 )
 
@@ -98,7 +101,9 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
         fault
         for found in (
             _check_hot_pixels(sample),
+            _check_unit(recording),
             _check_times(recording, sample),
+            _check_repeated_events(sample),
             _check_both(recording, sample),
             _check_white(recording),
         )
@@ -125,6 +130,16 @@ def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
         "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
         "calibrate(recording).hot_pixels",
     )  # fmt: skip
+
+
+def _check_unit(recording: Recording) -> Iterator[Fault]:
+    """Check whether the times of events are as usual as microseconds."""
+    doubt = doubt_microseconds(recording.events, (recording.width, recording.height))
+    if doubt is not None:
+        yield Fault(
+            "unusual clock", doubt.nats, WINNING_NATS, doubt.text,
+            f"if so, {doubt.remedy}, or read the file with --time-unit",
+        )  # fmt: skip
 
 
 def _times(recording: Recording, sample: Sample) -> list[NDArray[np.int64]]:
@@ -175,6 +190,23 @@ def _count_bursts(t: NDArray[np.int64]) -> int:
     around = np.maximum(before, after) / BURST_BINS + 1
     inner = (bins >= BURST_BINS) & (bins <= bins[-1] - BURST_BINS)
     return int(counts[inner & (counts > BURST_RATIO * around)].sum())
+
+
+def _check_repeated_events(sample: Sample) -> Iterator[Fault]:
+    """Check the share of events that are in the recording more than once."""
+    total, different = 0, 0
+    for t, pixel, p, *_ in sample.segments:
+        steps = np.diff(t)
+        if not steps.any() or steps[steps > 0].min() > MAX_CLOCK_STEP_US:
+            continue
+        total += len(t)
+        different += len(np.unique(((t - t[0]) * len(sample.places) + pixel) * 2 + p))
+    share = 1 - different / max(total, 1)
+    yield Fault(
+        "repeated events", share if total else 0.0, MAX_REPEATED_EVENTS_SHARE,
+        f"{100 * share:.3g} % of the events repeat the time, pixel and polarity of another one",
+        "look for parts that were stored twice; jaxevent filter --refractory 1 keeps one of each",
+    )  # fmt: skip
 
 
 def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:

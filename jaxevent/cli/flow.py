@@ -74,10 +74,9 @@ def run(
     recording = arguments.open_recording(path, reading)
     recording.refuse_empty(str(path))
     recording.refuse_one_time(str(path))
-    if times is not None:
-        wanted = read_times(times, (recording.start, recording.stop))
-    else:
-        wanted = image_times(recording, rate, start)
+    alone = dataclasses.replace(recording, frames=None, name=str(path))
+    span = alone.event_span()
+    wanted = read_times(times, span) if times else image_times(alone, rate, start, stop)
     chosen = within(wanted, start, stop, str(path))
     arguments.warn_of_faults(dataclasses.replace(recording, name=str(path)), frames=False)
     clock = time.perf_counter()

@@ -129,9 +129,13 @@ def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict
 
 
 def _default_times(
-    recording: Any, estimator: Any, values: Any, rate: float | int | None, start: float | int | None
+    recording: Any,
+    estimator: Any,
+    values: Any,
+    rate: float | int | None,
+    *span: float | int | None,
 ) -> Any:
-    """Return the times (us) of images where no file gives them."""
+    """Return times (us) of images, where no file gives them, from a start to a stop (s)."""
     from jaxevent.events.clocks import check_clocks, compare_clocks
     from jaxevent.runs.protocols import frame_times
     from jaxevent.show.export import image_times
@@ -145,7 +149,7 @@ def _default_times(
         check_clocks(recording, values.clock_offset)
     elif compare_clocks(recording, values.clock_offset) is not None:
         spanned = dataclasses.replace(recording, frames=None)
-    return image_times(spanned, 100.0 if rate is None else rate, start)
+    return image_times(spanned, 100.0 if rate is None else rate, *span)
 
 
 def run(
@@ -185,7 +189,7 @@ def run(
     def choose_times(values: Any) -> Any:
         wanted = file_times
         if wanted is None:
-            wanted = _default_times(recording, estimator, values, rate, start)
+            wanted = _default_times(recording, estimator, values, rate, start, stop)
         return within(wanted, start, stop, str(path))
 
     values = estimator.Params.of(table)

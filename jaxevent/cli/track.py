@@ -173,6 +173,11 @@ def run(
     if seeds is None and not detect:
         found = find(recording, **span, progress=show_progress())
         print(found.summary())
+        if len(found) and found.full and not found.camera_moves:
+            print(
+                "most of the image changes: if the camera moves, tracks may be pieces of its "
+                "scene; jaxevent motion tells how it moves"
+            )
         if not found.compact:
             print(
                 "a target covers a quarter of the sensor: no compact blobs here; they explain "

@@ -38,7 +38,7 @@ from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Imu, Recording
-from jaxevent.time_units import JUDGED_EVENTS, doubt_microseconds
+from jaxevent.time_units import doubt_microseconds
 
 PATCH_PX = 24
 MAX_GRID_DISPLACEMENT_PX = 7  # of the grid, in x and y
@@ -175,11 +175,8 @@ def describe_unit_doubt(recording: Recording) -> str:
 
     Where nothing is seen to move, a clock that runs too fast or too slowly may be the cause.
     """
-    events, last = recording.events, max(len(recording.events) - 1, 0)
-    ends = events[: min(last, JUDGED_EVENTS)], events[last:]
-    sample = {name: np.concatenate([getattr(end, name) for end in ends]) for name in "txy"}
-    doubt = doubt_microseconds(sample, len(events), (recording.width, recording.height))
-    return "" if doubt is None else f"; {doubt}"
+    doubt = doubt_microseconds(recording.events, (recording.width, recording.height))
+    return "" if doubt is None else f"; {doubt.text}; if so, {doubt.remedy}"
 
 
 def window_durations(recording: Recording) -> NDArray[np.float64]:
@@ -407,7 +404,8 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
 
     Returns:
         The median over some frames, or None. It is None where nothing is seen to move, and where no
-        frame has events before and after it while it moves by `FRAME_WINDOW_DISPLACEMENT_PX`.
+        frame has edges, and events before and after it while it moves by
+        `FRAME_WINDOW_DISPLACEMENT_PX`.
     """
     frames, events = recording.frames, recording.events
     if frames and speed is None:
@@ -425,18 +423,20 @@ def edge_event_fraction(recording: Recording, speed: ImageSpeed | None = None) -
     fractions = []
     for at, image in zip(frames.t[rows].tolist(), frames[rows].intensity, strict=True):
         edges = _find_edges(image)
+        if not edges.any():
+            continue
         part = events[events.index(at - half) : events.index(at + half)]
         active = np.zeros(edges.shape, bool)
         active[part.y, part.x] = True
         fractions.append(maximum_filter(active, 3)[edges].mean())
-    return float(np.median(fractions))
+    return float(np.median(fractions)) if fractions else None
 
 
 def _find_edges(image: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Find the pixels of a frame (intensity) where log intensity is steepest."""
     smooth = gaussian_filter(np.log(image + DARK_GREY_OFFSET), 1.0)
     slope = np.hypot(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
-    return slope >= np.quantile(slope, 1 - EDGE_PIXEL_FRACTION)
+    return (slope > 0) & (slope >= np.quantile(slope, 1 - EDGE_PIXEL_FRACTION))
 
 
 @renamed_fields(both="both_directions")

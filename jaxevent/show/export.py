@@ -1,6 +1,7 @@
 """Files of a reconstruction: HDF5 of exact values, a video, or a folder of images."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaxevent.codegen import N_THREADS
 from jaxevent.display import format_span
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
@@ -19,9 +20,14 @@ from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
 from jaxevent.show.images import Tone, display_limits, tone_map, video_writer, write_png
 
+MAX_IMAGES = 10_000_000  # times of one command: 80 MB, a day of 100 per second
+
 
 def image_times(
-    recording: Recording, rate: float | int, start: float | int | None = None
+    recording: Recording,
+    rate: float | int,
+    start: float | int | None = None,
+    stop: float | int | None = None,
 ) -> NDArray[np.int64]:
     """Return the times of evenly spaced images of a recording.
 
@@ -29,12 +35,13 @@ def image_times(
         recording: The recording.
         rate: Times per second.
         start: First time, s; None for the recording's start.
+        stop: Last time, s; None for the recording's stop.
 
     Returns:
         (T,) us, up to the recording's stop.
 
     Raises:
-        InputError: The rate is not possible.
+        InputError: The rate is not possible, or the times are too many.
     """
     if not 0 < rate <= 1e6:
         raise InputError(
@@ -44,7 +51,16 @@ def image_times(
     first = recording.start
     if start is not None:
         first = max(first, int(microseconds(float(start), "--start")))
-    count = max(0, math.floor((recording.stop - first) * rate / 1e6 + 1e-9) + 1)
+    last = recording.stop
+    if stop is not None:
+        last = min(last, int(microseconds(float(stop), "--stop")))
+    count = max(0, math.floor((last - first) * rate / 1e6 + 1e-9) + 1)
+    if count > MAX_IMAGES:
+        raise InputError(
+            f"{recording.name}: from {format_span((first, last))} there are {count:,} times at a "
+            f"rate of {rate:g} per second; give a part of it, --start and --stop, or a lower "
+            "--rate; jaxevent info tells gaps and wrong clocks"
+        )
     return first + np.rint(np.arange(count) * (1e6 / rate)).astype(np.int64)
 
 
@@ -350,11 +366,21 @@ def _batches(
         colours: Function that makes colour images of times; None: images are grey.
 
     Yields:
-        Times of a batch, us, and arrays (times, H, W[, 3]) by their names in HDF5.
+        Times of a batch, us, and arrays (times, H, W[, 3]) by their names in HDF5. An
+        `InputWarning` tells at the end that grey images are valid nowhere.
     """
     if colours is None:
+        is_valid = False
         for batch, estimate in video.batches(times):
+            is_valid = is_valid or bool(np.any(estimate.valid))
             yield batch, {"image": estimate.mean, "variance": estimate.covariance}
+        if not is_valid:
+            warnings.warn(
+                f"{video.recording.name}: no pixel of the images rests on data, they show what is "
+                "assumed without any; choose other times, or see jaxevent info",
+                InputWarning,
+                stacklevel=2,
+            )
         return
     rows = range(0, len(times), N_BATCH_IMAGES)
     for row in bar(rows, desc="images", unit="batch", progress=video.progress):

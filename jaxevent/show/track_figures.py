@@ -29,6 +29,7 @@ _BACKGROUND, _ON, _OFF = (24, 24, 28), (235, 235, 235), (110, 130, 190)  # RGB o
 _MIN_VIDEO_HEIGHT_PX = (
     480  # smaller sensors are enlarged in a video, so that lines and numbers can be seen
 )
+_MAX_VIDEO_WIDTH_PX = 1920  # of those that are enlarged: no codec takes a row of 64 px by 480
 _MAX_BACKGROUND_EVENTS = 1_000_000  # most events behind the paths
 _N_PATH_ELLIPSES = 6  # along a path
 _GROWTH_SIGMAS, _GROWTH_SHARE = 3.0, 0.2  # of a growth from 0, and share of its times
@@ -73,7 +74,7 @@ def track_frames(
         sigmas: Standard deviations of the ellipse.
         trail: Length of the way, s.
         window: Length of the events, s; None for the time since the picture before.
-        scale: Enlargement; None for 1, or more for sensors of fewer than 480 rows.
+        scale: Enlargement; None: up to 480 rows, where these have no more than 1920 columns.
 
     Yields:
         Pictures (scale height, scale width, 3), uint8.
@@ -112,7 +113,7 @@ def draw_frames(
         sigmas: Size of the ellipses, standard deviations.
         trail: Length of the trails, s.
         window: Time in which events are shown, s; None: between two images.
-        scale: Enlargement; None: by the sensor's height.
+        scale: Enlargement; None: by the sensor's size.
 
     Yields:
         Images, uint8.
@@ -121,7 +122,8 @@ def draw_frames(
         InputError: An image behind the tracks is missing, or has another shape or type.
     """
     if scale is None:
-        scale = max(1, math.ceil(_MIN_VIDEO_HEIGHT_PX / recording.height))
+        scale = math.ceil(_MIN_VIDEO_HEIGHT_PX / recording.height)
+        scale = max(1, min(scale, _MAX_VIDEO_WIDTH_PX // recording.width))
     if window is None:
         window = float(np.median(np.diff(t))) * 1e-6 if len(t) > 1 else 0.01
     events = _event_images(recording, t, round(window * 1e6)) if images is None else images

@@ -11,6 +11,7 @@ from PIL import Image
 from jaxevent import blob, simulate
 from jaxevent.blob import quantities
 from jaxevent.errors import InputError
+from jaxevent.recording import Events, Recording
 from jaxevent.show import track_figures as pictures
 from jaxevent.show.images import video_writer
 from jaxevent.show.track_figures import write_track_plot
@@ -503,6 +504,14 @@ def test_small_sensors_are_enlarged_in_a_video(tmp_path):
     (stream,) = [line for line in decoded.stderr.decode().splitlines() if "Video: h264" in line]
     assert " 720x480" in stream and " 20 fps" in stream
     assert len(decoded.stdout) == 12 * 720 * 480 * 3
+
+
+@pytest.mark.parametrize(("size", "drawn"), [((64, 1), (30, 1920)), ((1280, 4), (4, 1280))])
+def test_a_line_of_pixels_is_no_wider_than_a_video_may_be(size, drawn):
+    times, ids, mean, _, valid = tracks()
+    line = Recording("line", *size, Events([0, 10**6], [0, 0], [0, 0], [True, False]))
+    frame = next(iter(pictures.track_frames(line, times, ids, mean, valid)))
+    assert frame.shape[:2] == drawn
 
 
 @pytest.mark.slow

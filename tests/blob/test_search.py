@@ -640,6 +640,24 @@ def test_targets_do_not_depend_on_the_clock(crossed):
         np.testing.assert_allclose(other.p, one.p, atol=1e-4)
 
 
+@pytest.mark.slow
+def test_times_beyond_the_recording_change_nothing(crossed):
+    recording, _, found = crossed
+    params = blob.moment.Params(**found.settings())
+    want = blob.moment.estimate(recording, params, found=found)
+    again = blob.find(recording, -1.0, 20.0, progress=False)
+    assert again.background == found.background
+    for one, other in zip(found.paths, again.paths, strict=True):
+        np.testing.assert_array_equal(other.p, one.p)
+    tracks = blob.moment.estimate(recording, params, found=again, start=-1.0, stop=20.0)
+    assert (tracks.start, tracks.stop) == (want.start, want.stop)
+    np.testing.assert_array_equal(tracks.death, want.death)
+    seeded = blob.moment.estimate(recording, params, seeds=[(64, 48, 4, -0.5)], start=-1.0)
+    assert seeded.birth[0] == want.start
+    with pytest.raises(InputError, match="from 400001 us to 900000 us; the events reach"):
+        blob.find(recording, 400_001, 900_000)
+
+
 @pytest.mark.skipif("JAXEVENT_DATA" not in os.environ, reason="JAXEVENT_DATA is not set")
 @pytest.mark.slow
 def test_cars_on_a_street_and_a_spinning_dot_are_found():

@@ -153,6 +153,15 @@ def test_polarity_swapped(recording):
     np.testing.assert_allclose(one, -two, atol=1e-12)
 
 
+def test_what_has_nothing_to_do_with_frames_is_not_their_opposite(recording):
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        p = rng.random(len(recording.events)) < 0.5
+        events = dataclasses.replace(recording.events, p=p)
+        found = jaxevent.calibrate(dataclasses.replace(recording, events=events), 0.02)
+        assert "agree at no offset" in found.clock_offset.note
+
+
 def test_correlation_is_pearsons(recording):
     sample = take_sample(recording)
     (segment,) = sample.segments

@@ -515,6 +515,11 @@ def test_one_event_is_enough(tmp_path, capsys):
     expected = np.full((HEIGHT, WIDTH), 0.5)  # without frames the AKF begins with mid-grey
     expected[4, 3] = 1.5 * np.exp(0.1) - 1
     np.testing.assert_allclose(image, expected, rtol=1e-6)
+    assert "rests on data" not in capsys.readouterr().err
+    argv = ["reconstruct", str(path), "--method", "events-only", *size]
+    for name in ("grey.h5", "grey"):
+        assert cli.main([*argv, "--out", str(tmp_path / name)]) == 0
+        assert capsys.readouterr().err.count("no pixel of the images rests on data") == 1
 
 
 def test_reconstruct_to_hdf5(folder, capsys):

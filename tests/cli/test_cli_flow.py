@@ -1,5 +1,6 @@
 """`jaxevent flow`: its files, and what it refuses."""
 
+import dataclasses
 import struct
 import zlib
 from pathlib import Path
@@ -13,6 +14,7 @@ import jaxevent
 from jaxevent import cli
 from jaxevent.event_flow import FlowParams, flow_from_events
 from jaxevent.io import png
+from jaxevent.recording import Events
 from jaxevent.show.flow import decode_flow, encode_flow, flow_colours, write_flow_hdf5
 from jaxevent.simulate import motion_scene
 
@@ -176,3 +178,25 @@ def test_events_at_one_time_are_refused(name, tmp_path, capsys):
     np.savez(path, t=np.full(n, 1000), x=x, y=y, p=x % 2, width=20, height=15)
     out = ("--time-unit", "us", "--out", tmp_path / "out.h5")
     fails(capsys, [name, path, *out], path, "all 300 events are at one time, 1000 us")
+
+
+def test_times_are_those_of_the_events(stored, tmp_path, capsys):
+    """Frames of another clock do not stretch the span, and a damaged time is no endless one."""
+    recording = jaxevent.load(stored)
+    frames = recording.frames
+    late = dataclasses.replace(frames, t=frames.t + 10**15)
+    jaxevent.save(dataclasses.replace(recording, frames=late), tmp_path / "late.h5")
+    argv = f"flow {tmp_path}/late.h5 --rate 20 --out {tmp_path}/flow.h5"
+    assert cli.main(argv.split()) == 0
+    first, last = recording.event_span()
+    with h5py.File(tmp_path / "flow.h5") as file:
+        assert file["t"][0] == first and last - 50_000 < file["t"][-1] <= last
+    jaxevent.save(dataclasses.replace(recording, events=Events.empty()), tmp_path / "none.h5")
+    capsys.readouterr()
+    fails(capsys, f"flow {tmp_path}/none.h5 --out {tmp_path}/n".split(), "none.h5: holds no events")
+    t = recording.events.t.copy()
+    t[-1] += 10**15
+    broken = dataclasses.replace(recording.events[:], t=t)
+    jaxevent.save(dataclasses.replace(recording, events=broken), tmp_path / "broken.h5")
+    argv = f"flow {tmp_path}/broken.h5 --out {tmp_path}/broken"
+    fails(capsys, argv.split(), "broken.h5", "to 1000000000", "--stop", "--rate")

@@ -1,6 +1,7 @@
 """`jaxevent track`: what it writes is what `track` says, and bad input is said in one line."""
 
 import csv
+import dataclasses
 import functools
 import shlex
 import sys
@@ -259,6 +260,22 @@ def test_the_summary_counts_from_the_recordings_start(tmp_path):
     (note,) = [line for line in told[1] if line not in told[0]]
     assert note.startswith("birth, death: from the recording's start, 7.00")
     assert [line for line in told[1] if line != note] == told[0] and len(told[0]) > 3
+
+
+@pytest.mark.slow
+def test_tracks_are_doubted_where_the_camera_may_move(folder, capsys, monkeypatch):
+    find, argv = (
+        blob.find,
+        ["track", f"{folder}/two.h5", *METHOD, "--params", f"{folder}/mine.toml"],
+    )
+    for full, camera_moves in ((True, False), (True, True), (False, False)):
+        given = {"full": full, "camera_moves": camera_moves}
+        monkeypatch.setattr(
+            blob, "find", lambda *a, given=given, **k: dataclasses.replace(find(*a, **k), **given)
+        )
+        assert cli.main([*argv, "--out", f"{folder}/a.csv", "--force"]) == 0
+        said = capsys.readouterr().out
+        assert ("tracks may be pieces of its scene" in said) == (full and not camera_moves)
 
 
 @pytest.mark.slow

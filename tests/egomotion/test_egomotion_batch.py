@@ -418,6 +418,7 @@ def test_offset_of_stamps():
     mirrored = dataclasses.replace(recording.frames, images=recording.frames.images[:, :, ::-1])
     assert stamp_offset(dataclasses.replace(recording, frames=mirrored)) == 0
     assert stamp_offset(dataclasses.replace(recording, frames=recording.frames[:1])) == 0
+    assert stamp_offset(stamped(10**12)) == 0  # no event between them
 
 
 @pytest.mark.parametrize(

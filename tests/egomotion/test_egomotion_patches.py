@@ -264,6 +264,9 @@ def test_a_camera_that_stands_still_while_things_move():
         assert still == (told.covariance[0, 0, 0] > 70**2) == (columns.start == 0)
     assert shares[0] < 0.1 and shares[1] > 0.5
     assert edge_event_fraction(recording) is None
+    for grey in (0.0, 1.0):  # without any edge
+        frames = dataclasses.replace(shown.frames, images=np.full_like(shown.frames.images, grey))
+        assert edge_event_fraction(dataclasses.replace(shown, frames=frames)) is None
     general = estimate_of("general", motion.t, [0.0, 0, 1, 0.1, 0, 0], 0)
     unsure = general._with_full_uncertainty().covariance
     assert not is_observable("general", unsure)[:, :3].any() and unsure[0, 3, 3] > 0.1**2

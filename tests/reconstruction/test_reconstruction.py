@@ -641,6 +641,8 @@ def test_frames_of_an_automatic_exposure_share_a_scale():
     wrong = dataclasses.replace(recording, extra={"gain": gain})
     with pytest.raises(jaxevent.InputError, match="one positive number for each of the 3 frames"):
         jaxevent.last_frame.estimate(wrong)
+    bare = dataclasses.replace(wrong, frames=None)  # without frames gains tell nothing
+    assert jaxevent.high_pass.estimate(bare)(bare.stop).valid.any()
 
 
 @pytest.mark.parametrize("width", [0.0, 0.4])

@@ -233,7 +233,8 @@ def _level_changes(
     quiet = known & (np.bincount(pixel[:between], minlength=pixels) == 0)
     if not quiet.any():
         return None
-    number: NDArray = np.bincount(pixel[:between], p[:between], pixels)
+    # Without any event the sums are integers.
+    number = np.bincount(pixel[:between], p[:between], pixels).astype(np.float64)
     for sign, begin in ((-1, 0), (1, between)) if method else ():
         next_one = np.zeros(pixels)
         next_one[pixel[begin:][::-1]] = p[begin:][::-1]  # the last one written is the first
