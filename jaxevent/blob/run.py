@@ -43,19 +43,33 @@ READOUT_TIMES_PER_CALL = 64  # times read out by one compiled call
 
 
 class EventAssociation(eqx.Module):
-    """The likeliest track of each event: its serial number, -1 for none, and the event's weight."""
+    """The likeliest track of each event.
+
+    Attributes:
+        id: Serial number of the track; -1 for none.
+        weight: Weight of the event for this track.
+    """
 
     id: Int[Array, "*chunks steps M"]
     weight: Float[Array, "*chunks steps M"]
 
 
 class ChunkInfo(eqx.Module):
-    """Report of each chunk; fields that were not requested are None."""
+    """Report of each chunk; fields that were not requested are None.
+
+    Attributes:
+        log: Births, confirmations and deaths.
+        tracks: The tracks before the first step; with "states" those of steps + 1 moments.
+        association: The likeliest track of each event.
+        path: p (px), v (px/s) and time of the last update (us) of steps + 1 moments.
+        loss: Sum of the losses of the events that count.
+        count: Number of events that count.
+    """
 
     log: LifecycleLog
-    tracks: TrackBuffer | None = None  # before the first step; "states": of steps + 1 moments
+    tracks: TrackBuffer | None = None
     association: EventAssociation | None = None
-    path: tuple[Array, Array, Array] | None = None  # p, v and last update of steps + 1 moments
+    path: tuple[Array, Array, Array] | None = None
     loss: Array | None = None
     count: Array | None = None
 
@@ -144,11 +158,17 @@ def _prepend(one: Array, others: Array) -> Array:
 
 
 class NextChunk(NamedTuple):
-    """Backward information at the start of the chunk after one."""
+    """Backward information at the start of the chunk after one.
+
+    Attributes:
+        info: The backward information.
+        elapsed: Time from the start of the chunk to that of the next one, us.
+        smoothed: Smoothed tracks of the chunk itself, where they are kept.
+    """
 
     info: BackwardInfo
-    elapsed: Any  # us from the start of the chunk to that of the next one
-    smoothed: SmoothedTracks | None = None  # the chunk itself, where it is kept
+    elapsed: Any
+    smoothed: SmoothedTracks | None = None
 
 
 _init = jax.jit(init_state, static_argnames="filter")

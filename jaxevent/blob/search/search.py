@@ -219,7 +219,15 @@ class TargetSearchResult:
         return np.array(rows).T
 
     def _quantile(self, values: NDArray, part: float | int = 0.5) -> float:
-        """Compute a quantile of values of targets, weighted by their events."""
+        """Compute a quantile of values of targets, weighted by their events.
+
+        Args:
+            values: (targets,).
+            part: Share of the events up to the quantile, 0..1.
+
+        Returns:
+            The quantile.
+        """
         events = np.array([path.n.sum() for path in self.paths])
         order = np.argsort(values)
         total = np.cumsum(events[order])
