@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
+from jaxevent.blob.quantities import SIZE_FACTORS, inverse_ttc, inverse_ttc_from_size, size_range
 from jaxevent.blob.track import TrackStates
 from jaxevent.blob.tracks import TABLE_RATE_HZ, Tracks, evenly_spaced_times
 from jaxevent.errors import InputError, MissingExtra, require
@@ -295,7 +295,7 @@ class Output:
         nothing = np.full(len(rows.t), np.nan)
         for place, one in enumerate(tracks.id.tolist()):
             mean, covariance, valid = (part[:, 0] for part in rows.dense([place]))
-            value = growth(
+            value = inverse_ttc_from_size(
                 since, mean, covariance, jnp.asarray(valid),
                 Q_lambda=float(tracks.track_params(one).Q_lambda), smoothed=tracks.smooth,
             )  # fmt: skip
