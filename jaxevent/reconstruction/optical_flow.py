@@ -42,14 +42,26 @@ class FrameSeries(ShortRepr):
 
 
 class ImageTimes(NamedTuple):
-    """Times of images among the frames, prepared for `read`."""
+    """Times of images among the frames, prepared for `read`.
+
+    Attributes:
+        frame: (times,) index of the frame before.
+        share: (times,) time since that frame as a part of the interval, 0..1.
+    """
 
     frame: NDArray[np.int64]
     share: NDArray[np.floating]
 
 
 class FramePair(NamedTuple):
-    """Two successive frames (H, W), and the flows (H, W, 2) from each to the other, px."""
+    """Two successive frames, and the flows between them.
+
+    Attributes:
+        before: (H, W) the earlier frame.
+        after: (H, W) the later frame.
+        forward: (H, W, 2) flow from the earlier to the later, px.
+        backward: (H, W, 2) flow from the later to the earlier, px.
+    """
 
     before: NDArray[np.floating]
     after: NDArray[np.floating]

@@ -80,7 +80,14 @@ class PixelStates(NamedTuple):
 
 
 class ImageRows(NamedTuple):
-    """Arrays [times, pixels] of a `ReadOut`."""
+    """Arrays of a `ReadOut`.
+
+    Attributes:
+        slot: [times, pixels] slot of the pixel's last event in the window, -1 if there is none.
+        on: [times, pixels] ON events since the left edge of the piece's exposure.
+        off: [times, pixels] OFF events since the left edge of the piece's exposure.
+        since: [times, pixels] time since the pixel's last event, s.
+    """
 
     slot: NDArray[np.int32]
     on: NDArray

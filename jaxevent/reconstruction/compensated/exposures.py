@@ -58,13 +58,21 @@ SPEED_MARGIN = 2.0  # times the measured speed, for which exposures are sampled
 
 
 class AdjacentExposures(NamedTuple):
-    """Exposures of the n frames next to a target: before, and after or at its time."""
+    """Exposures of the n frames next to a target: before, and after or at its time.
 
-    frame: Int[Numeric, " n"]  # index in the recording
-    s: Float[Numeric, " n"]  # mid-exposures, relative to the target as `InstantLayout.s`
-    half: Float[Numeric, " n"]  # half of the exposures, on the same clock
-    present: Float[Numeric, " n"]  # 1, or 0 where there is none
-    # Along x and y, px: common displacement of all points, and its change over `half`.
+    Attributes:
+        frame: Index of the frame in the recording.
+        s: Mid-exposure relative to the target, as `InstantLayout.s`.
+        half: Half of the exposure, on the same clock.
+        present: 1, or 0 where there is no frame.
+        common: Common displacement of all points along x and y, px.
+        drift: Change of the common displacement over `half`, px.
+    """
+
+    frame: Int[Numeric, " n"]
+    s: Float[Numeric, " n"]
+    half: Float[Numeric, " n"]
+    present: Float[Numeric, " n"]
     common: Float[Numeric, "n 2"]
     drift: Float[Numeric, "n 2"]
 
@@ -75,7 +83,15 @@ class AdjacentExposures(NamedTuple):
 
 
 class AdjacentFrames(NamedTuple):
-    """The images of these frames as the camera gave them, as in `features.FrameFeatures`."""
+    """Images of the n frames next to a target as the camera gave them.
+
+    Attributes:
+        grey: Grey values, see `features.FrameFeatures`.
+        intensity: Intensity.
+        response: Camera response by grey value.
+        gain: Brightness of each frame relative to one in which intensity 1 is white.
+        white: Ends of the grey values beyond which pixels are clipped; None: not known.
+    """
 
     grey: Float[Numeric, "n pixels"]
     intensity: Float[Numeric, "n pixels"]
@@ -94,9 +110,15 @@ class _FrameEvidence(NamedTuple):
 
 
 class _ClippedSide(NamedTuple):
-    """Clipped pixels as `smoother.one_sided_message` reads them."""
+    """Clipped pixels as `smoother.one_sided_message` reads them.
 
-    side: Float[Array, "n h w"]  # +1, -1: B lies above, below `bound`; 0: nothing known
+    Attributes:
+        side: +1, -1: B lies above, below `bound`; 0: nothing is known.
+        bound: Bound of the log intensity.
+        excess: Expected log intensity beyond the bound; None: not known.
+    """
+
+    side: Float[Array, "n h w"]
     bound: Float[Array, "n h w"]
     excess: Float[Array, "n #h #w"] | None
 

@@ -186,6 +186,16 @@ class ImagePyramid:
 
 @njit_noalloc_inlined
 def _median(a, b, c):
+    """Return the median of three numbers.
+
+    Args:
+        a: The first.
+        b: The second.
+        c: The third.
+
+    Returns:
+        The median.
+    """
     return max(min(a, b), min(max(a, b), c))
 
 
@@ -510,12 +520,22 @@ class _SearchScratch(NamedTuple):
 
 
 class _SearchInputs(NamedTuple):
-    """One pass of `select_paths`."""
+    """One pass of `select_paths`.
+
+    Attributes:
+        images: Packed images.
+        paths: (h, w, 4) paths of every `spacing`-th pixel, px.
+        spacing: Distance of these pixels, px.
+        offsets: (n, 2) distances of the pixels whose paths are tried, px.
+        cost: Parameters of the cost.
+        taps: Taps of the Gaussian filter.
+        min_gain: Least gain from which another path is taken.
+    """
 
     images: PackedImages
-    paths: NDArray[np.float32]  # (h, w, 4), of every `spacing`-th pixel
+    paths: NDArray[np.float32]
     spacing: int
-    offsets: NDArray[np.int64]  # (n, 2), of the pixels whose paths are tried
+    offsets: NDArray[np.int64]
     cost: CostParams
     taps: NDArray[np.float32]
     min_gain: np.float32

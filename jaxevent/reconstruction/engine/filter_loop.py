@@ -46,17 +46,29 @@ from jaxevent.reconstruction.stream import StreamState
 
 
 class Timeline(NamedTuple):
-    """Intervals of a window in which points lie in one piece, after one frame."""
+    """Intervals of a window in which points lie in one piece, after one frame.
 
-    start: NDArray[np.int64]  # us since the recording's start
-    frame: NDArray[np.int64]  # of the piece, -1 before the first exposure
+    Attributes:
+        start: [intervals] begin of each interval, us since the recording's start.
+        frame: [intervals] frame of the piece, -1 before the first exposure.
+        variant: [intervals] index of the variant, see `filter_program.Variant`.
+        begin: [intervals] begin of the piece, us.
+        rate: [intervals] reciprocal length of the piece, 1/us.
+        mid: [intervals] middle of the frame before, us.
+        blend_rate: [intervals] reciprocal time from that to the next middle, 1/us.
+        uniform: [intervals, ...] inputs of tables that are equal for all pixels.
+        opening: Start of the window, us.
+    """
+
+    start: NDArray[np.int64]
+    frame: NDArray[np.int64]
     variant: NDArray[np.int64]
-    begin: NDArray[np.float64]  # of the piece, us
-    rate: NDArray[np.float64]  # 1/us
-    mid: NDArray[np.float64]  # of the frame before, us
-    blend_rate: NDArray[np.float64]  # 1/us
-    uniform: NDArray  # [intervals, ...], inputs of tables that are equal for all pixels
-    opening: int  # us, the window's start
+    begin: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    mid: NDArray[np.float64]
+    blend_rate: NDArray[np.float64]
+    uniform: NDArray
+    opening: int
 
 
 class BandedWindow(NamedTuple):
@@ -500,7 +512,13 @@ def filter_events(begin, end, inputs, memory, request):
 
 @dataclasses.dataclass(frozen=True)
 class PixelStates:
-    """State of all pixels, band by band."""
+    """State of all pixels, band by band.
+
+    Attributes:
+        cells: Real numbers of all pixels, band by band; see `filter_program.FieldPlaces`.
+        whole: Whole numbers of all pixels, likewise.
+        last: Times of the last events, us, likewise.
+    """
 
     cells: NDArray
     whole: NDArray

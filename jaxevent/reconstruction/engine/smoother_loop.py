@@ -90,13 +90,21 @@ class SegmentInputs(NamedTuple):
 
 
 class ImageTimes(NamedTuple):
-    """Times of images (us since the recording's start) and their positions among the frames."""
+    """Times of images and their positions among the frames.
+
+    Attributes:
+        time: [times] us since the recording's start.
+        frame: [times] frame before, -1 before the first.
+        elapsed: [times] time since then, s.
+        seconds: [times] time until the next frame, s; 0 after the last.
+        here: [times] 1 in the middle of the frame's exposure, else 0.
+    """
 
     time: NDArray[np.int64]
-    frame: NDArray[np.int64]  # the one before, -1 before the first
-    elapsed: NDArray[np.float64]  # s since then
-    seconds: NDArray[np.float64]  # until the next; 0 after the last
-    here: NDArray[np.float64]  # 1 in the middle of the frame's exposure
+    frame: NDArray[np.int64]
+    elapsed: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    here: NDArray[np.float64]
 
 
 class LastEvents(NamedTuple):
@@ -126,6 +134,15 @@ def spread_rates(bands: EventBands, reach_us: int) -> NDArray[np.float64]:
 
 @njit_noalloc
 def _fill_spread_rates(bands, reach, ahead, rates):
+    """Compute the rates of changes that are spread over the time between two events of a pixel.
+
+    Args:
+        bands: `EventBands`.
+        reach: Longest time over which a change is spread, us.
+        ahead: Scratch for each pixel of a band.
+        rates: (n,) output, from each event to its pixel's next one, signed events per us; others
+            stay.
+    """
     events, weights, first = bands.events, bands.weights, bands.first
     for band in range(len(first) - 1):
         for z in range(len(ahead)):

@@ -380,7 +380,7 @@ def _carry(places, memory, noise, out):
 
 
 @runtime_checkable
-class Windows(Protocol):
+class WindowSource(Protocol):
     """A source of a recording's events, their thresholds and their paths."""
 
     shape: tuple[int, int]  # (height, width)
@@ -426,7 +426,13 @@ class KeyMemories:
     """
 
     def __init__(
-        self, windows: Windows, recording: Recording, step: int, *, silence: float, threshold: float
+        self,
+        windows: WindowSource,
+        recording: Recording,
+        step: int,
+        *,
+        silence: float,
+        threshold: float,
     ):
         self.windows, self.recording, self.step = windows, recording, step
         self.silence, self.threshold, self.params = silence, threshold, MemoryParams()
@@ -463,7 +469,7 @@ class KeyMemories:
             The memories together; where no window saw anything the information is 0.
         """
         ends = [(first, 1)] + ([] if last is None else [(last, -1)])
-        found = [self._carried(self._at_key(k, s), k, at, at, self.params.blur) for k, s in ends]
+        found = [self._carry_to(self._at_key(k, s), k, at, at, self.params.blur) for k, s in ends]
         known = [memory for memory in found if memory is not None]
         if not known:
             zeros = np.zeros((*rows.shape, 2), np.float32)
@@ -473,7 +479,7 @@ class KeyMemories:
         joint = discount(joint, new, self.threshold, self.params.tail)
         return joint._replace(information=np.float32(self.params.independent) * joint.information)
 
-    def _carried(
+    def _carry_to(
         self, memory: GradientPrior | None, key: int, at: int, until: int, blur: float = 0.0
     ) -> GradientPrior | None:
         """Carry the memory at a key to another time.
@@ -541,7 +547,7 @@ class KeyMemories:
             The memory at `key + side`.
         """
         new = self._measure(key, side)
-        carried = self._carried(memory, key, self.time(key + side), self.time(key + side + 2))
+        carried = self._carry_to(memory, key, self.time(key + side), self.time(key + side + 2))
         if carried is None:
             return new
         return fuse(discount(carried, new, self.threshold, self.params.tail), new, self.threshold)
