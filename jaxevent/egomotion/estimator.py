@@ -114,12 +114,21 @@ class AdaptedParams(Generic[P]):
 
 
 class TrainingRuns(eqx.Module):
-    """A segment prepared for a fit of parameters: its known motion, and the estimates of runs."""
+    """A segment prepared for a fit of parameters: its known motion, and the estimates of runs.
 
-    time: Float[Array | np.ndarray, " T"]  # s since the segment's start
-    grid: Float[Array | np.ndarray, " G"]  # s, times of the truth
+    Attributes:
+        time: Times of estimates, s since the segment's start.
+        grid: Times of the truth, s since the segment's start.
+        truth: True motion.
+        counted: 1 where the error counts, else 0.
+        weight: Weight of the segment in the loss.
+        model: Motion model.
+    """
+
+    time: Float[Array | np.ndarray, " T"]
+    grid: Float[Array | np.ndarray, " G"]
     truth: Float[Array | np.ndarray, "G d"]
-    counted: Float[Array | np.ndarray, " T"]  # 1 where the error counts
+    counted: Float[Array | np.ndarray, " T"]
     weight: Float[Array | np.ndarray, ""]
     model: Model
 
@@ -413,6 +422,18 @@ class HostEstimator(MotionEstimator[P]):
         params: P,
         seeds: Sequence[int],
     ) -> TrainingRuns:
+        """Estimate a segment with several seeds, for its loss.
+
+        Args:
+            common: Fields of `TrainingRuns`.
+            recording: The segment.
+            times: (T,) times of the estimates, us.
+            params: Parameters of the method.
+            seeds: Seeds of the runs.
+
+        Returns:
+            The segment with the estimates.
+        """
         model, means = type(common[-1]), []
         for seed in seeds:
             motion = self._solve(recording, params, model=model, seed=seed, progress=False)

@@ -251,12 +251,19 @@ def _model_doubt(
 
 
 class _LensFit(NamedTuple):
-    """Rotations before a lens that distorts."""
+    """Rotations before a lens that distorts.
+
+    Attributes:
+        division: Coefficient of the lens's division model.
+        likelihood: Log-likelihood of the pixels that the coefficient was fitted to.
+        sharpness: Log sharpness of the patches' held-out pixels.
+        turns: (3,) rotation of each window, rad.
+    """
 
     division: float
-    likelihood: float  # of the pixels that it was fitted to
-    sharpness: NDArray[np.float64]  # of held-out pixels
-    turns: list[NDArray[np.float64]]  # rad, of windows
+    likelihood: float
+    sharpness: NDArray[np.float64]
+    turns: list[NDArray[np.float64]]
 
     def distortion(self, recording: Recording, camera: PinholeCamera) -> tuple[float, ...]:
         """Return coefficients k1, k2, p1, p2, k3 that distort about alike on a sensor."""

@@ -316,10 +316,18 @@ def measure_sharpness(
 
 
 class PatchEvents(NamedTuple):
-    """Events (n,) of patches."""
+    """Events of patches.
 
-    at: NDArray[np.float64]  # (n, 2) px, from the corner of the patch
-    since: NDArray[np.float64]  # time from the middle of the window, in durations
+    Attributes:
+        at: (n, 2) positions from the corner of the patch, px.
+        since: (n,) times from the middle of the window, in durations.
+        sign: (n,) polarities, +1 or -1.
+        patch: (n,) index of the patch.
+        half: (n,) half of the pixels that the event belongs to, 0 or 1.
+    """
+
+    at: NDArray[np.float64]
+    since: NDArray[np.float64]
     sign: NDArray[np.float64]
     patch: NDArray[np.int64]
     half: NDArray[np.int64]

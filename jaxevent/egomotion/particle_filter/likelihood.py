@@ -27,12 +27,19 @@ CANDIDATES_PER_BLOCK = 8  # candidates per event that are scored together
 
 
 class EventScores(NamedTuple):
-    """Log-likelihoods of a batch for all particles, and votes compared with chance."""
+    """Log-likelihoods of a batch for all particles, and votes compared with chance.
+
+    Attributes:
+        log_likelihood: Log-likelihood of each event for each particle.
+        votes: Mean over particles of the sum of votes over events.
+        chance: Votes expected by chance.
+        lag: Time by which the observed motion precedes the last event, s.
+    """
 
     log_likelihood: Float[Array, "K N"]
-    votes: Float[Array, ""]  # mean over particles, sum over events
-    chance: Float[Array, ""]  # votes expected by chance
-    lag: Float[Array, ""]  # s
+    votes: Float[Array, ""]
+    chance: Float[Array, ""]
+    lag: Float[Array, ""]
 
 
 class Event(eqx.Module):
@@ -72,7 +79,13 @@ class Votes(eqx.Module):
 
 
 class EventLikelihood(NamedTuple):
-    """Log-likelihoods of an event, or K, for all particles, and votes compared with chance."""
+    """Log-likelihoods of an event, or of K, for all particles, and votes compared with chance.
+
+    Attributes:
+        log_likelihood: Log-likelihood for each particle.
+        votes: Mean over particles of the votes.
+        chance: Votes expected by chance.
+    """
 
     log_likelihood: Float[Array, "*K N"]
     votes: Float[Array, "*K"]
