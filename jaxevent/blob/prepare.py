@@ -25,7 +25,7 @@ from jaxevent.blob.seeds import read_seeds, tracking_span
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.estimator import ShortRepr
-from jaxevent.events.filters import supported
+from jaxevent.events.filters import find_supported
 from jaxevent.recording import Recording, Times, check_times
 
 STEPS_PER_CHUNK_CHOICES = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
@@ -333,7 +333,9 @@ class ChunkPacker:
         shape = self.recording.height + 2, self.recording.width + 2
         last = np.full(shape, np.iinfo(np.int64).min // 2)
         for part in (warm, events):
-            passed = supported(part.t, part.x, part.y, last, self.prefilter_us, self.neighbours)
+            passed = find_supported(
+                part.t, part.x, part.y, last, self.prefilter_us, self.neighbours
+            )
         return passed
 
 

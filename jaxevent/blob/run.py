@@ -117,6 +117,19 @@ def _run_chunk(
     state: TrackerState,
     part: Any,
 ) -> tuple[TrackerState, ChunkInfo]:
+    """Run the tracker over one chunk, the step of the scan in `run`.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: All chunks.
+        output: Report that is requested; see `run`.
+        state: State before the chunk.
+        part: Number of the chunk, and its rows of the features' arrays.
+
+    Returns:
+        The state after the chunk, and its report.
+    """
     number, t, xi, polarity, valid, owner, elapsed, stop, cycle = part
     state = shift_state(state, elapsed)
     before = spawn_seeded_tracks(filter, params, features, features.seed == number, state.tracks)

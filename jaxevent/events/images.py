@@ -281,6 +281,15 @@ def _integer_type(part: AnyEvents) -> Any:
 
 
 def _sign(e: Any, xp: Any) -> Any:
+    """Return the polarities as +1 and -1.
+
+    Args:
+        e: Events, as `Events` or `DeviceEvents`.
+        xp: NumPy, or JAX's NumPy.
+
+    Returns:
+        (n,).
+    """
     return xp.where(e.p, 1, -1)
 
 

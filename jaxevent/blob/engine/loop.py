@@ -259,7 +259,12 @@ def run(kernel, chunks, state, out, scratch, updates):
 
 @njit_noalloc_inlined
 def _begin_chunk(context, chunk):
-    """Count times from the chunk's start, and begin the tracks of its seeds."""
+    """Count times from the chunk's start, and begin the tracks of its seeds.
+
+    Args:
+        context: `_Context`, whose state is changed.
+        chunk: Index of the chunk.
+    """
     chunks, state = context.chunks, context.state
     integers, elapsed = state.integers, np.int64(chunks.elapsed[chunk])
     for k in range(len(integers)):
@@ -480,7 +485,12 @@ def _fade(sums, factor):
 
 @njit_noalloc_inlined
 def _manage_tracks(context, chunk):
-    """Confirm, delete, merge and begin tracks at a chunk's end; see `lifecycle.manage_tracks`."""
+    """Confirm, delete, merge and begin tracks at a chunk's end; see `lifecycle.manage_tracks`.
+
+    Args:
+        context: `_Context`, whose state and output are changed.
+        chunk: Index of the chunk.
+    """
     functions, pointers, out = context.functions, context.pointers, context.out
     reals, integers = context.state.reals, context.state.integers
     stop, number = np.int64(context.chunks.stop[chunk]), len(reals)

@@ -484,7 +484,16 @@ def measure_dispersions(
 def _dispersion(
     N: NDArray[np.int32], background: Background, slices: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Compute the dispersion of counts (windows, rows, columns) of windows in given slices."""
+    """Compute the dispersion of the counts of windows in given slices.
+
+    Args:
+        N: (windows, rows, columns) counts of cells of 16 px.
+        background: The background.
+        slices: (windows,) slice of each window.
+
+    Returns:
+        (rows, columns) variance over mean, at least 1.
+    """
     calm, bright = background.calm[slices], background.bright
     N, active = N * calm, background.activity[slices, None, None] * calm
     mu = N.sum(0) / np.maximum(active.sum(0), 1) * active
