@@ -70,7 +70,7 @@ def find_clipping(recording: Recording) -> ClippedEnds:
     top = float(np.iinfo(grey.dtype).max) if whole else 1.0
     step = max(float(grey.max()) / N_LEVELS, 1.0 if whole else 1e-9)
     counts = np.bincount((grey / step + 0.5).astype(np.int64))
-    white, black = _pile_up(counts), _pile_up(counts[::-1])
+    white, black = _find_pile_up(counts), _find_pile_up(counts[::-1])
     if white.level is not None:
         level = white.level * step / top
         white = white._replace(
@@ -81,7 +81,7 @@ def find_clipping(recording: Recording) -> ClippedEnds:
     return ClippedEnds(black, white)
 
 
-def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
+def _find_pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     """Find the pile-up at the upper end of a histogram; its level is in bins."""
     beyond = counts[::-1].cumsum()[::-1] / counts.sum()
     last = int(np.flatnonzero(beyond >= MAX_STRAY_SHARE)[-1])

@@ -74,11 +74,18 @@ MIN_CHANGES_PER_PIXEL = 4.0
 
 
 class Clock(NamedTuple):
-    """Offsets that were tried, with their correlations, and the best of them."""
+    """Offsets that were tried, with their correlations, and the best of them.
 
-    offsets: NDArray[np.float64]  # s
+    Attributes:
+        offsets: (n,) offsets, s.
+        correlations: (n,) correlations of events and frames.
+        best: Offset of the highest correlation, s; NaN: none.
+        why: Reason why there is none; "" if there is one.
+    """
+
+    offsets: NDArray[np.float64]
     correlations: NDArray[np.float64]
-    best: float  # s; NaN: none
+    best: float
     why: str
 
 
@@ -318,7 +325,7 @@ def _with_fit(
         event_noise=event_noise,
         frame_noise=noise,
         exposure=exposure,
-        exposure_anchor=_anchor(offset, exposure),
+        exposure_anchor=_locate_stamps(offset, exposure),
         rho_ref=dead,
         hot_pixels=sample.hot,
         offsets=clock.offsets,
@@ -383,7 +390,7 @@ def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     return CalibrationValue(math.sqrt(max(square, least**2)), low, high, "s")
 
 
-def _anchor(offset: CalibrationValue, exposure: CalibrationValue) -> CalibrationValue:
+def _locate_stamps(offset: CalibrationValue, exposure: CalibrationValue) -> CalibrationValue:
     """Find where in the exposure the stamps lie, if the clocks are the same.
 
     Args:
@@ -451,10 +458,15 @@ def _drift(sample: Sample, fit: Fit) -> CalibrationValue:
 
 
 class _DarkOffsets(NamedTuple):
-    """Fits of thresholds at each of `DARK_OFFSETS`."""
+    """Fits of thresholds at each of `DARK_OFFSETS`.
+
+    Attributes:
+        fits: Fit of each offset.
+        losses: (offsets, n) losses, of densities of grey values.
+    """
 
     fits: list[Fit]
-    losses: NDArray[np.float64]  # (offsets, n), of densities of grey values
+    losses: NDArray[np.float64]
 
     @classmethod
     def of(cls, model: Model, fit: Fit) -> "_DarkOffsets":

@@ -123,11 +123,11 @@ def hash_content(recording: Recording, what: float | str) -> str:
     source, frames = recording.events, recording.frames
     feed(recording.width, recording.height, len(source))
     starts = np.arange(0, len(source), SAMPLE_EVENTS)
-    for first in _spread(starts, N_EVENT_SAMPLES).tolist():
+    for first in _choose_evenly(starts, N_EVENT_SAMPLES).tolist():
         events = source[first : first + SAMPLE_EVENTS]
         feed(events.t, events.x, events.y, events.p)
     if frames is not None:
-        rows = _spread(np.arange(len(frames)), N_FRAME_SAMPLES)
+        rows = _choose_evenly(np.arange(len(frames)), N_FRAME_SAMPLES)
         feed(frames.t, frames.exposure, recording.gain, np.asarray(frames.images[rows]))
         for name in ("response", "certainty", "f_Q"):
             if name in recording.extra:
@@ -135,7 +135,7 @@ def hash_content(recording: Recording, what: float | str) -> str:
     return whole.hexdigest()
 
 
-def _spread(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
+def _choose_evenly(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
     """Choose evenly spread values, the first and the last among them.
 
     Args:

@@ -427,12 +427,19 @@ class Clock(NamedTuple):
 
 
 class WindowEvents(NamedTuple):
-    """Events of a window: places (px), times and polarities."""
+    """Events of a window.
+
+    Attributes:
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        t: (n,) times, us.
+        p: (n,) polarities, of mean 0 and variance 1.
+    """
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
-    t: NDArray[np.int64]  # us
-    p: NDArray[np.float32]  # polarity, of mean 0 and variance 1
+    t: NDArray[np.int64]
+    p: NDArray[np.float32]
 
     @classmethod
     def of(cls, events: Events) -> "WindowEvents":
@@ -608,7 +615,9 @@ class Alignment:
             surface = np.stack([c @ B0, c @ B1], -1).reshape(u.shape)
         return surface
 
-    def _turn(self, clock: Clock, at: int, s: NDArray, turns: NDArray) -> NDArray[np.float64]:
+    def _update_clock(
+        self, clock: Clock, at: int, s: NDArray, turns: NDArray
+    ) -> NDArray[np.float64]:
         """Move the times of a clock by a step of (1), on the whole as fast as before alignment.
 
         Args:
@@ -699,7 +708,7 @@ class Alignment:
                 before = step * np.minimum(1, reach / np.maximum(length, 1e-9))
                 u += before
                 if adapt:
-                    ahead = self._turn(clock, at, ahead, turns)
+                    ahead = self._update_clock(clock, at, ahead, turns)
         information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
         return Displacement(
             u,

@@ -49,12 +49,19 @@ class FlowParams(Parameters):
 
 
 class Anchor(NamedTuple):
-    """Flow at one time, at nodes."""
+    """Flow at one time, at nodes.
 
-    row: int  # of the event there
-    t: int  # us
+    Attributes:
+        row: Number of the event there.
+        t: Its time, us.
+        aligned: Displacement of nodes.
+        rates: (2, K) rates of its clock, 1/s, and their variances.
+    """
+
+    row: int
+    t: int
     aligned: Displacement
-    rates: NDArray[np.float64]  # (2, K) of its clock, and their variances
+    rates: NDArray[np.float64]
 
     @property
     def rate(self) -> float:
@@ -63,10 +70,15 @@ class Anchor(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """Anchors that start one from the other: the first of them, and how many events apart."""
+    """Sequence of anchors, each estimated from the one before.
+
+    Attributes:
+        first: The first anchor.
+        half: Number of events on either side of an anchor.
+    """
 
     first: Anchor
-    half: int  # events on either side of an anchor
+    half: int
 
 
 class EventFlow:
@@ -108,8 +120,8 @@ class EventFlow:
         events = self.recording.events[max(row - half, 0) : row + half]
         return int(events.t[min(row, half)]), events
 
-    def _seek(self, row: int, most: int | None = None) -> Chain:
-        """Find the motion around an event from nothing, in windows that double.
+    def _start_chain(self, row: int, most: int | None = None) -> Chain:
+        """Estimate the motion around an event without an initial value, in windows that double.
 
         They grow until points are displaced far enough, or to `most` events.
 
@@ -172,7 +184,7 @@ class EventFlow:
         return Anchor(row, at, found, found.clock.rates())
 
     def _make_chain(self, number: int) -> Chain:
-        return self._seek(number * CHAIN_WINDOWS * self._base)
+        return self._start_chain(number * CHAIN_WINDOWS * self._base)
 
     def _make_anchor(self, number: int, k: int) -> Anchor:
         """Make an anchor of a chain; those before it are estimated first.
@@ -191,7 +203,7 @@ class EventFlow:
         row = number * CHAIN_WINDOWS * self._base + k * half
         found = self._refine(row, half, before.aligned.u, before.aligned.clock)
         if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
-            other = self._seek(row, half).first
+            other = self._start_chain(row, half).first
             if other.aligned.score > found.aligned.score:
                 return other
         return found
