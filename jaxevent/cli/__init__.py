@@ -35,7 +35,7 @@ from jaxevent.cli import (
     track,
     view,
 )
-from jaxevent.cli.arguments import CommandParser, HelpFormatter, guarded
+from jaxevent.cli.arguments import CommandParser, HelpFormatter, guard_outputs
 from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
@@ -55,14 +55,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     _mend_streams()
     try:
-        with _terminable(), _seldom_collected(ends=argv is None):
+        with _terminable(), _collect_seldom(ends=argv is None):
             try:
                 arguments = vars(_parser().parse_args(argv))
             finally:
                 sys.stdout.flush()  # help
             command = arguments.pop("command")
             words = ["jaxevent", *(sys.argv[1:] if argv is None else argv)]
-            with guarded(arguments, words) as options, _shown(words), _plain_warnings():
+            with guard_outputs(arguments, words) as options, _shown(words), _plain_warnings():
                 command(**options)
             sys.stdout.flush()
     except InputError as error:
@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _seldom_collected(ends: bool) -> Iterator[None]:
+def _collect_seldom(ends: bool) -> Iterator[None]:
     """Look for garbage in cycles seldom, and not at all when the process `ends` with the block.
 
     Libraries and traces make many objects that stay. To look through them as often as usual takes a
