@@ -79,6 +79,15 @@ class ParameterInterval:
     An end that is None is open: the loss does not rise enough within the range of the search.
     Without an interval both ends are NaN. `remark` says why an interval may not be trusted; it is
     mostly empty.
+
+    Attributes:
+        name: Name of the parameter.
+        unit: Its unit.
+        start: Value before the fit.
+        value: Value that was fitted or searched.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+        remark: Reason why the interval may not be trusted.
     """
 
     name: str
@@ -175,6 +184,16 @@ def confidence_intervals(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _parts(loss: Any, params: Any, batch: Any) -> tuple[Array, Array]:
+    """Return the loss of the parts of a batch and their weights, compiled.
+
+    Args:
+        loss: A `PartwiseLoss`.
+        params: Parameters of the method.
+        batch: A batch.
+
+    Returns:
+        Losses and weights, both (parts,).
+    """
     return loss.parts(params, batch)
 
 

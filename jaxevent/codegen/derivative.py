@@ -246,6 +246,16 @@ class _VectorInstructions:
         self.align = 4 if isinstance(real, ir.FloatType) else 8
 
     def _pointer(self, array: Any, begin: Any, offset: int) -> Any:
+        """Return the address of a vector in an array.
+
+        Args:
+            array: Pointer to the array's first number.
+            begin: Index of a record in the array; None: 0.
+            offset: Index of the vector's first number from there.
+
+        Returns:
+            Pointer to the vector.
+        """
         place = ir.Constant(ir.IntType(64), offset)
         if begin is not None:
             place = self.builder.add(begin, place)

@@ -45,10 +45,17 @@ _IDEAL = dataclasses.replace(
 
 @dataclasses.dataclass(frozen=True)
 class CameraMotion:
-    """A camera's twist mean + slope t + amplitude sin(2 pi frequency t + phase), six numbers each.
+    """A camera's twist: mean + slope t + amplitude sin(2 pi frequency t + phase).
 
-    They are T (m/s) and Omega (rad/s) of the camera, in its own axes; frequency is in Hz, phase in
-    rad. The pose at time 0 is the identity.
+    The six numbers of a twist are T (m/s) and Omega (rad/s) of the camera, in its own axes. The
+    pose at time 0 is the identity.
+
+    Attributes:
+        mean: (6,) twist.
+        slope: (6,) its change, 1/s.
+        amplitude: (6,) amplitudes of oscillations.
+        frequency: (6,) their frequencies, Hz.
+        phase: (6,) their phases, rad.
 
     Raises:
         InputError: A number is not finite.
@@ -234,13 +241,21 @@ class FlatPatch:
     """A flat, opaque ellipse or rectangle.
 
     Its axes are the world's x and y, turned by the rotation vector `turn`.
+
+    Attributes:
+        centre: X, Y and Z of the middle, m.
+        half: Half axes, m.
+        texture: Its texture.
+        base: ln intensity added to the texture's.
+        turn: (3,) rotation vector of its axes, rad.
+        ellipse: Whether it is an ellipse, else a rectangle.
     """
 
-    centre: Three  # m
-    half: tuple[float | int, float | int]  # half axes, m
+    centre: Three
+    half: tuple[float | int, float | int]
     texture: Texture
-    base: float | int = 0.0  # ln intensity added to the texture's
-    turn: Three = (0.0, 0.0, 0.0)  # rad
+    base: float | int = 0.0
+    turn: Three = (0.0, 0.0, 0.0)
     ellipse: bool = True
 
 
@@ -260,9 +275,15 @@ class BoxWorld:
     All walls have the same texture, which fades near their edges. Patches hide the walls, and each
     hides those before it in `patches`: give the farthest first. Their outlines are blurred over a
     pixel.
+
+    Attributes:
+        lower: Least X, Y and Z of the box, m.
+        upper: Largest X, Y and Z of the box, m.
+        texture: Texture of the walls.
+        patches: Patches in the box, the farthest first.
     """
 
-    lower: Three  # m
+    lower: Three
     upper: Three
     texture: Texture
     patches: tuple[FlatPatch, ...] = ()
@@ -366,6 +387,14 @@ class MovingCamera:
 
     Times of the truth are integers (us) or floats (s) from 0 to the duration.
 
+    Attributes:
+        world: The world.
+        motion: Motion of the camera.
+        size: Width and height of the sensor, px.
+        focal: Focal length of a lens without distortion, centred in the image, px.
+        duration: Length of the recording, s.
+        lens: Another lens, instead of `focal`.
+
     Raises:
         InputError: A time is outside the duration, or the distortion of the lens has no inverse in
             the image.
@@ -373,10 +402,10 @@ class MovingCamera:
 
     world: BoxWorld
     motion: CameraMotion
-    size: tuple[int, int] = (240, 180)  # width, height, px
-    focal: float | int = 200.0  # px, of a lens without distortion, centred in the image
-    duration: float | int = 0.5  # s
-    lens: PinholeCamera | None = None  # instead of `focal`
+    size: tuple[int, int] = (240, 180)
+    focal: float | int = 200.0
+    duration: float | int = 0.5
+    lens: PinholeCamera | None = None
 
     @property
     def camera(self) -> PinholeCamera:
@@ -542,6 +571,15 @@ def _random_direction(rng: np.random.Generator, dimensions: int = 3) -> NDArray[
 
 
 def _six(T: ArrayLike, Omega: ArrayLike) -> Six:
+    """Return a twist as six numbers.
+
+    Args:
+        T: (3,) velocity, m/s.
+        Omega: (3,) angular velocity, rad/s.
+
+    Returns:
+        The numbers.
+    """
     a, b, c, d, e, f = np.concatenate([np.asarray(T, float), np.asarray(Omega, float)]).tolist()
     return a, b, c, d, e, f
 
