@@ -163,7 +163,7 @@ def detect(
     """
     scratch = DetectionScratch.empty(len(events))
     cells = zeroed_cells(shape, 1 << clutter.cell_bits)
-    number = find_blobs(events.x, events.y, _weights(events), clutter, cells, scratch)
+    number = find_blobs(events.x, events.y, _event_counts(events), clutter, cells, scratch)
     return scratch.labels, number
 
 
@@ -173,7 +173,7 @@ def zeroed_cells(shape: tuple[int, int], cell: int) -> NDArray[np.int32]:
     return _cells(rows * columns)
 
 
-def _weights(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
+def _event_counts(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
     """Return the events of each pixel, or 1 of each event."""
     return events.n if isinstance(events, PixelCounts) else np.ones(len(events), np.int32)
 
@@ -197,15 +197,15 @@ def find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -
     Returns:
         Number of blobs.
     """
-    filled = _count(x, y, n, clutter, cells, scratch)
+    filled = _count_in_cells(x, y, n, clutter, cells, scratch)
     hits = _find_hits(filled, clutter, cells, scratch)
     for i in range(filled):
         cells[scratch.filled[i]] = 0
-    return _label(len(x), hits, clutter.row_cells, cells, scratch)
+    return _label_pixels(len(x), hits, clutter.row_cells, cells, scratch)
 
 
 @njit_noalloc_inlined
-def _count(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
+def _count_in_cells(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
     """Count events in cells, and list the cells that are not empty.
 
     Args:
@@ -265,7 +265,7 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
 
 
 @njit_noalloc_inlined
-def _label(pixels: int, hits: int, wide: int, labels: Any, scratch: Any) -> int:
+def _label_pixels(pixels: int, hits: int, wide: int, labels: Any, scratch: Any) -> int:
     """Label pixels by blobs of neighbouring hits, also across corners.
 
     Args:
@@ -316,7 +316,7 @@ def measure_blobs(
         number: Number of blobs.
     """
     blobs = Blobs.zeros(number)
-    sum_blobs(events.x, events.y, _weights(events), labels, number, blobs)
+    sum_blobs(events.x, events.y, _event_counts(events), labels, number, blobs)
     return blobs
 
 

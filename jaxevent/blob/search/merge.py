@@ -154,7 +154,7 @@ def _first_whole(
     """Return the indices of the first two paths that are parts of one object, and its path."""
     for k, i in itertools.combinations(range(len(paths)), 2):
         one, other = paths[k], paths[i]
-        are_parts, may_be_pieces = _compare(one, other)
+        are_parts, may_be_pieces = _compare_paths(one, other)
         if are_parts:
             return k, i, merge_paths(one, other)
         # Different parts of an outline have different balances.
@@ -166,7 +166,7 @@ def _first_whole(
     return None
 
 
-def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
+def _compare_paths(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     """Return whether two paths are those of parts of one object, and whether they may be pieces.
 
     Pieces are those of an outline that windows do not show as one.

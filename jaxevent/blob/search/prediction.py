@@ -84,7 +84,7 @@ class PredictionScore(NamedTuple):
 
 
 class _PredictionScratch(NamedTuple):
-    """Scratch memory of `_predict`, for windows of so many pixels."""
+    """Scratch memory of `_add_prediction`, for windows of so many pixels."""
 
     detection: DetectionScratch
     before: Blobs
@@ -147,7 +147,7 @@ def predict(
     for clutter in clutters:
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
         density, sums = np.zeros((number, N_DENSITIES)), np.zeros(3)
-        _predict(before, scored.pixels, rows, clutter, cells, scratch, (density, sums))
+        _add_prediction(before, scored.pixels, rows, clutter, cells, scratch, (density, sums))
         out.append(ScalePrediction(density, scored, sums))
     return out
 
@@ -178,7 +178,7 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
 
 
 @njit_noalloc
-def _predict(
+def _add_prediction(
     before: Any, scored: Any, rows: Any, clutter: Any, cells: Any, scratch: Any, out: Any
 ) -> None:
     """Add the predicted densities of a window's events, and the sums of `ScalePrediction`.
