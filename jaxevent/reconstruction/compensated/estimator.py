@@ -138,7 +138,7 @@ class PreparedTargets(ShortRepr):
 
 
 @jax.jit
-def _carry(images: Array, times: PathTimes, paths: Array) -> Array:
+def _warp_images(images: Array, times: PathTimes, paths: Array) -> Array:
     """Read images along trajectories.
 
     Args:
@@ -317,7 +317,7 @@ class CompensatedVideo(ImageSequence[Params]):
         if target.smooth is not None:
             L, M = L - gaussian_blur(L), M - gaussian_blur(M)
         warped = warp_images(L, V, clear, there, target.paths)
-        carried = _carry(np.asarray(images, np.float32), there, target.paths)
+        carried = _warp_images(np.asarray(images, np.float32), there, target.paths)
         return np.asarray(carried), np.asarray(_visibility(self.params, M, warped))
 
     @synchronized

@@ -381,7 +381,7 @@ class InstantSchedule:
         frames = self.frames
         right = int(np.searchsorted(frames, t, "right"))  # of frames at t, none is left or right
         left = int(np.searchsorted(frames, t, "left"))
-        times = np.array(sorted({t, *self._near_frames(t), *self._grid(t)}), np.int64)
+        times = np.array(sorted({t, *self._near_frames(t), *self._grid_times(t)}), np.int64)
         target = int(np.searchsorted(times, t))
         nearest = [
             int(np.searchsorted(times, frames[k]))
@@ -413,7 +413,7 @@ class InstantSchedule:
                 chosen.add(int(frames[k]))
         return chosen
 
-    def _grid(self, t: int) -> set[int]:
+    def _grid_times(self, t: int) -> set[int]:
         """Return the times (us) of a common grid, between the frames next to a time (us)."""
         frames, step, (first, last) = self.frames, self.step, self.span
         right = int(np.searchsorted(frames, t, "right"))

@@ -100,12 +100,12 @@ def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
     """
     out = np.empty((*L.shape, 4), np.float32)
     given = (read_only(np.asarray(values, np.float32)) for values in (L, V))
-    run_over_rows(_pack, L.shape[1], *given, out)
+    run_over_rows(_pack_rows, L.shape[1], *given, out)
     return out
 
 
 @njit_noalloc
-def _pack(begin, end, L, V, out):
+def _pack_rows(begin, end, L, V, out):
     """Pack some rows of images with their gradients.
 
     Args:
@@ -703,7 +703,7 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
 
 
 @njit_noalloc
-def _select(begin, end, inputs, found, scratch, out):
+def _write_selected_paths(begin, end, inputs, found, scratch, out):
     """Write the paths that pixels take.
 
     Args:
@@ -762,7 +762,7 @@ def select_paths(
         scratch = _SearchScratch.allocate(shape, len(images.times.s), len(taps))
         run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
         out = np.empty_like(path_index)
-        run_over_rows(_select, shape[0], inputs, (costs, path_index), scratch, out)
+        run_over_rows(_write_selected_paths, shape[0], inputs, (costs, path_index), scratch, out)
         path_index = out
     return path_index
 

@@ -282,30 +282,30 @@ class _FrameEntry:
                 yield STEP_MOVE, to * places.stride, of * places.stride
         fresh = 0 if not follows else 3 if frame == 0 else 2
         for row in range(fresh, 3):
-            yield from self._images(base + row - number, row, rows)
+            yield from self._image_steps(base + row - number, row, rows)
         for row in range(fresh, 3):
             left = mid = right = 0
             if row < rows:
                 k = base + row - number
                 left, mid, right = self.left[k], self.mid[k], self.right[k]
-            yield from self._count(places.head[:, row], left, mid)
-            yield from self._count(places.tail[:, row], mid, right)
+            yield from self._count_steps(places.head[:, row], left, mid)
+            yield from self._count_steps(places.tail[:, row], mid, right)
         for row in range(0 if not follows else 2 if frame == 0 else 1, 2):
             left = right = 0
             if row + 1 < rows:  # another frame follows
                 k = base + row - number
                 left, right = self.left[k], self.right[k + 1]
-            yield from self._count(places.span[:, row], left, right)
+            yield from self._count_steps(places.span[:, row], left, right)
             if places.around[row] >= 0:
                 fields = places.around[row], *places.span[:, row]
                 yield STEP_AROUND, *(int(field) * places.stride for field in fields)
         # The piece counts from its exposure's left edge, before the first from the window's start.
         begin = self.left[frame - number] if frame >= 0 else now
-        yield from self._count(np.array([places.on, places.off]), begin, now)
+        yield from self._count_steps(np.array([places.on, places.off]), begin, now)
         if frame < 0 and count > 0:
-            yield from self._count(places.before, self.opening, self.right[0])
+            yield from self._count_steps(places.before, self.opening, self.right[0])
 
-    def _images(self, k: int, row: int, rows: int) -> Iterator[tuple[int, ...]]:
+    def _image_steps(self, k: int, row: int, rows: int) -> Iterator[tuple[int, ...]]:
         """List the steps for the images of one frame of a piece, and for its exposure's sums.
 
         Args:
@@ -330,7 +330,9 @@ class _FrameEntry:
         if len(places.total) and row < rows:
             yield STEP_SUM, row, k
 
-    def _count(self, fields: NDArray[np.int64], left: int, right: int) -> Iterator[tuple[int, ...]]:
+    def _count_steps(
+        self, fields: NDArray[np.int64], left: int, right: int
+    ) -> Iterator[tuple[int, ...]]:
         """List the step that counts events of a span of time; none where a method needs no counts.
 
         Args:

@@ -186,7 +186,7 @@ def _gradient(u: Array) -> Array:
     return jnp.stack([along(1), along(0)], -1)
 
 
-def _cells(u: Array) -> Array:
+def _mean_squares(u: Array) -> Array:
     """Mean squares q of the differences of cells, (height - 1, width - 1)."""
     across, down = jnp.diff(u, axis=1) ** 2, jnp.diff(u, axis=0) ** 2
     return (across[:-1] + across[1:] + down[:, :-1] + down[:, 1:]) / 2
@@ -206,7 +206,7 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
     total = (weight * numbers.tail**2 * jnp.log1p(e**2 / (2 * numbers.tail**2))).sum()
-    total += numbers.gradient / 2 * jnp.log1p(_cells(u) / numbers.edge**2).sum()
+    total += numbers.gradient / 2 * jnp.log1p(_mean_squares(u) / numbers.edge**2).sum()
     return total + _quadratic(u, equations, jnp.asarray(numbers.leak))
 
 
@@ -298,7 +298,7 @@ def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
     """
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
-    s = numbers.gradient / (2 * (_cells(u) + numbers.edge**2))
+    s = numbers.gradient / (2 * (_mean_squares(u) + numbers.edge**2))
     across = jnp.pad(s, [(0, 1), (0, 0)]) + jnp.pad(s, [(1, 0), (0, 0)])
     down = jnp.pad(s, [(0, 0), (0, 1)]) + jnp.pad(s, [(0, 0), (1, 0)])
     return _Weights(weight / (1 + e**2 / (2 * numbers.tail**2)), across, down)

@@ -447,7 +447,7 @@ def _sample_variance(system, preconditioner, order, rng):
 
 
 @njit_fastmath_inlined
-def _row(system, k):
+def _row_coefficients(system, k):
     """Return the pixels that a row looks up, and their coefficients.
 
     Args:
@@ -494,8 +494,8 @@ def _look_up(pixels, a, u):
     """Return the difference of the two look-ups of a row.
 
     Args:
-        pixels: Eight flat indices, of `_row`.
-        a: Eight coefficients, of `_row`.
+        pixels: Eight flat indices, of `_row_coefficients`.
+        a: Eight coefficients, of `_row_coefficients`.
         u: (pixels,) flat image.
 
     Returns:
@@ -511,8 +511,8 @@ def _add_transposed_row(pixels, a, value, out):
     """Add the transposed of a row times a value to an image.
 
     Args:
-        pixels: Eight flat indices, of `_row`.
-        a: Eight coefficients, of `_row`.
+        pixels: Eight flat indices, of `_row_coefficients`.
+        a: Eight coefficients, of `_row_coefficients`.
         value: The value.
         out: (pixels,) flat image, added to.
     """
@@ -537,7 +537,7 @@ def _add_transposed(system, values, out):
     """
     flat = out.reshape(-1)
     for k in range(len(values)):
-        pixels, a = _row(system, k)
+        pixels, a = _row_coefficients(system, k)
         _add_transposed_row(pixels, a, values[k], flat)
 
 
@@ -613,7 +613,7 @@ def _add_cell(image, curvature, u, y, x, out):
 
 
 @njit_fastmath
-def _apply(system, u, out):
+def _apply_matrix(system, u, out):
     """Write A u.
 
     Args:
@@ -664,7 +664,7 @@ def _apply(system, u, out):
             _add_cell(system.image, system.curvature[y, x], u, y, x, out)
     flat, image = out.reshape(-1), u.reshape(-1)
     for k in range(len(system.weight)):
-        pixels, a = _row(system, k)
+        pixels, a = _row_coefficients(system, k)
         _add_transposed_row(pixels, a, system.weight[k] * _look_up(pixels, a, image), flat)
 
 
@@ -680,7 +680,7 @@ def _add_row_diagonal(system, diagonal, bend):
     width = system.across.shape[1]
     reciprocal, half = np.float32(1) / np.float32(width), np.float32(0.5)
     for k in range(len(system.weight)):
-        pixels, a = _row(system, k)
+        pixels, a = _row_coefficients(system, k)
         ya = np.floor((np.float32(pixels[0]) + half) * reciprocal)
         yb = np.floor((np.float32(pixels[4]) + half) * reciprocal)
         dy = ya + system.fraction[k, 0, 1] - yb - system.fraction[k, 1, 1]
@@ -861,7 +861,7 @@ def _reweight(system, u, data, numbers, residual):
     tail, gradient, edge = numbers
     image = u.reshape(-1)
     for k in range(len(change)):
-        pixels, a = _row(system, k)
+        pixels, a = _row_coefficients(system, k)
         e = _look_up(pixels, a, image) - change[k]
         residual[k] = e
         system.weight[k] = base[k] / (1 + e * e / (2 * tail * tail))
@@ -952,14 +952,14 @@ def _conjugate_gradients(system, b, u, scratch, stage):
     rho, steps = convert(stage[0]), stage[1]
     _, residual, _, direction, product, preconditioned = scratch.images
     r, before, p, Ap, z = scratch.images[1:].reshape(5, -1)
-    _apply(system, u, product)
+    _apply_matrix(system, u, product)
     np.subtract(b, product, out=residual)
     for _ in range(steps):
         _precondition(scratch, residual, preconditioned)
         rho = convert(_update_direction(r, before, z, rho, p))
         if rho <= 0:
             break
-        _apply(system, direction, product)
+        _apply_matrix(system, direction, product)
         if not _advance(p, Ap, u.reshape(-1), r, before):
             return convert(0)
     return rho
