@@ -189,13 +189,13 @@ def window_durations(recording: Recording) -> NDArray[np.float64]:
     """
     whole = 1e-6 * (recording.stop - recording.start)
     every = np.asarray(WINDOW_DURATIONS_S, np.float64)
-    fitting: NDArray[np.float64] = every[[_fits(recording, float(one)) for one in every]]
+    fitting: NDArray[np.float64] = every[[_is_long_enough(recording, float(one)) for one in every]]
     if whole >= WINDOW_DURATIONS_S[-1] or not len(fitting):
         return fitting
     return np.append(fitting, whole)
 
 
-def _fits(recording: Recording, duration: float) -> bool:
+def _is_long_enough(recording: Recording, duration: float) -> bool:
     """Return whether the recording is at least as long as a window.
 
     Args:
@@ -279,7 +279,7 @@ def measure_sharpness(
     columns = int((xi[..., 0].max() - corner[0]) // PATCH_PX) + 1
     half, index = round(5e5 * duration), recording.events.index
     start, stop = index(middle - half), index(middle + half)
-    if stop - start < MIN_PATCH_EVENTS or not _fits(recording, duration):
+    if stop - start < MIN_PATCH_EVENTS or not _is_long_enough(recording, duration):
         return None
     events = recording.events[start : min(stop, start + 40 * MAX_WINDOW_EVENTS)]
     at = xi[events.y, events.x] - corner

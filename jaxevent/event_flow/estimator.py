@@ -213,7 +213,7 @@ class EventFlow:
         row = max(self.recording.events.index(t + 1) - 1, 0)
         return self._chain(row // (CHAIN_WINDOWS * self._base)).half
 
-    def _rows(self, number: int) -> NDArray[np.int64]:
+    def _anchor_events(self, number: int) -> NDArray[np.int64]:
         """Return the events at which the anchors of a chain are."""
         length = CHAIN_WINDOWS * self._base
         end = min((number + 1) * length, len(self.recording.events))
@@ -241,7 +241,7 @@ class EventFlow:
         for number in range(first, min(high // length + 2, (n - 1) // length + 1)):
             if found and found[-1].row >= high:
                 break
-            rows = self._rows(number)
+            rows = self._anchor_events(number)
             if self.causal:
                 rows = rows[rows + self._chain(number).half <= seen]
             for k in range(len(rows)):
@@ -255,7 +255,7 @@ class EventFlow:
                     break
         return found
 
-    def _fields(
+    def _velocities_at(
         self, anchors: list[Anchor], knots: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return velocity and covariance of all nodes at some times.
@@ -305,7 +305,7 @@ class EventFlow:
         knots = np.unique(np.concatenate(times).astype(np.int64))
         if len(knots) > MAX_KNOTS:
             knots = knots[np.linspace(0, len(knots) - 1, MAX_KNOTS).round().astype(int)]
-        velocity, covariance = self._fields(anchors, knots)
+        velocity, covariance = self._velocities_at(anchors, knots)
         spread = self._align.fill(covariance.mean(0))
         return WindowPaths(int(at), knots, velocity, spread[None], self._align.spacing)
 
@@ -334,7 +334,7 @@ class EventFlow:
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
                 anchors = self._around(t, t, t)
-            found = self._fields(anchors, wanted[row : row + 1])
+            found = self._velocities_at(anchors, wanted[row : row + 1])
             mean[row], covariance[row] = (self._align.fill(one[0]) for one in found)
             if anchors:
                 rate = np.interp(t, [a.t for a in anchors], [abs(a.rate) for a in anchors])

@@ -252,7 +252,7 @@ class _Alignment:
         scale = pixel_scale(where.reshape(part.shape)) / self.stride
         images = self._smoothed_changes(sigma, scale)
         inside = ~np.isnan(where[:, 0])
-        values = _bilinear(np.where(inside[:, None], where, 0), self.shape) @ images
+        values = _interpolation_matrix(np.where(inside[:, None], where, 0), self.shape) @ images
         values = values.reshape(len(where), -1, 4).swapaxes(0, 1)
         values[..., 3] *= inside
         return values
@@ -377,7 +377,7 @@ class _Alignment:
         return step / max(far, abs(step[-1]) / (self.apart * 5e-7), 1)
 
 
-def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
+def _interpolation_matrix(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
     """Return the matrix of bilinear interpolation of an image.
 
     Args:
