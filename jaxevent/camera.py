@@ -325,7 +325,7 @@ def estimate_response(
         InputError: Images and exposures do not fit together or all have one exposure, too few
             pixels are usable, or a setting is outside its range.
     """
-    stack, times = _stack(images, exposures)
+    stack, times = _check_stack(images, exposures)
     if len(np.unique(times)) < 2:
         raise InputError(
             f"{len(stack)} images of one exposure time determine no camera response; give images "
@@ -352,7 +352,7 @@ def estimate_response(
     return TableResponse(levels, np.where(shown & (slope > 0), 1 / np.maximum(slope, 1e-9), 0))
 
 
-def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
+def _check_stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
     """Check the images and exposure times of a stack.
 
     Args:
@@ -477,7 +477,7 @@ def merge_exposures(
     Raises:
         InputError: Images and exposures do not fit together.
     """
-    stack, times = _stack(images, exposures)
+    stack, times = _check_stack(images, exposures)
     reference = float(times[0]) if reference is None else reference
     if not 0 < reference < np.inf or not 0 <= margin < 127:
         raise InputError(

@@ -580,7 +580,7 @@ class Clock(NamedTuple):
         """
         if not self._has_plausible_intervals(values, unit):
             return False
-        first, last = _ends(values, unit)
+        first, last = _extremes(values, unit)
         if last < self.first or first > self.last:
             return False
         inside = first >= self.first and last <= self.last
@@ -596,18 +596,18 @@ class Clock(NamedTuple):
         Returns:
             The ratio, 0 to 1.
         """
-        first, last = _ends(values, unit)
+        first, last = _extremes(values, unit)
         common = min(last, self.last) - max(first, self.first)
         return max(common, 0.0) / max(max(last, self.last) - min(first, self.first), 1.0)
 
     @staticmethod
     def _has_plausible_intervals(values: NDArray, unit: str) -> bool:
-        first, last = _ends(values, unit)
+        first, last = _extremes(values, unit)
         least, most = _PLAUSIBLE_INTERVALS_US
         return least <= (last - first) / (len(values) - 1) <= most
 
 
-def _ends(values: NDArray, unit: str) -> tuple[float, float]:
+def _extremes(values: NDArray, unit: str) -> tuple[float, float]:
     """Return the least and the greatest of some times.
 
     Args:

@@ -222,7 +222,7 @@ def voxel_grid(
     """
     if bins < 1:
         raise InputError(f"a voxel grid of {bins} bins is not possible; give 1 or more")
-    first, last = _ends(part, start, stop)
+    first, last = _fill_ends(part, start, stop)
 
     def increments(e: Any, xp: Any) -> list[_Increment]:
         length = xp.maximum(last - first, 1)
@@ -257,7 +257,7 @@ def time_surface(
         InputError: The time constant is shorter than 1 us.
     """
     tau_us = parse_duration(tau, "the time constant of a time surface")
-    _, now = _ends(part, None, at)
+    _, now = _fill_ends(part, None, at)
     if isinstance(part, DeviceEvents):
         width, height = part.size
         index = (part.p * height + part.y) * width + part.x
@@ -293,7 +293,7 @@ def _sign(e: Any, xp: Any) -> Any:
     return xp.where(e.p, 1, -1)
 
 
-def _ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
+def _fill_ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
     """Fill in the ends of a span of time.
 
     Args:

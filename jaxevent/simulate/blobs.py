@@ -222,7 +222,7 @@ class RandomWalk:
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the states (times, 8) at times (s)."""
         h = self.step
-        integral, rate, wander, log_size = self._grid
+        integral, rate, wander, log_size = self._grid_path
         k = np.clip(np.floor(t / h).astype(int), 0, len(rate) - 2)
         a = ((t - k * h) / h)[:, None]
         # Given both ends, the mean of an integrated Wiener process is the cubic through their
@@ -238,7 +238,7 @@ class RandomWalk:
         )
 
     @functools.cached_property
-    def _grid(self) -> tuple[NDArray[np.float64], ...]:
+    def _grid_path(self) -> tuple[NDArray[np.float64], ...]:
         """The path on the grid of steps.
 
         The integral of the rate, the rate and the Wiener part of x, y and theta, (steps + 1, 3)

@@ -88,7 +88,7 @@ class CameraMotion:
         """Return camera-to-world poses (times, 4, 4) at times (s) from 0 on, to about 1e-11."""
         t = np.asarray(t, np.float64)
         k = np.floor(t / _STEP_S).astype(int)
-        grid = self._grid(1 << int(k.max(initial=0)).bit_length())
+        grid = self._grid_poses(1 << int(k.max(initial=0)).bit_length())
         return grid[k] @ self._steps(k * _STEP_S, t - k * _STEP_S)
 
     def _steps(self, t: NDArray[np.floating], h: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -112,7 +112,7 @@ class CameraMotion:
         return RigidTransform.from_exp_coords(np.concatenate([turn, way], 1)).as_matrix()
 
     @functools.cache  # noqa: B019, motions are small and few
-    def _grid(self, count: int) -> NDArray[np.float64]:
+    def _grid_poses(self, count: int) -> NDArray[np.float64]:
         """Return the poses (count + 1, 4, 4) at the times 0, _STEP_S, ..."""
         steps = self._steps(np.arange(count) * _STEP_S, np.full(count, _STEP_S))
         poses = [np.eye(4)]
@@ -509,7 +509,7 @@ def simulate_motion(
 _GRAIN_M = 0.012  # 1 px at 2.4 m and f = 200 px
 
 
-def _room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
+def _describe_room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
     """Describe a room.
 
     Args:
@@ -684,7 +684,7 @@ def motion_scene(
         }[motion]()
     else:
         kind = {"shapes": "plain"}.get(name, "noise") if texture is None else texture
-        room = _room(kind, 2.0 if name == "wall" else 3.2, texture_seed)
+        room = _describe_room(kind, 2.0 if name == "wall" else 3.2, texture_seed)
         patches = ()
         if name != "wall":
             patches = (
@@ -760,10 +760,10 @@ def simulate_frame_events(
     begin = rng.integers(0, image.shape[::-1])
     position = begin - np.concatenate([np.zeros((1, 2)), np.cumsum(flow, axis=0)])
     y, x = np.mgrid[:height, :width]
-    before = _bilinear(image, x + position[0, 0], y + position[0, 1])
+    before = _sample_bilinear(image, x + position[0, 0], y + position[0, 1])
     parts = []
     for k, (px, py) in enumerate(position[1:], start=1):
-        now = _bilinear(image, x + px, y + py)
+        now = _sample_bilinear(image, x + px, y + py)
         change = now - before
         if noise:
             lit = rng.random(change.shape) < noise
@@ -781,7 +781,7 @@ def simulate_frame_events(
     return Recording(name, width, height, events).check(), flow / (step * 1e-6)
 
 
-def _bilinear(
+def _sample_bilinear(
     image: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Sample an image by B.10, periodic beyond its border.

@@ -186,7 +186,7 @@ class _Canvas:
         return list(zip(x.tolist(), self.rng.uniform(low, high, count).tolist(), strict=True))
 
 
-def _room(c: _Canvas) -> None:
+def _paint_room(c: _Canvas) -> None:
     """Paint a living room: windows on bright outdoors, shaded walls, dark furniture, a lamp."""
     c.level = -2.4 + 0.5 * c.noise(1.7) + 0.9 * np.cos(2 * np.pi * (c.y - 160) / 512)
     outside = 3.6 + 0.5 * c.noise(1.3, 60)
@@ -291,7 +291,7 @@ def _tunnel(c: _Canvas) -> None:
 
 # Functions that paint, and the part of the scene that is brighter than the frames' white.
 _SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
-    "room": (_room, 0.10),
+    "room": (_paint_room, 0.10),
     "forest": (_forest, 0.30),
     "mountain": (_mountain, 0.32),
     "lake": (_lake, 0.30),
