@@ -232,20 +232,22 @@ class SCurve(Response):
     def grey(self, intensity: Values) -> Float[Array, "..."]:
         inside = jnp.clip(jnp.asarray(intensity), 0, 1)
         # The rounding error of tanh may lead an ulp beyond the ends, which float frames may not.
-        grey = 0.5 + jnp.tanh(self.steepness * (inside - 0.5) / 2) / (2 * self._end())
+        grey = 0.5 + jnp.tanh(self.steepness * (inside - 0.5) / 2) / (2 * self._normaliser())
         return jnp.clip(grey, 0, 1)
 
     def intensity(self, grey: Values) -> Float[Array, "..."]:
-        return 0.5 + 2 / self.steepness * jnp.arctanh((2 * jnp.asarray(grey) - 1) * self._end())
+        return 0.5 + 2 / self.steepness * jnp.arctanh(
+            (2 * jnp.asarray(grey) - 1) * self._normaliser()
+        )
 
     def certainty(self, grey: Values) -> Float[Array, "..."]:
-        return 1 - ((2 * jnp.asarray(grey) - 1) * self._end()) ** 2
+        return 1 - ((2 * jnp.asarray(grey) - 1) * self._normaliser()) ** 2
 
     def table(self, entries: int = 256) -> Float[Array, " entries"]:
         """Return the intensities of evenly spaced grey values, as `TableResponse` takes them."""
         return self.intensity(jnp.linspace(0, 1, entries))
 
-    def _end(self) -> Float[Array, ""]:
+    def _normaliser(self) -> Float[Array, ""]:
         return jnp.tanh(self.steepness / 4)
 
 

@@ -340,7 +340,7 @@ def _rescale_weights(weights: NDArray, whole: float) -> NDArray:
     return weights * (whole / max(float(weights.sum()), 1e-300))
 
 
-def _physical(number: Number, raw: float) -> float:
+def _to_physical(number: Number, raw: float) -> float:
     return float(number.physical(jnp.asarray(raw)))
 
 
@@ -370,8 +370,8 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
         if not remark and rough:
             remark = ROUGH
         label = name if not index else f"{name}[{index[0] + 1}]"
-        began, value = (_physical(number, raw) for raw in (begun[k], sample.at[k]))
-        low, high = (None if raw is None else _physical(number, raw) for raw in (low, high))
+        began, value = (_to_physical(number, raw) for raw in (begun[k], sample.at[k]))
+        low, high = (None if raw is None else _to_physical(number, raw) for raw in (low, high))
         findings.append(ParameterInterval(label, number.unit, began, value, low, high, remark))
     return findings
 

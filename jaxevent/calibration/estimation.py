@@ -312,7 +312,7 @@ def _with_fit(
         dead = CalibrationValue(rho, rho - reach, rho + reach, "s")
     else:
         dead = not_identifiable("s", f"at most {rho + reach:.2g} s")
-    exposure = _exposure(sample, sensor, model)
+    exposure = _estimate_exposure(sample, sensor, model)
     noise, event_noise = _noises(sensor)
     c_on, c_off, ratio = _thresholds(thresholds)
     return Calibration(
@@ -360,7 +360,7 @@ def _gap(fit: Fit, column: int, power: int) -> float:
     return float(np.average(fit.changes.gap**power, weights=weight + 1e-300))
 
 
-def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
+def _estimate_exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     known = np.concatenate([s.exposure for s in sample.segments])
     if (known > 0).all():
         length = float(np.median(known)) * 1e-6

@@ -69,11 +69,11 @@ def parse_repair(text: str) -> Repair:
     chosen: dict[str, Any] = {}
     for word in text.split(","):
         kind, colon, value = word.strip().partition(":")
-        chosen |= _option(text, kind, value if colon else None)
+        chosen |= _parse_repair(text, kind, value if colon else None)
     return Repair(**chosen)
 
 
-def _option(text: str, kind: str, value: str | None) -> dict[str, Any]:
+def _parse_repair(text: str, kind: str, value: str | None) -> dict[str, Any]:
     refused = InputError(f"repair = {text!r} is not known; give {_REPAIR_USAGE}")
     if kind not in REPAIR_KINDS or (value is not None and kind in ("drop", "unwrap")):
         raise refused
@@ -167,7 +167,7 @@ class Disorder:
             )
         if self.outliers:
             n = self.dropped
-            yield "drop", f"{n:,} {plural('event', n)} far from the times around {_them(n)}"
+            yield "drop", f"{n:,} {plural('event', n)} far from the times around {_pronoun(n)}"
         if self.late:
             n, bound = self.late, max(self.bound, self.latest)
             sort = "sort" if bound == DEFAULT_MAX_LATE_US else f"sort:{bound}"
@@ -227,7 +227,7 @@ def _in_words(number: int) -> str:
     return "once" if number == 1 else f"{number:,} times"
 
 
-def _them(number: int) -> str:
+def _pronoun(number: int) -> str:
     return "it" if number == 1 else "them"
 
 

@@ -450,14 +450,14 @@ def _decode(
                 raise InputError(
                     f"{path}: has a line of over {_TEXT_BLOCK_BYTES} bytes; {_WANTED_LAYOUT}"
                 )
-            columns = _parsed(path, table, text[:cut], row)
+            columns = _parse_lines(path, table, text[:cut], row)
             yield (offset, row), columns
             row += len(columns[0])
             offset += cut
             rest = text[cut:]
 
 
-def _parsed(path: Path, table: _Table, text: bytes, row: int) -> Columns:
+def _parse_lines(path: Path, table: _Table, text: bytes, row: int) -> Columns:
     if not text.strip():
         none = np.empty(0)
         return none.astype(np.int64), none, none, none

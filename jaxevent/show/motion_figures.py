@@ -353,7 +353,7 @@ def warped_events(
         [np.interp(events.t, grid, c) - np.interp(reference_us, grid, c) for c in total.T], 1
     )
     # In single precision a place is off by some 1e-5 px.
-    xy = np.asarray(_warped(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
+    xy = np.asarray(_warp_positions(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
     if flow_px_s is not None:
         xy = xy - flow_px_s * since[:, None]
     centre = _centre(recording)
@@ -474,7 +474,7 @@ def _flows(model: Model, xi: Numeric, mean: Numeric) -> Array:
 
 
 @eqx.filter_jit
-def _warped(model: Model, xi: Numeric, way: Numeric) -> Array:
+def _warp_positions(model: Model, xi: Numeric, way: Numeric) -> Array:
     return model.warp(jnp.asarray(xi), jnp.asarray(way))
 
 

@@ -348,13 +348,13 @@ def _collect_recordings(
         if shown:
             first = shown[0][1]
             times = [one["t"] / 1e6 for one in first]
-            figures.append({"label": "truth", "images": {"image": _of("truth", first)}})
+            figures.append({"label": "truth", "images": {"image": _picture_column("truth", first)}})
             if "given" in first[0]:
-                before = {"image": _of("given", first)}
+                before = {"image": _picture_column("given", first)}
                 figures.append({"label": "last frame given", "images": before})
         for method, one in shown:
             kinds = [("image", "image"), ("error", "error"), ("deviation", "uncertainty")]
-            images = {what: _of(kind, one) for kind, what in kinds if kind in one[0]}
+            images = {what: _picture_column(kind, one) for kind, what in kinds if kind in one[0]}
             figures.append({"label": method, "images": images})
         if curves or figures:
             name = names[recording]
@@ -373,7 +373,7 @@ def spread_rows(count: int, most: int) -> list[int]:
     return [(2 * k + 1) * count // (2 * most) for k in range(most)]
 
 
-def _of(kind: str, pictures: Sequence[Mapping[str, Any]]) -> list[str | None]:
+def _picture_column(kind: str, pictures: Sequence[Mapping[str, Any]]) -> list[str | None]:
     return [one.get(kind) for one in pictures]
 
 

@@ -512,7 +512,7 @@ def constrain_image_jax(
     return dataclasses.replace(fused, L=image, P=P)
 
 
-def _single(values: Any) -> NDArray[np.float32]:
+def _to_float32(values: Any) -> NDArray[np.float32]:
     return np.asarray(values, np.float32)
 
 
@@ -537,15 +537,15 @@ def constrain_image(
         The image with other `L` and `P`.
     """
     fused = dataclasses.replace(fused, P=_compiled_variance(params, fused, model))
-    L, P = _single(fused.L), _single(fused.P)
-    D = _single(_compiled_displacements(model.exposures, model.paths, samples))
+    L, P = _to_float32(fused.L), _to_float32(fused.P)
+    D = _to_float32(_compiled_displacements(model.exposures, model.paths, samples))
     B, _ = blur_by_motion(L, D)
     evidence, image = _compiled_evidence(params, model, D, B, fused), L
     for _ in range(N_CONSTRAINT_STEPS):
         B, shares = blur_by_motion(image, D)
-        pull, information = map(_single, _compiled_pull(params, evidence, B))
+        pull, information = map(_to_float32, _compiled_pull(params, evidence, B))
         back = blur_by_motion_adjoint(pull, shares, D)
         image = image + ((L - image) / P + back) / (1 / P + information)
     B, _ = blur_by_motion(image, D)
-    P = P + _single(params.smear) * _single(_compiled_squared_blur(evidence, image, B))
+    P = P + _to_float32(params.smear) * _to_float32(_compiled_squared_blur(evidence, image, B))
     return dataclasses.replace(fused, L=jnp.asarray(image), P=jnp.asarray(P))
