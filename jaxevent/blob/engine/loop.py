@@ -35,12 +35,24 @@ GRID_TIME, NEXT_ID = 0, 1  # in `KernelState.counters`
 
 
 class TrackFunctions(NamedTuple):
-    """Compiled functions of a filter."""
+    """Compiled functions of a filter, of one track each.
+
+    Attributes:
+        init: Begin a track.
+        step: Predict and update the only track that is alive, with all events of a step.
+        predict: Predict a track to the step's time, with its gate and likelihoods.
+        weights_alone: Weigh the events of a track where no event is in two gates.
+        weights: Weigh one event for all tracks.
+        update: Update a track with weighted events.
+        limit: Compute the longest time without events.
+        measurement: Predict the distribution of the next events.
+        decide: Confirm, delete or keep a track.
+    """
 
     init: Any
-    step: Any  # one event and the one track that is alive
+    step: Any
     predict: Any
-    weights_alone: Any  # of events that one gate alone contains
+    weights_alone: Any
     weights: Any
     update: Any
     limit: Any

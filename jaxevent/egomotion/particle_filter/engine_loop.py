@@ -45,7 +45,15 @@ NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(4)
 
 
 class ModelFunctions(NamedTuple):
-    """Compiled functions of a model."""
+    """Compiled functions of a model, of all particles each.
+
+    Attributes:
+        predict: Predict the particles to the batch.
+        track: Score events for a block of motions, near a known motion.
+        search: Score events for a block of motions, in a search.
+        reweight: Update the weights by the batch.
+        restart: Begin a search.
+    """
 
     predict: Any
     track: Any

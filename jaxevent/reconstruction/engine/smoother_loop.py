@@ -43,18 +43,31 @@ from jaxevent.reconstruction.stream import StreamState
 
 
 class SmootherPlaces(NamedTuple):
-    """Places of fields, in strides."""
+    """Places of fields, in strides.
+
+    Attributes:
+        stride: Pixels of a band, with its border.
+        work: Number of fields of the frame that a pass has come to.
+        row: Number of fields that are stored for each frame.
+        image: Fields of grey value, intensity and certainty.
+        total: Fields of the sums over exposures, and of their derivatives.
+        inside: Field of events within exposures; -1: not needed.
+        side: Field of the side on which a pixel is clipped.
+        counts: Fields of ON and OFF events, and of those of the neighbours.
+        exposed: Whether exposures are known.
+        censored: Whether clipped frames measure anything.
+    """
 
     stride: int
-    work: int  # fields of the frame that a pass has come to
-    row: int  # fields that are stored for each frame
-    image: NDArray[np.int64]  # grey value, intensity, certainty
-    total: NDArray[np.int64]  # sums over exposures, and their derivatives
-    inside: int  # events within exposures; -1: not needed
+    work: int
+    row: int
+    image: NDArray[np.int64]
+    total: NDArray[np.int64]
+    inside: int
     side: int
-    counts: NDArray[np.int64]  # ON, OFF, and those of the neighbours
-    exposed: bool  # whether exposures are known
-    censored: bool  # whether clipped frames measure anything
+    counts: NDArray[np.int64]
+    exposed: bool
+    censored: bool
 
 
 class FrameTimeline(NamedTuple):
