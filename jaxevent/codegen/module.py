@@ -51,13 +51,21 @@ def get_or_make(known: dict[Any, T], key: Any, make: Callable[[], T]) -> T:
 
 
 class CompiledProgram(NamedTuple):
-    """A program's compiled functions, with the numbers of parameters."""
+    """A program's compiled functions, with the numbers of parameters.
+
+    Attributes:
+        program: The traced program.
+        functions: The functions, a tuple of the engine.
+        numbers: Numbers that the functions take.
+        places: Places where the functions find their data.
+        values: Values of the program's `host`.
+    """
 
     program: Any
     functions: Any
     numbers: NDArray
-    places: Any  # where the functions find their data
-    values: list[NDArray]  # of the program's `host`
+    places: Any
+    values: list[NDArray]
 
 
 class KernelCache:

@@ -74,11 +74,17 @@ class Candidates(eqx.Module):
 
 
 class CandidateBatches(NamedTuple):
-    """Some batches of candidates, with the events that they belong to."""
+    """Some batches of candidates, and the events that they belong to.
+
+    Attributes:
+        candidates: The candidates.
+        t: (batches,) time of the last event, us; empty batches repeat the one before.
+        row: (batches, K) rows of the events in the recording, -1 for padding.
+    """
 
     candidates: Candidates
-    t: NDArray[np.int64]  # (batches,) us, of the last event; empty batches repeat the one before
-    row: NDArray[np.int64]  # (batches, K) rows of the events in the recording, -1 for padding
+    t: NDArray[np.int64]
+    row: NDArray[np.int64]
 
 
 def pixel_coordinates(

@@ -57,13 +57,21 @@ def score_times(start: int, stop: int) -> NDArray[np.int64]:
 
 
 class TrainingSegment(NamedTuple):
-    """A part of a recording with known motion, from `start` to `stop` (us)."""
+    """A part of a recording with known motion.
+
+    Attributes:
+        recording: The recording.
+        start: First time, us.
+        stop: Time after the last, us.
+        known: The motion.
+        split: Index in `runs.family.SPLIT_NAMES`.
+    """
 
     recording: Recording
     start: int
     stop: int
     known: KnownMotion
-    split: int  # index in `runs.family.SPLIT_NAMES`
+    split: int
 
     def crop(self) -> Recording:
         """Return the part of the recording."""
@@ -376,14 +384,23 @@ class FixedEstimates(TrainingRuns):
 
 
 class HostInputs(NamedTuple):
-    """Inputs of a method that computes on the host."""
+    """Inputs of a method that computes on the host.
+
+    Attributes:
+        recording: The recording.
+        model: The motion model.
+        camera: Calibration; None: there is none.
+        seed: Seed of random numbers.
+        progress: Whether a bar is shown; None: if it takes long.
+        options: Options of this method alone.
+    """
 
     recording: Recording
     model: type[Model]
     camera: PinholeCamera | None
     seed: int
     progress: bool | None
-    options: Mapping[str, Any]  # of this method alone
+    options: Mapping[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -24,14 +24,22 @@ class DeviceEvents(eqx.Module):
     """A fixed number of events for `jax.jit`; those that pad the number are not valid.
 
     Times are int32 us since an origin, and so are all times that are passed with them.
+
+    Attributes:
+        t: Times, us.
+        x: Columns, px.
+        y: Rows, px.
+        p: Polarities, True for ON.
+        valid: Whether an event is real rather than padding.
+        size: Width and height of the sensor, px.
     """
 
-    t: Int[Numeric, "*batch n"]  # us
-    x: Int[Numeric, "*batch n"]  # column
-    y: Int[Numeric, "*batch n"]  # row
-    p: Bool[Numeric, "*batch n"]  # True: ON
+    t: Int[Numeric, "*batch n"]
+    x: Int[Numeric, "*batch n"]
+    y: Int[Numeric, "*batch n"]
+    p: Bool[Numeric, "*batch n"]
     valid: Bool[Numeric, "*batch n"]
-    size: Size = eqx.field(static=True)  # width, height, px
+    size: Size = eqx.field(static=True)
 
 
 AnyEvents = Events | Recording | DeviceEvents
@@ -85,9 +93,14 @@ def to_device(
 
 
 class _Increment(NamedTuple):
-    """Values that events add to an image each; numbers or (events,)."""
+    """Amounts that events add to an image; numbers or one for each event.
 
-    plane: Any  # the image of a stack
+    Attributes:
+        plane: Index of the image in a stack.
+        weight: The amount.
+    """
+
+    plane: Any
     weight: Any
 
 

@@ -288,7 +288,13 @@ def infer_format(
 
 
 class ColumnReadResult(NamedTuple):
-    """Events of named columns, with their clock and notes on how the unit of time was found."""
+    """Events of named columns, with their clock and notes on how the unit of time was found.
+
+    Attributes:
+        events: The events.
+        clock: Clock of images, poses and samples beside them.
+        notes: Remarks on the unit of time.
+    """
 
     events: EventSource
     clock: Clock

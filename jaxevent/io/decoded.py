@@ -165,7 +165,14 @@ def remember_call(load: Callable[P, Recording]) -> Callable[P, Recording]:
 
 
 class _Block(NamedTuple):
-    """A block of a file: the decoder's state before it, its first row, its first and last time."""
+    """A block of a file.
+
+    Attributes:
+        state: State of the decoder before it.
+        row: Row of its first event.
+        first: Its first time, us.
+        last: Its last time, us.
+    """
 
     state: Any
     row: int

@@ -89,7 +89,13 @@ def _parse_repair(text: str, kind: str, value: str | None) -> dict[str, Any]:
 
 
 class Reset(NamedTuple):
-    """A clock that is set back: the row of the first event after it, and times (us) around it."""
+    """A clock that is set back.
+
+    Attributes:
+        row: Row of the first event after it.
+        before: Last time before it, us.
+        after: First time after it, us.
+    """
 
     row: int
     before: int

@@ -114,7 +114,13 @@ def _decompress(path: Path) -> BytesIO:
 
 
 class _Element(NamedTuple):
-    """One element of a variable: its type and bytes, and the offset of the next element."""
+    """One element of a variable.
+
+    Attributes:
+        kind: Its type.
+        data: Its bytes.
+        stop: Offset of the next element.
+    """
 
     kind: int
     data: memoryview

@@ -101,14 +101,24 @@ def refine(
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """Linear model of the changes of all pairs, and its fit."""
+    """Linear model of the changes of all pairs, and its fit.
 
-    X: NDArray[np.float64]  # (values, 3): ON, OFF and 1
-    D: NDArray[np.float64]  # (values,)
-    slope: NDArray[np.float64]  # (values, 2) of D, per px of the other camera
-    use: NDArray[np.bool_]  # (pairs, n): which these are
-    weight: NDArray[np.float64]  # (values,)
-    b: NDArray[np.float64]  # (3,)
+    Attributes:
+        X: (values, 3) ON and OFF events, and 1.
+        D: (values,) changes of log intensity.
+        slope: (values, 2) derivative of `D` per px of the other camera.
+        use: (pairs, n) whether a value of a pair is used.
+        weight: (values,) weights.
+        b: (3,) coefficients.
+        agreement: Correlation of the fit with the changes.
+    """
+
+    X: NDArray[np.float64]
+    D: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+    b: NDArray[np.float64]
     agreement: float
 
 

@@ -310,12 +310,19 @@ def _samples(
 
 
 class _Pixels(NamedTuple):
-    """Pixels of a sensor while events are simulated, each (pixels,)."""
+    """Pixels of a sensor while events are simulated.
 
-    on: NDArray[np.float64]  # thresholds, ln intensity
+    Attributes:
+        on: (pixels,) thresholds of ON events, ln intensity.
+        off: (pixels,) thresholds of OFF events, ln intensity.
+        reference: (pixels,) level at the last event; updated.
+        ready: (pixels,) end of the dead time, us; updated.
+    """
+
+    on: NDArray[np.float64]
     off: NDArray[np.float64]
-    reference: NDArray[np.float64]  # level at the last event; updated
-    ready: NDArray[np.float64]  # us, end of the dead time; updated
+    reference: NDArray[np.float64]
+    ready: NDArray[np.float64]
 
 
 class _NoiseEvents(NamedTuple):

@@ -294,14 +294,23 @@ class Problem(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Residuals, weights and cost of a scene."""
+    """Residuals, weights and cost of a scene.
+
+    Attributes:
+        scene: The scene.
+        samples: Projections of events, and the map's values there.
+        residual: (E,) residuals before the means of series are subtracted, C.
+        weight: (E,) weights.
+        objective: Sum that steps reduce: robust cost and priors.
+        cost: Robust cost per event, C^2.
+    """
 
     scene: Scene
     samples: MapSamples
-    residual: NDArray  # (E,) C, before the means of series are subtracted
-    weight: NDArray  # (E,)
-    objective: float  # that steps reduce: robust cost and priors
-    cost: float  # robust, C^2 per event
+    residual: NDArray
+    weight: NDArray
+    objective: float
+    cost: float
 
 
 def path_unknowns(scene: Scene, unit: NDArray) -> NDArray[np.float64]:

@@ -98,10 +98,17 @@ class CameraMotion(NamedTuple):
 
 
 class CellGrid(NamedTuple):
-    """Square cells of the reference view, row by row."""
+    """Square cells of the reference view, row by row.
 
-    corner: tuple[float, float]  # px, position of the first pixel of the first cell
-    size: int  # px
+    Attributes:
+        corner: Position of the first pixel of the first cell, px.
+        size: Side of a cell, px.
+        rows: Rows of cells.
+        columns: Columns of cells.
+    """
+
+    corner: tuple[float, float]
+    size: int
     rows: int
     columns: int
 

@@ -75,12 +75,19 @@ class Features(eqx.Module):
 
 
 class ReadoutTimes(eqx.Module):
-    """Positions of times between batches."""
+    """Positions of times between batches.
 
-    before: Any  # (times,) batch
-    after: Any  # (times,) batch
+    Attributes:
+        before: (times,) batch before each time.
+        after: (times,) batch after each time.
+        fraction: Part of the interval between both that is over, 0..1.
+        inside: Whether the time is in the recording, from the first batch on.
+    """
+
+    before: Any
+    after: Any
     fraction: Float[Array | np.ndarray, " times"]
-    inside: Bool[Array | np.ndarray, " times"]  # of the recording, from the first batch on
+    inside: Bool[Array | np.ndarray, " times"]
 
 
 @renamed_methods(gatherer="sampler")
@@ -766,7 +773,13 @@ def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
 
 
 class CandidateRange(NamedTuple):
-    """Candidates that the next batches can need; see `CandidateSampler.sample`."""
+    """Candidates that the next batches can need; see `CandidateSampler.sample`.
+
+    Attributes:
+        youngest: Least age, s; an array (rows, columns) is for as many equal parts of the sensor.
+        oldest: Largest age, s; likewise.
+        expected: Flow near which candidates are sampled; None: all are.
+    """
 
     youngest: float | NDArray[np.floating]
     oldest: float | NDArray[np.floating]

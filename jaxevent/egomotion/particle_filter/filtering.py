@@ -385,7 +385,13 @@ def restart(
 
 
 class BatchNoise(eqx.Module):
-    """Random numbers of one batch, see `RandomNumbers`."""
+    """Random numbers of one batch, see `RandomNumbers`.
+
+    Attributes:
+        normal: Normal numbers that move the particles.
+        uniform: Uniform number for resampling, 0..1.
+        cloud: Uniform numbers in [-1, 1], for a search that begins in this batch.
+    """
 
     normal: Float[Array, "N d"]
     uniform: Float[Array, ""]
