@@ -62,9 +62,7 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
         if reference is None:
             reference = image
             continue
-        motion = _align(
-            reference, image, _find_shift(reference, image) if motion is None else motion
-        )
+        motion = _align(reference, image, _offset(reference, image) if motion is None else motion)
         turn, shift = _rigid_motion(motion, shape)
         middle = corner + (bins * shape[::-1] - 1) / 2
         moved = bins * shift + middle - turn @ middle
@@ -114,7 +112,7 @@ def _rigid_motion(motion: NDArray, shape: NDArray) -> tuple[NDArray, NDArray]:
     return after_half @ (np.eye(2) + half), after_half @ motion[1:]
 
 
-def _find_shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+def _offset(one: NDArray, other: NDArray) -> NDArray[np.float64]:
     """Return the motion (3,) without turn at which two images correlate most.
 
     Args:
