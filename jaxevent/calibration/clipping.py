@@ -104,7 +104,7 @@ def _find_pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
 
 
 def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:
-    """Return how far beyond white clipped pixels lie on average, ln I.
+    """Return the mean distance of clipped pixels beyond white, ln I.
 
     If the density of ln I falls exponentially, with mean m, from the band below white on, then the
     band holds exp(BAND / m) - 1 pixels for each one beyond white.

@@ -748,7 +748,7 @@ class HeldOutTest:
         return other if self.z(one, other) > 0 else one
 
     def z(self, one: Scene, other: Scene) -> float:
-        """Return by how much held-out events prefer one scene to another.
+        """Compare two scenes by the cost of held-out events.
 
         Args:
             one: A scene.

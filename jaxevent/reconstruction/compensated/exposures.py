@@ -311,7 +311,7 @@ def blur_by_motion_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArr
 
 
 def exposure_displacements(exposures: AdjacentExposures, paths: Array, samples: int) -> Array:
-    """Return how far points move from mid-exposure to the samples of each exposure.
+    """Return the displacements of points from mid-exposure to the samples of each exposure.
 
     Args:
         exposures: The n exposures.

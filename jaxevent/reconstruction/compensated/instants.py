@@ -159,7 +159,7 @@ def fit_motion_clock(
 
 
 def common_motion_fraction(counts: NDArray[np.floating]) -> float:
-    """Estimate how far the parts of the image move in common.
+    """Estimate the fraction of the motion that all parts of the image have in common.
 
     Returns the slope of a regression: of the deviation of a part's rate of events from a constant
     one, on that of all other parts.

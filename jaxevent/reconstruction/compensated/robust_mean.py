@@ -386,7 +386,7 @@ def _fill_variance(inputs, k, y, steepness, out):
 
 @njit_noalloc_inlined
 def _fill_visibility(residual, tolerance, most, out):
-    """Write how far points are visible, by residuals around them.
+    """Write the visibility of points, by residuals around them.
 
     Args:
         residual: (w,) blurred squared residuals in units of their variance.

@@ -28,7 +28,7 @@ CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
 
 
 class PathTimes(NamedTuple):
-    """Instants on the clock of paths, and how far all points have moved beside their paths."""
+    """Instants on the clock of paths, and displacements of all points beside their paths."""
 
     s: Float[Numeric, " k"]  # relative to the target, -1..1
     common: Float[Numeric, "k 2"]  # displacement along x and y that all points share, px
