@@ -629,7 +629,7 @@ def scale_levels(frames: Any, white: Any, what: str = "frames") -> NDArray:
 
 
 def doubt_levels(images: NDArray) -> str | None:
-    """Return what shows that images of uint16 hold fewer bits, and the remedy; None of others.
+    """Describe the sign that images of uint16 hold fewer bits, and the remedy; None without one.
 
     Args:
         images: (n, height, width) images, of which at most `_JUDGED_IMAGES` are looked at.

@@ -382,7 +382,7 @@ def _rises_otherwise(
     width: float,
     curvature: float,
 ) -> bool:
-    """Return true if the loss at the ends of an interval is not what the curvature predicts.
+    """Return true if the loss at the ends of an interval differs from the curvature's prediction.
 
     Args:
         sample: The loss of all parts.

@@ -121,7 +121,7 @@ def _describe_span(what: str, number: int, t: Any) -> str:
 
 
 def _doubt_times(events: NDArray[np.int64], frames: "Frames") -> str | None:
-    """Return what shows that frames have another unit of time than events, or None.
+    """Describe the sign that frames have another unit of time than events; None without one.
 
     Args:
         events: (n,) times of events, us.

@@ -213,7 +213,7 @@ def infer_unit(
 def doubt_given_unit(
     t: NDArray, x: NDArray, y: NDArray, size: tuple[int, int], unit: str | None
 ) -> str | None:
-    """Compare events in a unit that a caller gives with what recordings are like.
+    """Compare events, in a unit that a caller gives, with typical recordings.
 
     Args:
         t: (n,) times as given.
@@ -243,7 +243,7 @@ def doubt_given_unit(
 def doubt_microseconds(
     sample: Mapping[str, NDArray], n_events: int, size: tuple[int, int]
 ) -> str | None:
-    """Compare a recording that something else makes doubtful with what recordings are like.
+    """Compare a recording that is doubtful for another reason with typical ones.
 
     Args:
         sample: Columns t (us), x and y, (n,) each: the first events, and then the last one.

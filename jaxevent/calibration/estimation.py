@@ -165,7 +165,7 @@ def _first_fit(model: Model, clock: Clock) -> Fit | None:
 def _fit_sensor(
     sample: Sample, slope: NDArray[np.float64], clock: Clock, is_unknown: bool
 ) -> tuple[Model, Fit] | None:
-    """Fit what does not depend on the logarithm that a method works in.
+    """Fit the numbers that do not depend on the logarithm that a method works in.
 
     Where thresholds are not the same at all intensities, changes lie off the model by more than
     noise, and the clock follows them: the fit is at the dark offset that the frames prefer.
@@ -234,7 +234,7 @@ def _without_fit(
     why: str,
     clock: Clock | None = None,
 ) -> Calibration:
-    """Return what is known without a fit to frames."""
+    """Return the calibration that needs no fit to frames."""
     units = {
         "clock_offset": "s", "clock_drift": "s/s", "c_on": "ln I", "c_off": "ln I",
         "dark_offset": "intensity", "event_noise": "c", "frame_noise": "grey", "exposure": "s",
@@ -346,7 +346,7 @@ def _thresholds(fit: Fit) -> tuple[CalibrationValue, CalibrationValue, Calibrati
 
 
 def _gap(fit: Fit, column: int, power: int) -> float:
-    """Return the mean power of the time between events where they tell of a parameter.
+    """Return the mean power of the time between events, weighted by their effect on a parameter.
 
     Args:
         fit: The fit.

@@ -102,7 +102,7 @@ def _recall(
 
 
 def hash_content(recording: Recording, what: float | str) -> str:
-    """Hash samples of a recording, its sizes, the source of the estimator and what is asked.
+    """Hash samples of a recording, its sizes, the source of the estimator and the request.
 
     Args:
         recording: The recording.
@@ -245,7 +245,7 @@ def format_toml(
 
 
 def _read(key: str, of_bytes: Callable[[bytes], Any]) -> Any:
-    """Return what is kept under a key; None where it is missing or damaged."""
+    """Return the value that is stored under a key; None where it is missing or damaged."""
     folder = cache.folder_for_calibrations()
     with contextlib.suppress(Exception):  # whatever NumPy says of damaged archives
         if folder is not None:
@@ -254,7 +254,7 @@ def _read(key: str, of_bytes: Callable[[bytes], Any]) -> Any:
 
 
 def _write(key: str, content: bytes) -> None:
-    """Keep what was found where this is possible, and at most `N_KEPT_FILES` in all."""
+    """Store a result where this is possible, and at most `N_KEPT_FILES` in all."""
     folder = cache.folder_for_calibrations()
     if folder is None:
         return

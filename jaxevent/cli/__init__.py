@@ -108,7 +108,7 @@ def _collect_seldom(ends: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _shown(words: Sequence[str]) -> Iterator[None]:
-    """Say in a terminal which command runs, wherever it says no more itself."""
+    """Name the running command in a terminal, unless it prints more itself."""
     if not sys.stderr.isatty():
         yield
         return
@@ -279,7 +279,7 @@ def _silence(stream: Any) -> None:
 
 
 class _PrintCompletion(argparse.Action):
-    """Print what shtab makes of the parser, and exit."""
+    """Print the completion script that shtab makes of the parser, and exit."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
         try:

@@ -135,7 +135,7 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
 
 
 def add_live(one: argparse.ArgumentParser, printed: str) -> None:
-    """Add the option --live, by which a command prints what events show as they come."""
+    """Add the option --live, by which a command prints estimates as events come."""
     one.add_argument(
         "--live",
         action="store_true",

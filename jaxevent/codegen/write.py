@@ -354,7 +354,7 @@ class ModuleWriter:
         return (begin,) if node.op == "number" else (begin, count - 1)
 
     def _text(self, node: Node) -> str:
-        """Return the text of what no block computes."""
+        """Return the lines of the nodes that no block computes."""
         found = self.addresses.get(node.args[0]) if node.op == "input" else None
         if isinstance(found, str):
             return found

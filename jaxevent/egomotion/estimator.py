@@ -228,7 +228,7 @@ class MotionEstimator(Estimator[P]):
     def check_against(
         self, recording: Recording, motion: MotionEstimate, camera: PinholeCamera | None
     ) -> MotionEstimate:
-        """Return a motion with what the whole recording shows, see `with_flow_consistency`.
+        """Add the evidence of the whole recording to a motion, see `with_flow_consistency`.
 
         Args:
             recording: The recording.
@@ -490,7 +490,7 @@ class HostEstimator(MotionEstimator[P]):
         return motion
 
     def _solve(self, recording: Recording, params: P | None, **options: Any) -> MotionEstimate:
-        """Estimate the motion, and say nothing if it is lost.
+        """Estimate the motion, without a warning if it is lost.
 
         Args:
             recording: The recording.

@@ -121,7 +121,7 @@ class LiveMotion:
 
     @synchronized
     def finish(self) -> MotionEstimate:
-        """Estimate what the last events show, and return the estimates that are new."""
+        """Estimate the motion at the last events, and return the estimates that are new."""
         self._is_finished = True
         return self._run(until_end=True)
 

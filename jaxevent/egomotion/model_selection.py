@@ -81,7 +81,7 @@ class ModelSelection:
     camera: PinholeCamera | None = None
 
     def include_doubt(self, motion: MotionEstimate) -> MotionEstimate:
-        """Add what the models that are not excluded tell otherwise to the covariance.
+        """Add the differences of models that are not excluded to the covariance.
 
         Args:
             motion: A motion of the selected model.
@@ -213,7 +213,7 @@ class _WindowFits(NamedTuple):
 def _model_doubt(
     model: type[Model], fits: list[_WindowFits], against: dict[str, float]
 ) -> tuple[NDArray[np.float64] | None, list[str]]:
-    """Average what other models tell, by their weights exp(-z^2 / 2) relative to the chosen one.
+    """Average the squared differences of other models, by their weights exp(-z^2 / 2).
 
     Args:
         model: The chosen model.

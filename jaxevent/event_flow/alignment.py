@@ -463,7 +463,7 @@ class WindowEvents(NamedTuple):
 
 
 class Displacement(NamedTuple):
-    """Displacement of nodes and what events tell of it."""
+    """Displacement of nodes, with its information and covariance."""
 
     u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
     clock: Clock

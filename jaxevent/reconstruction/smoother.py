@@ -700,7 +700,7 @@ class Smoother(KernelEstimator[AnyParams]):
     def readout_inputs(
         self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
     ) -> Any:
-        """Return what images need of frames beside the messages; here nothing.
+        """Return the data of frames that images need beside the messages; here none.
 
         Args:
             params: Parameters.

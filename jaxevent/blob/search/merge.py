@@ -94,7 +94,7 @@ class OwnFrame(NamedTuple):
         return self._replace(stream=stream)._connect(one, other)
 
     def _connect(self, one: TargetPath, other: TargetPath) -> TargetPath | None:
-        """Return the path of what connects two pieces by all events of the stream."""
+        """Return the path of the part between two pieces, by all events of the stream."""
         rows = merge_paths(one, other)
         both = [interpolate_path(path, rows.t).p for path in (one, other)]
         # Means of several windows, for pieces slide along their outline.

@@ -297,7 +297,7 @@ def _required_gain(moving: Background) -> float | None:
 
 
 def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
-    """Compute what a map gains by moving, in most windows.
+    """Compute the gain of a map that moves over one at rest, in most windows.
 
     Things that move differently are no scene: where they are, some places gain, and others lose.
 

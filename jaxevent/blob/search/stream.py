@@ -133,7 +133,7 @@ class Stream:
             yield part, owner_candidates(part, table, sigmas)
 
     def _leave_out(self, masks: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
-        """Leave out events, told by the first row of each batch and a mask of its events."""
+        """Leave out events, given by the first row of each batch and a mask of its events."""
         kept = np.ones(self._last - self._first, bool)
         if self._kept is not None:
             kept &= self._kept[: len(kept)]
@@ -213,7 +213,7 @@ class Stream:
         return first, last
 
     def _read(self, first: int, last: int) -> Events:
-        """Return those of a range of rows that are not left out."""
+        """Return the events of a range of rows, without those left out."""
         events = self._events[first:last]
         if self._kept is None:
             return events

@@ -546,7 +546,7 @@ def _without_heading(
 def _ambiguity_covariance(
     test: "HeldOutTest", path: Path, best: Scene, others: list[tuple[Path, Scene]]
 ) -> NDArray[np.float64]:
-    """Return what other motions add to a path's covariance, by their likelihood, exp(-z^2 / 2).
+    """Return the covariance that other motions add, by their likelihood exp(-z^2 / 2).
 
     Args:
         test: Test with held-out pixels.

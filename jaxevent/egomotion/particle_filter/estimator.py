@@ -346,7 +346,7 @@ class VotingEstimator(MotionEstimator[Params]):
         sampler: CandidateSampler,
         camera: PinholeCamera | None,
     ) -> LockDetector | None:
-        """Return the test of what the filter finds; None for likelihoods and models without one."""
+        """Return the test of the motions found; None for likelihoods and models without one."""
         if params.likelihood == "literal" or model.half_line:
             return None
         diffusion = jax.jit(functools.partial(model.diffusion, params))
@@ -465,7 +465,7 @@ class ChunkRunner:
     def causal_motion(
         self, parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]]
     ) -> MotionEstimate:
-        """Join what `run` returned for some chunks to a causal estimate."""
+        """Join the results of `run` for some chunks to a causal estimate."""
         motion = dataclasses.replace(join_reports(self.model, parts), causal=True)
         return calibrate(motion, self.camera)
 
@@ -474,7 +474,7 @@ class ChunkRunner:
         parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]],
         smooth: bool = True,
     ) -> MotionEstimate:
-        """Join what `run` returned for all chunks to an estimate.
+        """Join the results of `run` for all chunks to an estimate.
 
         Args:
             parts: What it returned.

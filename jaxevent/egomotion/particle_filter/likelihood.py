@@ -262,7 +262,7 @@ def init_votes(
     weights: Float[Array, " N"],
     searching: Bool[Array, ""] | bool,
 ) -> Votes:
-    """Compute what each particle expects of the candidates of one event.
+    """Compute each particle's expectation of the candidates of one event.
 
     Args:
         params: The parameters.

@@ -241,7 +241,7 @@ class CompensatedVideo(ImageSequence[Params]):
             yield target
 
     def _begin(self, t: int) -> Callable[[], Target]:
-        """Begin the target at a time (us); return what refines it, on any thread."""
+        """Begin the target at a time (us); return the function that refines it, on any thread."""
         latest = self._latest
         if latest is not None and latest.t == t:
             return lambda: latest

@@ -377,7 +377,7 @@ def clipped_part(params: Params, model: ExposureModel) -> Array | None:
 
 
 def clipped_variance(params: Params, fused: FusedImage, model: ExposureModel) -> Array:
-    """Return the variance of an image, no less than events alone can tell of points at white.
+    """Return the variance of an image, at white no less than that by events alone.
 
     A point that all frames next to the target show clipped is known by events, to within a
     threshold, and by frames that showed it darker, if they did: no evidence that it is as dark.

@@ -526,7 +526,7 @@ def _add_excess(inputs, k, y, residual, variance, sums):
 
 @njit_noalloc
 def _finish(begin, end, inputs, scratch, out):
-    """Write all but the scatter of some rows, and what the scatter is gathered from.
+    """Write all outputs but the scatter of some rows, and the sums for the scatter.
 
     Args:
         begin: First row.

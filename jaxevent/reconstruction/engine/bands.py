@@ -366,7 +366,7 @@ class PartitionedRecording:
         return self.windows.clock.origin
 
     def fixed_inputs(self, frame_delay: Any, has_variance: bool) -> dict[str, NDArray]:
-        """Return what kernels know beside parameters.
+        """Return the inputs of kernels beside parameters.
 
         Args:
             frame_delay: Time added to the frames' stamps that windows were made for, s.
@@ -540,7 +540,7 @@ def ceil_to_us(time_us):
 
 @njit_noalloc_inlined
 def load_frame_image(frames, table_kind, frame, bands, band, out_field):
-    """Write what a table says of a frame's pixels into a field of a band.
+    """Write the values of a frame's pixels, by a table, into a field of a band.
 
     Args:
         frames: `FrameRows`.

@@ -248,12 +248,12 @@ class FilterProgram:
         return [] if self.derivatives is None else self.derivatives.factors_of(*names)
 
     def results(self) -> list[Node]:
-        """Return what is computed at a point."""
+        """Return the nodes that are computed at a point."""
         names = [] if self.derivatives is None else [*self.derivatives.factors]
         return [*self.state.values(), self.mean, self.variance, *self.factors(*names)]
 
     def table_derivatives(self, variant: int) -> list[tuple[int, int, Node]]:
-        """Return what a piece adds to derivatives: vector, direction, expression."""
+        """Return the terms that a piece adds to derivatives: vector, direction, expression."""
         changes = [] if self.derivatives is None else self.derivatives.changes
         return [
             (k, lane, nodes[variant])
@@ -428,7 +428,7 @@ def _input(
 
 
 def _substitute(results: dict[str, Node], known: dict[Node, Node], graph: Graph) -> Any:
-    """Put other nodes in place of some, and simplify what uses them."""
+    """Replace some nodes by others, and simplify the nodes that use them."""
     new = dict(known)
     for node in find_dependencies([*results.values()]):
         arguments = [a for a in node.args if isinstance(a, Node)]
@@ -443,7 +443,7 @@ def _slots(results: dict[str, Node]) -> list[Node]:
 
 
 def _fill_slots(results: dict[str, Node], table: list[Node], graph: Graph) -> dict[str, Node]:
-    """Put what slots hold in place of the slots."""
+    """Replace slots by the nodes that they hold."""
     while slots := _slots(results):
         results = _substitute(results, {slot: table[slot.args[0]] for slot in slots}, graph)
     return results

@@ -586,7 +586,7 @@ def _neighbour_fractions(layout: BandLayout, width: int, height: int) -> NDArray
 
 
 class SmootherPasses:
-    """A smoother's kernel for a recording, and what passes over its frames take.
+    """A smoother's kernel for a recording, and the inputs of passes over its frames.
 
     Args:
         recording: The recording, divided among bands.

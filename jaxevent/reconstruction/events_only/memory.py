@@ -58,7 +58,7 @@ class MemoryParams(NamedTuple):
 
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
-    """Return what the rows of a window say of the gradient at each pixel (4).
+    """Measure the gradient at each pixel by the rows of a window (4).
 
     Args:
         rows: Equations of the window.
@@ -109,7 +109,7 @@ def _add_row(a, b, change, weight, information, eta):
 
 @njit_noalloc
 def _add_rows(rows, weight, c, information, eta):
-    """Add what rows say of the gradient, each shared out among the pixels between its two look-ups.
+    """Add the evidence of rows on the gradient, each shared out between its two look-ups' pixels.
 
     Args:
         rows: `Rows` of a window.
@@ -454,7 +454,7 @@ class KeyMemories:
         return min(-(-row // self.step), self.last)
 
     def prior(self, rows: Rows, at: int, first: int, last: int | None) -> GradientPrior:
-        """Return what the windows before and after one say of its image.
+        """Return the prior of a window's gradient by the windows before and after it.
 
         Where images are causal, a window begins at least two steps before its image: flow for the
         memory rests on so many events after the key.
@@ -553,7 +553,7 @@ class KeyMemories:
         return fuse(discount(carried, new, self.threshold, self.params.tail), new, self.threshold)
 
     def _measure(self, key: int, side: int) -> GradientPrior:
-        """Return what the events from a key to the next one on the way say of the gradient there.
+        """Measure the gradient by the events from a key to the next one on the way.
 
         A pixel's first row begins at its last event before the key, if it has one since the key
         before: otherwise windows of few events would find gradients too small. Silence after a
