@@ -75,19 +75,12 @@ class Features(eqx.Module):
 
 
 class ReadoutTimes(eqx.Module):
-    """Positions of times between batches.
+    """Positions of times between batches."""
 
-    Attributes:
-        before: (times,) batch before each time.
-        after: (times,) batch after each time.
-        fraction: Part of the interval between both that is over, 0..1.
-        inside: Whether the time is in the recording, from the first batch on.
-    """
-
-    before: Any
-    after: Any
+    before: Any  # (times,) batch
+    after: Any  # (times,) batch
     fraction: Float[Array | np.ndarray, " times"]
-    inside: Bool[Array | np.ndarray, " times"]
+    inside: Bool[Array | np.ndarray, " times"]  # of the recording, from the first batch on
 
 
 @renamed_methods(gatherer="sampler")
@@ -346,7 +339,7 @@ class VotingEstimator(MotionEstimator[Params]):
         sampler: CandidateSampler,
         camera: PinholeCamera | None,
     ) -> LockDetector | None:
-        """Return the test of the motions found; None for likelihoods and models without one."""
+        """Return the test of what the filter finds; None for likelihoods and models without one."""
         if params.likelihood == "literal" or model.half_line:
             return None
         diffusion = jax.jit(functools.partial(model.diffusion, params))
@@ -465,7 +458,7 @@ class ChunkRunner:
     def causal_motion(
         self, parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]]
     ) -> MotionEstimate:
-        """Join the results of `run` for some chunks to a causal estimate."""
+        """Join what `run` returned for some chunks to a causal estimate."""
         motion = dataclasses.replace(join_reports(self.model, parts), causal=True)
         return calibrate(motion, self.camera)
 
@@ -474,7 +467,7 @@ class ChunkRunner:
         parts: list[tuple[NDArray[np.int64], Any, NDArray[np.bool_]]],
         smooth: bool = True,
     ) -> MotionEstimate:
-        """Join the results of `run` for all chunks to an estimate.
+        """Join what `run` returned for all chunks to an estimate.
 
         Args:
             parts: What it returned.
@@ -773,13 +766,7 @@ def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
 
 
 class CandidateRange(NamedTuple):
-    """Candidates that the next batches can need; see `CandidateSampler.sample`.
-
-    Attributes:
-        youngest: Least age, s; an array (rows, columns) is for as many equal parts of the sensor.
-        oldest: Largest age, s; likewise.
-        expected: Flow near which candidates are sampled; None: all are.
-    """
+    """Candidates that the next batches can need; see `CandidateSampler.sample`."""
 
     youngest: float | NDArray[np.floating]
     oldest: float | NDArray[np.floating]
