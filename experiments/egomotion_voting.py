@@ -240,7 +240,7 @@ def part_rotation(seeds: range) -> Table:
     return "rotation, 2 rad/s", rows
 
 
-def _turn(source: Any) -> Callable[[NDArray], NDArray]:
+def _true_rotation(source: Any) -> Callable[[NDArray], NDArray]:
     return lambda t: source.twist(t)[1]
 
 
@@ -267,7 +267,7 @@ def part_penalty(seeds: range) -> Table:
                         recording, params, model=model, seed=seed, smooth=False
                     )
                     times = np.arange(SETTLE, duration - 1e-6, 0.005)
-                    truth = source.velocity if model == "planar" else _turn(source)
+                    truth = source.velocity if model == "planar" else _true_rotation(source)
                     errors.append(motion_errors(motion, params, truth, times)["at once"])
                 row[f"{r_t:.2g}"] = float(np.exp(np.log(errors).mean()))
             rows.append(row)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import jaxevent
 from jaxevent import register
 from jaxevent.camera import PinholeCamera
-from jaxevent.egomotion.geometry import undistort
+from jaxevent.egomotion.geometry import centred_coordinates
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import (
     SENSORS,
@@ -83,7 +83,7 @@ class CameraView:
 
     def __post_init__(self) -> None:
         y, x = np.mgrid[: self.size[1], : self.size[0]].reshape(2, -1)
-        at, f = undistort(self.camera, x, y)
+        at, f = centred_coordinates(self.camera, x, y)
         ray = np.concatenate([at / f, np.ones((len(at), 1))], 1) @ self.rotation
         object.__setattr__(self, "_ray", ray)
 

@@ -367,7 +367,7 @@ def check_span(
         )
         shown = f"{values[row]:.16g}" if is_float else str(values[row])
         raise InputError(
-            f"{_place(source)}{what} {first_row + row} has the time {shown}, not finite "
+            f"{_intro(source)}{what} {first_row + row} has the time {shown}, not finite "
             f"or too large for {unit}; correct the unit or remove it"
         )
 
@@ -388,7 +388,7 @@ def numbers(values: NDArray, source: str, what: str) -> NDArray:
     """
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise InputError(
-            f"{_place(source)}{what} is {values.dtype} of shape {values.shape}; store a list of "
+            f"{_intro(source)}{what} is {values.dtype} of shape {values.shape}; store a list of "
             "numbers"
         )
     return values
@@ -399,7 +399,8 @@ def shorten_value(value: Any) -> str:
     return " ".join(repr(value).split())[:60]
 
 
-def _place(source: str) -> str:
+def _intro(source: str) -> str:
+    """Return the beginning of a message: the source and a colon, or nothing."""
     return f"{source}: " if source else ""
 
 
@@ -420,11 +421,11 @@ def as_size(width: Any, height: Any, source: str) -> tuple[int, int]:
     for name, side in (("width", width), ("height", height)):
         if not isinstance(side, int | np.integer) or isinstance(side, bool):
             raise InputError(
-                f"{_place(source)}{name} is {shorten_value(side)}; give a whole number of pixels"
+                f"{_intro(source)}{name} is {shorten_value(side)}; give a whole number of pixels"
             )
     if min(width, height) < 1 or max(width, height) > MAX_SIDE_PX:
         raise InputError(
-            f"{_place(source)}the sensor has {width}x{height} pixels, but at most {MAX_SIDE_PX} "
+            f"{_intro(source)}the sensor has {width}x{height} pixels, but at most {MAX_SIDE_PX} "
             "of a side, and at least one, can be read; correct its size with size=(width, height) "
             "or --size"
         )
@@ -475,7 +476,7 @@ def coordinates(
         if values[bad_row] != np.rint(values[bad_row]):
             remedy = "round x and y to the pixels of the sensor"
         raise InputError(
-            f"{_place(source)}event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; "
+            f"{_intro(source)}event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; "
             f"{on}{name} is a whole number from {origin} to {last}, so {remedy}"
         )
     return as_plain(values - origin if origin else values, np.uint16)
@@ -510,12 +511,12 @@ def polarities(p: NDArray, source: str, first_row: int = 0) -> NDArray[np.bool_]
         if p[row] == 255 and on.any():
             remedy = "p == 1, if 255 is -1 without its sign"
         raise InputError(
-            f"{_place(source)}event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 "
+            f"{_intro(source)}event {first_row + row} has the polarity {p[row]:.12g}; it must be 1 "
             f"for ON and 0 or -1 for OFF; give {remedy}"
         )
     if off.any() and negative.any():
         raise InputError(
-            f"{_place(source)}polarities 0 and -1 both occur; use 0/1 or -1/1 throughout, 1 being "
+            f"{_intro(source)}polarities 0 and -1 both occur; use 0/1 or -1/1 throughout, 1 being "
             "ON"
         )
     return on
@@ -536,7 +537,7 @@ def check_lengths(t: Any, x: Any, y: Any, p: Any, source: str) -> None:
     """
     if not len(t) == len(x) == len(y) == len(p):
         raise InputError(
-            f"{_place(source)}t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
+            f"{_intro(source)}t, x, y and p have {len(t)}, {len(x)}, {len(y)} and {len(p)} values; "
             "they must be equally long"
         )
 
@@ -628,7 +629,7 @@ def scale_levels(frames: Any, white: Any, what: str = "frames") -> NDArray:
 
 
 def doubt_levels(images: NDArray) -> str | None:
-    """Return what shows that images of uint16 hold fewer bits, and the remedy; None of others.
+    """Describe the sign that images of uint16 hold fewer bits, and the remedy; None without one.
 
     Args:
         images: (n, height, width) images, of which at most `_JUDGED_IMAGES` are looked at.

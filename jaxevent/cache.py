@@ -34,7 +34,7 @@ _OPEN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # which not e
 
 
 def keep_compiled() -> Path | None:
-    """Have JAX keep what it compiles; returns the folder, or None where nothing is changed.
+    """Have JAX store compiled programs; returns the folder, or None where nothing is changed.
 
     The settings are variables of the environment too, because processes started later inherit them;
     in those, they are ours and not the user's own.

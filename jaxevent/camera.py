@@ -232,20 +232,22 @@ class SCurve(Response):
     def grey(self, intensity: Values) -> Float[Array, "..."]:
         inside = jnp.clip(jnp.asarray(intensity), 0, 1)
         # The rounding error of tanh may lead an ulp beyond the ends, which float frames may not.
-        grey = 0.5 + jnp.tanh(self.steepness * (inside - 0.5) / 2) / (2 * self._end())
+        grey = 0.5 + jnp.tanh(self.steepness * (inside - 0.5) / 2) / (2 * self._normaliser())
         return jnp.clip(grey, 0, 1)
 
     def intensity(self, grey: Values) -> Float[Array, "..."]:
-        return 0.5 + 2 / self.steepness * jnp.arctanh((2 * jnp.asarray(grey) - 1) * self._end())
+        return 0.5 + 2 / self.steepness * jnp.arctanh(
+            (2 * jnp.asarray(grey) - 1) * self._normaliser()
+        )
 
     def certainty(self, grey: Values) -> Float[Array, "..."]:
-        return 1 - ((2 * jnp.asarray(grey) - 1) * self._end()) ** 2
+        return 1 - ((2 * jnp.asarray(grey) - 1) * self._normaliser()) ** 2
 
     def table(self, entries: int = 256) -> Float[Array, " entries"]:
         """Return the intensities of evenly spaced grey values, as `TableResponse` takes them."""
         return self.intensity(jnp.linspace(0, 1, entries))
 
-    def _end(self) -> Float[Array, ""]:
+    def _normaliser(self) -> Float[Array, ""]:
         return jnp.tanh(self.steepness / 4)
 
 
@@ -325,7 +327,7 @@ def estimate_response(
         InputError: Images and exposures do not fit together or all have one exposure, too few
             pixels are usable, or a setting is outside its range.
     """
-    stack, times = _stack(images, exposures)
+    stack, times = _check_stack(images, exposures)
     if len(np.unique(times)) < 2:
         raise InputError(
             f"{len(stack)} images of one exposure time determine no camera response; give images "
@@ -352,7 +354,7 @@ def estimate_response(
     return TableResponse(levels, np.where(shown & (slope > 0), 1 / np.maximum(slope, 1e-9), 0))
 
 
-def _stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
+def _check_stack(images: NDArray, exposures: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
     """Check the images and exposure times of a stack.
 
     Args:
@@ -477,7 +479,7 @@ def merge_exposures(
     Raises:
         InputError: Images and exposures do not fit together.
     """
-    stack, times = _stack(images, exposures)
+    stack, times = _check_stack(images, exposures)
     reference = float(times[0]) if reference is None else reference
     if not 0 < reference < np.inf or not 0 <= margin < 127:
         raise InputError(

@@ -79,6 +79,15 @@ class ParameterInterval:
     An end that is None is open: the loss does not rise enough within the range of the search.
     Without an interval both ends are NaN. `remark` says why an interval may not be trusted; it is
     mostly empty.
+
+    Attributes:
+        name: Name of the parameter.
+        unit: Its unit.
+        start: Value before the fit.
+        value: Value that was fitted or searched.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+        remark: Reason why the interval may not be trusted.
     """
 
     name: str
@@ -175,6 +184,16 @@ def confidence_intervals(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _parts(loss: Any, params: Any, batch: Any) -> tuple[Array, Array]:
+    """Return the loss of the parts of a batch and their weights, compiled.
+
+    Args:
+        loss: A `PartwiseLoss`.
+        params: Parameters of the method.
+        batch: A batch.
+
+    Returns:
+        Losses and weights, both (parts,).
+    """
     return loss.parts(params, batch)
 
 
@@ -321,7 +340,7 @@ def _rescale_weights(weights: NDArray, whole: float) -> NDArray:
     return weights * (whole / max(float(weights.sum()), 1e-300))
 
 
-def _physical(number: Number, raw: float) -> float:
+def _to_physical(number: Number, raw: float) -> float:
     return float(number.physical(jnp.asarray(raw)))
 
 
@@ -351,8 +370,8 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
         if not remark and rough:
             remark = ROUGH
         label = name if not index else f"{name}[{index[0] + 1}]"
-        began, value = (_physical(number, raw) for raw in (begun[k], sample.at[k]))
-        low, high = (None if raw is None else _physical(number, raw) for raw in (low, high))
+        began, value = (_to_physical(number, raw) for raw in (begun[k], sample.at[k]))
+        low, high = (None if raw is None else _to_physical(number, raw) for raw in (low, high))
         findings.append(ParameterInterval(label, number.unit, began, value, low, high, remark))
     return findings
 
@@ -363,7 +382,7 @@ def _rises_otherwise(
     width: float,
     curvature: float,
 ) -> bool:
-    """Return true if the loss at the ends of an interval is not what the curvature predicts.
+    """Return true if the loss at the ends of an interval differs from the curvature's prediction.
 
     Args:
         sample: The loss of all parts.

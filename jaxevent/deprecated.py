@@ -20,6 +20,7 @@ T = TypeVar("T")
 # The full name until this release, and the one from now on.
 RENAMED: dict[str, str] = {
     "jaxevent.blob.Found": "jaxevent.blob.TargetSearchResult",
+    "jaxevent.blob.quantities.growth": "jaxevent.blob.quantities.inverse_ttc_from_size",
     "jaxevent.confidence.Finding": "jaxevent.confidence.ParameterInterval",
     "jaxevent.confidence.Findings": "jaxevent.confidence.FitIntervals",
     "jaxevent.confidence.Parted": "jaxevent.confidence.PartwiseLoss",
@@ -30,7 +31,8 @@ RENAMED: dict[str, str] = {
     "jaxevent.egomotion.flow.iterate": "jaxevent.egomotion.flow.iterate_flow",
     "jaxevent.egomotion.geometry.contrast": "jaxevent.egomotion.geometry.image_variance",
     "jaxevent.egomotion.geometry.energy": "jaxevent.egomotion.geometry.sum_of_squares",
-    "jaxevent.egomotion.geometry.undistorted": "jaxevent.egomotion.geometry.undistort",
+    "jaxevent.egomotion.geometry.undistort": "jaxevent.egomotion.geometry.centred_coordinates",
+    "jaxevent.egomotion.geometry.undistorted": "jaxevent.egomotion.geometry.centred_coordinates",
     "jaxevent.egomotion.model_selection.Choice": "jaxevent.egomotion.model_selection.ModelSelection",
     "jaxevent.egomotion.model_selection.choose": "jaxevent.egomotion.model_selection.select_model",
     "jaxevent.egomotion.model_selection.decide": "jaxevent.egomotion.model_selection.select_by_z",
@@ -75,6 +77,7 @@ RENAMED: dict[str, str] = {
     "jaxevent.io.ros_events.event_topic": "jaxevent.io.ros.open_event_topic",
     "jaxevent.io.timelens.read": "jaxevent.io.folders.read_timelens",
     "jaxevent.io.whole_number": "jaxevent.io.checks.whole_number",
+    "jaxevent.metrics.checked": "jaxevent.metrics.check_images",
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
     "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
     "jaxevent.reconstruction.compensated.estimator.MotionCompensated": "jaxevent.reconstruction.compensated.estimator.MotionCompensation",

@@ -196,7 +196,7 @@ class Estimator(abc.ABC, Generic[P]):
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
         for name in CHECKED_METHODS & vars(cls).keys():
-            setattr(cls, name, _checked(name, vars(cls)[name]))
+            setattr(cls, name, _check_arguments(name, vars(cls)[name]))
 
     def __post_init__(self):
         # `help(akf)` shows an object's own text, if it has one, before its class.
@@ -392,7 +392,7 @@ class Estimator(abc.ABC, Generic[P]):
 CHECKED_METHODS = frozenset({"prepare", "prepare_images", "estimate", "live", "run"})
 
 
-def _checked(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
+def _check_arguments(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a step of an estimator so that wrong arguments are refused in a sentence."""
     signature = inspect.signature(method)
     kinds = signature.parameters.items()

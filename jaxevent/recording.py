@@ -103,8 +103,17 @@ def check_times(times: Times, start_us: int, stop_us: int, name: str) -> None:
         )
 
 
-def _span(what: str, number: int, t: Any) -> str:
-    """Describe a number of things and their times, as in "2 events from 0.1 to 0.2 s"."""
+def _describe_span(what: str, number: int, t: Any) -> str:
+    """Describe a number of things and their times, as in "2 events from 0.1 to 0.2 s".
+
+    Args:
+        what: Name of one of the things.
+        number: Their number.
+        t: (n,) sorted times, us.
+
+    Returns:
+        The description.
+    """
     text = f"{number:,} {plural(what, number)}"
     if number < 2:
         return f"{text} at {format_seconds(t[0])} s" if number else text
@@ -112,7 +121,7 @@ def _span(what: str, number: int, t: Any) -> str:
 
 
 def _doubt_times(events: NDArray[np.int64], frames: "Frames") -> str | None:
-    """Return what shows that frames have another unit of time than events, or None.
+    """Describe the sign that frames have another unit of time than events; None without one.
 
     Args:
         events: (n,) times of events, us.
@@ -149,14 +158,23 @@ class EventSource(Protocol):
 
 
 class EventColumns(NamedTuple):
-    """Columns of events as they are stored, whose order and coordinates are not checked."""
+    """Columns of events as they are stored, whose order and coordinates are not checked.
 
-    t: NDArray[np.int64]  # us after `offset`
+    Attributes:
+        t: (n,) times after `offset`, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        p: (n,) 1 ON, 0 OFF.
+        offset: Time added to all times, us.
+        previous: `t` of the event before them; of the first, one that is not later.
+    """
+
+    t: NDArray[np.int64]
     x: NDArray[np.uint16]
     y: NDArray[np.uint16]
-    p: NDArray[np.uint8]  # 1 ON, 0 OFF
+    p: NDArray[np.uint8]
     offset: int
-    previous: int  # t of the event before them; of the first, one that is not later
+    previous: int
 
 
 @runtime_checkable
@@ -193,6 +211,12 @@ class Events:
     type. Arrays that have the type already are kept, not copied; change them no more. Raises
     `InputError` for other types, values that the types do not hold, columns of different length
     and times that go back.
+
+    Attributes:
+        t: Times, us.
+        x: Columns, px.
+        y: Rows, px.
+        p: Polarities, True for ON.
     """
 
     t: NDArray[np.int64]
@@ -244,7 +268,7 @@ class Events:
         return cls.of_checked(*(np.empty(0, kind) for kind in kinds))
 
     def __repr__(self) -> str:
-        return f"<{_span('event', len(self), self.t)}>"
+        return f"<{_describe_span('event', len(self), self.t)}>"
 
     def __len__(self) -> int:
         return len(self.t)
@@ -329,7 +353,12 @@ class Events:
 
 
 def _check_rows(rows: Any, what: str) -> None:
-    """Raise `InputError` for rows that choose one row, or several columns, of `what`."""
+    """Raise `InputError` for rows that choose one row, or several columns, of `what`.
+
+    Args:
+        rows: Rows as a caller gives them.
+        what: Name of the whole, for messages.
+    """
     if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
         raise InputError(
             f"{what} are chosen by a slice, a mask or a list of rows, "
@@ -503,7 +532,9 @@ class Frames:
 
     def __repr__(self) -> str:
         height, width = self.images.shape[1:]
-        return f"<{_span('frame', len(self), self.t)}, {width}x{height} {self.images.dtype}>"
+        return (
+            f"<{_describe_span('frame', len(self), self.t)}, {width}x{height} {self.images.dtype}>"
+        )
 
     def __len__(self) -> int:
         return len(self.t)
@@ -636,7 +667,13 @@ class _TimedRows:
 
 @dataclasses.dataclass(frozen=True)
 class Poses(_TimedRows):
-    """Ground-truth camera poses: t (us), position (n, 3) in m, quaternion (n, 4) as x y z w."""
+    """Ground-truth camera poses.
+
+    Attributes:
+        t: (n,) sorted times, us.
+        position: (n, 3) m.
+        quaternion: (n, 4) as x, y, z, w.
+    """
 
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
@@ -647,9 +684,12 @@ class Poses(_TimedRows):
 
 @dataclasses.dataclass(frozen=True)
 class Imu(_TimedRows):
-    """Inertial measurements: t (us), gyro (samples, 3) in rad/s, acc (samples, 3) in m/s^2.
+    """Inertial measurements.
 
-    The acceleration may be left out, and is NaN where it was not measured.
+    Attributes:
+        t: (n,) sorted times, us.
+        gyro: (n, 3) angular velocity, rad/s.
+        acc: (n, 3) acceleration, m/s^2, NaN where it was not measured; it may be left out.
     """
 
     gyro: NDArray[np.float64]
@@ -663,7 +703,13 @@ class Imu(_TimedRows):
 
 @dataclasses.dataclass(frozen=True)
 class Triggers(_TimedRows):
-    """Signals from outside: t (us), edge (1 rising, 0 falling, -1 unknown), channel, each (n,)."""
+    """Signals from outside.
+
+    Attributes:
+        t: (n,) sorted times, us.
+        edge: (n,) 1 rising, 0 falling, -1 unknown.
+        channel: (n,) number of the input.
+    """
 
     edge: NDArray[np.int8]
     channel: NDArray[np.uint8]
@@ -675,7 +721,20 @@ class Triggers(_TimedRows):
 
 
 def _columns_given(t: Any, x: Any, y: Any, p: Any) -> dict[str, Any]:
-    """Return the columns of events by name, from each on its own or from `t` that holds all."""
+    """Return the columns of events by name.
+
+    Args:
+        t: (n,) times in any unit; or all columns in one array or table, if the others are None.
+        x: (n,) columns, px; None: as `t` says.
+        y: (n,) rows, px; None: as `t` says.
+        p: (n,) polarities; None: as `t` says.
+
+    Returns:
+        The columns.
+
+    Raises:
+        InputError: One is missing.
+    """
     given = dict(zip("txyp", (t, x, y, p), strict=True))
     if x is None and y is None and p is None:
         given = arrays.columns_of(t)
@@ -729,6 +788,20 @@ class Recording(HtmlRepr):
     prints: the unit of time it inferred, the number of words it skipped. `left_out` describes, by
     the name of a field that is None ("frames", "camera"), the data of the file and how to have them
     read; messages that miss the field end with that.
+
+    Attributes:
+        name: Name, for messages and results.
+        width: Width of the sensor, px.
+        height: Height of the sensor, px.
+        events: The events, in memory or in a file.
+        frames: The frames; None: there are none.
+        camera: Calibration of the lens.
+        poses: True poses of the camera.
+        imu: Inertial measurements.
+        extra: Further arrays by name.
+        triggers: Signals from outside.
+        notes: Remarks of the reader.
+        left_out: Descriptions of data that were not read, by field.
     """
 
     name: str
@@ -890,9 +963,9 @@ class Recording(HtmlRepr):
     def __repr__(self) -> str:
         count = len(self.events)
         ends = [self.events[row : row + 1].t[0] for row in ((0, count - 1) if count else ())]
-        parts = [f"{self.name}: {self.width}x{self.height}", _span("event", count, ends)]
+        parts = [f"{self.name}: {self.width}x{self.height}", _describe_span("event", count, ends)]
         if self.frames is not None:
-            parts.append(_span("frame", len(self.frames), self.frames.t))
+            parts.append(_describe_span("frame", len(self.frames), self.frames.t))
         parts += [n for n in ("camera", "poses", "imu", "triggers") if getattr(self, n) is not None]
         extra = [f"{len(self.extra)} arrays in extra"] if len(self.extra) > 3 else self.extra
         return f"<{', '.join([*parts, *extra])}>"
@@ -984,7 +1057,7 @@ class Recording(HtmlRepr):
         cuts = {name: cut(getattr(self, name)) for name in names}
         part = dataclasses.replace(
             self,
-            extra=self._extra_of(rows),
+            extra=self._cut_extra(rows),
             events=self.events[self.events.index(t0) : self.events.index(t1)],
             left_out=self._left_out_of(cuts, "outside the times taken"),
             **cuts,
@@ -1027,7 +1100,15 @@ class Recording(HtmlRepr):
         return f" ({self.left_out[field]})" if is_missing and field in self.left_out else ""
 
     def _left_out_of(self, cuts: Mapping[str, Any], why: str) -> Mapping[str, str]:
-        """Return `left_out` with the fields that a cut leaves without a part, and `why`."""
+        """Return `left_out` with the fields that a cut leaves empty.
+
+        Args:
+            cuts: Parts of the recording after the cut, by field; None: nothing is left.
+            why: End of the note, such as "not among those chosen".
+
+        Returns:
+            Notes by field.
+        """
         left_out = dict(self.left_out)
         for name, part in cuts.items():
             whole = getattr(self, name)
@@ -1040,10 +1121,10 @@ class Recording(HtmlRepr):
         frames = (self.frames[rows] if self.frames is not None else None) or None
         left_out = self._left_out_of({"frames": frames}, "not among those chosen")
         return dataclasses.replace(
-            self, frames=frames, extra=self._extra_of(rows), left_out=left_out
+            self, frames=frames, extra=self._cut_extra(rows), left_out=left_out
         )
 
-    def _extra_of(self, rows: slice | NDArray | None) -> Mapping[str, Any]:
+    def _cut_extra(self, rows: slice | NDArray | None) -> Mapping[str, Any]:
         """Return the further arrays; those with one entry per frame are cut like frames."""
         if rows is None:
             return self.extra

@@ -216,7 +216,7 @@ def infer_unit(
 def doubt_given_unit(
     t: NDArray, x: NDArray, y: NDArray, size: tuple[int, int], unit: str | None
 ) -> str | None:
-    """Compare events in a unit that a caller gives with what recordings are like.
+    """Compare events, in a unit that a caller gives, with typical recordings.
 
     Args:
         t: (n,) times as given.
@@ -593,7 +593,7 @@ class Clock(NamedTuple):
         """
         if not self._has_plausible_intervals(values, unit):
             return False
-        first, last = _ends(values, unit)
+        first, last = _extremes(values, unit)
         if last < self.first or first > self.last:
             return False
         inside = first >= self.first and last <= self.last
@@ -609,18 +609,18 @@ class Clock(NamedTuple):
         Returns:
             The ratio, 0 to 1.
         """
-        first, last = _ends(values, unit)
+        first, last = _extremes(values, unit)
         common = min(last, self.last) - max(first, self.first)
         return max(common, 0.0) / max(max(last, self.last) - min(first, self.first), 1.0)
 
     @staticmethod
     def _has_plausible_intervals(values: NDArray, unit: str) -> bool:
-        first, last = _ends(values, unit)
+        first, last = _extremes(values, unit)
         least, most = _PLAUSIBLE_INTERVALS_US
         return least <= (last - first) / (len(values) - 1) <= most
 
 
-def _ends(values: NDArray, unit: str) -> tuple[float, float]:
+def _extremes(values: NDArray, unit: str) -> tuple[float, float]:
     """Return the least and the greatest of some times.
 
     Args:

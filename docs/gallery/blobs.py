@@ -65,18 +65,18 @@ axes[1].set(xlabel="time (ms)", ylabel="px")
 axes[1].legend()
 
 # %% [markdown]
-# A blob that grows comes nearer. `blob.quantities.growth` gives the inverse of its time to contact,
-# which is defined at rest, and its variance. `inverse_ttc` compares two blobs at one depth, and
-# `size_range` gives the range of one of known size. This blob comes from 17 m at 8 m/s. Given
-# `Q_lambda`, `growth` undoes the lag of filtered sizes and knows how long their errors last; for a
-# smoothed track give `smoothed=True`, too.
+# A blob that grows comes nearer. `blob.quantities.inverse_ttc_from_size` gives the inverse of its
+# time to contact, which is defined at rest, and its variance. `inverse_ttc` compares two blobs at
+# one depth, and `size_range` gives the range of one of known size. This blob comes from 17 m at
+# 8 m/s. Given `Q_lambda`, `inverse_ttc_from_size` undoes the lag of filtered sizes and knows how
+# long their errors last; for a smoothed track give `smoothed=True`, too.
 
 # %%
 scene, _ = jaxevent.simulate.blob_scene("growing", seed=100, rate=20_000)
 near = jaxevent.blob.moment.estimate(scene[:1.2], smooth=False)
 times = np.arange(0.1, 1.2, 0.01)
 mean, covariance, valid = near(times)
-inverse, variance = jaxevent.blob.quantities.growth(
+inverse, variance = jaxevent.blob.quantities.inverse_ttc_from_size(
     times, mean[:, 0], covariance[:, 0], valid[:, 0], Q_lambda=near.params.Q_lambda
 )
 grown = near.to_dataframe(times, ids=near.id[:1])

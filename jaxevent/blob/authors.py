@@ -35,13 +35,22 @@ MAX_PENDING_EVENTS = 8 * PENDING_EVENTS_PER_BLOCK
 
 
 class ReferenceState(eqx.Module):
-    """Association state of each target; times are us since the chunk's start."""
+    """Association state of each target; times are us since the chunk's start.
 
-    last_event: Int[Array, "*targets"]  # of any target
-    last_nearest: Int[Array, "*targets"]  # the last event that was nearest to this target
+    Attributes:
+        last_event: Time of the last event of any target.
+        last_nearest: Time of the last event that was nearest to the target.
+        next_display: Time of the next display in the authors' program, which decides `is_adapting`.
+        is_adapting: Whether the radius of the gate follows the size.
+        pending: Positions of events that await the next update, px; the first `n_pending` count.
+        n_pending: Number of these events.
+    """
+
+    last_event: Int[Array, "*targets"]
+    last_nearest: Int[Array, "*targets"]
     next_display: Int[Array, "*targets"]
-    is_adapting: Bool[Array, "*targets"]  # whether the radius follows the size
-    pending: Float[Array, "*targets n 2"]  # px, the first `n_pending` count
+    is_adapting: Bool[Array, "*targets"]
+    pending: Float[Array, "*targets n 2"]
     n_pending: Int[Array, "*targets"]
 
     @classmethod
@@ -67,21 +76,35 @@ class ReferenceState(eqx.Module):
 
 
 class ReferenceStepResult(eqx.Module):
-    """A target after an event that is nearest to it."""
+    """A target after an event that is nearest to it.
+
+    Attributes:
+        state: State of the filter.
+        radius: Radius of the gate, px.
+        reference: Association state of the target.
+        accepted: Whether the event is inside the gate.
+        updated: Whether the state is of this event's time; else the event may be pending.
+    """
 
     state: Any
-    radius: Float[Array, ""]  # px
+    radius: Float[Array, ""]
     reference: ReferenceState
-    accepted: Bool[Array, ""]  # whether the event is inside the gate
-    updated: Bool[Array, ""]  # whether the state is of this event's time; else it may be pending
+    accepted: Bool[Array, ""]
+    updated: Bool[Array, ""]
 
 
 class ReferenceEvent(eqx.Module):
-    """One event, and the time since a target's last update."""
+    """One event, and the time since a target's last update.
 
-    batch: EventBatch  # of one event
-    time: Int[Array, ""]  # us since the chunk's start
-    since: Float[Array, ""]  # s
+    Attributes:
+        batch: A batch of one event.
+        time: Time of the event, us since the chunk's start.
+        since: Time since the target's last update, s.
+    """
+
+    batch: EventBatch
+    time: Int[Array, ""]
+    since: Float[Array, ""]
 
 
 def reference_step(

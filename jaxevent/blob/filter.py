@@ -28,21 +28,35 @@ T = TypeVar("T")
 
 
 class EventBatch(eqx.Module):
-    """The M events of one step."""
+    """The M events of one step.
 
-    xi: Float[Array, "M 2"]  # px
-    age: Float[Array, " M"]  # s before the step's time; 0 for an event at that time
-    polarity: Float[Array, " M"]  # +1 or -1
+    Attributes:
+        xi: Positions, px.
+        age: Time before the step's time, s; 0 for an event at that time.
+        polarity: +1 or -1.
+    """
+
+    xi: Float[Array, "M 2"]
+    age: Float[Array, " M"]
+    polarity: Float[Array, " M"]
 
 
 class PredictedMeasurement(eqx.Module):
-    """Predicted distribution of a target's next events."""
+    """Predicted distribution of a target's next events.
 
-    p: Float[Array, " 2"]  # px, centre
-    v: Float[Array, " 2"]  # px/s
-    spread: Float[Array, "2 2"]  # px^2, covariance of events about the true centre
-    P_p: Float[Array, "2 2"]  # px^2, covariance of p
-    size: Float[Array, " 2"]  # px, lambda1 and lambda2
+    Attributes:
+        p: Centre, px.
+        v: Velocity, px/s.
+        spread: Covariance of events about the true centre, px^2.
+        P_p: Covariance of `p`, px^2.
+        size: lambda1 and lambda2, px.
+    """
+
+    p: Float[Array, " 2"]
+    v: Float[Array, " 2"]
+    spread: Float[Array, "2 2"]
+    P_p: Float[Array, "2 2"]
+    size: Float[Array, " 2"]
 
 
 def where_tree(condition: Array, new: T, old: T) -> T:

@@ -33,14 +33,25 @@ END_REASONS = ("end", "idle", "unconfirmed", "left", "size", "uncertain", "merge
 
 
 class ClutterGrid(eqx.Module):
-    """Unassociated events per cell, forgotten exponentially: number and sums of x and y."""
+    """Sums of unassociated events per cell, forgotten exponentially.
+
+    Attributes:
+        sums: Number of events, and sums of x and of y, px.
+        time: Time of the sums, us since the chunk's start.
+    """
 
     sums: Float[Array, "3 rows columns"]
-    time: Int[Array, ""]  # us since the chunk's start
+    time: Int[Array, ""]
 
 
 class TrackerState(eqx.Module):
-    """State of a tracker between two chunks."""
+    """State of a tracker between two chunks.
+
+    Attributes:
+        tracks: The tracks.
+        grid: Unassociated events; None where no track begins of them.
+        next_id: Serial number of the next track.
+    """
 
     tracks: TrackBuffer
     grid: ClutterGrid | None
@@ -48,30 +59,52 @@ class TrackerState(eqx.Module):
 
 
 class LifecycleLog(eqx.Module):
-    """Births, confirmations and deaths of one or several chunks, by entry of the buffer."""
+    """Births, confirmations and deaths of one or several chunks, by entry of the buffer.
 
-    id_before: Int[Numeric, "*chunks targets"]  # -1: no track
+    Attributes:
+        id_before: Serial number at the chunk's start; -1: no track.
+        id_after: Serial number at its end; -1: no track.
+        confirmed: Whether the track is confirmed in the chunk.
+        end_reason: Index of `END_REASONS`; 0: the track goes on.
+        death: Time of its end, us since the chunk's start.
+    """
+
+    id_before: Int[Numeric, "*chunks targets"]
     id_after: Int[Numeric, "*chunks targets"]
     confirmed: Bool[Numeric, "*chunks targets"]
-    end_reason: Int[Numeric, "*chunks targets"]  # index of `END_REASONS`; 0: it goes on
-    death: Int[Numeric, "*chunks targets"]  # us since the chunk's start
+    end_reason: Int[Numeric, "*chunks targets"]
+    death: Int[Numeric, "*chunks targets"]
 
 
 class TrackDecision(eqx.Module):
-    """Decision on a track at a chunk's end: confirm, delete or keep."""
+    """Decision on a track at a chunk's end: confirm, delete or keep.
+
+    Attributes:
+        confirmed: Whether the track is confirmed.
+        end_reason: Index of `END_REASONS`; 0: the track goes on.
+        death: Time of its end, us since the chunk's start.
+        last_apart: Time at which it was last apart from all older tracks, us since the chunk's
+            start.
+    """
 
     confirmed: Bool[Array, "*targets"]
-    end_reason: Int[Array, "*targets"]  # index of `END_REASONS`; 0: it goes on
-    death: Int[Array, "*targets"]  # us since the chunk's start
+    end_reason: Int[Array, "*targets"]
+    death: Int[Array, "*targets"]
     last_apart: Int[Array, "*targets"]
 
 
 class TrackEvidence(eqx.Module):
-    """Evidence on a track at a chunk's end."""
+    """Evidence on a track at a chunk's end.
+
+    Attributes:
+        predicted: Distribution of its next events.
+        merging: Whether it is within one lambda of an older track.
+        detected: Whether it was born of clutter, not of a seed.
+    """
 
     predicted: PredictedMeasurement
-    merging: Bool[Array, "*targets"]  # within one lambda of an older track
-    detected: Bool[Array, "*targets"]  # born of clutter, not of a seed
+    merging: Bool[Array, "*targets"]
+    detected: Bool[Array, "*targets"]
 
 
 def init_state(filter: Filter, params: TrackerParams, features: Features) -> TrackerState:

@@ -44,13 +44,22 @@ def negative_log_likelihood(
 
 
 class PositionBatch(eqx.Module):
-    """A batch of `position_error`: prepared events, and true positions of the seeds' targets."""
+    """A batch of `position_error`: prepared events, and true positions of the seeds' targets.
+
+    Attributes:
+        features: Prepared events.
+        chunk: Chunk of each time.
+        step: Steps of the chunk done by then.
+        time: The time, us since the chunk's start.
+        xi: True positions, px.
+        known: Whether the position is known.
+    """
 
     features: Features
     chunk: Int[np.ndarray | Array, " times"]
-    step: Int[np.ndarray | Array, " times"]  # steps of the chunk done by then
-    time: Int[np.ndarray | Array, " times"]  # us since the chunk's start
-    xi: Float[np.ndarray | Array, "times seeds 2"]  # px
+    step: Int[np.ndarray | Array, " times"]
+    time: Int[np.ndarray | Array, " times"]
+    xi: Float[np.ndarray | Array, "times seeds 2"]
     known: Bool[np.ndarray | Array, "times seeds"]
 
 

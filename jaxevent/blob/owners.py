@@ -37,14 +37,23 @@ class PathTable(NamedTuple):
 
 
 class _Owners(NamedTuple):
-    """Columns of events, and the likeliest paths of each, for kernels."""
+    """Columns of events, and the likeliest paths of each, for kernels.
+
+    Attributes:
+        t: (n,) times, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        p: (n,) polarities.
+        owner: (n, 2) likeliest paths of each event; -1: none.
+        cost: (n, 2) -2 ln likelihood + constant, output; (0, 2) for a single path.
+    """
 
     t: NDArray[np.int64]
     x: NDArray[np.integer]
     y: NDArray[np.integer]
     p: NDArray[np.bool_]
-    owner: NDArray[np.int32]  # (events, 2)
-    cost: NDArray[np.float64]  # (events, 2) -2 ln likelihood + constant; (0, 2) for a single path
+    owner: NDArray[np.int32]
+    cost: NDArray[np.float64]
 
 
 def owner_candidates(events: Events, table: PathTable, sigmas: float | int) -> NDArray[np.int32]:

@@ -25,7 +25,7 @@ from jaxevent.blob.seeds import read_seeds, tracking_span
 from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.estimator import ShortRepr
-from jaxevent.events.filters import supported
+from jaxevent.events.filters import find_supported
 from jaxevent.recording import Recording, Times, check_times, microseconds
 
 STEPS_PER_CHUNK_CHOICES = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
@@ -73,21 +73,35 @@ class ReadoutTimes(ShortRepr):
 
 
 class PackingCursor(NamedTuple):
-    """Begin of a segment: the next event's row and the start of the chunk."""
+    """Place in a recording where the packing of a segment begins.
+
+    Attributes:
+        row: Row of the next event.
+        previous: Start of the chunk before, us.
+        start: Start of the chunk, us.
+        seed: Index of the next seed.
+    """
 
     row: int
-    previous: int  # us, start of the chunk before
-    start: int  # us
-    seed: int  # the next one
+    previous: int
+    start: int
+    seed: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """Consecutive chunks, with their times (us) and the rows of their events."""
+    """Consecutive chunks, with their times and the rows of their events.
+
+    Attributes:
+        features: Packed events of the chunks.
+        start: (chunks,) start of each chunk, us.
+        row: (chunks, steps, M) row of each event in the recording, -1 where not valid.
+        next: Place where the next segment begins; None: this is the last one.
+    """
 
     features: Features
-    start: NDArray[np.int64]  # of each chunk
-    row: NDArray[np.int64]  # (chunks, steps, M), -1 where not valid
+    start: NDArray[np.int64]
+    row: NDArray[np.int64]
     next: PackingCursor | None
 
     @property
@@ -322,7 +336,9 @@ class ChunkPacker:
         shape = self.recording.height + 2, self.recording.width + 2
         last = np.full(shape, np.iinfo(np.int64).min // 2)
         for part in (warm, events):
-            passed = supported(part.t, part.x, part.y, last, self.prefilter_us, self.neighbours)
+            passed = find_supported(
+                part.t, part.x, part.y, last, self.prefilter_us, self.neighbours
+            )
         return passed
 
 
@@ -354,20 +370,38 @@ def find_steps(
 
 
 class _EventRows(NamedTuple):
-    """Events to be packed, and others with the time of the first or the last one."""
+    """Events that were read, of which some are packed.
+
+    Attributes:
+        t: (n,) times, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        p: (n,) polarities.
+        accepted: (n,) whether the prefilter accepts the event.
+        owner: (n, 2) serial numbers of tracks that may own the event, or empty.
+        order: Indices of the events to be packed, one after another.
+        first: Row of the first event in the recording.
+    """
 
     t: NDArray
     x: NDArray
     y: NDArray
     p: NDArray
-    accepted: NDArray  # by the prefilter
+    accepted: NDArray
     owner: NDArray
-    order: NDArray  # indices of the events to be packed, one after another
-    first: int  # row of the first
+    order: NDArray
+    first: int
 
 
 class _ChunkLimits(NamedTuple):
-    """Times (us) at which chunks end: the cycles from `start` on, `stop`, the seeds' times."""
+    """Times at which chunks end.
+
+    Attributes:
+        start: Start of the first cycle, us.
+        stop: End of the recording, us.
+        period: Length of a cycle, us.
+        seed_t: (seeds,) start times of the seeds, us.
+    """
 
     start: int
     stop: int
@@ -376,20 +410,44 @@ class _ChunkLimits(NamedTuple):
 
 
 class _PackingState(NamedTuple):
-    """State of the packing between two reads."""
+    """State of the packing between two reads.
+
+    Attributes:
+        chunk: Index of the chunk.
+        opened: Whether that chunk is begun.
+        fill: Number of events in it.
+        row: Row of its first event.
+        previous: Start of the chunk before, us.
+        begin: Its start, us.
+        end: Its end, us.
+        seed: Index of the next seed.
+    """
 
     chunk: int
-    opened: int  # whether that chunk is begun
-    fill: int  # events in it
-    row: int  # its first event's
-    previous: int  # us, start of the chunk before
-    begin: int  # us, its start
-    end: int  # us
-    seed: int  # the next one
+    opened: int
+    fill: int
+    row: int
+    previous: int
+    begin: int
+    end: int
+    seed: int
 
 
 class _ChunkArrays(NamedTuple):
-    """Arrays to be filled; see `Features` and `Segment`."""
+    """Arrays of chunks to be filled.
+
+    Attributes:
+        t: (chunks, steps, M) times, us since the chunk's start.
+        xi: (chunks, steps, M, 2) positions, px.
+        polarity: (chunks, steps, M) +1 or -1.
+        row: (chunks, steps, M) row in the recording; -1: padding.
+        start: (chunks,) start of each chunk, us.
+        elapsed: (chunks,) time from the start of the chunk before, us.
+        stop: (chunks,) time from the chunk's start to its end, us.
+        cycle: (chunks,) whether births and deaths happen at its end.
+        seed: (seeds,) chunk at whose start each seed begins; -1: none of these.
+        owner: (chunks, steps, M, 2) serial numbers of tracks that may own the event, or empty.
+    """
 
     t: NDArray
     xi: NDArray

@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxevent.deprecated import renamed_names
 from jaxevent.precision import full_precision
 
 # lambda1 of the events of a disc over the disc's diameter: of an even rim (a disc that grows or
@@ -77,7 +78,7 @@ def log_size(
     return jnp.sum(jnp.log(mean[..., 4:6]), -1) / 2, variance
 
 
-def growth(
+def inverse_ttc_from_size(
     times: Float[Array | np.ndarray, " times"],
     mean: Float[Array | np.ndarray, "times 8"],
     covariance: Float[Array | np.ndarray, "times 8 8"],
@@ -88,7 +89,7 @@ def growth(
     smooth: bool = True,
     smoothed: bool = False,
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
-    """Compute 1 / TTC from the growth of one blob.
+    """Compute the inverse time to contact from the sizes of one blob.
 
     The scale w = 1 / sqrt(lambda1 lambda2) is proportional to depth, so that at constant speed it
     is a line in time and 1 / TTC = -w' / w: a Kalman filter of (w, w'), exactly linear, whose
@@ -116,26 +117,26 @@ def growth(
     """
     # Differences, while times are double: seconds since 1970 in single precision are 128 s apart.
     valid = jnp.ones(times.shape, bool) if valid is None else valid
-    return _growth(
+    return _inverse_ttc_from_size(
         times - times[:1], mean, covariance, valid, Q, Q_lambda, smooth=smooth, smoothed=smoothed
     )
 
 
 @functools.partial(jax.jit, static_argnames=("smooth", "smoothed"))
 @full_precision
-def _growth(
+def _inverse_ttc_from_size(
     times: Array, mean: Array, covariance: Array, valid: Array, Q: Number,
     Q_lambda: Number | None, *, smooth: bool, smoothed: bool,
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:  # fmt: skip
-    """Compute `growth` of times from 0 on.
+    """Compute `inverse_ttc_from_size` of times from 0 on.
 
     Args:
         times: (times,) s, from 0 on.
         mean: (times, 8) states of a track.
         covariance: (times, 8, 8) their covariances.
         valid: (times,) whether the track is seen.
-        Q: As of `growth`, 1/s^3.
-        Q_lambda: As of `growth`, px^2/s.
+        Q: As of `inverse_ttc_from_size`, 1/s^3.
+        Q_lambda: As of `inverse_ttc_from_size`, px^2/s.
         smooth: Whether all times are used for each, or those up to it.
         smoothed: Whether the track is smoothed.
 
@@ -317,3 +318,6 @@ def calibrate_size_factor(
     factor = jnp.sum(weight * diameter * size) / information
     residual = jnp.sum(weight * (size - factor * diameter) ** 2)
     return factor, residual / (size.shape[0] - 1) / information
+
+
+__getattr__ = renamed_names(__name__)

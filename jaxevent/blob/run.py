@@ -43,19 +43,33 @@ READOUT_TIMES_PER_CALL = 64  # times read out by one compiled call
 
 
 class EventAssociation(eqx.Module):
-    """The likeliest track of each event: its serial number, -1 for none, and the event's weight."""
+    """The likeliest track of each event.
+
+    Attributes:
+        id: Serial number of the track; -1 for none.
+        weight: Weight of the event for this track.
+    """
 
     id: Int[Array, "*chunks steps M"]
     weight: Float[Array, "*chunks steps M"]
 
 
 class ChunkInfo(eqx.Module):
-    """Report of each chunk; fields that were not requested are None."""
+    """Report of each chunk; fields that were not requested are None.
+
+    Attributes:
+        log: Births, confirmations and deaths.
+        tracks: The tracks before the first step; with "states" those of steps + 1 moments.
+        association: The likeliest track of each event.
+        path: p (px), v (px/s) and time of the last update (us) of steps + 1 moments.
+        loss: Sum of the losses of the events that count.
+        count: Number of events that count.
+    """
 
     log: LifecycleLog
-    tracks: TrackBuffer | None = None  # before the first step; "states": of steps + 1 moments
+    tracks: TrackBuffer | None = None
     association: EventAssociation | None = None
-    path: tuple[Array, Array, Array] | None = None  # p, v and last update of steps + 1 moments
+    path: tuple[Array, Array, Array] | None = None
     loss: Array | None = None
     count: Array | None = None
 
@@ -103,6 +117,19 @@ def _run_chunk(
     state: TrackerState,
     part: Any,
 ) -> tuple[TrackerState, ChunkInfo]:
+    """Run the tracker over one chunk, the step of the scan in `run`.
+
+    Args:
+        filter: Filter of one target.
+        params: Parameters of the tracker.
+        features: All chunks.
+        output: Report that is requested; see `run`.
+        state: State before the chunk.
+        part: Number of the chunk, and its rows of the features' arrays.
+
+    Returns:
+        The state after the chunk, and its report.
+    """
     number, t, xi, polarity, valid, owner, elapsed, stop, cycle = part
     state = shift_state(state, elapsed)
     before = spawn_seeded_tracks(filter, params, features, features.seed == number, state.tracks)
@@ -144,11 +171,17 @@ def _prepend(one: Array, others: Array) -> Array:
 
 
 class NextChunk(NamedTuple):
-    """Backward information at the start of the chunk after one."""
+    """Backward information at the start of the chunk after one.
+
+    Attributes:
+        info: The backward information.
+        elapsed: Time from the start of the chunk to that of the next one, us.
+        smoothed: Smoothed tracks of the chunk itself, where they are kept.
+    """
 
     info: BackwardInfo
-    elapsed: Any  # us from the start of the chunk to that of the next one
-    smoothed: SmoothedTracks | None = None  # the chunk itself, where it is kept
+    elapsed: Any
+    smoothed: SmoothedTracks | None = None
 
 
 _init = jax.jit(init_state, static_argnames="filter")

@@ -49,20 +49,34 @@ class BackwardInfo(eqx.Module):
 
 
 class SmoothedTracks(eqx.Module):
-    """Tracks with backward information: arrays begin with (chunks, steps + 1, targets)."""
+    """Tracks with backward information: arrays begin with (chunks, steps + 1, targets).
+
+    Attributes:
+        tracks: The filtered tracks.
+        info: Their backward information.
+    """
 
     tracks: TrackBuffer
     info: BackwardInfo
 
 
 class _TrackUpdate(eqx.Module):
-    """Update of a track in a step."""
+    """Update of a track in a step.
 
-    touched: Bool[Array, "*steps"]  # whether there was one
-    F: Float[Array, "*steps 8 8"]  # from the update before to this one
-    b: Float[Array, "*steps 8"]  # (P-)^-1 (x - x-)
-    M: Float[Array, "*steps 8 8"]  # (P-)^-1 P
-    B: Float[Array, "*steps 8 8"]  # (P-)^-1 (P - P-) (P-)^-1
+    Attributes:
+        touched: Whether there was an update.
+        F: Transition from the update before to this one.
+        b: (P-)^-1 (x - x-).
+        M: (P-)^-1 P.
+        B: (P-)^-1 (P - P-) (P-)^-1.
+        time: Time of the update, us since the chunk's start.
+    """
+
+    touched: Bool[Array, "*steps"]
+    F: Float[Array, "*steps 8 8"]
+    b: Float[Array, "*steps 8"]
+    M: Float[Array, "*steps 8 8"]
+    B: Float[Array, "*steps 8 8"]
     time: Int[Array, "*steps"]
 
     @property

@@ -34,60 +34,107 @@ MIN_THETA_AXIS_RATIO = 1.15  # lambda1 / lambda2 from which theta is defined wel
 
 
 class TrackBuffer(eqx.Module):
-    """Tracks of one moment in a buffer of fixed capacity; times are us since the chunk's start."""
+    """Tracks of one moment in a buffer of fixed capacity; times are us since the chunk's start.
 
-    state: Any  # the filter's, at the last update, with a leading axis of targets
-    gate: Float[Array, "*targets"]  # px, before the position's uncertainty is added
-    hits: Float[Array, "*targets"]  # events, by weight
+    Attributes:
+        state: States of the filter at the last updates, with a leading axis of targets.
+        gate: Radius of the gate, px, before the position's uncertainty is added.
+        hits: Number of events, by weight.
+        last_update: Time of the last update.
+        last_hit: Time of the last step with half an event or more.
+        birth: Time of birth.
+        last_apart: Time at which the track was last more than a lambda away from all older tracks.
+        id: Serial number; -1: the entry is free.
+        confirmed: Whether the track is confirmed.
+        overrides: `raw` parameters of single targets, by name.
+        reference: Association state, of `association = "authors"`.
+    """
+
+    state: Any
+    gate: Float[Array, "*targets"]
+    hits: Float[Array, "*targets"]
     last_update: Int[Array, "*targets"]
-    last_hit: Int[Array, "*targets"]  # the last step with half an event or more
+    last_hit: Int[Array, "*targets"]
     birth: Int[Array, "*targets"]
-    last_apart: Int[Array, "*targets"]  # last more than a lambda away from all older tracks
-    id: Int[Array, "*targets"]  # serial number; -1: free
+    last_apart: Int[Array, "*targets"]
+    id: Int[Array, "*targets"]
     confirmed: Bool[Array, "*targets"]
-    overrides: dict[str, Float[Array, "*targets"]]  # `raw` parameters of single targets
-    reference: ReferenceState | None = None  # of `association = "authors"`
+    overrides: dict[str, Float[Array, "*targets"]]
+    reference: ReferenceState | None = None
 
 
 class NewTracks(eqx.Module):
-    """Tracks that may begin, one for each entry of the buffer."""
+    """Tracks that may begin, one for each entry of the buffer.
 
-    begins: Bool[Array, " targets"]  # whether a track begins in this entry
-    xi: Float[Array, "targets 2"]  # px
-    size: Float[Array, " targets"]  # px
+    Attributes:
+        begins: Whether a track begins in this entry.
+        xi: Position, px.
+        size: Size, px.
+        id: Serial number.
+    """
+
+    begins: Bool[Array, " targets"]
+    xi: Float[Array, "targets 2"]
+    size: Float[Array, " targets"]
     id: Int[Array, " targets"]
 
 
 class StepEvents(eqx.Module):
-    """The events of one step, with the tracks that may own them."""
+    """The events of one step, with the tracks that may own them.
 
-    time: Int[Array, ""]  # us since the chunk's start
+    Attributes:
+        time: Time of the step, us since the chunk's start.
+        batch: The M events.
+        valid: Whether an event is real rather than padding.
+        owner: Serial numbers of tracks that may own each event; None: any track.
+    """
+
+    time: Int[Array, ""]
     batch: EventBatch
-    valid: Bool[Array, " M"]  # real rather than padding
-    owner: Int[Array, "M 2"] | None  # serial numbers of possible tracks; None: any track
+    valid: Bool[Array, " M"]
+    owner: Int[Array, "M 2"] | None
 
 
 class StepInfo(eqx.Module):
-    """Report of one step; fields that were not requested are None."""
+    """Report of one step; fields that were not requested are None.
+
+    Attributes:
+        unassociated: Whether an event belongs to no track.
+        tracks: The tracks after the step.
+        target: (M,) serial number of each event's likeliest track.
+        weight: (M,) weight of the event for this track.
+        path: See `positions`.
+        loss: Sum of the losses of the events that count.
+        count: Number of events that count.
+    """
 
     unassociated: Bool[Array, " M"]
-    tracks: Any = None  # after the step
-    target: Any = None  # (M,) serial number of each event's likeliest target
-    weight: Any = None  # (M,)
-    path: Any = None  # see `positions`
-    loss: Any = None  # sum over the events that count
+    tracks: Any = None
+    target: Any = None
+    weight: Any = None
+    path: Any = None
+    loss: Any = None
     count: Any = None
 
 
 class TrackPrediction(eqx.Module):
-    """A track at a step's time, before its events, with its gate and likelihoods."""
+    """A track at a step's time, before its events, with its gate and likelihoods.
+
+    Attributes:
+        state: Predicted state of the filter.
+        alive: Whether the track is alive.
+        radius: Radius of the gate, px.
+        inside: Whether an event is inside the gate.
+        near: Whether an event is too near to begin another track.
+        log_likelihood: ln(2 pi p) of the events.
+    """
 
     state: Any
     alive: Bool[Array, "*targets"]
-    radius: Float[Array, "*targets"]  # of the gate, px
-    inside: Bool[Array, "*targets M"]  # events inside the gate
-    near: Bool[Array, "*targets M"]  # events too near to begin another track
-    log_likelihood: Float[Array, "*targets M"]  # ln(2 pi p) of the events
+    radius: Float[Array, "*targets"]
+    inside: Bool[Array, "*targets M"]
+    near: Bool[Array, "*targets M"]
+    log_likelihood: Float[Array, "*targets M"]
 
 
 class TrackStates(Estimate):

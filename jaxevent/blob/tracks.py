@@ -80,17 +80,30 @@ def evenly_spaced_times(start: int, stop: int, rate: float) -> NDArray[np.int64]
 
 
 class AssociatedEvents(NamedTuple):
-    """Events of a segment of the recording with their likeliest tracks, one entry for each."""
+    """Events of a segment of the recording with their likeliest tracks, one entry for each.
 
-    row: NDArray[np.int64]  # in `recording.events`
-    t: NDArray[np.int64]  # us
-    id: NDArray[np.int64]  # the likeliest track that holds it in its gate; -1: none
-    weight: NDArray[np.floating]  # of the event for this track
+    Attributes:
+        row: (n,) row in `recording.events`.
+        t: (n,) times, us.
+        id: (n,) the likeliest track with the event in its gate; -1: none.
+        weight: (n,) weight of the event for this track.
+    """
+
+    row: NDArray[np.int64]
+    t: NDArray[np.int64]
+    id: NDArray[np.int64]
+    weight: NDArray[np.floating]
 
 
 @dataclasses.dataclass
 class _History:
-    """Births, confirmations and deaths (us, with the reason) by serial number."""
+    """Life of tracks, by serial number.
+
+    Attributes:
+        birth: Time of birth, us.
+        confirmed: Time of confirmation, us.
+        death: Time of the end, us, and its reason, an index of `END_REASONS`.
+    """
 
     birth: dict[int, int]
     confirmed: dict[int, int]

@@ -19,13 +19,21 @@ MAX_WEIGHT = 3.0  # events that one stands for after a dead time
 
 
 class PixelEvents(NamedTuple):
-    """Events of the pixels of a segment that fire often enough, pixel by pixel."""
+    """Events of the pixels of a segment that fire often enough, pixel by pixel.
 
-    t: NDArray[np.int64]  # us
+    Attributes:
+        t: (n,) times, us.
+        p: (n,) polarities.
+        first: (active + 1,) row of the first event of each pixel, and n.
+        active: (active,) index among the sampled pixels.
+        clear: (active, frames) whether the pixel is unclipped.
+    """
+
+    t: NDArray[np.int64]
     p: NDArray[np.bool_]
-    first: NDArray[np.intp]  # (active + 1,) row of the first event of each pixel
-    active: NDArray[np.intp]  # (active,) index among the sampled pixels
-    clear: NDArray[np.bool_]  # (active, frames)
+    first: NDArray[np.intp]
+    active: NDArray[np.intp]
+    clear: NDArray[np.bool_]
 
     def take_every(self, step: int) -> "PixelEvents":
         """Return the events of every `step`-th pixel."""
@@ -60,7 +68,7 @@ class Positions(NamedTuple):
     mean: NDArray[np.float32]  # over the exposure
     edges: NDArray[np.float32]  # mean of those at its begin and its end
     travel: NDArray[np.float32]  # from its begin to its end
-    spread: NDArray[np.float32]  # of errors of events, see `_spread`
+    spread: NDArray[np.float32]  # of errors of events, see `_exposure_error_sums`
 
 
 def sort_by_pixel(segment: SampledSegment, clear: NDArray[np.bool_]) -> PixelEvents:
@@ -87,7 +95,7 @@ def sort_by_pixel(segment: SampledSegment, clear: NDArray[np.bool_]) -> PixelEve
 
 
 @njit_noalloc
-def _interpolate(t, p, first, rho, counts, bend, integral):
+def _interpolate_counts(t, p, first, rho, counts, bend, integral):
     """Interpolate the counts of events between events, pixel by pixel.
 
     Args:
@@ -158,7 +166,7 @@ def interpolate(events: PixelEvents, rho_us: float) -> Interpolation:
     # gap after it: the sum of all is the path, later by half of the dead time.
     t = (events.t - origin).astype(np.float64) + rho_us / 2
     counts, bend, integral = (np.empty((len(t), 4)) for _ in range(3))
-    _interpolate(t, events.p, events.first, float(rho_us), counts, bend, integral)
+    _interpolate_counts(t, events.p, events.first, float(rho_us), counts, bend, integral)
     return Interpolation(t, counts, bend, integral, origin)
 
 
@@ -198,7 +206,7 @@ def _area(counts, bend, integral, k, channel, gap, u):
 
 
 @njit_noalloc_inlined
-def _spread(t, k, m, u, v, length):
+def _exposure_error_sums(t, k, m, u, v, length):
     """Return the share of events' errors that remains in the mean over an exposure.
 
     An error of one event stands on the lines to its neighbours. So the mean has weights w of the
@@ -279,7 +287,7 @@ def _read(events, path, begin, end, longest, out):
             good[i, f], gaps[i, f] = True, gap
             u = (begin[f] - t[k - 1]) / before if before > 0 else 1.0
             v = (end[f] - t[m - 1]) / after if after > 0 else 1.0
-            parts = _spread(t, k, m, u, v, end[f] - begin[f])
+            parts = _exposure_error_sums(t, k, m, u, v, end[f] - begin[f])
             for part in range(4):
                 spread[i, f, part] = parts[part]
             for channel in range(4):

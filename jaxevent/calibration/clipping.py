@@ -70,7 +70,7 @@ def find_clipping(recording: Recording) -> ClippedEnds:
     top = float(np.iinfo(grey.dtype).max) if whole else 1.0
     step = max(float(grey.max()) / N_LEVELS, 1.0 if whole else 1e-9)
     counts = np.bincount((grey / step + 0.5).astype(np.int64))
-    white, black = _pile_up(counts), _pile_up(counts[::-1])
+    white, black = _find_pile_up(counts), _find_pile_up(counts[::-1])
     if white.level is not None:
         level = white.level * step / top
         white = white._replace(
@@ -81,7 +81,7 @@ def find_clipping(recording: Recording) -> ClippedEnds:
     return ClippedEnds(black, white)
 
 
-def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
+def _find_pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
     """Find the pile-up at the upper end of a histogram; its level is in bins."""
     beyond = counts[::-1].cumsum()[::-1] / counts.sum()
     last = int(np.flatnonzero(beyond >= MAX_STRAY_SHARE)[-1])
@@ -104,7 +104,7 @@ def _pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
 
 
 def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:
-    """Return how far beyond white clipped pixels lie on average, ln I.
+    """Return the mean distance of clipped pixels beyond white, ln I.
 
     If the density of ln I falls exponentially, with mean m, from the band below white on, then the
     band holds exp(BAND / m) - 1 pixels for each one beyond white.

@@ -78,12 +78,19 @@ class Correspondence(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Sums of a pair of frames over its busy pixels."""
+    """Sums of a pair of frames over its busy pixels.
 
-    S2: NDArray[np.float64]  # (m, m) of S at two lags
-    Sd: NDArray[np.float64]  # (m,)
+    Attributes:
+        S2: (m, m) sums of S at two lags.
+        Sd: (m,) sums of S d.
+        d2: Sum of d^2.
+        inside: (m,) lags of which all events are known.
+    """
+
+    S2: NDArray[np.float64]
+    Sd: NDArray[np.float64]
     d2: float
-    inside: NDArray[np.bool_]  # (m,) lags of which all events are known
+    inside: NDArray[np.bool_]
 
 
 def _lag_counts(
@@ -193,7 +200,7 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
     sums, busy, tiles = [], 0, 0
     chosen = np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).round().astype(int))
     for segment, row in (pairs[i] for i in chosen):
-        changes, clears = log_changes(_pair(segment, row), I0)
+        changes, clears = log_changes(_cut_frame_pair(segment, row), I0)
         d, clear = changes[0], clears[0]
         begin = max(segment.span[0], int(segment.t[0]))
         end = min(segment.span[1], int(segment.t[-1])) + 1
@@ -265,7 +272,7 @@ def turn_events(sample: Sample, name: str, inverted: bool) -> Sample:
     return sample._replace(segments=tuple(turned))
 
 
-def _pair(segment: SampledSegment, row: int) -> SampledSegment:
+def _cut_frame_pair(segment: SampledSegment, row: int) -> SampledSegment:
     """Cut two consecutive frames out of a segment.
 
     Args:

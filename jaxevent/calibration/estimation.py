@@ -74,11 +74,18 @@ MIN_CHANGES_PER_PIXEL = 4.0
 
 
 class Clock(NamedTuple):
-    """Offsets that were tried, with their correlations, and the best of them."""
+    """Offsets that were tried, with their correlations, and the best of them.
 
-    offsets: NDArray[np.float64]  # s
+    Attributes:
+        offsets: (n,) offsets, s.
+        correlations: (n,) correlations of events and frames.
+        best: Offset of the highest correlation, s; NaN: none.
+        why: Reason why there is none; "" if there is one.
+    """
+
+    offsets: NDArray[np.float64]
     correlations: NDArray[np.float64]
-    best: float  # s; NaN: none
+    best: float
     why: str
 
 
@@ -160,7 +167,7 @@ def _first_fit(model: Model, clock: Clock) -> Fit | None:
 def _fit_sensor(
     sample: Sample, slope: NDArray[np.float64], clock: Clock, is_unknown: bool
 ) -> tuple[Model, Fit] | None:
-    """Fit what does not depend on the logarithm that a method works in.
+    """Fit the numbers that do not depend on the logarithm that a method works in.
 
     Where thresholds are not the same at all intensities, changes lie off the model by more than
     noise, and the clock follows them: the fit is at the dark offset that the frames prefer.
@@ -229,7 +236,7 @@ def _without_fit(
     why: str,
     clock: Clock | None = None,
 ) -> Calibration:
-    """Return what is known without a fit to frames."""
+    """Return the calibration that needs no fit to frames."""
     units = {
         "clock_offset": "s", "clock_drift": "s/s", "c_on": "ln I", "c_off": "ln I",
         "dark_offset": "intensity", "event_noise": "c", "frame_noise": "grey", "exposure": "s",
@@ -307,7 +314,7 @@ def _with_fit(
         dead = CalibrationValue(rho, rho - reach, rho + reach, "s")
     else:
         dead = not_identifiable("s", f"at most {rho + reach:.2g} s")
-    exposure = _exposure(sample, sensor, model)
+    exposure = _estimate_exposure(sample, sensor, model)
     noise, event_noise = _noises(sensor)
     c_on, c_off, ratio = _thresholds(thresholds)
     return Calibration(
@@ -320,7 +327,7 @@ def _with_fit(
         event_noise=event_noise,
         frame_noise=noise,
         exposure=exposure,
-        exposure_anchor=_anchor(offset, exposure),
+        exposure_anchor=_locate_stamps(offset, exposure),
         rho_ref=dead,
         hot_pixels=sample.hot,
         offsets=clock.offsets,
@@ -341,7 +348,7 @@ def _thresholds(fit: Fit) -> tuple[CalibrationValue, CalibrationValue, Calibrati
 
 
 def _gap(fit: Fit, column: int, power: int) -> float:
-    """Return the mean power of the time between events where they tell of a parameter.
+    """Return the mean power of the time between events, weighted by their effect on a parameter.
 
     Args:
         fit: The fit.
@@ -355,7 +362,7 @@ def _gap(fit: Fit, column: int, power: int) -> float:
     return float(np.average(fit.changes.gap**power, weights=weight + 1e-300))
 
 
-def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
+def _estimate_exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     known = np.concatenate([s.exposure for s in sample.segments])
     if (known > 0).all():
         length = float(np.median(known)) * 1e-6
@@ -385,7 +392,7 @@ def _exposure(sample: Sample, fit: Fit, model: Model) -> CalibrationValue:
     return CalibrationValue(math.sqrt(max(square, least**2)), low, high, "s")
 
 
-def _anchor(offset: CalibrationValue, exposure: CalibrationValue) -> CalibrationValue:
+def _locate_stamps(offset: CalibrationValue, exposure: CalibrationValue) -> CalibrationValue:
     """Find where in the exposure the stamps lie, if the clocks are the same.
 
     Args:
@@ -453,10 +460,15 @@ def _drift(sample: Sample, fit: Fit) -> CalibrationValue:
 
 
 class _DarkOffsets(NamedTuple):
-    """Fits of thresholds at each of `DARK_OFFSETS`."""
+    """Fits of thresholds at each of `DARK_OFFSETS`.
+
+    Attributes:
+        fits: Fit of each offset.
+        losses: (offsets, n) losses, of densities of grey values.
+    """
 
     fits: list[Fit]
-    losses: NDArray[np.float64]  # (offsets, n), of densities of grey values
+    losses: NDArray[np.float64]
 
     @classmethod
     def of(cls, model: Model, fit: Fit) -> "_DarkOffsets":

@@ -62,7 +62,7 @@ class Physics:
 
 
 class Changes(NamedTuple):
-    """Pixels at two consecutive frames, and what events say of the change."""
+    """Pixels at two consecutive frames, with the change that events report."""
 
     intensity: NDArray[np.float32]  # (2, n) of both frames
     slope: NDArray[np.float64]  # (2, n) of intensity by the grey value

@@ -102,7 +102,7 @@ def _recall(
 
 
 def hash_content(recording: Recording, what: float | str) -> str:
-    """Hash samples of a recording, its sizes, the source of the estimator and what is asked.
+    """Hash samples of a recording, its sizes, the source of the estimator and the request.
 
     Args:
         recording: The recording.
@@ -123,11 +123,11 @@ def hash_content(recording: Recording, what: float | str) -> str:
     source, frames = recording.events, recording.frames
     feed(recording.width, recording.height, len(source))
     starts = np.arange(0, len(source), SAMPLE_EVENTS)
-    for first in _spread(starts, N_EVENT_SAMPLES).tolist():
+    for first in _choose_evenly(starts, N_EVENT_SAMPLES).tolist():
         events = source[first : first + SAMPLE_EVENTS]
         feed(events.t, events.x, events.y, events.p)
     if frames is not None:
-        rows = _spread(np.arange(len(frames)), N_FRAME_SAMPLES)
+        rows = _choose_evenly(np.arange(len(frames)), N_FRAME_SAMPLES)
         feed(frames.t, frames.exposure, recording.gain, np.asarray(frames.images[rows]))
         for name in ("response", "certainty", "f_Q"):
             if name in recording.extra:
@@ -135,7 +135,7 @@ def hash_content(recording: Recording, what: float | str) -> str:
     return whole.hexdigest()
 
 
-def _spread(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
+def _choose_evenly(values: NDArray[np.integer], count: int) -> NDArray[np.integer]:
     """Choose evenly spread values, the first and the last among them.
 
     Args:
@@ -245,7 +245,7 @@ def format_toml(
 
 
 def _read(key: str, of_bytes: Callable[[bytes], Any]) -> Any:
-    """Return what is kept under a key; None where it is missing or damaged."""
+    """Return the value that is stored under a key; None where it is missing or damaged."""
     folder = cache.folder_for_calibrations()
     with contextlib.suppress(Exception):  # whatever NumPy says of damaged archives
         if folder is not None:
@@ -254,7 +254,7 @@ def _read(key: str, of_bytes: Callable[[bytes], Any]) -> Any:
 
 
 def _write(key: str, content: bytes) -> None:
-    """Keep what was found where this is possible, and at most `N_KEPT_FILES` in all."""
+    """Store a result where this is possible, and at most `N_KEPT_FILES` in all."""
     folder = cache.folder_for_calibrations()
     if folder is None:
         return

@@ -35,7 +35,7 @@ from jaxevent.cli import (
     track,
     view,
 )
-from jaxevent.cli.arguments import CommandParser, HelpFormatter, guarded
+from jaxevent.cli.arguments import CommandParser, HelpFormatter, guard_outputs
 from jaxevent.errors import InputError, InputWarning, require
 
 # In the order of `jaxevent --help`.
@@ -58,14 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         # No result comes sooner from a GPU, of whose memory JAX would take three quarters.
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     try:
-        with _terminable(), _seldom_collected(ends=argv is None):
+        with _terminable(), _collect_seldom(ends=argv is None):
             try:
                 arguments = vars(_parser().parse_args(argv))
             finally:
                 sys.stdout.flush()  # help
             command = arguments.pop("command")
             words = ["jaxevent", *(sys.argv[1:] if argv is None else argv)]
-            with guarded(arguments, words) as options, _shown(words), _plain_warnings():
+            with guard_outputs(arguments, words) as options, _shown(words), _plain_warnings():
                 command(**options)
             sys.stdout.flush()
     except InputError as error:
@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _seldom_collected(ends: bool) -> Iterator[None]:
+def _collect_seldom(ends: bool) -> Iterator[None]:
     """Look for garbage in cycles seldom, and not at all when the process `ends` with the block.
 
     Libraries and traces make many objects that stay. To look through them as often as usual takes a
@@ -111,7 +111,7 @@ def _seldom_collected(ends: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _shown(words: Sequence[str]) -> Iterator[None]:
-    """Say in a terminal which command runs, wherever it says no more itself."""
+    """Name the running command in a terminal, unless it prints more itself."""
     if not sys.stderr.isatty():
         yield
         return
@@ -282,7 +282,7 @@ def _silence(stream: Any) -> None:
 
 
 class _PrintCompletion(argparse.Action):
-    """Print what shtab makes of the parser, and exit."""
+    """Print the completion script that shtab makes of the parser, and exit."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
         try:

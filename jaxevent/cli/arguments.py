@@ -135,7 +135,7 @@ def add_reading(one: argparse.ArgumentParser, frames: bool = True) -> None:
 
 
 def add_live(one: argparse.ArgumentParser, printed: str) -> None:
-    """Add the option --live, by which a command prints what events show as they come."""
+    """Add the option --live, by which a command prints estimates as events come."""
     one.add_argument(
         "--live",
         action="store_true",
@@ -242,7 +242,7 @@ def warn_of_faults(recording: Any, sample: Any = None, *, frames: bool = True) -
 def add_output(
     one: argparse.ArgumentParser, *names: str, shared: bool = False, **more: Any
 ) -> None:
-    """Add an option for a file or folder to write, and --force; `guarded` knows it by this.
+    """Add an option for a file or folder to write, and --force; `guard_outputs` knows it by this.
 
     A `shared` folder may hold other files. `run` then takes `force` and sees to its files itself,
     by `jaxevent.runs.results.check_folder`, which knows their names.
@@ -259,7 +259,7 @@ def add_output(
 
 
 @contextlib.contextmanager
-def guarded(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str, Any]]:
+def guard_outputs(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Check the outputs of a command, and yield the options that its `run` takes.
 
     All paths among the options that are no outputs are inputs. Within the block, written files

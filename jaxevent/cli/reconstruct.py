@@ -173,7 +173,7 @@ def run(
     from jaxevent.io.images import read_times
     from jaxevent.methods import find
     from jaxevent.reconstruction.augment import calibrated_values
-    from jaxevent.show.export import default_tone, within, write_hdf5, writer
+    from jaxevent.show.export import ExportOptions, default_tone, within, write_hdf5, writer
 
     write = writer(out)
     if tone is not None and write is write_hdf5:
@@ -219,9 +219,8 @@ def run(
         from jaxevent.reconstruction.colour import colour_video
 
         colours = colour_video(video, recording)
-    how = write(
-        video, chosen, out, tone or default_tone(estimator.has_covariance, recording), name, colours
-    )
+    shown = tone or default_tone(estimator.has_covariance, recording)
+    how = write(video, chosen, out, ExportOptions(shown, name, colours))
     seconds = time.perf_counter() - clock
     print(
         f"{out}: {len(chosen):,} images{how}, "

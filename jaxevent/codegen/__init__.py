@@ -47,7 +47,7 @@ def njit_inlined(function: Callable) -> Any:
 
     It has no cache entry of its own: its machine code is stored with each caller.
     """
-    return _inside(function, error_model="numpy", **_COMMON_OPTIONS)
+    return _njit_without_cache(function, error_model="numpy", **_COMMON_OPTIONS)
 
 
 def njit_noalloc(function: Callable) -> Any:
@@ -77,7 +77,7 @@ def njit_fastmath_inlined(function: Callable) -> Any:
     return _lean_inside(function, nogil=True, **_NOALLOC_OPTIONS, **_FASTMATH_OPTIONS)
 
 
-def _inside(function: Callable, **options: Any) -> Any:
+def _njit_without_cache(function: Callable, **options: Any) -> Any:
     """Compile a function with `numba.njit`, without a cache.
 
     Return it as it is where there is no numba.
@@ -87,7 +87,7 @@ def _inside(function: Callable, **options: Any) -> Any:
 
 
 def _lean_inside(function: Callable, **options: Any) -> Any:
-    return (njit_linked if support.HAS_INTERNALS else _inside)(function, **options)
+    return (njit_linked if support.HAS_INTERNALS else _njit_without_cache)(function, **options)
 
 
 class ZeroedScratch:

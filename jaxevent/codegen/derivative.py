@@ -24,9 +24,14 @@ from jaxevent.codegen.support import ir, types
 
 
 class DerivativeDirections(NamedTuple):
-    """Numbers of the parameters by which derivatives are taken, and outputs that have them."""
+    """Numbers of the parameters by which derivatives are taken, and the outputs that have them.
 
-    numbers: tuple[tuple[int, int], ...] = ()  # leaf of the parameters, number in it
+    Attributes:
+        numbers: Leaf of the parameters, and index in it, of each number.
+        of: Names of the outputs.
+    """
+
+    numbers: tuple[tuple[int, int], ...] = ()
     of: tuple[str, ...] = ("mean", "variance")
 
     @property
@@ -246,6 +251,16 @@ class _VectorInstructions:
         self.align = 4 if isinstance(real, ir.FloatType) else 8
 
     def _pointer(self, array: Any, begin: Any, offset: int) -> Any:
+        """Return the address of a vector in an array.
+
+        Args:
+            array: Pointer to the array's first number.
+            begin: Index of a record in the array; None: 0.
+            offset: Index of the vector's first number from there.
+
+        Returns:
+            Pointer to the vector.
+        """
         place = ir.Constant(ir.IntType(64), offset)
         if begin is not None:
             place = self.builder.add(begin, place)
@@ -280,10 +295,15 @@ class ChangeVector:
 
 @dataclasses.dataclass(frozen=True)
 class Derivatives:
-    """Derivatives of results, as sums of factors times vectors of changes."""
+    """Derivatives of results, as sums of factors times vectors of changes.
+
+    Attributes:
+        changes: The vectors.
+        factors: For each result by name, its factors and the indices of their vectors in `changes`.
+    """
 
     changes: list[ChangeVector]
-    factors: dict[str, list[tuple[Node, int]]]  # by the result's name: factor, place in `changes`
+    factors: dict[str, list[tuple[Node, int]]]
 
     def factors_of(self, *names: str) -> list[Node]:
         """Return the factors of some results, each once."""

@@ -93,13 +93,21 @@ class Level(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Node:
-    """One number: an operation on others, or an input with a name."""
+    """One number: an operation on others, or an input with a name.
 
-    op: str  # the primitive's name, or "input", "number", "entry"
+    Attributes:
+        op: Name of the primitive, or "input", "number", "entry".
+        args: Other nodes, or what names the input.
+        kind: "f", "i" or "b": a real number, an integer, a truth value.
+        level: Time at which the number is known.
+        number: Number in order of creation; arguments come before what uses them.
+    """
+
+    op: str
     args: tuple[Any, ...]
-    kind: str  # "f", "i" or "b": a real number, an integer, a truth value
+    kind: str
     level: Level
-    number: int  # in order of creation; arguments come before what uses them
+    number: int
 
 
 class Graph:
@@ -543,13 +551,21 @@ def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:
 
 @dataclasses.dataclass
 class ParameterProgram:
-    """Numbers known with the parameters: inputs, and the equations that make others of them."""
+    """Numbers that are known with the parameters.
+
+    Attributes:
+        values: Their values: of the inputs, then of the results of equations.
+        n_inputs: Number of inputs.
+        steps: Equations, each with its arguments and the indices of its results.
+        conditions: Indices of truth values that chose a branch.
+        zeros: Elements whose values must be 0, by index.
+    """
 
     values: list[NDArray] = dataclasses.field(default_factory=list)
     n_inputs: int = 0
     steps: list[tuple[Any, list[Any], list[int]]] = dataclasses.field(default_factory=list)
-    conditions: list[int] = dataclasses.field(default_factory=list)  # truth values that chose a way
-    zeros: dict[int, NDArray] = dataclasses.field(default_factory=dict)  # where values must be 0
+    conditions: list[int] = dataclasses.field(default_factory=list)
+    zeros: dict[int, NDArray] = dataclasses.field(default_factory=dict)
     _known: dict[Any, list[int]] = dataclasses.field(default_factory=dict)
 
     def add_input(self, value: NDArray) -> int:

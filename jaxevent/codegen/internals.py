@@ -109,7 +109,7 @@ class SignatureCache:
         self._files.flush()
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Load what was compiled for a signature, or return None.
+        """Load the machine code of a signature, or return None.
 
         numba refreshes the target first, for what only compiling needs: imports that take half a
         second.
@@ -121,7 +121,7 @@ class SignatureCache:
         return None if kept is None else CompileResult._rebuild(target, *kept)
 
     def save_overload(self, signature: Any, made: Any) -> None:
-        """Keep what was compiled for a signature, unless it holds addresses of this process."""
+        """Store the machine code of a signature, unless it holds addresses of this process."""
         if self._enabled and not made.lifted and not made.library.has_dynamic_globals:
             self._files.save(self._key(signature, made.codegen), made._reduce())
 

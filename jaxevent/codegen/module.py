@@ -51,13 +51,21 @@ def get_or_make(known: dict[Any, T], key: Any, make: Callable[[], T]) -> T:
 
 
 class CompiledProgram(NamedTuple):
-    """A program's compiled functions, with the numbers of parameters."""
+    """A program's compiled functions, with the numbers of parameters.
+
+    Attributes:
+        program: The traced program.
+        functions: The functions, a tuple of the engine.
+        numbers: Numbers that the functions take.
+        places: Places where the functions find their data.
+        values: Values of the program's `host`.
+    """
 
     program: Any
     functions: Any
     numbers: NDArray
-    places: Any  # where the functions find their data
-    values: list[NDArray]  # of the program's `host`
+    places: Any
+    values: list[NDArray]
 
 
 class KernelCache:
@@ -155,7 +163,7 @@ def _match(
 
 
 def choose_backend(compiler: str | None, numba_serves: bool) -> str:
-    """Choose what compiles a method.
+    """Choose the compiler of a method.
 
     Args:
         compiler: "numba" or "xla" if the user names one.
@@ -175,7 +183,7 @@ def choose_backend(compiler: str | None, numba_serves: bool) -> str:
 def make_kernel(
     name: str, compiler: str | None, numba_serves: bool, make: Callable[[], T]
 ) -> T | None:
-    """Make what runs a method by a kernel, or return None where XLA compiles the method.
+    """Make the kernel object of a method, or return None where XLA compiles the method.
 
     Args:
         name: Name of the method.
@@ -237,7 +245,7 @@ def _content(path: Path) -> bytes | None:
 
 @functools.cache
 def _hash_writer() -> str:
-    """Hash the sources of what kernels are made of beside their text."""
+    """Hash the sources that kernels depend on beside their text."""
     names = ("write.py", "derivative.py", "functions.py")
     sources = (Path(__file__).with_name(name).read_bytes() for name in names)
     return hashlib.blake2b(b"".join(sources)).hexdigest()

@@ -48,7 +48,9 @@ KIND_BY_DTYPE = {"f": "f", "i": "i", "u": "i", "b": "b"}
 class ConstantArray:
     """Array that is known when the program is written.
 
-    `at_point`: it depends on where a point lies, which differs between variants of a program.
+    Attributes:
+        value: The array.
+        at_point: Whether it depends on the position of a point, which differs between variants.
     """
 
     value: NDArray
@@ -57,9 +59,12 @@ class ConstantArray:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterArray:
-    """Array that is known with the parameters: a value of the `ParameterProgram`.
+    """Array that is known with the parameters.
 
-    Kernels leave out elements of `sparse` ones that are 0. `change`: it is a derivative.
+    Attributes:
+        number: Index of the value in the `ParameterProgram`.
+        sparse: Whether kernels leave out elements that are 0.
+        change: Whether it is a derivative.
     """
 
     number: int
@@ -580,11 +585,18 @@ class TracedFunction:
 
 @dataclasses.dataclass(frozen=True)
 class TracedProgram:
-    """Expressions of the functions of a family, and the places of their numbers."""
+    """Expressions of the functions of a family, and the places of their numbers.
+
+    Attributes:
+        functions: The functions by name.
+        host: Numbers that are known with the parameters.
+        layout: Places of the numbers.
+        dtype: Type of real numbers.
+    """
 
     functions: dict[str, TracedFunction]
     host: ParameterProgram
-    layout: Any  # where the numbers lie
+    layout: Any
     dtype: np.dtype
 
 
@@ -616,10 +628,16 @@ def number_names(name: str, leaf: Any, elements: bool = True) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class TracedJaxpr:
-    """Jaxpr of a function of parameters and named inputs."""
+    """Jaxpr of a function of parameters and named inputs.
+
+    Attributes:
+        jaxpr: The jaxpr.
+        inputs: Shapes of the inputs beside the parameters, by name.
+        outputs: Shapes of the outputs, by name.
+    """
 
     jaxpr: Any
-    inputs: dict[str, jax.ShapeDtypeStruct]  # beside the parameters
+    inputs: dict[str, jax.ShapeDtypeStruct]
     outputs: dict[str, jax.ShapeDtypeStruct]
 
     def translate(self, translation: JaxprTranslator, values: list[Value]) -> dict[str, Node]:

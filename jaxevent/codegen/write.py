@@ -62,10 +62,17 @@ LOOP_OPTIONS = {{"error_model": "numpy", "fastmath": {{"contract", "reassoc", "n
 
 @dataclasses.dataclass(frozen=True)
 class ParameterLayout:
-    """Places of parameters among the numbers that a module's functions take."""
+    """Places of parameters among the numbers that a module's functions take.
 
-    begins: dict[tuple[int, int | None], int]  # of an element of a host value, or of all of it
-    vectors: list[tuple[int, int, int]]  # place, and the element of a host value added there
+    Attributes:
+        begins: Place of an element of a host value, or of all of it, by index and element.
+        vectors: Place, and the index and element of a host value that is added there.
+        size: Number of numbers.
+        dtype: Type of the numbers.
+    """
+
+    begins: dict[tuple[int, int | None], int]
+    vectors: list[tuple[int, int, int]]
     size: int
     dtype: np.dtype
 
@@ -83,20 +90,32 @@ class ParameterLayout:
 
 
 class ModuleText(NamedTuple):
-    """The text of a module."""
+    """The text of a module, with the places of its data.
+
+    Attributes:
+        text: The text.
+        parameters: Places of parameters.
+        places: Places where the functions find their data.
+    """
 
     text: str
     parameters: ParameterLayout
-    places: Any  # where the functions find their data
+    places: Any
 
 
 @dataclasses.dataclass(frozen=True)
 class ElementLoop:
-    """Text of a loop over elements."""
+    """Text of a loop over elements.
+
+    Attributes:
+        index: Name of the index.
+        count: Number of elements, as text.
+        arguments: Names of the arguments of the function with the loop.
+    """
 
     index: str
     count: str
-    arguments: tuple[str, ...]  # of the function that holds it
+    arguments: tuple[str, ...]
 
 
 class ModuleWriter:
@@ -335,7 +354,7 @@ class ModuleWriter:
         return (begin,) if node.op == "number" else (begin, count - 1)
 
     def _text(self, node: Node) -> str:
-        """Return the text of what no block computes."""
+        """Return the lines of the nodes that no block computes."""
         found = self.addresses.get(node.args[0]) if node.op == "input" else None
         if isinstance(found, str):
             return found

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
 from jaxevent.deprecated import renamed_methods
-from jaxevent.egomotion.geometry import undistort
+from jaxevent.egomotion.geometry import centred_coordinates
 from jaxevent.recording import Recording
 
 EVENTS_PER_READ = 65536  # events read from a file at a time
@@ -74,11 +74,17 @@ class Candidates(eqx.Module):
 
 
 class CandidateBatches(NamedTuple):
-    """Some batches of candidates, with the events that they belong to."""
+    """Some batches of candidates, and the events that they belong to.
+
+    Attributes:
+        candidates: The candidates.
+        t: (batches,) time of the last event, us; empty batches repeat the one before.
+        row: (batches, K) rows of the events in the recording, -1 for padding.
+    """
 
     candidates: Candidates
-    t: NDArray[np.int64]  # (batches,) us, of the last event; empty batches repeat the one before
-    row: NDArray[np.int64]  # (batches, K) rows of the events in the recording, -1 for padding
+    t: NDArray[np.int64]
+    row: NDArray[np.int64]
 
 
 def pixel_coordinates(
@@ -95,12 +101,12 @@ def pixel_coordinates(
         Positions (height, width, 2), px, and their focal length, px; 1 without a camera.
 
     Raises:
-        InputError: The distortion has no inverse; see `geometry.undistort`.
+        InputError: The distortion has no inverse; see `geometry.centred_coordinates`.
     """
     y, x = np.mgrid[:height, :width].astype(np.float64)
     if camera is None:
         return np.stack([x - (width - 1) / 2, y - (height - 1) / 2], -1), 1.0
-    xi, f = undistort(camera, x.ravel(), y.ravel())
+    xi, f = centred_coordinates(camera, x.ravel(), y.ravel())
     return xi.reshape(height, width, 2), f
 
 
@@ -262,7 +268,15 @@ class CandidateSampler:
 
 
 class EventStream(NamedTuple):
-    """Events (n,), and the row of the first one in the recording."""
+    """Events that were read, and their place in the recording.
+
+    Attributes:
+        t: (n,) times, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        p: (n,) polarities.
+        row: Row of the first event in the recording.
+    """
 
     t: NDArray
     x: NDArray
@@ -272,10 +286,21 @@ class EventStream(NamedTuple):
 
 
 class BatchRules(NamedTuple):
-    """Rules by which batches are filled, see `CandidateSampler.sample`; times in us."""
+    """Rules by which batches are filled, see `CandidateSampler.sample`.
 
-    limits: NDArray[np.int64]  # (2, rows, columns) least and largest age
-    gate: NDArray[np.float64]  # (3, rows, columns) px/s, U and slack of the expected flow
+    Attributes:
+        limits: (2, rows, columns) least and largest age of candidates, us.
+        gate: (3, rows, columns) expected flow along x and y, and its slack, px/s.
+        margin: Displacement that candidates may differ from the expected one beside the slack, px.
+        every: One event in so many is scored.
+        longest: Largest duration of a batch, us.
+        span: Largest time from the first event to the last, us.
+        radius: Largest distance of a candidate in x and y, px.
+        silence: Gap between events after which the history starts anew, us.
+    """
+
+    limits: NDArray[np.int64]
+    gate: NDArray[np.float64]
     margin: float
     every: int
     longest: int
@@ -294,7 +319,20 @@ class RecentEvents(NamedTuple):
 
 
 class CandidateArrays(NamedTuple):
-    """The arrays of `Candidates` and `CandidateBatches`, to be filled."""
+    """Arrays of `Candidates` and `CandidateBatches`, to be filled.
+
+    Attributes:
+        d: (batches, K, C, 2) displacement from candidate to event, px.
+        age: (batches, K, C) age of each candidate, s; 0: unused.
+        xi: (batches, K, 2) positions of events, px.
+        bounds: (batches, K, 2, 2) least and largest displacement within the sensor, px.
+        scale: (batches, K) number of candidates that each stands for.
+        rate: (batches, K) candidates per time of age, 1/s.
+        valid: (batches, K) whether an event is scored.
+        row: (batches, K) rows of the events in the recording, -1 for padding.
+        t: (batches,) times of the last events, us.
+        history: (batches,) age up to which all candidates are known, s.
+    """
 
     d: NDArray
     age: NDArray

@@ -56,13 +56,21 @@ def score_times(start: int, stop: int) -> NDArray[np.int64]:
 
 
 class TrainingSegment(NamedTuple):
-    """A part of a recording with known motion, from `start` to `stop` (us)."""
+    """A part of a recording with known motion.
+
+    Attributes:
+        recording: The recording.
+        start: First time, us.
+        stop: Time after the last, us.
+        known: The motion.
+        split: Index in `runs.family.SPLIT_NAMES`.
+    """
 
     recording: Recording
     start: int
     stop: int
     known: KnownMotion
-    split: int  # index in `runs.family.SPLIT_NAMES`
+    split: int
 
     def crop(self) -> Recording:
         """Return the part of the recording."""
@@ -113,12 +121,21 @@ class AdaptedParams(Generic[P]):
 
 
 class TrainingRuns(eqx.Module):
-    """A segment prepared for a fit of parameters: its known motion, and the estimates of runs."""
+    """A segment prepared for a fit of parameters: its known motion, and the estimates of runs.
 
-    time: Float[Array | np.ndarray, " T"]  # s since the segment's start
-    grid: Float[Array | np.ndarray, " G"]  # s, times of the truth
+    Attributes:
+        time: Times of estimates, s since the segment's start.
+        grid: Times of the truth, s since the segment's start.
+        truth: True motion.
+        counted: 1 where the error counts, else 0.
+        weight: Weight of the segment in the loss.
+        model: Motion model.
+    """
+
+    time: Float[Array | np.ndarray, " T"]
+    grid: Float[Array | np.ndarray, " G"]
     truth: Float[Array | np.ndarray, "G d"]
-    counted: Float[Array | np.ndarray, " T"]  # 1 where the error counts
+    counted: Float[Array | np.ndarray, " T"]
     weight: Float[Array | np.ndarray, ""]
     model: Model
 
@@ -206,7 +223,7 @@ class MotionEstimator(Estimator[P]):
     def check_against(
         self, recording: Recording, motion: MotionEstimate, camera: PinholeCamera | None
     ) -> MotionEstimate:
-        """Return a motion with what the whole recording shows, see `with_flow_consistency`.
+        """Add the evidence of the whole recording to a motion, see `with_flow_consistency`.
 
         Args:
             recording: The recording.
@@ -362,14 +379,23 @@ class FixedEstimates(TrainingRuns):
 
 
 class HostInputs(NamedTuple):
-    """Inputs of a method that computes on the host."""
+    """Inputs of a method that computes on the host.
+
+    Attributes:
+        recording: The recording.
+        model: The motion model.
+        camera: Calibration; None: there is none.
+        seed: Seed of random numbers.
+        progress: Whether a bar is shown; None: if it takes long.
+        options: Options of this method alone.
+    """
 
     recording: Recording
     model: type[Model]
     camera: PinholeCamera | None
     seed: int
     progress: bool | None
-    options: Mapping[str, Any]  # of this method alone
+    options: Mapping[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -408,6 +434,18 @@ class HostEstimator(MotionEstimator[P]):
         params: P,
         seeds: Sequence[int],
     ) -> TrainingRuns:
+        """Estimate a segment with several seeds, for its loss.
+
+        Args:
+            common: Fields of `TrainingRuns`.
+            recording: The segment.
+            times: (T,) times of the estimates, us.
+            params: Parameters of the method.
+            seeds: Seeds of the runs.
+
+        Returns:
+            The segment with the estimates.
+        """
         model, means = type(common[-1]), []
         for seed in seeds:
             motion = self._solve(recording, params, model=model, seed=seed, progress=False)
@@ -447,7 +485,7 @@ class HostEstimator(MotionEstimator[P]):
         return motion
 
     def _solve(self, recording: Recording, params: P | None, **options: Any) -> MotionEstimate:
-        """Estimate the motion, and say nothing if it is lost.
+        """Estimate the motion, without a warning if it is lost.
 
         Args:
             recording: The recording.

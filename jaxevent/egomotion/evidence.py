@@ -240,7 +240,7 @@ class LockDetector:
             self._restart()
         if not ends[-1]:
             if not self.sparse[-1]:
-                self._weigh(events, int(t[-1]), mean[-1], covariance[-1])
+                self._update_decision(events, int(t[-1]), mean[-1], covariance[-1])
             first = len(t) - int(ends[::-1].argmax()) if ends.any() else 0
             reported[first:] = self._is_settled
         return reported & ~self.sparse
@@ -281,7 +281,7 @@ class LockDetector:
                 self._density = old + (count[k] - old * path[k]) / max(path[k], 1)
         return ends
 
-    def _weigh(self, events: Any, t: int, mean: NDArray, covariance: NDArray) -> None:
+    def _update_decision(self, events: Any, t: int, mean: NDArray, covariance: NDArray) -> None:
         """Update the decision by the window before a time.
 
         Args:

@@ -77,8 +77,8 @@ class Flow(NamedTuple):
     """Flow of n events.
 
     It is the flow of undistorted coordinates of one focal length, if there is a calibration (see
-    `geometry.undistort`). Events are invalid where the motion is lost and, in general motion, where
-    no candidate is within `Params.limit`.
+    `geometry.centred_coordinates`). Events are invalid where the motion is lost and, in general
+    motion, where no candidate is within `Params.limit`.
 
     Attributes:
         flow: (n, 2) flow, px/s; NaN where invalid.

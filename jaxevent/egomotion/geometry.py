@@ -48,8 +48,8 @@ def A(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
     Returns:
         (..., 2, 3) matrices, px.
     """
-    x, y, f = jnp.broadcast_arrays(*map(_real, (x, y, f)))
-    return _rows([-f, 0 * f, x], [0 * f, -f, y])
+    x, y, f = jnp.broadcast_arrays(*map(_as_float, (x, y, f)))
+    return _stack_rows([-f, 0 * f, x], [0 * f, -f, y])
 
 
 def B(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
@@ -63,7 +63,7 @@ def B(x: Scalars, y: Scalars, f: Scalars) -> Float[Array, "... 2 3"]:
     Returns:
         (..., 2, 3) matrices, px.
     """
-    x, y, f = jnp.broadcast_arrays(*map(_real, (x, y, f)))
+    x, y, f = jnp.broadcast_arrays(*map(_as_float, (x, y, f)))
     return jnp.stack([jnp.stack(row, -1) for row in _rotation_rows(x, y, f)], -2)
 
 
@@ -86,6 +86,16 @@ def rotation_basis(
 
 
 def _rotation_rows(x: Any, y: Any, f: Any) -> tuple[list, list]:
+    """Return the rows of the rotation matrix `B`.
+
+    Args:
+        x: Column from the principal point, px.
+        y: Row from the principal point, px.
+        f: Focal length, px.
+
+    Returns:
+        Both rows, of three numbers or arrays each.
+    """
     return [x * y / f, -(f + x * x / f), y], [f + y * y / f, -x * y / f, -x]
 
 
@@ -110,7 +120,7 @@ def flow(
     Returns:
         (..., 2) flow, px/s.
     """
-    rho = _real(inverse_depth)[..., None]
+    rho = _as_float(inverse_depth)[..., None]
     return _apply(A(x, y, f), T) * rho + _apply(B(x, y, f), Omega)
 
 
@@ -139,8 +149,8 @@ def bilinear(
     Returns:
         (...) values, px^2/s times the unit of T.
     """
-    x, y, f = map(_real, (x, y, f))
-    U, T, Omega = map(_real, (U, T, Omega))
+    x, y, f = map(_as_float, (x, y, f))
+    U, T, Omega = map(_as_float, (U, T, Omega))
     u, v = U[..., 0], U[..., 1]
     X = jnp.stack(jnp.broadcast_arrays(x, y, f), -1)
     moment = jnp.stack(jnp.broadcast_arrays(f * v, -f * u, y * u - x * v), -1)
@@ -171,7 +181,7 @@ def rotation_residual(
     Returns:
         (..., 2) residual, px.
     """
-    return _real(d) - _real(dt)[..., None] * _apply(B(x, y, f), Omega)
+    return _as_float(d) - _as_float(dt)[..., None] * _apply(B(x, y, f), Omega)
 
 
 # Eight letters of one equation, public since the first release.
@@ -209,13 +219,13 @@ def half_line_residual(
     a = _apply(A(x, y, f), T)
     size = length(a)[..., None]
     a = a / jnp.where(size > 0, size, 1)
-    farthest = _real(rho_max) * _real(dt)
+    farthest = _as_float(rho_max) * _as_float(dt)
     return q - jnp.clip(_dot(q, a), 0, farthest)[..., None] * a
 
 
 def length(v: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
     """Return the Euclidean length along the last axis, whose gradient at 0 is 0."""
-    square = jnp.sum(_real(v) ** 2, -1)
+    square = jnp.sum(_as_float(v) ** 2, -1)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
@@ -228,7 +238,7 @@ def unit(v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
 @full_precision
 def rotation_exp(phi: Float[Array | np.ndarray, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """Return the rotation matrix of a rotation vector (rad), by Rodrigues' formula."""
-    phi = _real(phi)
+    phi = _as_float(phi)
     first, second, _ = _coefficients(_dot(phi, phi))
     K = _cross_matrix(phi)
     return jnp.eye(3, dtype=phi.dtype) + first * K + second * (K @ K)
@@ -239,7 +249,7 @@ def rotation_log(R: Float[Array | np.ndarray, "*batch 3 3"]) -> Float[Array, "*b
 
     At half turns, which have two rotation vectors, it jumps and has no gradient.
     """
-    R = _real(R)
+    R = _as_float(R)
     # 4 q q' of the unit quaternion q = (w, v) is linear in R. Its column with the largest diagonal
     # entry, at least 1, is q up to a factor that is not small: no root near 0.
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
@@ -265,7 +275,7 @@ def rotation_log(R: Float[Array | np.ndarray, "*batch 3 3"]) -> Float[Array, "*b
 @full_precision
 def twist_exp(xi: Float[Array | np.ndarray, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
     """Return the camera's pose after 1 s of a constant twist (T, Omega), relative to the first."""
-    xi = _real(xi)
+    xi = _as_float(xi)
     phi = xi[..., 3:]
     _, second, third = _coefficients(_dot(phi, phi))
     K = _cross_matrix(phi)
@@ -278,7 +288,7 @@ def twist_exp(xi: Float[Array | np.ndarray, "*batch 6"]) -> Float[Array, "*batch
 @full_precision
 def twist_log(P: Float[Array | np.ndarray, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
     """Return the constant twist (T, Omega) that leads to the pose P in 1 s, as `twist_exp` does."""
-    P = _real(P)
+    P = _as_float(P)
     phi = rotation_log(P[..., :3, :3])
     square = _dot(phi, phi)
     small = square < 0.1
@@ -291,12 +301,12 @@ def twist_log(P: Float[Array | np.ndarray, "*batch 4 4"]) -> Float[Array, "*batc
     return jnp.concatenate([(inverse @ P[..., :3, 3:])[..., 0], phi], -1)
 
 
-def undistort(
+def centred_coordinates(
     camera: PinholeCamera, x: ArrayLike, y: ArrayLike
 ) -> tuple[NDArray[np.float64], float]:
-    """Undo the distortion of pixels, on the host in float64.
+    """Return undistorted coordinates of pixels about the principal point, and their focal length.
 
-    The principal point becomes (0, 0), and both axes get the focal length f = sqrt(fx fy).
+    Both axes get the focal length f = sqrt(fx fy). Computed on the host in float64.
 
     Args:
         camera: The camera.
@@ -398,12 +408,12 @@ def _replace_nonfinite(value: Array) -> Array:
     return jnp.where(jnp.isfinite(value), value, -1e6)
 
 
-def _real(value: ArrayLike | float | int) -> Array:
+def _as_float(value: ArrayLike | float | int) -> Array:
     value = jnp.asarray(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
 
 
-def _rows(*rows: Sequence[Array]) -> Array:
+def _stack_rows(*rows: Sequence[Array]) -> Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
@@ -431,12 +441,12 @@ def _apply(matrix: Array, vector: Array | np.ndarray) -> Array:
     Returns:
         (..., m).
     """
-    return jnp.sum(matrix * _real(vector)[..., None, :], -1)
+    return jnp.sum(matrix * _as_float(vector)[..., None, :], -1)
 
 
 def _cross_matrix(v: Array) -> Array:
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return _rows([0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x])
+    return _stack_rows([0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x])
 
 
 def _polynomial(t: Array, coefficients: Sequence[float | int]) -> Array:

@@ -121,7 +121,7 @@ class LiveMotion:
 
     @synchronized
     def finish(self) -> MotionEstimate:
-        """Estimate what the last events show, and return the estimates that are new."""
+        """Estimate the motion at the last events, and return the estimates that are new."""
         self._is_finished = True
         return self._run(until_end=True)
 
@@ -149,12 +149,12 @@ class LiveMotion:
                 break
             parts.append(runner.run())
         if runner is None or not parts:
-            return _rows(self._motion, slice(0, 0))
+            return _take_estimates(self._motion, slice(0, 0))
         new = runner.causal_motion(parts)
-        last = _rows(self._motion, slice(-1, None))
+        last = _take_estimates(self._motion, slice(-1, None))
         joined = _join(last, new)._with_gaps(float(runner.params.tau_max))
-        new = _rows(joined, slice(len(last), None))
-        self._motion = _rows(_join(self._motion, new), slice(-HELD_ESTIMATES, None))
+        new = _take_estimates(joined, slice(len(last), None))
+        self._motion = _take_estimates(_join(self._motion, new), slice(-HELD_ESTIMATES, None))
         needed = self._tail.index(int(new.t[-1] - 1e6 * float(runner.params.tau_max)) - 1)
         needed = min(needed, runner.sampler.next_row)
         if needed - self._tail.dropped > DROPPED_EVENTS:
@@ -162,7 +162,7 @@ class LiveMotion:
         return new
 
 
-def _rows(motion: MotionEstimate, rows: slice) -> MotionEstimate:
+def _take_estimates(motion: MotionEstimate, rows: slice) -> MotionEstimate:
     """Return some estimates."""
     arrays = {
         f.name: v[rows]

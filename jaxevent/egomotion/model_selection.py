@@ -81,7 +81,7 @@ class ModelSelection:
     camera: PinholeCamera | None = None
 
     def include_doubt(self, motion: MotionEstimate) -> MotionEstimate:
-        """Add what the models that are not excluded tell otherwise to the covariance.
+        """Add the differences of models that are not excluded to the covariance.
 
         Args:
             motion: A motion of the selected model.
@@ -213,7 +213,7 @@ class _WindowFits(NamedTuple):
 def _model_doubt(
     model: type[Model], fits: list[_WindowFits], against: dict[str, float]
 ) -> tuple[NDArray[np.float64] | None, list[str]]:
-    """Average what other models tell, by their weights exp(-z^2 / 2) relative to the chosen one.
+    """Average the squared differences of other models, by their weights exp(-z^2 / 2).
 
     Args:
         model: The chosen model.
@@ -251,12 +251,19 @@ def _model_doubt(
 
 
 class _LensFit(NamedTuple):
-    """Rotations before a lens that distorts."""
+    """Rotations before a lens that distorts.
+
+    Attributes:
+        division: Coefficient of the lens's division model.
+        likelihood: Log-likelihood of the pixels that the coefficient was fitted to.
+        sharpness: Log sharpness of the patches' held-out pixels.
+        turns: (3,) rotation of each window, rad.
+    """
 
     division: float
-    likelihood: float  # of the pixels that it was fitted to
-    sharpness: NDArray[np.float64]  # of held-out pixels
-    turns: list[NDArray[np.float64]]  # rad, of windows
+    likelihood: float
+    sharpness: NDArray[np.float64]
+    turns: list[NDArray[np.float64]]
 
     def distortion(self, recording: Recording, camera: PinholeCamera) -> tuple[float, ...]:
         """Return coefficients k1, k2, p1, p2, k3 that distort about alike on a sensor."""

@@ -186,13 +186,13 @@ def window_durations(recording: Recording) -> NDArray[np.float64]:
     """
     whole = 1e-6 * (recording.stop - recording.start)
     every = np.asarray(WINDOW_DURATIONS_S, np.float64)
-    fitting: NDArray[np.float64] = every[[_fits(recording, float(one)) for one in every]]
+    fitting: NDArray[np.float64] = every[[_is_long_enough(recording, float(one)) for one in every]]
     if whole >= WINDOW_DURATIONS_S[-1] or not len(fitting):
         return fitting
     return np.append(fitting, whole)
 
 
-def _fits(recording: Recording, duration: float) -> bool:
+def _is_long_enough(recording: Recording, duration: float) -> bool:
     """Return whether the recording is at least as long as a window.
 
     Args:
@@ -276,7 +276,7 @@ def measure_sharpness(
     columns = int((xi[..., 0].max() - corner[0]) // PATCH_PX) + 1
     half, index = round(5e5 * duration), recording.events.index
     start, stop = index(middle - half), index(middle + half)
-    if stop - start < MIN_PATCH_EVENTS or not _fits(recording, duration):
+    if stop - start < MIN_PATCH_EVENTS or not _is_long_enough(recording, duration):
         return None
     events = recording.events[start : min(stop, start + 40 * MAX_WINDOW_EVENTS)]
     at = xi[events.y, events.x] - corner
@@ -313,10 +313,18 @@ def measure_sharpness(
 
 
 class PatchEvents(NamedTuple):
-    """Events (n,) of patches."""
+    """Events of patches.
 
-    at: NDArray[np.float64]  # (n, 2) px, from the corner of the patch
-    since: NDArray[np.float64]  # time from the middle of the window, in durations
+    Attributes:
+        at: (n, 2) positions from the corner of the patch, px.
+        since: (n,) times from the middle of the window, in durations.
+        sign: (n,) polarities, +1 or -1.
+        patch: (n,) index of the patch.
+        half: (n,) half of the pixels that the event belongs to, 0 or 1.
+    """
+
+    at: NDArray[np.float64]
+    since: NDArray[np.float64]
     sign: NDArray[np.float64]
     patch: NDArray[np.int64]
     half: NDArray[np.int64]

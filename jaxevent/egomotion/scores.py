@@ -39,7 +39,7 @@ def endpoint_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]
     Returns:
         (n,) errors, in the unit of the vectors.
     """
-    estimate, truth = _pair(estimate, truth)
+    estimate, truth = _check_motions(estimate, truth)
     return np.linalg.norm(estimate - truth, axis=-1)
 
 
@@ -53,7 +53,9 @@ def relative_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]
     Returns:
         (n,) errors; infinite where only the truth is the zero vector, 0 where both are.
     """
-    return _ratio(endpoint_error(estimate, truth), np.linalg.norm(_pair(truth, truth)[1], axis=-1))
+    return _ratio(
+        endpoint_error(estimate, truth), np.linalg.norm(_check_motions(truth, truth)[1], axis=-1)
+    )
 
 
 def axis_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
@@ -70,7 +72,7 @@ def axis_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
         (n,) angles, degrees. They are 90, the mean over all directions, where one is the zero
         vector, and 0 where both are.
     """
-    estimate, truth = (unit_vectors(v) for v in _pair(estimate, truth))
+    estimate, truth = (unit_vectors(v) for v in _check_motions(estimate, truth))
     # tan(angle / 2) = |a - b| / |a + b| of unit vectors.
     apart = np.linalg.norm(estimate - truth, axis=-1)
     together = np.linalg.norm(estimate + truth, axis=-1)
@@ -87,7 +89,7 @@ def magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64
     Returns:
         (n,) errors, in the unit of the vectors.
     """
-    estimate, truth = _pair(estimate, truth)
+    estimate, truth = _check_motions(estimate, truth)
     return np.abs(np.linalg.norm(estimate, axis=-1) - np.linalg.norm(truth, axis=-1))
 
 
@@ -101,7 +103,9 @@ def relative_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[n
     Returns:
         (n,) errors; infinite where only the truth is the zero vector, 0 where both are.
     """
-    return _ratio(magnitude_error(estimate, truth), np.linalg.norm(_pair(truth, truth)[1], axis=-1))
+    return _ratio(
+        magnitude_error(estimate, truth), np.linalg.norm(_check_motions(truth, truth)[1], axis=-1)
+    )
 
 
 def normalised_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
@@ -115,7 +119,7 @@ def normalised_magnitude_error(estimate: ArrayLike, truth: ArrayLike) -> NDArray
         (n,) errors; infinite where the whole truth is 0 and the estimate is not, 0 where both are.
     """
     error = magnitude_error(estimate, truth)
-    largest = np.linalg.norm(_pair(truth, truth)[1], axis=-1).max(initial=0)
+    largest = np.linalg.norm(_check_motions(truth, truth)[1], axis=-1).max(initial=0)
     return _ratio(error, np.full(len(error), largest))
 
 
@@ -329,7 +333,7 @@ def errors_by_part(
     return errors
 
 
-def _pair(estimate: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], ...]:
+def _check_motions(estimate: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.float64], ...]:
     """Check a motion and its truth, and return both as arrays.
 
     Args:

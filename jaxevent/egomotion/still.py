@@ -34,13 +34,21 @@ MAX_WINDOW_S = 1.0
 
 
 class MotionRows(NamedTuple):
-    """Estimates of a motion of d components."""
+    """Estimates of a motion of d components.
+
+    Attributes:
+        model: The model.
+        t: (n,) times at which they were observed, us.
+        mean: (n, d) motion.
+        covariance: (n, d, d) its covariance.
+        valid: (n,) whether the motion is known.
+    """
 
     model: type[Model]
-    t: NDArray[np.int64]  # (n,) us, at which they were observed
-    mean: NDArray[np.floating]  # (n, d)
-    covariance: NDArray[np.floating]  # (n, d, d)
-    valid: NDArray[np.bool_]  # (n,)
+    t: NDArray[np.int64]
+    mean: NDArray[np.floating]
+    covariance: NDArray[np.floating]
+    valid: NDArray[np.bool_]
 
 
 def find_undecided(recording: Recording, motion: MotionRows) -> tuple[NDArray[np.bool_], str]:

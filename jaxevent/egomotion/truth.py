@@ -53,7 +53,7 @@ def _check_known(us: NDArray[np.int64], start: int | np.integer, stop: int | np.
         )
 
 
-def _interpolate(at: NDArray, t: NDArray[np.int64], values: NDArray) -> NDArray[np.float64]:
+def _interpolate_columns(at: NDArray, t: NDArray[np.int64], values: NDArray) -> NDArray[np.float64]:
     """Interpolate columns linearly in time.
 
     Args:
@@ -101,8 +101,8 @@ class Twists:
         given = np.atleast_1d(np.asarray(times))
         _check_known(us, self.start, self.stop)
         at = given * 1e6 if given.dtype.kind == "f" else us.astype(np.float64)
-        T = None if self.T is None else _interpolate(at, self.t, self.T)
-        return T, _interpolate(at, self.t, self.Omega)
+        T = None if self.T is None else _interpolate_columns(at, self.t, self.T)
+        return T, _interpolate_columns(at, self.t, self.Omega)
 
 
 def from_poses(poses: Poses, span: float | int = 0.0) -> Twists:
@@ -323,7 +323,7 @@ class KnownMotion:
         """
         us = np.atleast_1d(microseconds(times))
         _check_known(us, self.t[0], self.t[-1])
-        values = _interpolate(us, self.t, self.values)
+        values = _interpolate_columns(us, self.t, self.values)
         for part in self.model.parts:
             if part.direction:
                 values[:, part.rows] = unit_vectors(values[:, part.rows])

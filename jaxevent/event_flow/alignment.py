@@ -351,7 +351,7 @@ def _quadratic_basis(x: NDArray, y: NDArray) -> NDArray[np.float64]:
     return np.array([along_x, [zero, zero, zero, one, x, y, x * y, y * y]])
 
 
-def _smooth(values: NDArray) -> NDArray[np.float64]:
+def _binomial_means(values: NDArray) -> NDArray[np.float64]:
     """Return binomial means over five values, four fewer than there are."""
     return np.convolve(values, [1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16], "valid")
 
@@ -422,17 +422,24 @@ class Clock(NamedTuple):
         order = 1 if len(self.t) < 3 else 2
         rates = 1e6 * np.gradient(self.s, self.t, edge_order=order)
         # Rates at both ends continue those inside, so that a camera which brakes brakes to the end.
-        smooth = _smooth(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
-        return np.stack([smooth, _smooth(np.pad((rates - smooth) ** 2, 2, mode="edge"))])
+        smooth = _binomial_means(np.pad(rates, 2, mode="reflect", reflect_type="odd"))
+        return np.stack([smooth, _binomial_means(np.pad((rates - smooth) ** 2, 2, mode="edge"))])
 
 
 class WindowEvents(NamedTuple):
-    """Events of a window: places (px), times and polarities."""
+    """Events of a window.
+
+    Attributes:
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        t: (n,) times, us.
+        p: (n,) polarities, of mean 0 and variance 1.
+    """
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
-    t: NDArray[np.int64]  # us
-    p: NDArray[np.float32]  # polarity, of mean 0 and variance 1
+    t: NDArray[np.int64]
+    p: NDArray[np.float32]
 
     @classmethod
     def of(cls, events: Events) -> "WindowEvents":
@@ -456,7 +463,7 @@ class WindowEvents(NamedTuple):
 
 
 class Displacement(NamedTuple):
-    """Displacement of nodes and what events tell of it."""
+    """Displacement of nodes, with its information and covariance."""
 
     u: NDArray[np.float64]  # (rows, columns, 2), px per unit of s
     clock: Clock
@@ -479,7 +486,7 @@ def _principal(information: NDArray, reach: int) -> tuple[NDArray, NDArray]:
     return np.linalg.eigh(4 * np.pi * reach**2 * pooled[..., [[0, 1], [1, 2]]])
 
 
-def _rotate(axes: NDArray, values: NDArray) -> NDArray:
+def _compose_matrices(axes: NDArray, values: NDArray) -> NDArray:
     """Return matrices of these axes and eigenvalues.
 
     Args:
@@ -545,7 +552,7 @@ class Alignment:
         trace = np.maximum(information[..., 0] + information[..., 2], 0) + 1e-9
         for reach in POOLING:
             values, axes = _principal(information, reach)
-            C = _rotate(axes, 1 / (np.maximum(values, 0) + 1 / UNKNOWN_VARIANCE))
+            C = _compose_matrices(axes, 1 / (np.maximum(values, 0) + 1 / UNKNOWN_VARIANCE))
             pooled, squares = (
                 gaussian_filter(one, reach, mode="constant") for one in (trace, trace**2)
             )
@@ -568,7 +575,7 @@ class Alignment:
         """
         values, axes = _principal(aligned.information, POOLING[-1])
         values = np.maximum(values, 0)
-        known = _rotate(axes, values / (values + FIRST_INFORMATION))
+        known = _compose_matrices(axes, values / (values + FIRST_INFORMATION))
         return (known @ aligned.u[..., None])[..., 0]
 
     def typical(self, aligned: Displacement) -> float:
@@ -608,7 +615,9 @@ class Alignment:
             surface = np.stack([c @ B0, c @ B1], -1).reshape(u.shape)
         return surface
 
-    def _turn(self, clock: Clock, at: int, s: NDArray, turns: NDArray) -> NDArray[np.float64]:
+    def _update_clock(
+        self, clock: Clock, at: int, s: NDArray, turns: NDArray
+    ) -> NDArray[np.float64]:
         """Move the times of a clock by a step of (1), on the whole as fast as before alignment.
 
         Args:
@@ -699,7 +708,7 @@ class Alignment:
                 before = step * np.minimum(1, reach / np.maximum(length, 1e-9))
                 u += before
                 if adapt:
-                    ahead = self._turn(clock, at, ahead, turns)
+                    ahead = self._update_clock(clock, at, ahead, turns)
         information = normal[..., 2:5] - NOISE * normal[..., 5:] * [1, 0, 1]
         return Displacement(
             u,

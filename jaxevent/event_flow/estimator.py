@@ -49,12 +49,19 @@ class FlowParams(Parameters):
 
 
 class Anchor(NamedTuple):
-    """Flow at one time, at nodes."""
+    """Flow at one time, at nodes.
 
-    row: int  # of the event there
-    t: int  # us
+    Attributes:
+        row: Number of the event there.
+        t: Its time, us.
+        aligned: Displacement of nodes.
+        rates: (2, K) rates of its clock, 1/s, and their variances.
+    """
+
+    row: int
+    t: int
     aligned: Displacement
-    rates: NDArray[np.float64]  # (2, K) of its clock, and their variances
+    rates: NDArray[np.float64]
 
     @property
     def rate(self) -> float:
@@ -63,10 +70,15 @@ class Anchor(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """Anchors that start one from the other: the first of them, and how many events apart."""
+    """Sequence of anchors, each estimated from the one before.
+
+    Attributes:
+        first: The first anchor.
+        half: Number of events on either side of an anchor.
+    """
 
     first: Anchor
-    half: int  # events on either side of an anchor
+    half: int
 
 
 class EventFlow:
@@ -108,8 +120,8 @@ class EventFlow:
         events = self.recording.events[max(row - half, 0) : row + half]
         return int(events.t[min(row, half)]), events
 
-    def _seek(self, row: int, most: int | None = None) -> Chain:
-        """Find the motion around an event from nothing, in windows that double.
+    def _start_chain(self, row: int, most: int | None = None) -> Chain:
+        """Estimate the motion around an event without an initial value, in windows that double.
 
         They grow until points are displaced far enough, or to `most` events.
 
@@ -172,7 +184,7 @@ class EventFlow:
         return Anchor(row, at, found, found.clock.rates())
 
     def _make_chain(self, number: int) -> Chain:
-        return self._seek(number * CHAIN_WINDOWS * self._base)
+        return self._start_chain(number * CHAIN_WINDOWS * self._base)
 
     def _make_anchor(self, number: int, k: int) -> Anchor:
         """Make an anchor of a chain; those before it are estimated first.
@@ -191,7 +203,7 @@ class EventFlow:
         row = number * CHAIN_WINDOWS * self._base + k * half
         found = self._refine(row, half, before.aligned.u, before.aligned.clock)
         if found.aligned.score < MIN_SCORE_RATIO * before.aligned.score:
-            other = self._seek(row, half).first
+            other = self._start_chain(row, half).first
             if other.aligned.score > found.aligned.score:
                 return other
         return found
@@ -201,7 +213,7 @@ class EventFlow:
         row = max(self.recording.events.index(t + 1) - 1, 0)
         return self._chain(row // (CHAIN_WINDOWS * self._base)).half
 
-    def _rows(self, number: int) -> NDArray[np.int64]:
+    def _anchor_events(self, number: int) -> NDArray[np.int64]:
         """Return the events at which the anchors of a chain are."""
         length = CHAIN_WINDOWS * self._base
         end = min((number + 1) * length, len(self.recording.events))
@@ -229,7 +241,7 @@ class EventFlow:
         for number in range(first, min(high // length + 2, (n - 1) // length + 1)):
             if found and found[-1].row >= high:
                 break
-            rows = self._rows(number)
+            rows = self._anchor_events(number)
             if self.causal:
                 rows = rows[rows + self._chain(number).half <= seen]
             for k in range(len(rows)):
@@ -243,7 +255,7 @@ class EventFlow:
                     break
         return found
 
-    def _fields(
+    def _velocities_at(
         self, anchors: list[Anchor], knots: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return velocity and covariance of all nodes at some times.
@@ -293,7 +305,7 @@ class EventFlow:
         knots = np.unique(np.concatenate(times).astype(np.int64))
         if len(knots) > MAX_KNOTS:
             knots = knots[np.linspace(0, len(knots) - 1, MAX_KNOTS).round().astype(int)]
-        velocity, covariance = self._fields(anchors, knots)
+        velocity, covariance = self._velocities_at(anchors, knots)
         spread = self._align.fill(covariance.mean(0))
         return WindowPaths(int(at), knots, velocity, spread[None], self._align.spacing)
 
@@ -322,7 +334,7 @@ class EventFlow:
         for row, t in enumerate(wanted.tolist()):
             with self._lock:
                 anchors = self._around(t, t, t)
-            found = self._fields(anchors, wanted[row : row + 1])
+            found = self._velocities_at(anchors, wanted[row : row + 1])
             mean[row], covariance[row] = (self._align.fill(one[0]) for one in found)
             if anchors:
                 rate = np.interp(t, [a.t for a in anchors], [abs(a.rate) for a in anchors])

@@ -11,7 +11,7 @@ BLOCK_POINTS = 64  # that pass through a stretch of time one beside the other
 
 
 @njit_fastmath_inlined
-def _interpolate(field, place, part, component):
+def _bilinear(field, place, part, component):
     """Interpolate a component of a field in a cell of nodes.
 
     Args:
@@ -52,8 +52,8 @@ def _velocity_at(fields, weight, x, y):
     fx, fy = x - np.float32(i), y - np.float32(j)
     place, part = (np.uint32(i), np.uint32(j)), (fx, fy)
     early = one - weight
-    u = early * _interpolate(before, place, part, 0) + weight * _interpolate(after, place, part, 0)
-    v = early * _interpolate(before, place, part, 1) + weight * _interpolate(after, place, part, 1)
+    u = early * _bilinear(before, place, part, 0) + weight * _bilinear(after, place, part, 0)
+    v = early * _bilinear(before, place, part, 1) + weight * _bilinear(after, place, part, 1)
     return u, v
 
 

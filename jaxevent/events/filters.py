@@ -146,11 +146,13 @@ def filter_background(
     if not 1 <= neighbours <= 8:
         raise InputError(f"{neighbours} of 8 neighbours are not possible; give 1 to 8")
     last = np.full((height + 2, width + 2), LONG_AGO_US)
-    return select_events(part, lambda e: supported(e.t, e.x, e.y, last, window_us, neighbours))
+    return select_events(part, lambda e: find_supported(e.t, e.x, e.y, last, window_us, neighbours))
 
 
 @njit
-def supported(t: Any, x: Any, y: Any, last_t: Any, max_age_us: Any, min_neighbours: Any) -> Any:
+def find_supported(
+    t: Any, x: Any, y: Any, last_t: Any, max_age_us: Any, min_neighbours: Any
+) -> Any:
     """Find events that pixels around them support.
 
     Args:

@@ -24,14 +24,22 @@ class DeviceEvents(eqx.Module):
     """A fixed number of events for `jax.jit`; those that pad the number are not valid.
 
     Times are int32 us since an origin, and so are all times that are passed with them.
+
+    Attributes:
+        t: Times, us.
+        x: Columns, px.
+        y: Rows, px.
+        p: Polarities, True for ON.
+        valid: Whether an event is real rather than padding.
+        size: Width and height of the sensor, px.
     """
 
-    t: Int[Numeric, "*batch n"]  # us
-    x: Int[Numeric, "*batch n"]  # column
-    y: Int[Numeric, "*batch n"]  # row
-    p: Bool[Numeric, "*batch n"]  # True: ON
+    t: Int[Numeric, "*batch n"]
+    x: Int[Numeric, "*batch n"]
+    y: Int[Numeric, "*batch n"]
+    p: Bool[Numeric, "*batch n"]
     valid: Bool[Numeric, "*batch n"]
-    size: Size = eqx.field(static=True)  # width, height, px
+    size: Size = eqx.field(static=True)
 
 
 AnyEvents = Events | Recording | DeviceEvents
@@ -85,9 +93,14 @@ def to_device(
 
 
 class _Increment(NamedTuple):
-    """Values that events add to an image each; numbers or (events,)."""
+    """Amounts that events add to an image; numbers or one for each event.
 
-    plane: Any  # the image of a stack
+    Attributes:
+        plane: Index of the image in a stack.
+        weight: The amount.
+    """
+
+    plane: Any
     weight: Any
 
 
@@ -222,7 +235,7 @@ def voxel_grid(
     """
     if bins < 1:
         raise InputError(f"a voxel grid of {bins} bins is not possible; give 1 or more")
-    first, last = _ends(part, start, stop)
+    first, last = _fill_ends(part, start, stop)
 
     def increments(e: Any, xp: Any) -> list[_Increment]:
         length = xp.maximum(last - first, 1)
@@ -257,7 +270,7 @@ def time_surface(
         InputError: The time constant is shorter than 1 us.
     """
     tau_us = parse_duration(tau, "the time constant of a time surface")
-    _, now = _ends(part, None, at)
+    _, now = _fill_ends(part, None, at)
     if isinstance(part, DeviceEvents):
         width, height = part.size
         index = (part.p * height + part.y) * width + part.x
@@ -281,10 +294,19 @@ def _integer_type(part: AnyEvents) -> Any:
 
 
 def _sign(e: Any, xp: Any) -> Any:
+    """Return the polarities as +1 and -1.
+
+    Args:
+        e: Events, as `Events` or `DeviceEvents`.
+        xp: NumPy, or JAX's NumPy.
+
+    Returns:
+        (n,).
+    """
     return xp.where(e.p, 1, -1)
 
 
-def _ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
+def _fill_ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
     """Fill in the ends of a span of time.
 
     Args:

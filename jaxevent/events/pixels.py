@@ -242,11 +242,11 @@ def undistort(recording: Recording) -> Recording:
     events = _in_memory(map_events(recording, step))
     at = camera.distort(ideal.normalise(x, y)).reshape(height, width, 2)
     return _with_pixels(
-        recording, events, (width, height), lambda images: _interpolate(images, at), ideal
+        recording, events, (width, height), lambda images: _interpolate_images(images, at), ideal
     )
 
 
-def _interpolate(images: NDArray, at: NDArray[np.float64]) -> NDArray:
+def _interpolate_images(images: NDArray, at: NDArray[np.float64]) -> NDArray:
     """Interpolate images linearly at points.
 
     Args:

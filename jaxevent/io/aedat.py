@@ -366,11 +366,11 @@ class _Readouts:
                 int(times[-1]),
             )
             if found and not begins[piece[0]]:
-                one = _joined(found.pop(), one)
+                one = _join_readouts(found.pop(), one)
             found.append(one)
 
 
-def _joined(a: _Readout, b: _Readout) -> _Readout:
+def _join_readouts(a: _Readout, b: _Readout) -> _Readout:
     number = a.samples + b.samples
     # Relative to one of them: a time in float64 keeps its us to 285 years.
     mean = a.mean + (b.mean - a.mean) * (b.samples / number)

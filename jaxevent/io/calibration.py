@@ -187,8 +187,23 @@ def _make_camera(
     model: str,
     coefficients: Any,
     source: str,
-    place: tuple[tuple[int, int] | None, NDArray[np.float64]],
+    size_and_pose: tuple[tuple[int, int] | None, NDArray[np.float64]],
 ) -> CalibratedCamera:
+    """Make a camera of a calibration file's numbers.
+
+    Args:
+        intrinsics: (4,) fx, fy, cx and cy, px.
+        model: Name of the distortion model; "": none.
+        coefficients: List of its coefficients.
+        source: Name of the file and camera, for messages.
+        size_and_pose: (width, height), px, or None, and the transform (4, 4) from the first camera.
+
+    Returns:
+        The camera.
+
+    Raises:
+        InputError: A number is not possible.
+    """
     count = len(coefficients) if isinstance(coefficients, list) else 0
     k = _numbers(coefficients, count, f"{source}: the distortion")
     if not (intrinsics[:2] > 0).all():
@@ -197,7 +212,7 @@ def _make_camera(
             "positive ones"
         )
     lens, left_out = make_supported_camera(intrinsics, model, k, source)
-    return CalibratedCamera(lens, left_out.get("camera", ""), *place)
+    return CalibratedCamera(lens, left_out.get("camera", ""), *size_and_pose)
 
 
 def _data(part: Any) -> Any:
@@ -205,13 +220,39 @@ def _data(part: Any) -> Any:
 
 
 def _matrix(values: Any, where: str) -> NDArray[np.float64]:
+    """Convert four lists of four numbers to a matrix.
+
+    Args:
+        values: The lists, as read.
+        where: Name of their place, for messages.
+
+    Returns:
+        (4, 4).
+
+    Raises:
+        InputError: They are none.
+    """
     if not isinstance(values, list) or len(values) != 4:
         raise InputError(f"{where} must be four rows of four numbers; correct it")
     return np.stack([_numbers(row, 4, where) for row in values])
 
 
 def _numbers(values: Any, count: int, where: str) -> NDArray[np.float64]:
-    """Return a list of `count` finite numbers, or raise `InputError`; lists may hold themselves."""
+    """Convert a list of finite numbers to an array.
+
+    Lists may hold themselves.
+
+    Args:
+        values: The list, as read.
+        count: Number of numbers.
+        where: Name of its place, for messages.
+
+    Returns:
+        (count,).
+
+    Raises:
+        InputError: It is none.
+    """
     held = values if isinstance(values, list) else []
     are_numbers = all(isinstance(value, int | float) for value in held)
     if len(held) != count or not are_numbers or not all(abs(value) < 1e300 for value in held):

@@ -163,7 +163,7 @@ def record_fields(records: NDArray, source: str) -> dict[str, str]:
 
 
 def _unsigned_off(p: NDArray) -> float | None:
-    """Find the largest number of 8, 16, 32 or 64 bits that stands for -1 in polarities (n,).
+    """Find the number that stands for -1 in polarities (n,) stored unsigned: 255, 65535, ...
 
     Returns None unless the number occurs and 0 does not.
     """
@@ -287,8 +287,14 @@ def infer_format(
     return ColumnFormat(found, _unsigned_off(sample["p"]), t.dtype.kind == "f")
 
 
-class ColumnEvents(NamedTuple):
-    """Events of named columns, with their clock and the notes of how their unit was found."""
+class ColumnReadResult(NamedTuple):
+    """Events of named columns, with their clock and notes on how the unit of time was found.
+
+    Attributes:
+        events: The events.
+        clock: Clock of images, poses and samples beside them.
+        notes: Remarks on the unit of time.
+    """
 
     events: EventSource
     clock: Clock
@@ -307,8 +313,8 @@ def read_columns(
     unit: str | None = None,
     origin: int = 0,
     block: int | None = None,
-) -> ColumnEvents:
-    """Read events of which any range of rows can be had.
+) -> ColumnReadResult:
+    """Make events of named columns, of which any range of rows is read when needed.
 
     Args:
         fields: Columns t, x, y and p of a range of rows.
@@ -345,7 +351,7 @@ def read_columns(
     events = read_events(decode, size, source, options, origin)
     last = max(len(events) - 1, 0)
     ends = [int(t) for t in (*events[:1].t, *events[last:].t)] or [0, 0]
-    return ColumnEvents(events, found.clock(ends[0], ends[-1]), list(found.unit.notes))
+    return ColumnReadResult(events, found.clock(ends[0], ends[-1]), list(found.unit.notes))
 
 
 def read_whole_columns(
@@ -357,7 +363,7 @@ def read_whole_columns(
     name: str = "",
     usual: str | None = None,
     origin: int = 0,
-) -> ColumnEvents:
+) -> ColumnReadResult:
     """Read events of columns in memory, as `read_columns` does.
 
     Args:

@@ -165,7 +165,14 @@ def remember_call(load: Callable[P, Recording]) -> Callable[P, Recording]:
 
 
 class _Block(NamedTuple):
-    """A block of a file: the decoder's state before it, its first row, its first and last time."""
+    """A block of a file.
+
+    Attributes:
+        state: State of the decoder before it.
+        row: Row of its first event.
+        first: Its first time, us.
+        last: Its last time, us.
+    """
 
     state: Any
     row: int
@@ -224,7 +231,7 @@ def read_events(
     if not blocks:
         return Events.empty()
     if options.in_memory or len(blocks) <= 2:
-        return _joined(pieces)
+        return _concatenate_events(pieces)
     return DecodedEvents(decode, blocks, row, (pieces[0], pieces[1]), size, source, origin=origin)
 
 
@@ -244,7 +251,7 @@ def _find_disorder(
         return disorder.find_disorder((columns[0] for _, columns in decode(None)), bound, source)
 
 
-def _joined(pieces: list[Events]) -> Events:
+def _concatenate_events(pieces: list[Events]) -> Events:
     if len(pieces) == 1:
         return pieces[0]
     columns = []
@@ -375,7 +382,7 @@ class DecodedEvents(EventsInFile):
             row = int(self._rows[block])
             pieces.append(self._block(block)[max(start - row, 0) : stop - row])
             block += 1
-        return _joined(pieces)
+        return _concatenate_events(pieces)
 
     @synchronized
     def index(self, time: int) -> int:
@@ -399,7 +406,7 @@ class DecodedEvents(EventsInFile):
             columns = next((block for _, block in self._stream if len(block[0])), None)
         count = int(self._rows[number + 1] - self._rows[number])
         if columns is None or len(columns[0]) != count:
-            raise _changed(self._source, "events")
+            raise _changed_file_error(self._source, "events")
         events = check_events(
             *columns,
             self.checked_size,
@@ -434,7 +441,7 @@ def slice_bounds(rows: slice, count: int) -> tuple[int, int]:
     return start, stop
 
 
-def _changed(source: str, what: str) -> InputError:
+def _changed_file_error(source: str, what: str) -> InputError:
     return InputError(
         f"{source}: no longer holds the {what} it held when it was opened; load it again"
     )
@@ -468,7 +475,7 @@ class DecodedImages(ImagesInFile):
             for i, row in enumerate(rows):
                 image = self._stream.read(row)
                 if image is None or (image.shape, image.dtype) != (out.shape[1:], self.dtype):
-                    raise _changed(self._stream.source, "image")
+                    raise _changed_file_error(self._stream.source, "image")
                 out[i] = image
         return out
 

@@ -69,11 +69,11 @@ def parse_repair(text: str) -> Repair:
     chosen: dict[str, Any] = {}
     for word in text.split(","):
         kind, colon, value = word.strip().partition(":")
-        chosen |= _option(text, kind, value if colon else None)
+        chosen |= _parse_repair(text, kind, value if colon else None)
     return Repair(**chosen)
 
 
-def _option(text: str, kind: str, value: str | None) -> dict[str, Any]:
+def _parse_repair(text: str, kind: str, value: str | None) -> dict[str, Any]:
     refused = InputError(f"repair = {text!r} is not known; give {_REPAIR_USAGE}")
     if kind not in REPAIR_KINDS or (value is not None and kind in ("drop", "unwrap")):
         raise refused
@@ -89,7 +89,13 @@ def _option(text: str, kind: str, value: str | None) -> dict[str, Any]:
 
 
 class Reset(NamedTuple):
-    """A clock that is set back: the row of the first event after it, and times (us) around it."""
+    """A clock that is set back.
+
+    Attributes:
+        row: Row of the first event after it.
+        before: Last time before it, us.
+        after: First time after it, us.
+    """
 
     row: int
     before: int
@@ -156,18 +162,18 @@ class Disorder:
         if self.wraps:
             period = abs(self.wraps[0][1])
             number = sum(1 for _, size in self.wraps if size > 0)
-            yield "unwrap", f"a counter of {_period(period)} wraps {_times(number)}"
+            yield "unwrap", f"a counter of {_period(period)} wraps {_in_words(number)}"
         if self.resets:
             first, sizes = self.resets[0], [end - begin for begin, end in self.parts]
             shown = ", ".join(f"{size:,}" for size in sizes[:8]) + ", ..." * (len(sizes) > 8)
             yield (
                 "part",
-                f"the clock is set back {_times(len(self.resets))}, at event {first.row} from "
+                f"the clock is set back {_in_words(len(self.resets))}, at event {first.row} from "
                 f"{first.before} to {first.after} us, which leaves parts of {shown} events",
             )
         if self.outliers:
             n = self.dropped
-            yield "drop", f"{n:,} {plural('event', n)} far from the times around {_them(n)}"
+            yield "drop", f"{n:,} {plural('event', n)} far from the times around {_pronoun(n)}"
         if self.late:
             n, bound = self.late, max(self.bound, self.latest)
             sort = "sort" if bound == DEFAULT_MAX_LATE_US else f"sort:{bound}"
@@ -186,7 +192,7 @@ class Disorder:
         if repair.part is not None and repair.part > len(self.parts):
             raise InputError(
                 f"{source}: has no part {repair.part}, as its clock is set back "
-                f"{_times(len(self.resets))}; give a part from 1 to {len(self.parts)}"
+                f"{_in_words(len(self.resets))}; give a part from 1 to {len(self.parts)}"
             )
 
     def kept_rows(self, repair: Repair) -> tuple[int, int]:
@@ -223,11 +229,11 @@ class Disorder:
         return f"repaired event times: {', '.join(made) or 'none went back'}"
 
 
-def _times(number: int) -> str:
+def _in_words(number: int) -> str:
     return "once" if number == 1 else f"{number:,} times"
 
 
-def _them(number: int) -> str:
+def _pronoun(number: int) -> str:
     return "it" if number == 1 else "them"
 
 
@@ -310,7 +316,7 @@ class _Scan:
             self.shift += size
             shifts[at] = size
             found.wraps.append((row + int(at), size))
-            self._count()
+            self._count_fault()
         return block + np.rint(self.shift - shifts.sum() + np.cumsum(shifts)).astype(np.int64)
 
     def classify_steps(self, t: NDArray[np.int64], stop: int) -> None:
@@ -333,7 +339,7 @@ class _Scan:
             else:
                 found.outliers.append((max(origin + run[0], last_run), origin + run[1]))
                 last_run = origin + run[1]
-            self._count()
+            self._count_fault()
         self.settled = origin + stop
 
     def count_late(self, t: NDArray[np.int64], end: int) -> None:
@@ -381,7 +387,7 @@ class _Scan:
         ):
             found.outliers.append((found.resets.pop().row, found.events))
 
-    def _count(self) -> None:
+    def _count_fault(self) -> None:
         self.faults += 1
         if self.faults > _MIN_REFUSED_FAULTS and self.faults > _MAX_FAULT_SHARE * self.found.events:
             raise OrderError(

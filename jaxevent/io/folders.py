@@ -271,7 +271,7 @@ class _NumberedImages:
 
     def select(self, frames: Sequence[Mapping[str, Any]]) -> tuple[NDArray[np.int64], Any]:
         """Return the times (us) and images of those frames of `meta` that have an image."""
-        held = [(frame["ts"], self._name(frame)) for frame in frames]
+        held = [(frame["ts"], self._member_name(frame)) for frame in frames]
         held = [(stamp, name) for stamp, name in held if name in self.names]
         if not held or self.shape is None:
             return np.empty(0, np.int64), None
@@ -283,7 +283,7 @@ class _NumberedImages:
         )
         return t, images
 
-    def _name(self, frame: Mapping[str, Any]) -> str:
+    def _member_name(self, frame: Mapping[str, Any]) -> str:
         return f"{self.kind}_{whole_number(frame['id'], str(self.file), 'id'):010d}.npy"
 
     def _decode(self, names: Sequence[str]) -> Iterator[NDArray]:

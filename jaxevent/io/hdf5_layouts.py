@@ -198,7 +198,7 @@ def _read_m3ed(file: Any, path: Path, options: ReadOptions, group: str) -> Recor
             names = [name for name in names if f"{calib}/{name}" in file]
             held = {name: array(file, f"{calib}/{name}", source) for name in names}
             if "resolution" in held and size is None:
-                size = _pair(held["resolution"], source)
+                size = _check_size(held["resolution"], source)
             model = held.get("distortion_model", np.array("radtan")).item()
             camera, left_out = make_supported_camera(
                 held["intrinsics"],
@@ -287,16 +287,16 @@ def _stated_size(file: Any, source: str) -> tuple[int, int] | None:
         if (size := attribute(file, "sensor_resolution")) is not None:
             if np.size(size) == 3:  # height, width, channels
                 size = np.ravel(size)[:2]
-            height, width = _pair(size, source)
+            height, width = _check_size(size, source)
             return width, height
         if (text := attribute(file, "geometry")) is not None:
             width, _, height = str(text).partition("x")
             return int(width), int(height)
         width, height = (attribute(file, name) for name in ("width", "height"))
-        return None if width is None or height is None else _pair([width, height], source)
+        return None if width is None or height is None else _check_size([width, height], source)
 
 
-def _pair(values: Any, source: str) -> tuple[int, int]:
+def _check_size(values: Any, source: str) -> tuple[int, int]:
     if np.size(values) != 2:
         raise InputError(
             f"{source}: the sensor's size is {np.size(values)} numbers; store two, or give "

@@ -534,14 +534,14 @@ def read_times(path: Path, span: tuple[int, int] | None = None) -> NDArray[np.in
     remedy = "give a time in each line, or a table with a column t"
     times = _parse_times(path, words, remedy, unit)
     if span is not None and unit is None:
-        times = _inside(path, words, remedy, times, span)
+        times = _choose_unit_inside(path, words, remedy, times, span)
     if (times[1:] < times[:-1]).any():
         row = int(np.argmax(times[1:] < times[:-1])) + 1
         raise InputError(f"{path}: time {row}, {words[row]}, is before the one above it; sort them")
     return times
 
 
-def _inside(
+def _choose_unit_inside(
     path: Path, words: Sequence[str], remedy: str, times: NDArray[np.int64], span: tuple[int, int]
 ) -> NDArray[np.int64]:
     """Parse times in their usual unit, or in the only one that puts them in the recording.

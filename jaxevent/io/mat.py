@@ -41,7 +41,7 @@ from jaxevent.io.checks import (
     sensor_size,
 )
 from jaxevent.io.columns import (
-    ColumnEvents,
+    ColumnReadResult,
     as_rows,
     find_fields,
     order_of,
@@ -75,13 +75,13 @@ def read_v5(path: Path, options: ReadOptions) -> Recording:
     import scipy.io
 
     with reading(path):
-        variables = scipy.io.loadmat(_unpacked(path))
+        variables = scipy.io.loadmat(_decompress(path))
     return _make_recording(
         path, options, {name: v for name, v in variables.items() if not name.startswith("__")}
     )
 
 
-def _unpacked(path: Path) -> BytesIO:
+def _decompress(path: Path) -> BytesIO:
     """Copy the numeric variables of a file, without compression and checked to be whole.
 
     SciPy takes the number of a type as an index into its table without looking, and reads on past
@@ -114,7 +114,13 @@ def _unpacked(path: Path) -> BytesIO:
 
 
 class _Element(NamedTuple):
-    """One element of a variable: its type and bytes, and the offset of the next element."""
+    """One element of a variable.
+
+    Attributes:
+        kind: Its type.
+        data: Its bytes.
+        stop: Offset of the next element.
+    """
 
     kind: int
     data: memoryview
@@ -178,11 +184,11 @@ def _numeric_parts(
         whole = bytes(kept[2].data) + b"." + name
         if len(field.data):
             held = _numeric_parts(field.data, order, wrong, is_field=True)
-            parts += [_renamed(part, whole, order) for part in held]
+            parts += [_rename_array(part, whole, order) for part in held]
     return parts
 
 
-def _renamed(body: bytes, name: bytes, order: str) -> bytes:
+def _rename_array(body: bytes, name: bytes, order: str) -> bytes:
     """Replace the name of an array of numbers, its third element."""
     elements = [*_elements(memoryview(body), order, damaged("it"))]
     held = struct.pack(order + "2I", 1, len(name)) + name + bytes(-len(name) % 8)
@@ -243,17 +249,17 @@ def _make_recording(path: Path, options: ReadOptions, variables: dict) -> Record
         )
     images = arrays.pop("image") if "image" in arrays else None
     if images is not None:
-        images = _checked_images(path, images)
+        images = _check_images(path, images)
     otherwise = f"{path}: has no image to show the sensor's size"
     size = sensor_size(otherwise, options.size, image_size(images))
     events, clock, notes = _read_events(path, found, size, options)
     frames = None
     if images is not None:
-        frames = _frames(path, images, arrays, clock, notes)
+        frames = _make_frames(path, images, arrays, clock, notes)
     extra = {name: _squeeze(value) for name, value in arrays.items() if name != "HDR_mat"}
     if "HDR_mat" in arrays:
         number = 0 if frames is None else len(frames)
-        extra["HDR_mat"] = _reference(arrays["HDR_mat"], number, f"{path}: HDR_mat")
+        extra["HDR_mat"] = _to_grey_reference(arrays["HDR_mat"], number, f"{path}: HDR_mat")
     return Recording(path.stem, *size, events, frames, extra=extra, notes=tuple(notes))
 
 
@@ -289,13 +295,13 @@ def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
 
 def _read_events(
     path: Path, found: _StoredEvents, size: tuple[int, int], options: ReadOptions
-) -> ColumnEvents:
+) -> ColumnReadResult:
     source = f"{path}: events"
     if found.array is None:
         columns = {name: _vector(value) for name, value in found.columns.items()}
     elif found.array.size == 0:
         is_float = found.array.dtype.kind == "f"
-        return ColumnEvents(Events.empty(), Clock("us", 0, 0, is_float), [])
+        return ColumnReadResult(Events.empty(), Clock("us", 0, 0, is_float), [])
     else:
         rows = as_rows(found.array)
         if rows is None:
@@ -335,7 +341,7 @@ def _vector(value: NDArray) -> NDArray:
     return value.reshape(-1) if value.size == max(value.shape, default=0) else value
 
 
-def _checked_images(path: Path, images: NDArray) -> NDArray | None:
+def _check_images(path: Path, images: NDArray) -> NDArray | None:
     """Check images and put frames first.
 
     Args:
@@ -360,7 +366,7 @@ def _checked_images(path: Path, images: NDArray) -> NDArray | None:
     return _frames_first(images, f"{path}: image")
 
 
-def _frames(
+def _make_frames(
     path: Path, images: NDArray, arrays: dict[str, NDArray], clock: Clock, notes: list[str]
 ) -> Frames:
     if "time_image" not in arrays:
@@ -395,7 +401,7 @@ def _frames_first(images: NDArray, source: str) -> NDArray:
     return np.ascontiguousarray(np.moveaxis(images, 2, 0) if images.ndim == 3 else images)
 
 
-def _reference(images: NDArray, frames: int, source: str) -> NDArray:
+def _to_grey_reference(images: NDArray, frames: int, source: str) -> NDArray:
     """Convert `HDR_mat` to grey.
 
     Args:

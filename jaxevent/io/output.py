@@ -81,7 +81,7 @@ def check_outputs(
     """
     for number, out in enumerate(outputs):
         for other in outputs[:number]:
-            if _same(out, other):
+            if _is_same_file(out, other):
                 raise InputError(f"{out}: is named for two outputs; give each a name of its own")
         for source in inputs:
             for one in (source, *companions(source)):
@@ -102,12 +102,12 @@ def check_outputs(
 
 def _check_against(out: Path, source: Path) -> None:
     """Raise `InputError` if writing `out` would cost `source`, or a part of it."""
-    if _same(out, source):
+    if _is_same_file(out, source):
         raise InputError(f"{out}: is an input too, which would be lost; choose another name")
-    if out.is_dir() and any(_same(out, parent) for parent in _parents(source)):
+    if out.is_dir() and any(_is_same_file(out, parent) for parent in _parents(source)):
         raise InputError(f"{out}: holds the input {source}; choose another folder")
     there = out.is_file() or (out.is_dir() and any(out.iterdir()))
-    if there and source.is_dir() and any(_same(parent, source) for parent in _parents(out)):
+    if there and source.is_dir() and any(_is_same_file(parent, source) for parent in _parents(out)):
         raise InputError(f"{out}: is a part of the input {source}; choose another name")
 
 
@@ -115,7 +115,7 @@ def _parents(path: Path) -> Sequence[Path]:
     return Path(os.path.realpath(path)).parents
 
 
-def _same(one: Path, other: Path) -> bool:
+def _is_same_file(one: Path, other: Path) -> bool:
     try:
         return os.path.samefile(one, other)
     except OSError:  # one does not exist yet
@@ -321,7 +321,7 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
     # It has its name once it is locked: nobody shall take it for abandoned.
     unlocked = partial.with_suffix(".new")
     try:
-        _refuse(path, directory)
+        _refuse_taken_path(path, directory)
         for remains in abandoned_partials(path):
             _remove(remains)
         if directory:
@@ -494,7 +494,7 @@ class _NeverFailingFile:
         return size
 
 
-def _refuse(path: Path, directory: bool) -> None:
+def _refuse_taken_path(path: Path, directory: bool) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
     if directory and path.is_dir():

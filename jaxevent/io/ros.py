@@ -237,7 +237,11 @@ def _choose_frames(
             )
         return options.frames, {}
     found = bag.beside(events, several)
-    if len(several) > 1 and not found and len({_source_of(topic) for topic in several}) == 1:
+    if (
+        len(several) > 1
+        and not found
+        and len({_uncompressed_topic(topic) for topic in several}) == 1
+    ):
         found = several
 
     def fits(topic: str) -> bool:
@@ -246,7 +250,7 @@ def _choose_frames(
     for prefer in (
         lambda topic: images[topic].is_read,
         fits,
-        lambda topic: _source_of(topic).rpartition("/")[2] == "image_raw",
+        lambda topic: _uncompressed_topic(topic).rpartition("/")[2] == "image_raw",
         lambda topic: bag.kind(topic) == _IMAGE,
     ):
         found = [topic for topic in found if prefer(topic)] or found
@@ -273,12 +277,12 @@ def _choose_frames(
     return None, {}
 
 
-def _source_of(topic: str) -> str:
+def _uncompressed_topic(topic: str) -> str:
     """Return the topic of images to which a topic of compressed copies belongs."""
     return topic.removesuffix("/compressed")
 
 
-def _stamp(message: Any) -> int:
+def _stamp_us(message: Any) -> int:
     """Return the time of a message's header in us."""
     stamp = message.header.stamp
     return stamp.sec * 1_000_000 + stamp.nanosec // 1000
@@ -294,7 +298,7 @@ def _read_frames(
 
     def first_pass() -> Iterator[NDArray]:
         for place, message in bag.decoded(topic):
-            times.append(_stamp(message))
+            times.append(_stamp_us(message))
             places.append(place)
             yield _read_image(bag, name, message)
 
@@ -391,7 +395,7 @@ def _interpolate_colours(image: NDArray, encoding: str) -> NDArray:
 
 def _read_imu(bag: Bag, topic: str | None) -> Imu | None:
     rows = [
-        (_stamp(m), _xyz(m.angular_velocity), _xyz(m.linear_acceleration))
+        (_stamp_us(m), _xyz(m.angular_velocity), _xyz(m.linear_acceleration))
         for _, m in bag.decoded(topic)
     ]
     if not rows:
@@ -402,7 +406,11 @@ def _read_imu(bag: Bag, topic: str | None) -> Imu | None:
 
 def _read_poses(bag: Bag, topic: str | None) -> Poses | None:
     rows = [
-        (_stamp(m), _xyz(m.pose.position), (*_xyz(m.pose.orientation), float(m.pose.orientation.w)))
+        (
+            _stamp_us(m),
+            _xyz(m.pose.position),
+            (*_xyz(m.pose.orientation), float(m.pose.orientation.w)),
+        )
         for _, m in bag.decoded(topic)
     ]
     if not rows:
@@ -557,6 +565,20 @@ def _decode_arrays(
 
 
 def _columns(bag: Bag, topic: str, names: _EventFields, pieces: list[NDArray]) -> Columns:
+    """Concatenate the events of messages.
+
+    Args:
+        bag: The bag.
+        topic: Topic of the events.
+        names: Names of the fields.
+        pieces: Structured arrays of the messages' events.
+
+    Returns:
+        t in us, x, y and p, (n,) each.
+
+    Raises:
+        InputError: A time is not possible.
+    """
     s, ns, x, y, p = (
         np.concatenate([piece[name] for piece in pieces])
         for name in (names.sec, names.nanosec, names.x, names.y, names.p)

@@ -113,6 +113,15 @@ def read_npy(path: Path, options: ReadOptions) -> Recording:
 
 
 def _record_columns(records: NDArray, names: Mapping[str, str]) -> dict[str, NDArray]:
+    """Return the columns of a structured array.
+
+    Args:
+        records: (n,) structured array.
+        names: Names of its fields by "t", "x", "y" and "p".
+
+    Returns:
+        Contiguous columns (n,) by these names.
+    """
     return {key: np.ascontiguousarray(records[name]) for key, name in names.items()}
 
 
@@ -441,14 +450,14 @@ def _decode(
                 raise InputError(
                     f"{path}: has a line of over {_TEXT_BLOCK_BYTES} bytes; {_WANTED_LAYOUT}"
                 )
-            columns = _parsed(path, table, text[:cut], row)
+            columns = _parse_lines(path, table, text[:cut], row)
             yield (offset, row), columns
             row += len(columns[0])
             offset += cut
             rest = text[cut:]
 
 
-def _parsed(path: Path, table: _Table, text: bytes, row: int) -> Columns:
+def _parse_lines(path: Path, table: _Table, text: bytes, row: int) -> Columns:
     if not text.strip():
         none = np.empty(0)
         return none.astype(np.int64), none, none, none
@@ -586,6 +595,19 @@ class _RowGroups:
 
 
 def _as_numpy(column: Any, name: str, source: str) -> NDArray:
+    """Convert a column of a Parquet file to numbers.
+
+    Args:
+        column: Column of pyarrow.
+        name: Its name, for messages.
+        source: Name of the file, for messages.
+
+    Returns:
+        (n,).
+
+    Raises:
+        InputError: It has empty values, or no numbers.
+    """
     if column.null_count:
         raise InputError(f"{source}: the column {name} has empty values; remove those events")
     values = column.to_numpy()

@@ -151,7 +151,7 @@ def _read_numbers(
     skip = 0
     with reading(source), file.open("rb") as lines:
         while line := lines.readline().removeprefix(BOM_UTF8):
-            words = _words(line)
+            words = _split_words(line)
             if header is not None and len(words) == len(names) and find_fields(words):
                 names = words
             elif header is not None and len(fields := line.split()) == len(header.split()):
@@ -203,7 +203,7 @@ def _read_numbers(
     return columns, found, names
 
 
-def _words(line: bytes) -> list[str]:
+def _split_words(line: bytes) -> list[str]:
     """Split a line that may be a comment into words; a unit belongs to its name: "t [s] x y p"."""
     text = line.decode("utf-8", "replace").lstrip("#% ")
     return re.sub(r"\s+(?=[\[(])", "", text).split()

@@ -109,6 +109,19 @@ def _read_poses_m3ed(file: Path) -> Poses:
 
 
 def _make_poses(t: NDArray[np.int64], matrices: NDArray, source: str) -> Poses:
+    """Make poses of matrices.
+
+    Args:
+        t: (n,) times, us.
+        matrices: (n, 4, 4) poses of the camera, m.
+        source: Name of the file for messages.
+
+    Returns:
+        The poses.
+
+    Raises:
+        InputError: Shapes differ, or a number is not finite.
+    """
     from scipy.spatial.transform import Rotation
 
     if matrices.shape != (len(t), 4, 4) or not np.isfinite(matrices).all():
@@ -121,6 +134,21 @@ def _make_poses(t: NDArray[np.int64], matrices: NDArray, source: str) -> Poses:
 
 
 def _open_images(opened: Any, name: str, axes: int, count: int, file: Path) -> StoredImages:
+    """Open images of a file, which are read when needed.
+
+    Args:
+        opened: The open HDF5 file.
+        name: Name of the dataset.
+        axes: Number of its axes.
+        count: Number of images.
+        file: The file, for messages.
+
+    Returns:
+        The images.
+
+    Raises:
+        InputError: The dataset has another shape or type.
+    """
     images = dataset(opened, name, str(file))
     if images.ndim != axes or len(images) != count or images.dtype.kind not in "iuf":
         raise InputError(

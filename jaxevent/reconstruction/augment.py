@@ -111,7 +111,7 @@ class FrameParams(Parameters):
 def calibrated_values(
     recording: Recording, params: FrameParams, names: Sequence[str], sample: Sample | None = None
 ) -> CalibratedValues:
-    """Return what a recording says of some numbers, thresholds at the `I0` of parameters.
+    """Calibrate some numbers by a recording, thresholds at the `I0` of parameters.
 
     Parameters with a `predictor` take the numbers by which this method predicts hidden frames of
     the recording best, sought from the calibration on.

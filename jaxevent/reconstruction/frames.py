@@ -93,15 +93,24 @@ class FrameClock:
     `breaks` are the times at which pieces end. Exposures that overlap (a jittering stamp) share the
     overlap as their gap, clipped to the two mid-exposures, so that the augmented frame stays
     continuous. Exposures that do not overlap are used as they are.
+
+    Attributes:
+        mid: (frames,) middles of the exposures, us.
+        left: (frames,) begins of the exposures, us.
+        right: (frames,) ends of the exposures, us.
+        breaks: Times at which pieces end, us.
+        exposed: Whether exposures are pieces of their own.
+        offset: Offset that was added to the stamps, s.
+        origin: Start of the recording, us.
     """
 
     mid: NDArray[np.floating]
     left: NDArray[np.floating]
     right: NDArray[np.floating]
     breaks: NDArray[np.floating]
-    exposed: bool  # whether exposures are pieces of their own
-    offset: float  # s
-    origin: int  # us, the recording's start
+    exposed: bool
+    offset: float
+    origin: int
 
     @classmethod
     def of(cls, recording: Recording, timing: EventTiming) -> "FrameClock":

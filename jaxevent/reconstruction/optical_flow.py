@@ -42,14 +42,26 @@ class FrameSeries(ShortRepr):
 
 
 class ImageTimes(NamedTuple):
-    """Times of images among the frames, prepared for `read`."""
+    """Times of images among the frames, prepared for `read`.
+
+    Attributes:
+        frame: (times,) index of the frame before.
+        share: (times,) time since that frame as a part of the interval, 0..1.
+    """
 
     frame: NDArray[np.int64]
     share: NDArray[np.floating]
 
 
 class FramePair(NamedTuple):
-    """Two successive frames (H, W), and the flows (H, W, 2) from each to the other, px."""
+    """Two successive frames, and the flows between them.
+
+    Attributes:
+        before: (H, W) the earlier frame.
+        after: (H, W) the later frame.
+        forward: (H, W, 2) flow from the earlier to the later, px.
+        backward: (H, W, 2) flow from the later to the earlier, px.
+    """
 
     before: NDArray[np.floating]
     after: NDArray[np.floating]
@@ -181,7 +193,7 @@ class FlowVideo(ImageSequence[Params]):
         for first in range(0, len(times), N_BATCH_IMAGES):
             batch = slice(first, first + N_BATCH_IMAGES)
             places = zip(located.frame[batch], located.share[batch], strict=True)
-            images = np.stack([self._image(int(frame), float(share)) for frame, share in places])
+            images = np.stack([self._image_at(int(frame), float(share)) for frame, share in places])
             yield times[batch], _estimate(images)
 
     @synchronized
@@ -207,10 +219,10 @@ class FlowVideo(ImageSequence[Params]):
             frame = int(located.frame[row])
             if self._clock.mid[0] <= since[row] and frame + 1 < len(self._clock):
                 seconds = float(self._clock.mid[frame + 1] - self._clock.mid[frame]) * 1e-6
-                flows[row] = self._between(frame).flow(float(located.share[row])) / seconds
+                flows[row] = self._frame_pair(frame).flow(float(located.share[row])) / seconds
         return flows
 
-    def _image(self, frame: int, share: float) -> NDArray[np.floating]:
+    def _image_at(self, frame: int, share: float) -> NDArray[np.floating]:
         """Return the image at a position between two frames.
 
         Args:
@@ -222,9 +234,9 @@ class FlowVideo(ImageSequence[Params]):
         """
         if share == 0:
             return _read_frames(self._images, self._clock, slice(frame, frame + 1)).intensity[0]
-        return self._between(frame).at(share)
+        return self._frame_pair(frame).at(share)
 
-    def _between(self, frame: int) -> FramePair:
+    def _frame_pair(self, frame: int) -> FramePair:
         if self._pair is None or self._pair[0] != frame:
             two = _read_frames(self._images, self._clock, slice(frame, frame + 2))
             self._pair = frame, make_frame_pair(two, 0)

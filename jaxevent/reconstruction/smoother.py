@@ -127,14 +127,24 @@ class SmootherParams(Params):
 
 
 class Gaussian(eqx.Module):
-    """Mean and variance of the log intensity of pixels."""
+    """Normal distribution of the log intensity of pixels.
+
+    Attributes:
+        m: Mean.
+        P: Variance.
+    """
 
     m: Float[Numeric, "*pixels"]
     P: Float[Numeric, "*pixels"]
 
 
 class Message(eqx.Module):
-    """Likelihood exp(h L - J L^2 / 2) of later frames, given the log intensity L of pixels."""
+    """Likelihood exp(h L - J L^2 / 2) of later frames, given the log intensity L of pixels.
+
+    Attributes:
+        h: Coefficient of the linear term, 1 / ln I.
+        J: Information, 1 / (ln I)^2.
+    """
 
     h: Float[Numeric, "*pixels"]
     J: Float[Numeric, "*pixels"]
@@ -157,11 +167,17 @@ class Message(eqx.Module):
 
 
 class MessageMap(eqx.Module):
-    """Map from the message after several frames to the one before them (Sarkka & Garcia-Fernandez
-    2021).
+    """Map from the message after several frames to the one before them.
 
-    h' = h + A (h_later - J_later b) / (1 + C J_later), J' = J + A^2 J_later / (1 + C J_later).
-    Maps compose; they are elements of an associative scan.
+    h' = h + A (h_later - J_later b) / (1 + C J_later), J' = J + A^2 J_later / (1 + C J_later). Maps
+    compose; they are elements of an associative scan (Sarkka & Garcia-Fernandez 2021).
+
+    Attributes:
+        A: Factor of the log intensity from before the frames to after them.
+        b: Change of the log intensity over them, ln I.
+        C: Variance that is added over them, (ln I)^2.
+        h: Linear coefficient of the frames' own message, 1 / ln I.
+        J: Information of the frames' own message, 1 / (ln I)^2.
     """
 
     A: Float[Numeric, "*pixels"]
@@ -190,15 +206,25 @@ class MessageMap(eqx.Module):
 
 
 class FrameMeasurements(eqx.Module):
-    """Measurements of the log intensity by frames, some of them censored."""
+    """Measurements of the log intensity by frames, some of them censored.
 
-    z: Float[Array, "*frames pixels"]  # deblurred log intensity
-    r: Float[Array, "*frames pixels"]  # its variance
-    clear: Float[Array, "*frames pixels"]  # 1: a measurement; 0: none
-    slope: Float[Array, "*frames pixels"]  # d z / d I = 1 / (I + I0)
-    side: Float[Array, "*frames pixels"]  # +1, -1: L lies above, below `bound`; 0: nothing known
+    Attributes:
+        z: Deblurred log intensity.
+        r: Its variance, (ln I)^2.
+        clear: 1: a measurement; 0: none.
+        slope: d z / d I = 1 / (I + I0).
+        side: +1, -1: L lies above, below `bound`; 0: nothing is known.
+        bound: Bound of the log intensity of clipped pixels.
+        excess: Expected log intensity beyond the bound; None: not known.
+    """
+
+    z: Float[Array, "*frames pixels"]
+    r: Float[Array, "*frames pixels"]
+    clear: Float[Array, "*frames pixels"]
+    slope: Float[Array, "*frames pixels"]
+    side: Float[Array, "*frames pixels"]
     bound: Float[Array, "*frames pixels"]
-    excess: Float[Array, "*#frames #pixels"] | None  # beyond the bound, expected; None: not known
+    excess: Float[Array, "*#frames #pixels"] | None
 
 
 class FrameSteps(eqx.Module):
@@ -650,7 +676,7 @@ def adjacent_counts(
 AnyParams = TypeVar("AnyParams", bound=Params)
 
 
-@renamed_methods(keep="frame_info", tell="readout")
+@renamed_methods(keep="readout_inputs", frame_info="readout_inputs", tell="readout")
 @dataclasses.dataclass(frozen=True, repr=False)
 class Smoother(KernelEstimator[AnyParams]):
     """The asynchronous Kalman smoother."""
@@ -671,10 +697,10 @@ class Smoother(KernelEstimator[AnyParams]):
     def needs_future(self) -> bool:
         return True
 
-    def frame_info(
+    def readout_inputs(
         self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
     ) -> Any:
-        """Return what images need of frames beside the messages; here nothing.
+        """Return the data of frames that images need beside the messages; here none.
 
         Args:
             params: Parameters.
@@ -693,7 +719,7 @@ class Smoother(KernelEstimator[AnyParams]):
         Args:
             params: Parameters.
             state: Smoothed states (times, pixels).
-            info: `frame_info` of the frames before.
+            info: `readout_inputs` of the frames before.
             here: Whether the time is the middle of the exposure of the frame before.
 
         Returns:
@@ -766,7 +792,7 @@ class Smoother(KernelEstimator[AnyParams]):
         events = None
         if frames.head is not None and frames.tail is not None:
             events = (jnp.asarray(frames.head) + frames.tail).sum(0)
-        info = self.frame_info(params, frames, rows.measured, events)
+        info = self.readout_inputs(params, frames, rows.measured, events)
         window = SmoothedWindow(
             past, later, first, counts, frames, info, link, last, likelihood.sum(1)
         )
@@ -847,7 +873,7 @@ class Smoother(KernelEstimator[AnyParams]):
             z = jnp.log(frames.intensity + params.I0)
             z = deblur_level(params, z, total) if exposed else z
             measured = measure_frames(params, frames, z, exists)
-            info = self.frame_info(params, frames, measured, inside if exposed else None)
+            info = self.readout_inputs(params, frames, measured, inside if exposed else None)
             side = measured.side
             if not clipped:
                 measured = dataclasses.replace(measured, side=jnp.zeros_like(side))

@@ -18,9 +18,17 @@ MAX_EVENT_WEIGHT = 3.0
 
 
 class EventStream(NamedTuple):
-    """Events in order of time, as compiled loops take them, of a sensor `width` pixels wide."""
+    """Events in order of time, as compiled loops take them.
 
-    t: NDArray[np.int64]  # us
+    Attributes:
+        t: (n,) times, us.
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        p: (n,) polarities.
+        width: Width of the sensor, px.
+    """
+
+    t: NDArray[np.int64]
     x: NDArray[np.uint16]
     y: NDArray[np.uint16]
     p: NDArray[np.bool_]

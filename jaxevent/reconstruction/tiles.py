@@ -203,7 +203,21 @@ class TileKind(NamedTuple):
 
 
 class TileArrays(NamedTuple):
-    """The arrays of `EventTiles` that `_fill` writes: two per tile, the others [tiles, slots]."""
+    """Arrays of `EventTiles` that `_fill` writes.
+
+    Attributes:
+        kind: [tiles] index in `TILE_SHAPES`; their number: the tile is not used.
+        lane: [tiles] first lane of the tile.
+        since: [tiles, slots] time since the pixel's previous event, s.
+        near: [tiles, slots] time since the 3x3 neighbourhood's previous event, s.
+        weight: [tiles, slots] position in the piece, 0..1.
+        blend: [tiles, slots] position between the mid-exposures of two frames, 0..1.
+        on: [tiles, slots] ON events since the left edge of the piece's exposure.
+        off: [tiles, slots] OFF events since the left edge of the piece's exposure.
+        piece_cell: [tiles, slots] piece * pixels + pixel.
+        frame_cell: [tiles, slots] frame before the event * pixels + pixel.
+        polarity: [tiles, slots] +1, -1, or 0 where there is no event.
+    """
 
     kind: NDArray[np.int32]
     lane: NDArray[np.int32]
@@ -244,14 +258,24 @@ class TileArrays(NamedTuple):
 
 
 class LaneStates(NamedTuple):
-    """State of each of 64 lanes while `_fill` passes over their events."""
+    """State of each of 64 lanes while `_fill` passes over their events.
+
+    Attributes:
+        piece: Index of the piece that the lane has come to.
+        frame: Index of the frame before it.
+        before: Time of the last event since the origin, us.
+        on: ON events counted so far.
+        off: OFF events counted so far.
+        own_on: ON events at the left edge of the piece's exposure.
+        own_off: OFF events at the left edge of the piece's exposure.
+    """
 
     piece: NDArray[np.int64]
     frame: NDArray[np.int64]
-    before: NDArray[np.int64]  # time of the last event since the origin, us
-    on: NDArray  # events counted so far
+    before: NDArray[np.int64]
+    on: NDArray
     off: NDArray
-    own_on: NDArray  # at the left edge of the piece's exposure
+    own_on: NDArray
     own_off: NDArray
 
 

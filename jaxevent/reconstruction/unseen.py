@@ -32,7 +32,7 @@ class UnseenChange(NamedTuple):
 
 
 def measure_unseen_change(images: FrameImages, clock: FrameClock) -> UnseenChange:
-    """Measure what a recording tells of changes without events.
+    """Measure the changes of a recording that events do not show.
 
     Args:
         images: Frames of the recording.

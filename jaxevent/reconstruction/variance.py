@@ -80,7 +80,13 @@ def bridge_weight(part: Array) -> Array:
 
 
 class AugmentedFrameErrors(eqx.Module):
-    """Variance of the augmented frame: `steady` + w `halfway` + `per_event` (ON + OFF events)."""
+    """Variance of the augmented frame: `steady` + w `halfway` + `per_event` (ON + OFF events).
+
+    Attributes:
+        steady: Variance at all times, (ln I)^2.
+        halfway: Variance per weight w of the blend, (ln I)^2.
+        per_event: Variance per event, (ln I)^2.
+    """
 
     steady: Float[Array, "pieces pixels"]
     halfway: Float[Array, "pieces pixels"]

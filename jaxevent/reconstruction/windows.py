@@ -80,7 +80,14 @@ class PixelStates(NamedTuple):
 
 
 class ImageRows(NamedTuple):
-    """Arrays [times, pixels] of a `ReadOut`."""
+    """Arrays of a `ReadOut`.
+
+    Attributes:
+        slot: [times, pixels] slot of the pixel's last event in the window, -1 if there is none.
+        on: [times, pixels] ON events since the left edge of the piece's exposure.
+        off: [times, pixels] OFF events since the left edge of the piece's exposure.
+        since: [times, pixels] time since the pixel's last event, s.
+    """
 
     slot: NDArray[np.int32]
     on: NDArray
@@ -476,7 +483,7 @@ class WindowedRecording:
         before: StreamState,
     ) -> tuple[EventWindow, Features]:
         clock, used = self.clock, self.clock.frames_within(start, stop)
-        weight, counts = self._count(start, used, events.with_frames, before)
+        weight, counts = self._weigh_and_count(start, used, events.with_frames, before)
         segments = None
         if clock.exposed:
             stream = self._stream(events.with_frames)
@@ -519,7 +526,7 @@ class WindowedRecording:
         ends = np.maximum([before.frames - 1 - used.start, onward - used.start], 0)
         return np.array([n, *ends], np.int32)
 
-    def _count(
+    def _weigh_and_count(
         self, start: int | None, used: slice, around: Events, before: StreamState
     ) -> tuple[NDArray, EdgeCounts]:
         """Weigh the events of a window, and count them before its start and the edges of exposures.

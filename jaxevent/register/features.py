@@ -12,7 +12,7 @@ from jaxevent.errors import InputError, require
 from jaxevent.progress import bar
 from jaxevent.recording import Events, Frames, Recording, check_recording
 from jaxevent.register.frames import ResampledImages, log_image
-from jaxevent.register.geometry import recording_grid, undistort
+from jaxevent.register.geometry import recording_grid, undistort_positions
 
 _MAX_DISTANCE_RATIO = 0.75  # of the nearest and the second descriptor; Lowe's 0.8 is laxer
 _MIN_MATCHES = 12  # of frames and events, that agree on a homography
@@ -106,8 +106,8 @@ def match_frames(
         end += [there[k] for _, k in pairs]
     found, count = [], 0
     if len(begin) >= _MIN_MATCHES:
-        one = undistort(recording.camera, np.array(begin))
-        two = undistort(other.camera, np.array(end))
+        one = undistort_positions(recording.camera, np.array(begin))
+        two = undistort_positions(other.camera, np.array(end))
         far = _TOLERANCE_PX / scales[1]
         for fit in (cv2.findHomography, cv2.estimateAffine2D, cv2.estimateAffinePartial2D):
             cv2.setRNGSeed(0)
@@ -268,7 +268,7 @@ def register_still(
         pairs = _match(about, described)
         if len(pairs) < _MIN_IMAGE_MATCHES:
             continue
-        one = undistort(recording.camera, seen[[k for k, _ in pairs]])
+        one = undistort_positions(recording.camera, seen[[k for k, _ in pairs]])
         two = where[[k for _, k in pairs]]
         cv2.setRNGSeed(0)
         how = {"method": cv2.USAC_MAGSAC, "confidence": 0.9999, "maxIters": 20_000}

@@ -155,7 +155,9 @@ def apply_homography(H: NDArray[np.float64], points_px: NDArray[np.float64]) -> 
     return seen[:, :2] / np.where(w > 1e-9, seen[:, 2:], np.nan)
 
 
-def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[np.float64]:
+def undistort_positions(
+    camera: PinholeCamera | None, at: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Remove the distortion of a camera from positions.
 
     Args:
@@ -167,9 +169,9 @@ def undistort(camera: PinholeCamera | None, at: NDArray[np.float64]) -> NDArray[
     """
     if camera is None or not camera.is_distorted:
         return at.astype(np.float64)
-    from jaxevent.egomotion.geometry import undistort
+    from jaxevent.egomotion.geometry import centred_coordinates
 
-    straight, f = undistort(camera, at[:, 0], at[:, 1])
+    straight, f = centred_coordinates(camera, at[:, 0], at[:, 1])
     return straight / f * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
@@ -186,7 +188,7 @@ def undistorted_pixels(
         (height * width, 2) x and y, px, row by row.
     """
     y, x = np.mgrid[: sensor_size[1], : sensor_size[0]].astype(np.float64)
-    return undistort(camera, np.stack([x.ravel(), y.ravel()], 1))
+    return undistort_positions(camera, np.stack([x.ravel(), y.ravel()], 1))
 
 
 def pixel_rays(camera: PinholeCamera, sensor_size: tuple[int, int]) -> NDArray[np.float64]:

@@ -101,14 +101,24 @@ def refine(
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """Linear model of the changes of all pairs, and its fit."""
+    """Linear model of the changes of all pairs, and its fit.
 
-    X: NDArray[np.float64]  # (values, 3): ON, OFF and 1
-    D: NDArray[np.float64]  # (values,)
-    slope: NDArray[np.float64]  # (values, 2) of D, per px of the other camera
-    use: NDArray[np.bool_]  # (pairs, n): which these are
-    weight: NDArray[np.float64]  # (values,)
-    b: NDArray[np.float64]  # (3,)
+    Attributes:
+        X: (values, 3) ON and OFF events, and 1.
+        D: (values,) changes of log intensity.
+        slope: (values, 2) derivative of `D` per px of the other camera.
+        use: (pairs, n) whether a value of a pair is used.
+        weight: (values,) weights.
+        b: (3,) coefficients.
+        agreement: Correlation of the fit with the changes.
+    """
+
+    X: NDArray[np.float64]
+    D: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+    b: NDArray[np.float64]
     agreement: float
 
 
@@ -252,7 +262,7 @@ class _Alignment:
         scale = pixel_scale(where.reshape(part.shape)) / self.stride
         images = self._smoothed_changes(sigma, scale)
         inside = ~np.isnan(where[:, 0])
-        values = _bilinear(np.where(inside[:, None], where, 0), self.shape) @ images
+        values = _interpolation_matrix(np.where(inside[:, None], where, 0), self.shape) @ images
         values = values.reshape(len(where), -1, 4).swapaxes(0, 1)
         values[..., 3] *= inside
         return values
@@ -377,7 +387,7 @@ class _Alignment:
         return step / max(far, abs(step[-1]) / (self.apart * 5e-7), 1)
 
 
-def _bilinear(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
+def _interpolation_matrix(at: NDArray[np.float64], shape: tuple[int, int]) -> Any:
     """Return the matrix of bilinear interpolation of an image.
 
     Args:

@@ -242,7 +242,18 @@ def _choose_cameras(
 
 
 def _check_numbers(values: Any, where: str) -> NDArray[np.float64]:
-    """Return finite numbers as an array, or raise `InputError` that names their place."""
+    """Convert numbers to an array, checked.
+
+    Args:
+        values: Numbers, in nested lists.
+        where: Name of their place, for messages.
+
+    Returns:
+        The array.
+
+    Raises:
+        InputError: They are no finite numbers.
+    """
     try:
         numbers = np.array(values, np.float64)
     except (TypeError, ValueError):

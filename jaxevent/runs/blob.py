@@ -128,7 +128,7 @@ class TrackGoal(Goal):
         return self.targets.files(recording)
 
     def problem(self, data: FitData) -> Callable[[TrackerParams], Batches]:
-        found = [part for part in self._windows(data) if part.split < 2]
+        found = [part for part in self._cut_windows(data) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
 
@@ -142,7 +142,7 @@ class TrackGoal(Goal):
     def score(
         self, data: FitData, params: TrackerParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        found = self._windows(data)
+        found = self._cut_windows(data)
         packed = self._pack(found, params, "likelihood")
         for place, given, recording in data:
             errors = self.targets.errors(recording, self.tracker, params, progress)
@@ -184,7 +184,7 @@ class TrackGoal(Goal):
             columns[3:3] = [("covered", "covered", 1, 3)]
         return results_table(rows, columns) + legend(columns)
 
-    def _windows(self, data: FitData) -> list[TrackWindow]:
+    def _cut_windows(self, data: FitData) -> list[TrackWindow]:
         """Cut all recordings into windows, and leave out those without events."""
         found = []
         for place, _, recording in data:

@@ -46,7 +46,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from jaxevent.blob import Tracker, TrackerParams, find
-from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
+from jaxevent.blob.quantities import SIZE_FACTORS, inverse_ttc, inverse_ttc_from_size, size_range
 from jaxevent.blob.scores import score_tracks
 from jaxevent.blob.track import MIN_THETA_AXIS_RATIO
 from jaxevent.blob.tracks import Tracks
@@ -482,8 +482,8 @@ def _errors(
         mean: (times, targets, 8) states of the targets' tracks.
         covariance: (times, targets, 8, 8).
         options: Settings of the protocol.
-        noise: Settings of `growth` that describe the errors of sizes; empty where they are not
-            known.
+        noise: Settings of `inverse_ttc_from_size` that describe the errors of sizes; empty where
+            they are not known.
         recording: Name of the recording for messages.
 
     Returns:
@@ -530,7 +530,7 @@ def _closing_errors(
         mean: (times, targets, 8) states of the targets' tracks.
         covariance: (times, targets, 8, 8).
         options: Settings of the protocol, with the pairs.
-        noise: Settings of `growth`; without any, growth is left out.
+        noise: Settings of `inverse_ttc_from_size`; without any, growth is left out.
         recording: Name of the recording for messages.
 
     Returns:
@@ -557,6 +557,6 @@ def _closing_errors(
     for k in set(range(len(ids))) - paired if noise else ():
         seen = np.isfinite(mean[:, k, 0])
         if seen.any():
-            value, _ = growth(since, x[:, k], P[:, k], jnp.asarray(seen), **noise)
+            value, _ = inverse_ttc_from_size(since, x[:, k], P[:, k], jnp.asarray(seen), **noise)
             errors.append(np.where(seen, np.asarray(value), np.nan) - truth[:, k])
     return np.concatenate([np.zeros(0), *errors])

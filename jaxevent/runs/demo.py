@@ -163,7 +163,7 @@ def _draw_events(
         return None
     changes, alone = (pickle.loads(source.read_bytes()).estimate for source in sources)
     _, hidden = held_out(recording)
-    toned = [_toned(changes, "changes"), _toned(alone, "relative")]
+    toned = [_tone_images(changes, "changes"), _tone_images(alone, "relative")]
     toned.append(tone_map(hidden.intensity, "display"))
     if name == EVENT_VIDEO:
         return {"slower": _video_of_events(toned, hidden.t, path)}
@@ -171,7 +171,7 @@ def _draw_events(
     return {"slower": None}
 
 
-def _toned(estimate: Estimate, tone: str) -> NDArray[np.uint8]:
+def _tone_images(estimate: Estimate, tone: str) -> NDArray[np.uint8]:
     """Show images (T, height, width) with limits of their own."""
     limits = display_limits(estimate.mean, tone, estimate.covariance)
     return tone_map(estimate.mean, tone, limits, estimate.covariance)

@@ -384,7 +384,7 @@ class MotionGoal(Goal):
         return truth_files_of(recording, {"truth": self.truth})
 
     def problem(self, data: FitData) -> Callable[[Any], Batches]:
-        found = [one for one in self._windows(data) if one.split < 2]
+        found = [one for one in self._cut_windows(data) if one.split < 2]
 
         def acting(params: Any) -> dict[str, float]:
             acts = params.without_gradient() if self.method.differentiable else params.numbers
@@ -399,7 +399,7 @@ class MotionGoal(Goal):
     def score(
         self, data: FitData, params: Parameters, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
-        found = self._windows(data)
+        found = self._cut_windows(data)
         for place, given, recording in data:
             mine = [p for p in found if p.recording is recording]
             if not mine:
@@ -443,7 +443,7 @@ class MotionGoal(Goal):
         settings = {"model": self.model, "truth": self.truth, **self.of_truth}
         return true_motion(recording, settings)
 
-    def _windows(self, data: FitData) -> list[TrainingSegment]:
+    def _cut_windows(self, data: FitData) -> list[TrainingSegment]:
         """Cut all recordings with known truth into windows that hold events."""
         found = []
         for place, _, recording in data:

@@ -157,7 +157,7 @@ def evaluate(
 
 
 def evaluate(*arguments: Any, **settings: Any) -> Evaluation:
-    """Compare methods with what is known of recordings: a row per recording and method.
+    """Compare methods with the ground truth of recordings: a row per recording and method.
 
         evaluate("config.toml", out)
         evaluate([recording, "file.h5"], ["akf", (aks, aks.Params(c_on=0.2))], metrics=["lpips"])

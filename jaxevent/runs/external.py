@@ -105,14 +105,16 @@ class ExternalImages(Source):
     def find(self, recording: str) -> Series:
         """Return the images of a recording by its name; raise `InputError` for missing ones."""
         root = Path(self.folder)
-        images = root / _named(self.images, recording)
+        images = root / _expand_template(self.images, recording)
         if not images.exists():
             raise InputError(
                 f"{images}: there are no images of {recording} here; correct images, in which "
                 "{recording} stands for its name"
             )
         names = (
-            TIMESTAMP_FILES if self.timestamps is None else (_named(self.timestamps, recording),)
+            TIMESTAMP_FILES
+            if self.timestamps is None
+            else (_expand_template(self.timestamps, recording),)
         )
         return read_series(images, Scale(self.white, self.gamma), names, root)
 
@@ -136,7 +138,7 @@ class ExternalImages(Source):
                 yield row, near
 
 
-def _named(template: str, recording: str) -> str:
+def _expand_template(template: str, recording: str) -> str:
     expanded = os.path.expanduser(os.path.expandvars(template))
     return expanded.replace("{recording}", recording).replace("*", recording)
 

@@ -181,7 +181,7 @@ class Goal(abc.ABC):
         return []
 
     def calibrate(self, data: FitData, params: Any, names: Sequence[str]) -> Any:
-        """Return the start of a fit, with what the recordings to fit say of some numbers.
+        """Return the start of a fit, calibrated by the recordings to fit.
 
         Args:
             data: The recordings.

@@ -210,7 +210,11 @@ class MethodFunction(NamedTuple):
             arrays = []
         mean = arrays[0] if arrays else None
         wanted = " or ".join(_axes(shape) for shape in shapes)
-        if mean is None or mean.dtype.kind not in "iufb" or not _fits(mean.shape, times, shapes):
+        if (
+            mean is None
+            or mean.dtype.kind not in "iufb"
+            or not _is_possible_shape(mean.shape, times, shapes)
+        ):
             raise InputError(
                 f"{where} returned {_describe_value(parts[0])}; return an array {wanted}"
             )
@@ -226,7 +230,7 @@ class MethodFunction(NamedTuple):
         return Estimate(mean, covariance, np.isfinite(mean))
 
 
-def _fits(
+def _is_possible_shape(
     shape: tuple[int, ...], times: NDArray[np.int64], shapes: Sequence[tuple[int, ...]]
 ) -> bool:
     return any(

@@ -85,7 +85,7 @@ def _draw_counts(axis: Any, calibration: Calibration, recording: Recording, I0: 
         recording: Events and frames.
         I0: Offset inside the logarithm.
     """
-    change, net = _changes(recording, calibration, I0)
+    change, net = _measure_frame_changes(recording, calibration, I0)
     axis.set(xlabel=f"change of ln(I + {I0:g}) between frames", ylabel="ON minus OFF events")
     if not len(net):
         axis.set_title("no events between frames")
@@ -110,7 +110,7 @@ def _draw_counts(axis: Any, calibration: Calibration, recording: Recording, I0: 
         axis.legend(frameon=False, loc="upper left")
 
 
-def _changes(
+def _measure_frame_changes(
     recording: Recording, calibration: Calibration, I0: float
 ) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
     """Measure changes of log intensity between frames, and count the events meanwhile.

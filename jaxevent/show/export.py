@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -97,14 +98,30 @@ MAX_WHITE_SHARE = 0.01  # of the pixels at white, twice what "display" leaves ou
 _COMPRESSION_OPTIONS = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 Colours = Callable[[NDArray], NDArray] | None  # what `colour_video` returns; None: grey
-Writer = Callable[[ImageSequence, NDArray, Path, str, str, Colours], str]
+
+
+class ExportOptions(NamedTuple):
+    """Choices for a file of images.
+
+    Args:
+        tone: Tone of `tone_map`, of videos and PNG images.
+        name: Name of the recording, which HDF5 files hold.
+        colours: Function that makes colour images of times, `colour_video(video, recording)`;
+            None: images are grey.
+    """
+
+    tone: str
+    name: str
+    colours: Colours = None
+
+
+Writer = Callable[[ImageSequence, NDArray, Path, ExportOptions], str]
 
 
 def writer(out: Path) -> Writer:
     """Return the function that writes a file of some suffix.
 
-    It is called as `writer(out)(video, times, out, tone, recording_name, colours)`, where `times`
-    are sorted (us) and `colours` is `colour_video(video, recording)`, or None for grey images. It
+    It is called as `writer(out)(video, times, out, options)`, where `times` are sorted (us). It
     returns the end of a sentence about the file. HDF5 holds t, image and variance, exact, or t and
     image (T, H, W, 3) in colour. Videos and PNG images are toned for the display.
 
@@ -148,21 +165,17 @@ def save_video(
     if tone is not None and write is write_hdf5:
         raise InputError(f"{out}: a tone is for images to look at; HDF5 holds linear intensity")
     shown = tone or default_tone(video.estimator.has_covariance, recording)
-    write(video, wanted, out, shown, recording.name, None)
+    write(video, wanted, out, ExportOptions(shown, recording.name))
 
 
-def write_hdf5(
-    video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
-) -> str:
+def write_hdf5(video: ImageSequence, times: NDArray, out: Path, options: ExportOptions) -> str:
     """Write exact images as HDF5, see `writer`.
 
     Args:
         video: The images.
         times: (T,) us.
         out: File to write.
-        tone: Not used: intensity is linear.
-        name: Name of the recording.
-        colours: Function that makes colour images of times; None: images are grey.
+        options: Name of the recording, and colours; the tone plays no part.
 
     Returns:
         The end of a sentence about the file: "".
@@ -170,6 +183,7 @@ def write_hdf5(
     Raises:
         InputError: No image holds a finite number.
     """
+    colours = options.colours
     shape = (len(times), video.recording.height, video.recording.width)
     what = "linear intensity" if colours is None else "linear Rec. 709 red, green, blue"
     units = {"image": f"{what}: 0 is the frames' black, 1 their white"}
@@ -178,7 +192,7 @@ def write_hdf5(
     else:
         shape = (*shape, 3)
     with complete_hdf5(out, video.estimator.name, video.params) as (file, check):
-        file.attrs["recording"] = name
+        file.attrs["recording"] = options.name
         file["t"] = times.astype("i8")
         file["t"].attrs["unit"] = CLOCK_UNIT
         fields = {
@@ -222,52 +236,46 @@ def _store(compressed: list[tuple[h5py.Dataset, int, Future[bytes]]]) -> None:
         stored.id.write_direct_chunk((row, *[0] * (len(stored.shape) - 1)), job.result())
 
 
-def _write_video(
-    video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
-) -> str:
+def _write_video(video: ImageSequence, times: NDArray, out: Path, options: ExportOptions) -> str:
     """Write images for the display as MP4, see `writer`.
 
     Args:
         video: The images.
         times: (T,) us.
         out: File to write.
-        tone: Tone curve, as of `tone_map`.
-        name: Not used.
-        colours: Function that makes colour images of times; None: images are grey.
+        options: Tone and colours; the recording's name plays no part.
 
     Returns:
         The end of a sentence about the file.
     """
     rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
     fps = min(rate, 60.0)
-    range_used = RangeCounter(tone)
+    range_used = RangeCounter(options.tone)
     with video_writer(out, fps) as write:
-        for _, image in display_images(video, times, tone, colours):
+        for _, image in display_images(video, times, options.tone, options.colours):
             range_used.add(image)
             write(image)
     return f", played at {fps:.4g} per s, {fps / rate:.3g} of real time{range_used}"
 
 
-def _write_images(
-    video: ImageSequence, times: NDArray, out: Path, tone: str, name: str, colours: Colours
-) -> str:
+def _write_images(video: ImageSequence, times: NDArray, out: Path, options: ExportOptions) -> str:
     """Write images for the display as PNG files, see `writer`.
 
     Args:
         video: The images.
         times: (T,) us.
         out: Folder to write.
-        tone: Tone curve, as of `tone_map`.
-        name: Not used.
-        colours: Function that makes colour images of times; None: images are grey.
+        options: Tone and colours; the recording's name plays no part.
 
     Returns:
         The end of a sentence about the file.
     """
-    range_used = RangeCounter(tone)
+    range_used = RangeCounter(options.tone)
     with complete(out, directory=True) as partial:
         lines = []
-        for number, (at, image) in enumerate(display_images(video, times, tone, colours)):
+        for number, (at, image) in enumerate(
+            display_images(video, times, options.tone, options.colours)
+        ):
             range_used.add(image)
             file = f"frame_{number:08d}.png"
             write_png(partial / file, image)
@@ -331,10 +339,10 @@ def display_images(
     if tone == "linear":
         limits = (0.0, 1.0)
     elif tone == "display" and frames is not None and len(frames):
-        seen = [frames[row : row + 1].intensity for row in _spread(len(frames))]
+        seen = [frames[row : row + 1].intensity for row in _spaced_rows(len(frames))]
         limits = display_limits(np.concatenate(seen), tone)
     else:
-        sample = video(times[_spread(len(times))])
+        sample = video(times[_spaced_rows(len(times))])
         limits = display_limits(sample.mean, tone, sample.covariance)
     for batch, values in _batches(video, times, colours):
         images = values["image"]
@@ -350,7 +358,7 @@ def display_images(
             yield int(at), image
 
 
-def _spread(count: int) -> NDArray[np.int64]:
+def _spaced_rows(count: int) -> NDArray[np.int64]:
     """Return at most 16 evenly spaced rows of `count`."""
     return np.unique(np.linspace(0, count - 1, 16).round().astype(np.int64))
 

@@ -129,7 +129,7 @@ def plot_image(video: ImageSequence, time: Times, *, tone: Tone | None = None) -
     absolute = getattr(method, "is_absolute", True) and video.recording.frames is not None
     if tone is None:
         tone = "display" if absolute else "relative" if method.has_covariance else "changes"
-    values, norm = _toned(image, tone, variance)
+    values, norm = _tone_values(image, tone, variance)
     what = "intensity" if absolute else "relative intensity"
     panels = [(values, what, {"cmap": "gray", "norm": norm})]
     if np.isfinite(deviation).any():
@@ -157,7 +157,7 @@ def plot_image(video: ImageSequence, time: Times, *, tone: Tone | None = None) -
     return figure
 
 
-def _toned(
+def _tone_values(
     image: NDArray[np.floating], tone: str, variance: NDArray[np.floating]
 ) -> tuple[NDArray[np.floating], Any]:
     """Return the values of an image in a tone, and the scale of greys for them.
@@ -332,7 +332,7 @@ def _(recording: Recording) -> str:
     ]
     also = [name for name in ("camera", "poses", "imu") if getattr(recording, name) is not None]
     rows.append(("also", ", ".join([*also, *recording.extra]) or "-"))
-    return _block(recording.name, rows, lambda: plot_events(recording))
+    return _format_block(recording.name, rows, lambda: plot_events(recording))
 
 
 @as_html.register
@@ -346,7 +346,7 @@ def _(video: ImageSequence) -> str:
         ("images", f"{recording.width} x {recording.height} px, at any time"),
         ("time", format_span((recording.start, recording.stop))),
     ]
-    return _block(recording.name, rows, lambda: plot_image(video, middle))
+    return _format_block(recording.name, rows, lambda: plot_image(video, middle))
 
 
 @as_html.register
@@ -367,7 +367,7 @@ def _(tracks: Tracks) -> str:
         (lambda: plot_tracks(tracks)) if len(tracks.recording.events) <= MAX_HTML_EVENTS else None
     )
     title = f"{len(tracks)} {plural('track', len(tracks))} of {tracks.recording.name}"
-    return _block(title, rows, picture)
+    return _format_block(title, rows, picture)
 
 
 @as_html.register
@@ -381,10 +381,12 @@ def _(motion: MotionEstimate) -> str:
         if motion.valid.any():
             mean = motion.mean[motion.valid, i].mean()
             rows.append((name, f"{mean:.4g}{'' if unit == '1' else f' {unit}'} on average"))
-    return _block(motion.recording, rows, lambda: plot_motion(motion))
+    return _format_block(motion.recording, rows, lambda: plot_motion(motion))
 
 
-def _block(title: str, rows: Sequence[tuple[str, str]], picture: Callable[[], Any] | None) -> str:
+def _format_block(
+    title: str, rows: Sequence[tuple[str, str]], picture: Callable[[], Any] | None
+) -> str:
     """Format a title, a table and a picture as HTML."""
     cells = "".join(
         f"<tr><th>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"

@@ -87,8 +87,8 @@ def write_flow_images(
 ) -> None:
     """Write displacements between consecutive times as PNG images of the kind of DSEC.
 
-    Image k shows, along x, along y and in px, how far the points that its pixels see at times[k]
-    move to times[k + 1], and where that is valid; see `encode_flow`. The file
+    Image k holds the displacements along x and y, px, from times[k] to times[k + 1] of the points
+    that its pixels see at times[k], and which of them are valid; see `encode_flow`. The file
     forward_timestamps.txt has both times of each, in us.
 
     Args:

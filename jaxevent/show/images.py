@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete
-from jaxevent.metrics import checked
+from jaxevent.metrics import check_images
 
 # Colours of lines and areas on white, and on a dark page. Any two differ by 30 and more in CIELAB,
 # also to eyes that lack one kind of cone, and have a contrast of 3 or more to the page.
@@ -69,7 +69,7 @@ def display_limits(
         most = float(np.percentile(size, 95)) if len(size) else 1.0
         return math.expm1(-most), math.expm1(most)
     if tone == "display":
-        return 0.0, _bright(images)
+        return 0.0, _bright_level(images)
     values = images[images > 0] if logarithmic else images.ravel()
     if not len(values):
         return (2.0**-MAX_OCTAVES, 1.0) if logarithmic else (0.0, 1.0)
@@ -135,7 +135,7 @@ def tone_map(
     return np.rint(shown * 255).astype(np.uint8)
 
 
-def _bright(images: NDArray[np.floating]) -> float:
+def _bright_level(images: NDArray[np.floating]) -> float:
     """Return the intensity that the brightest 0.5 % exceed, or 1 where that is black."""
     bright = float(np.percentile(images, 99.5)) if images.size else 0.0
     return bright if bright > 0 else 1.0
@@ -146,7 +146,7 @@ def _clip_infinite(images: ArrayLike) -> NDArray[np.floating]:
     images = np.asarray(images)
     if images.dtype.kind == "f":
         images = images.clip(-1e30, 1e30)
-    return checked(images, "images")
+    return check_images(images, "images")
 
 
 def _to_tone_scale(intensity: NDArray[np.floating], tone: str) -> NDArray[np.floating]:
@@ -358,6 +358,11 @@ def _figure_class() -> type:
 def save_figure(figure: Any, path: str | Path, dpi: int = 150) -> None:
     """Write a figure in the format of the path's suffix, complete or not at all.
 
+    Args:
+        figure: A figure of matplotlib.
+        path: The file.
+        dpi: Dots per inch, of images of pixels.
+
     Raises:
         InputError: matplotlib does not know the suffix.
     """
@@ -435,7 +440,16 @@ def comparison_figure(
 
 
 def _style(kind: str, arrays: list[NDArray], panels: Sequence[tuple]) -> dict[str, Any]:
-    """Return the colours and common scale of all panels of one kind, for `imshow`."""
+    """Return the colours and common scale of all panels of one kind, for `imshow`.
+
+    Args:
+        kind: Kind of the panels.
+        arrays: Their arrays, (height, width) each.
+        panels: Title, array and kind of each panel.
+
+    Returns:
+        Arguments of `imshow` by name.
+    """
     same = [a.ravel() for a, panel in zip(arrays, panels, strict=True) if panel[2] == kind]
     values = np.concatenate(same)
     values = values[np.isfinite(values)]

@@ -110,7 +110,12 @@ def write_known(
 
 
 def _write_csv(path: str | Path, columns: Mapping[str, Any]) -> None:
-    """Write columns as CSV."""
+    """Write columns as CSV.
+
+    Args:
+        path: The file.
+        columns: (n,) columns by name.
+    """
     with complete(Path(path)) as partial:
         pd.DataFrame(dict(columns)).to_csv(partial, index=False)
 

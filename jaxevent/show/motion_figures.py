@@ -68,7 +68,7 @@ def motion_figure(
     grid = figure.subplots(rows + bool(extra), columns, sharex=True, squeeze=False)
     for column, part in enumerate(model.parts):
         for row, i in enumerate(range(len(model.components))[part.rows]):
-            _cloud(grid[row, column], motion, i, centred)
+            _draw_particles(grid[row, column], motion, i, centred)
             _plot_component(grid[row, column], i, part, model, times, estimated, truth)
     for k, (label, series) in enumerate(extra):
         _plot_extra(grid[rows, min(k, columns - 1)], seconds, label, series)
@@ -215,7 +215,9 @@ def _contrasts(
     return []
 
 
-def _cloud(axis: Any, motion: MotionEstimate, component: int, centred: bool | None) -> None:
+def _draw_particles(
+    axis: Any, motion: MotionEstimate, component: int, centred: bool | None
+) -> None:
     """Draw some of the particles of a component."""
     cloud = motion.cloud
     if cloud is None or not len(cloud):
@@ -351,7 +353,7 @@ def warped_events(
         [np.interp(events.t, grid, c) - np.interp(reference_us, grid, c) for c in total.T], 1
     )
     # In single precision a place is off by some 1e-5 px.
-    xy = np.asarray(_warped(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
+    xy = np.asarray(_warp_positions(motion.model(f), _padded(xy), _padded(way)), float)[: len(xy)]
     if flow_px_s is not None:
         xy = xy - flow_px_s * since[:, None]
     centre = _centre(recording)
@@ -404,7 +406,7 @@ def plot_warped(
         warped_events(recording, motion, events, part.reference, moved),
     )
     sign = _padded(sign)
-    drawn = [_image(_padded(xy), sign, shape) for xy in places]
+    drawn = [_accumulate_image(_padded(xy), sign, shape) for xy in places]
     images, sharp = [np.asarray(one[0]) for one in drawn], [float(one[1]) for one in drawn]
     limit = max(np.percentile(np.abs(images[1]), 99.7), 1e-9)
     figure = new_figure()
@@ -435,7 +437,7 @@ def _padded(array: NDArray) -> NDArray:
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+def _accumulate_image(xy: Array, weight: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Sum weights at places in an image.
 
     Args:
@@ -472,7 +474,7 @@ def _flows(model: Model, xi: Numeric, mean: Numeric) -> Array:
 
 
 @eqx.filter_jit
-def _warped(model: Model, xi: Numeric, way: Numeric) -> Array:
+def _warp_positions(model: Model, xi: Numeric, way: Numeric) -> Array:
     return model.warp(jnp.asarray(xi), jnp.asarray(way))
 
 

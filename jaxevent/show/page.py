@@ -95,10 +95,10 @@ def page(
     now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     counts = {one["recordings"] for one in means(rows)}
     plotted, over_time = _plotted(done)
-    shown = _recordings(rows, pictures, methods, over_time, names)
+    shown = _collect_recordings(rows, pictures, methods, over_time, names)
     data = {
         "methods": methods,
-        "spreads": _spreads(done, methods, [*plotted, over_time]),
+        "spreads": _summarise_measures(done, methods, [*plotted, over_time]),
         "recordings": shown,
     }
     values: dict[str, Any] = {
@@ -110,8 +110,8 @@ def page(
             for title, place, _, _ in columns
             if place in MEASURE_MEANINGS
         },
-        "failures": _failures(rows, names),
-        "means": _means(rows, columns),
+        "failures": _list_failures(rows, names),
+        "means": _tabulate_means(rows, columns),
         "unequal": len(counts) > 1,
         "several": len(recordings) > 1,
         "recordings": shown,
@@ -120,8 +120,8 @@ def page(
         "unit": "ln(I + 0.003)" if hdr else "intensity",
         "certain": DEVIATION_LIMITS[0],
         "uncertain": DEVIATION_LIMITS[1],
-        "everything": _table(rows, columns, names),
-        "parameters": _parameters(rows, methods),
+        "everything": _tabulate_rows(rows, columns, names),
+        "parameters": _tabulate_parameters(rows, methods),
         "computed": _computed(hosts),
         "config": config,
         "palette": list(zip(COLOURS, DARK_COLOURS, strict=True)),
@@ -212,7 +212,7 @@ def _png(image: Any) -> str:
     return base64.b64encode(held.getvalue()).decode()
 
 
-def _failures(
+def _list_failures(
     rows: Sequence[Mapping[str, Any]], names: Mapping[str, str]
 ) -> list[tuple[str, list[str]]]:
     """List what failed and what was skipped, with titles."""
@@ -238,7 +238,7 @@ def _higher_is_better(measure: str, own: Mapping[str, bool | None]) -> bool | No
     return own.get(measure, measure in HIGHER_IS_BETTER)
 
 
-def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
+def _tabulate_means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
     """Tabulate the means of each method, the best of every measure marked.
 
     Metrics of the user's own are marked where they say whether higher is better.
@@ -267,7 +267,7 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Tabl
     return ["method", *titles], lines, 1
 
 
-def _table(
+def _tabulate_rows(
     rows: Sequence[Mapping[str, Any]], columns: Sequence[Column], names: Mapping[str, str]
 ) -> Table:
     """Tabulate all rows."""
@@ -284,7 +284,7 @@ def _table(
     return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 
 
-def _parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Table:
+def _tabulate_parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Table:
     """Tabulate the parameters of each method."""
     lines = []
     for method in methods:
@@ -321,7 +321,7 @@ def _computed(hosts: Sequence[str]) -> Table:
     return ["", ""], [[Cell(k, "left"), Cell(v, "wrap")] for k, v in facts.items()], 2
 
 
-def _recordings(
+def _collect_recordings(
     rows: Sequence[Mapping[str, Any]],
     pictures: Sequence[Sequence[Mapping[str, Any]] | None],
     methods: Sequence[str],
@@ -341,20 +341,20 @@ def _recordings(
             for row, one in zip(rows, pictures, strict=True)
             if row["recording"] == recording and "error" not in row
         ]
-        curves = _curves([row for row, _ in mine], methods, measure)
-        shown = [(row["method"], _choose(one, most)) for row, one in mine if one]
+        curves = _collect_curves([row for row, _ in mine], methods, measure)
+        shown = [(row["method"], _choose_pictures(one, most)) for row, one in mine if one]
         figures: list[dict[str, Any]] = []
         times: list[float] = []
         if shown:
             first = shown[0][1]
             times = [one["t"] / 1e6 for one in first]
-            figures.append({"label": "truth", "images": {"image": _of("truth", first)}})
+            figures.append({"label": "truth", "images": {"image": _picture_column("truth", first)}})
             if "given" in first[0]:
-                before = {"image": _of("given", first)}
+                before = {"image": _picture_column("given", first)}
                 figures.append({"label": "last frame given", "images": before})
         for method, one in shown:
             kinds = [("image", "image"), ("error", "error"), ("deviation", "uncertainty")]
-            images = {what: _of(kind, one) for kind, what in kinds if kind in one[0]}
+            images = {what: _picture_column(kind, one) for kind, what in kinds if kind in one[0]}
             figures.append({"label": method, "images": images})
         if curves or figures:
             name = names[recording]
@@ -362,7 +362,7 @@ def _recordings(
     return found
 
 
-def _choose(pictures: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
+def _choose_pictures(pictures: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
     """Choose pictures at even intervals, the middle one among them."""
     return [pictures[row] for row in spread_rows(len(pictures), most)]
 
@@ -373,7 +373,7 @@ def spread_rows(count: int, most: int) -> list[int]:
     return [(2 * k + 1) * count // (2 * most) for k in range(most)]
 
 
-def _of(kind: str, pictures: Sequence[Mapping[str, Any]]) -> list[str | None]:
+def _picture_column(kind: str, pictures: Sequence[Mapping[str, Any]]) -> list[str | None]:
     return [one.get(kind) for one in pictures]
 
 
@@ -409,7 +409,7 @@ def _is_logarithmic(higher_is_better: bool | None, values: NDArray[np.float64]) 
     return bool(values.min() > 0 and values.max() > MIN_LOG_RATIO * values.min())
 
 
-def _spreads(
+def _summarise_measures(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Summarise each measure over all images, or times, of all recordings, by method.
@@ -460,7 +460,7 @@ def _spreads(
     return spreads
 
 
-def _curves(
+def _collect_curves(
     rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measure: str
 ) -> dict[str, Any] | None:
     """Collect the error of every method over the time of one recording."""

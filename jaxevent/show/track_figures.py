@@ -18,7 +18,7 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
+from jaxevent.blob.quantities import SIZE_FACTORS, inverse_ttc, inverse_ttc_from_size, size_range
 from jaxevent.errors import InputError
 from jaxevent.events import count_events
 from jaxevent.recording import Recording, Times
@@ -242,8 +242,9 @@ def write_track_plot(
 
     Over time are the six tracks that are seen longest, and those of pairs. Paths are drawn over the
     events, coloured by time, with ellipses of two standard deviations at intervals. 1 / TTC of a
-    track is that of its growth (`quantities.growth`, smoothed). It is drawn if it differs from 0
-    and both axes, larger than pixels, grow alike and one way, as those of an approaching object do.
+    track is that of its size (`quantities.inverse_ttc_from_size`, smoothed). It is drawn if it
+    differs from 0 and both axes, larger than pixels, grow alike and one way, as those of an
+    approaching object do.
     Time counts from the recording's start.
 
     Args:
@@ -259,7 +260,7 @@ def write_track_plot(
         focal: Focal length, px, for their range.
         size_factor: Size of a blob over that of its object's image.
         Q: Process noise of the growth.
-        Q_lambda: (N,) process noises of the sizes; None for that of `growth`.
+        Q_lambda: (N,) process noises of the sizes; None for that of `inverse_ttc_from_size`.
         smoothed: Whether the tracks are smoothed.
         total: Number of all tracks, of which these are a part.
 
@@ -409,15 +410,15 @@ def _growths(
         m: (T, N, 8) states.
         P: (T, N, 8, 8) covariances.
         valid: (T, N) whether a track is seen.
-        Q: See `growth`.
-        Q_lambda: (N,), see `growth`; None: independent errors.
+        Q: See `inverse_ttc_from_size`.
+        Q_lambda: (N,), see `inverse_ttc_from_size`; None: independent errors.
         smoothed: Whether the tracks are smoothed.
 
     Returns:
         1 / TTC (T, N), 1/s, its variance, and the tracks (N,) where it is significantly not 0.
     """
     since = jnp.asarray((t - t[0]) * 1e-6, m.dtype)
-    one = functools.partial(growth, since, Q=Q, smoothed=smoothed)
+    one = functools.partial(inverse_ttc_from_size, since, Q=Q, smoothed=smoothed)
     grown, spread = jax.vmap(
         lambda m, P, seen, noise: one(m, P, seen, Q_lambda=noise),
         in_axes=(1, 1, 1, None if Q_lambda is None else 0),

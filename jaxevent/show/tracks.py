@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from jaxevent.blob.quantities import SIZE_FACTORS, growth, inverse_ttc, size_range
+from jaxevent.blob.quantities import SIZE_FACTORS, inverse_ttc, inverse_ttc_from_size, size_range
 from jaxevent.blob.track import TrackStates
 from jaxevent.blob.tracks import TABLE_RATE_HZ, Tracks, evenly_spaced_times
 from jaxevent.errors import InputError, MissingExtra, require
@@ -295,7 +295,7 @@ class Output:
         nothing = np.full(len(rows.t), np.nan)
         for place, one in enumerate(tracks.id.tolist()):
             mean, covariance, valid = (part[:, 0] for part in rows.dense([place]))
-            value = growth(
+            value = inverse_ttc_from_size(
                 since, mean, covariance, jnp.asarray(valid),
                 Q_lambda=float(tracks.track_params(one).Q_lambda), smoothed=tracks.smooth,
             )  # fmt: skip
@@ -424,7 +424,7 @@ class _TrackRows:
         self._parts.append((at, column, mean[row, column], covariance[row, column]))
 
     @functools.cached_property
-    def _joined(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def _sorted_rows(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         at, _, mean, covariance = empty_rows()
         parts = self._parts or [(at, at, mean, covariance)]
         at, column, mean, covariance = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -432,11 +432,11 @@ class _TrackRows:
         return at[order], column[order], mean[order], covariance[order]
 
     def _slice(self, place: int) -> slice:
-        return slice(*np.searchsorted(self._joined[1], [place, place + 1]))
+        return slice(*np.searchsorted(self._sorted_rows[1], [place, place + 1]))
 
     def of(self, place: int) -> NDArray:
         """Return the means (rows, 8) of one track."""
-        return self._joined[2][self._slice(place)]
+        return self._sorted_rows[2][self._slice(place)]
 
     def longest(self, most: int, also: Sequence[int]) -> list[int]:
         """Return the places of the tracks that are seen at the most times, and of some others.
@@ -448,13 +448,13 @@ class _TrackRows:
         Returns:
             Places, ascending.
         """
-        count = np.bincount(self._joined[1], minlength=len(self.ids))
+        count = np.bincount(self._sorted_rows[1], minlength=len(self.ids))
         order = np.argsort(-count, kind="stable")[:most].tolist()
         return sorted({*order, *(int(np.flatnonzero(self.ids == one)[0]) for one in also)})
 
     def dense(self, places: Sequence[int]) -> tuple[NDArray, NDArray, NDArray]:
         """Return mean (T, n, 8), covariance (T, n, 8, 8) and valid (T, n) of some tracks."""
-        at, _, rows, P = self._joined
+        at, _, rows, P = self._sorted_rows
         shape = len(self.t), len(places)
         mean, valid = np.ones((*shape, 8), rows.dtype), np.zeros(shape, bool)
         covariance = np.broadcast_to(np.eye(8, dtype=rows.dtype), (*shape, 8, 8)).copy()

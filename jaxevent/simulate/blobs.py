@@ -43,7 +43,13 @@ class TargetMotion(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _ConstantSize:
-    """Base of targets of constant size (px), initial angle theta (rad) and spin (rad/s)."""
+    """Base of targets of constant size.
+
+    Attributes:
+        size: lambda1 and lambda2, px.
+        theta: Initial angle, rad.
+        spin: Angular velocity, rad/s.
+    """
 
     size: Pair = (10.0, 5.0)
     theta: float | int = 0.0
@@ -64,7 +70,11 @@ class _ConstantSize:
 class LissajousMotion(_ConstantSize):
     """Motion along a Lissajous curve: p = centre + amplitude sin(2 pi frequency t + phase).
 
-    Each is a pair for x and y. Centre and amplitude are in px, frequency in Hz, phase in rad.
+    Attributes:
+        centre: x and y of the centre, px.
+        amplitude: Amplitudes along x and y, px.
+        frequency: Frequencies along x and y, Hz.
+        phase: Phases along x and y, rad.
     """
 
     centre: Pair
@@ -81,7 +91,12 @@ class LissajousMotion(_ConstantSize):
 
 @dataclasses.dataclass(frozen=True)
 class LinearMotion(_ConstantSize):
-    """Motion at constant velocity: p = start (px) + velocity (px/s) t."""
+    """Motion at constant velocity: p = start + velocity t.
+
+    Attributes:
+        start: x and y at time 0, px.
+        velocity: Velocity along x and y, px/s.
+    """
 
     start: Pair
     velocity: Pair = (0.0, 0.0)
@@ -93,9 +108,15 @@ class LinearMotion(_ConstantSize):
 
 @dataclasses.dataclass(frozen=True)
 class CircularMotion(_ConstantSize):
-    """Motion along a circle of `radius` (px) at `rate` (rad/s) from the angle `phase`.
+    """Motion along a circle.
 
     As y is downwards, a positive rate is clockwise.
+
+    Attributes:
+        centre: x and y of the centre, px.
+        radius: Radius, px.
+        rate: Angular velocity, rad/s.
+        phase: Angle at time 0, rad.
     """
 
     centre: Pair
@@ -113,21 +134,31 @@ class CircularMotion(_ConstantSize):
 
 @dataclasses.dataclass(frozen=True)
 class ApproachMotion:
-    """A target at (X, Y) = `point` (m), whose depth is distance - speed t - acceleration t^2 / 2.
+    """Motion of a target whose depth is distance - speed t - acceleration t^2 / 2.
 
-    Its image is at centre + focal point / depth (px). Its lambda_i is size_factor focal extent_i /
-    depth, for its `extent` (m) along two axes, the first of which has the angle theta (rad). The
-    inverse time to contact is (speed + acceleration t) / depth.
+    Its image is at centre + focal point / depth. Its lambda_i is size_factor focal extent_i /
+    depth. The inverse time to contact is (speed + acceleration t) / depth.
+
+    Attributes:
+        point: X and Y of the target, m.
+        distance: Depth at time 0, m.
+        speed: Speed of approach at time 0, m/s.
+        extent: Diameters along its two axes, m.
+        focal: Focal length, px.
+        centre: Principal point, px.
+        size_factor: lambda over the diameter of the image.
+        acceleration: Acceleration of the approach, m/s^2.
+        theta: Angle of the first axis, rad.
     """
 
     point: Pair
-    distance: float | int  # m
-    speed: float | int  # m/s
+    distance: float | int
+    speed: float | int
     extent: Pair
-    focal: float | int = 1000.0  # px
-    centre: Pair = (639.5, 359.5)  # px, the principal point
+    focal: float | int = 1000.0
+    centre: Pair = (639.5, 359.5)
     size_factor: float | int = 0.25
-    acceleration: float | int = 0.0  # m/s^2
+    acceleration: float | int = 0.0
     theta: float | int = 0.0
 
     def depth(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,14 +176,24 @@ class ApproachMotion:
 
 @dataclasses.dataclass(frozen=True)
 class RandomWalk:
-    """A random path of the filters' own model, for `duration` s from the state `start`.
+    """A random path of the filters' own model.
 
-    Velocity and spin are Wiener processes of densities Q_v (px^2/s^3) and Q_q (rad^2/s^3),
-    position and angle their integrals plus Wiener processes of densities Q_p (px^2/s) and Q_theta
-    (rad^2/s); d log lambda = sqrt(Q_lambda) / lambda dW, which keeps lambda positive. Drawn on a
-    grid of `step` seconds, where position, velocity, angle and spin have exactly the model's joint
-    distribution; between grid times the conditional mean is given. It lacks at most Q_v step / 12
-    of the variance of velocity; without Q_p velocity is the derivative of position everywhere.
+    Velocity and spin are Wiener processes, position and angle their integrals plus Wiener
+    processes; d log lambda = sqrt(Q_lambda) / lambda dW, which keeps lambda positive. Drawn on a
+    grid, where position, velocity, angle and spin have exactly the model's joint distribution;
+    between grid times the conditional mean is given. It lacks at most Q_v step / 12 of the variance
+    of velocity; without Q_p velocity is the derivative of position everywhere.
+
+    Attributes:
+        start: (8,) state at time 0.
+        duration: Length of the path, s.
+        Q_p: Spectral density of the position's own process, px^2/s.
+        Q_v: Spectral density of the velocity's process, px^2/s^3.
+        Q_lambda: Spectral density of the sizes' processes, px^2/s.
+        Q_theta: Spectral density of the angle's own process, rad^2/s.
+        Q_q: Spectral density of the spin's process, rad^2/s^3.
+        seed: Seed of the random numbers.
+        step: Distance of grid times, s.
     """
 
     start: tuple[float | int, ...]
@@ -181,7 +222,7 @@ class RandomWalk:
     def state(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the states (times, 8) at times (s)."""
         h = self.step
-        integral, rate, wander, log_size = self._grid
+        integral, rate, wander, log_size = self._grid_path
         k = np.clip(np.floor(t / h).astype(int), 0, len(rate) - 2)
         a = ((t - k * h) / h)[:, None]
         # Given both ends, the mean of an integrated Wiener process is the cubic through their
@@ -197,7 +238,7 @@ class RandomWalk:
         )
 
     @functools.cached_property
-    def _grid(self) -> tuple[NDArray[np.float64], ...]:
+    def _grid_path(self) -> tuple[NDArray[np.float64], ...]:
         """The path on the grid of steps.
 
         The integral of the rate, the rate and the Wiener part of x, y and theta, (steps + 1, 3)
@@ -245,6 +286,15 @@ class Target:
     With `flicker` (Hz) the events come in bursts, ON at the start of a period and OFF in its
     middle, whose rate decays with the time constant `burst` (s); `rate` is still the mean. There
     are no events in `dropouts`, pairs of times (s).
+
+    Attributes:
+        motion: Motion of the centre, and the sizes.
+        rate: Events per second.
+        shape: Distribution of the events about the centre.
+        bright: Whether a disc is brighter than the background.
+        flicker: Frequency of bursts, Hz; 0: events come evenly.
+        burst: Time constant of a burst, s.
+        dropouts: Pairs of times without events, s.
 
     Raises:
         InputError: A value is not possible.
@@ -358,13 +408,20 @@ class BlobTruth:
 
     Rounding of events to pixels adds 1/12 px^2 to the variances of their positions, which the true
     lambda does not contain.
+
+    Attributes:
+        targets: The targets.
+        duration: Length of the recording, s.
+        source: (events,) target of each event, -1 for background.
+        t: (events,) times before rounding to microseconds, s.
+        xi: (events, 2) positions before rounding to pixels, px.
     """
 
     targets: tuple[Target, ...]
-    duration: float | int  # s
-    source: NDArray[np.int64]  # (events,), the target of each event, -1 for background
-    t: NDArray[np.float64]  # (events,), s, before rounding to microseconds
-    xi: NDArray[np.float64]  # (events, 2), px, before rounding to pixels
+    duration: float | int
+    source: NDArray[np.int64]
+    t: NDArray[np.float64]
+    xi: NDArray[np.float64]
 
     def __call__(self, times: Times) -> NDArray[np.float64]:
         """Return the states of all targets.

@@ -23,7 +23,16 @@ from jaxevent.recording import Events, Frames, Recording
 
 
 def _with_events(recording: Recording, rows: Any = slice(None), **columns: NDArray) -> Recording:
-    """Choose events by rows, then replace some of their columns."""
+    """Choose events by rows, then replace some of their columns.
+
+    Args:
+        recording: The recording.
+        rows: Rows to keep, of all that `Events` takes.
+        **columns: New columns (n,) of the rows that are kept, by name.
+
+    Returns:
+        The recording with these events.
+    """
     events = recording.events[:][rows]
     return dataclasses.replace(recording, events=dataclasses.replace(events, **columns))
 

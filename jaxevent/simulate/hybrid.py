@@ -30,34 +30,53 @@ _TARGET_GREY, _GAIN_RANGE = 0.45, 16.0  # of automatic exposure
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """Settings of a simulated hybrid sensor; the defaults are like a DAVIS. Times in seconds.
+    """Settings of a simulated hybrid sensor; the defaults are like a DAVIS.
 
-    Thresholds are changes of ln(I + dark_offset). Intensity 1 is the frames' white. With
-    `auto_exposure`, frame k shows the intensity times a gain, which follows the mean of frame
-    k - 1. `response` is None for the cropping S-curve `camera.SCurve()`.
+    Thresholds are changes of ln(I + dark_offset). Intensity 1 is the frames' white.
+
+    Attributes:
+        c_on: Threshold of ON events, ln intensity.
+        c_off: Threshold of OFF events, ln intensity.
+        mismatch: Relative standard deviation of a threshold over the pixels.
+        dark_offset: Intensity that a dark photoreceptor reports.
+        refractory: Time after an event during which change is lost, s.
+        background_rate: Noise events per pixel, of either polarity, Hz.
+        hot_fraction: Fraction of pixels that are hot.
+        hot_rate: Events of a hot pixel, of either polarity, Hz.
+        jitter: Standard deviation of the time stamps, s, dead time or not.
+        response: Response of the frames; None: the cropping S-curve `camera.SCurve()`.
+        frame_rate: Frames per second.
+        exposure: Length of an exposure, s.
+        exposure_samples: Instants averaged over an exposure.
+        read_noise: Standard deviation in grey levels of 8 bit.
+        full_well: Electrons at intensity 1; infinite: no shot noise.
+        auto_exposure: Whether frame k shows the intensity times a gain that follows the mean of
+            frame k - 1.
+        clock_offset: Time that an estimator must add to the frames' stamps, s.
+        truth_rate: HDR reference images per second.
 
     Raises:
         InputError: A value is not possible.
     """
 
-    c_on: float | int = 0.20  # ln intensity
+    c_on: float | int = 0.20
     c_off: float | int = 0.18
-    mismatch: float | int = 0.03  # relative standard deviation of a threshold over the pixels
-    dark_offset: float | int = 0.003  # intensity that a dark photoreceptor reports
-    refractory: float | int = 5e-4  # s after an event during which change is lost
-    background_rate: float | int = 0.3  # Hz per pixel, of either polarity
-    hot_fraction: float | int = 3e-4  # of the pixels
-    hot_rate: float | int = 100.0  # Hz, of either polarity
-    jitter: float | int = 0.0  # s, standard deviation of the time stamps, dead time or not
+    mismatch: float | int = 0.03
+    dark_offset: float | int = 0.003
+    refractory: float | int = 5e-4
+    background_rate: float | int = 0.3
+    hot_fraction: float | int = 3e-4
+    hot_rate: float | int = 100.0
+    jitter: float | int = 0.0
     response: Response | None = None
-    frame_rate: float | int = 50.0  # Hz
-    exposure: float | int = 5e-3  # s
-    exposure_samples: int = 8  # instants averaged over an exposure
-    read_noise: float | int = 0.7  # standard deviation in grey levels of 8 bit
-    full_well: float | int = math.inf  # electrons at intensity 1; infinite: no shot noise
+    frame_rate: float | int = 50.0
+    exposure: float | int = 5e-3
+    exposure_samples: int = 8
+    read_noise: float | int = 0.7
+    full_well: float | int = math.inf
     auto_exposure: bool = False
-    clock_offset: float | int = 0.0  # s that an estimator must add to the frames' stamps
-    truth_rate: float | int = 30.0  # HDR reference images per second
+    clock_offset: float | int = 0.0
+    truth_rate: float | int = 30.0
 
     def __post_init__(self) -> None:
         positive = ("c_on", "c_off", "dark_offset", "frame_rate", "exposure", "full_well")
@@ -291,12 +310,19 @@ def _samples(
 
 
 class _Pixels(NamedTuple):
-    """Pixels of a sensor while events are simulated, each (pixels,)."""
+    """Pixels of a sensor while events are simulated.
 
-    on: NDArray[np.float64]  # thresholds, ln intensity
+    Attributes:
+        on: (pixels,) thresholds of ON events, ln intensity.
+        off: (pixels,) thresholds of OFF events, ln intensity.
+        reference: (pixels,) level at the last event; updated.
+        ready: (pixels,) end of the dead time, us; updated.
+    """
+
+    on: NDArray[np.float64]
     off: NDArray[np.float64]
-    reference: NDArray[np.float64]  # level at the last event; updated
-    ready: NDArray[np.float64]  # us, end of the dead time; updated
+    reference: NDArray[np.float64]
+    ready: NDArray[np.float64]
 
 
 class _NoiseEvents(NamedTuple):

@@ -45,10 +45,17 @@ _IDEAL = dataclasses.replace(
 
 @dataclasses.dataclass(frozen=True)
 class CameraMotion:
-    """A camera's twist mean + slope t + amplitude sin(2 pi frequency t + phase), six numbers each.
+    """A camera's twist: mean + slope t + amplitude sin(2 pi frequency t + phase).
 
-    They are T (m/s) and Omega (rad/s) of the camera, in its own axes; frequency is in Hz, phase in
-    rad. The pose at time 0 is the identity.
+    The six numbers of a twist are T (m/s) and Omega (rad/s) of the camera, in its own axes. The
+    pose at time 0 is the identity.
+
+    Attributes:
+        mean: (6,) twist.
+        slope: (6,) its change, 1/s.
+        amplitude: (6,) amplitudes of oscillations.
+        frequency: (6,) their frequencies, Hz.
+        phase: (6,) their phases, rad.
 
     Raises:
         InputError: A number is not finite.
@@ -81,7 +88,7 @@ class CameraMotion:
         """Return camera-to-world poses (times, 4, 4) at times (s) from 0 on, to about 1e-11."""
         t = np.asarray(t, np.float64)
         k = np.floor(t / _STEP_S).astype(int)
-        grid = self._grid(1 << int(k.max(initial=0)).bit_length())
+        grid = self._grid_poses(1 << int(k.max(initial=0)).bit_length())
         return grid[k] @ self._steps(k * _STEP_S, t - k * _STEP_S)
 
     def _steps(self, t: NDArray[np.floating], h: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -105,7 +112,7 @@ class CameraMotion:
         return RigidTransform.from_exp_coords(np.concatenate([turn, way], 1)).as_matrix()
 
     @functools.cache  # noqa: B019, motions are small and few
-    def _grid(self, count: int) -> NDArray[np.float64]:
+    def _grid_poses(self, count: int) -> NDArray[np.float64]:
         """Return the poses (count + 1, 4, 4) at the times 0, _STEP_S, ..."""
         steps = self._steps(np.arange(count) * _STEP_S, np.full(count, _STEP_S))
         poses = [np.eye(4)]
@@ -234,13 +241,21 @@ class FlatPatch:
     """A flat, opaque ellipse or rectangle.
 
     Its axes are the world's x and y, turned by the rotation vector `turn`.
+
+    Attributes:
+        centre: X, Y and Z of the middle, m.
+        half: Half axes, m.
+        texture: Its texture.
+        base: ln intensity added to the texture's.
+        turn: (3,) rotation vector of its axes, rad.
+        ellipse: Whether it is an ellipse, else a rectangle.
     """
 
-    centre: Three  # m
-    half: tuple[float | int, float | int]  # half axes, m
+    centre: Three
+    half: tuple[float | int, float | int]
     texture: Texture
-    base: float | int = 0.0  # ln intensity added to the texture's
-    turn: Three = (0.0, 0.0, 0.0)  # rad
+    base: float | int = 0.0
+    turn: Three = (0.0, 0.0, 0.0)
     ellipse: bool = True
 
 
@@ -260,9 +275,15 @@ class BoxWorld:
     All walls have the same texture, which fades near their edges. Patches hide the walls, and each
     hides those before it in `patches`: give the farthest first. Their outlines are blurred over a
     pixel.
+
+    Attributes:
+        lower: Least X, Y and Z of the box, m.
+        upper: Largest X, Y and Z of the box, m.
+        texture: Texture of the walls.
+        patches: Patches in the box, the farthest first.
     """
 
-    lower: Three  # m
+    lower: Three
     upper: Three
     texture: Texture
     patches: tuple[FlatPatch, ...] = ()
@@ -366,6 +387,14 @@ class MovingCamera:
 
     Times of the truth are integers (us) or floats (s) from 0 to the duration.
 
+    Attributes:
+        world: The world.
+        motion: Motion of the camera.
+        size: Width and height of the sensor, px.
+        focal: Focal length of a lens without distortion, centred in the image, px.
+        duration: Length of the recording, s.
+        lens: Another lens, instead of `focal`.
+
     Raises:
         InputError: A time is outside the duration, or the distortion of the lens has no inverse in
             the image.
@@ -373,10 +402,10 @@ class MovingCamera:
 
     world: BoxWorld
     motion: CameraMotion
-    size: tuple[int, int] = (240, 180)  # width, height, px
-    focal: float | int = 200.0  # px, of a lens without distortion, centred in the image
-    duration: float | int = 0.5  # s
-    lens: PinholeCamera | None = None  # instead of `focal`
+    size: tuple[int, int] = (240, 180)
+    focal: float | int = 200.0
+    duration: float | int = 0.5
+    lens: PinholeCamera | None = None
 
     @property
     def camera(self) -> PinholeCamera:
@@ -480,7 +509,7 @@ def simulate_motion(
 _GRAIN_M = 0.012  # 1 px at 2.4 m and f = 200 px
 
 
-def _room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
+def _describe_room(kind: str, depth: float, seed: int) -> tuple[Three, Three, Texture]:
     """Describe a room.
 
     Args:
@@ -542,6 +571,15 @@ def _random_direction(rng: np.random.Generator, dimensions: int = 3) -> NDArray[
 
 
 def _six(T: ArrayLike, Omega: ArrayLike) -> Six:
+    """Return a twist as six numbers.
+
+    Args:
+        T: (3,) velocity, m/s.
+        Omega: (3,) angular velocity, rad/s.
+
+    Returns:
+        The numbers.
+    """
     a, b, c, d, e, f = np.concatenate([np.asarray(T, float), np.asarray(Omega, float)]).tolist()
     return a, b, c, d, e, f
 
@@ -646,7 +684,7 @@ def motion_scene(
         }[motion]()
     else:
         kind = {"shapes": "plain"}.get(name, "noise") if texture is None else texture
-        room = _room(kind, 2.0 if name == "wall" else 3.2, texture_seed)
+        room = _describe_room(kind, 2.0 if name == "wall" else 3.2, texture_seed)
         patches = ()
         if name != "wall":
             patches = (
@@ -722,10 +760,10 @@ def simulate_frame_events(
     begin = rng.integers(0, image.shape[::-1])
     position = begin - np.concatenate([np.zeros((1, 2)), np.cumsum(flow, axis=0)])
     y, x = np.mgrid[:height, :width]
-    before = _bilinear(image, x + position[0, 0], y + position[0, 1])
+    before = _sample_bilinear(image, x + position[0, 0], y + position[0, 1])
     parts = []
     for k, (px, py) in enumerate(position[1:], start=1):
-        now = _bilinear(image, x + px, y + py)
+        now = _sample_bilinear(image, x + px, y + py)
         change = now - before
         if noise:
             lit = rng.random(change.shape) < noise
@@ -743,7 +781,7 @@ def simulate_frame_events(
     return Recording(name, width, height, events).check(), flow / (step * 1e-6)
 
 
-def _bilinear(
+def _sample_bilinear(
     image: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Sample an image by B.10, periodic beyond its border.

@@ -186,7 +186,7 @@ class _Canvas:
         return list(zip(x.tolist(), self.rng.uniform(low, high, count).tolist(), strict=True))
 
 
-def _room(c: _Canvas) -> None:
+def _paint_room(c: _Canvas) -> None:
     """Paint a living room: windows on bright outdoors, shaded walls, dark furniture, a lamp."""
     c.level = -2.4 + 0.5 * c.noise(1.7) + 0.9 * np.cos(2 * np.pi * (c.y - 160) / 512)
     outside = 3.6 + 0.5 * c.noise(1.3, 60)
@@ -291,7 +291,7 @@ def _tunnel(c: _Canvas) -> None:
 
 # Functions that paint, and the part of the scene that is brighter than the frames' white.
 _SCENES: dict[str, tuple[Callable[[_Canvas], None], float]] = {
-    "room": (_room, 0.10),
+    "room": (_paint_room, 0.10),
     "forest": (_forest, 0.30),
     "mountain": (_mountain, 0.32),
     "lake": (_lake, 0.30),
@@ -360,14 +360,21 @@ class Pan:
     beyond the panorama's edges it is repeated sideways and mirrored up and down. Deterministic in
     `seed`.
 
+    Attributes:
+        panorama: (rows, columns) intensity.
+        size: Width and height of the sensor, px.
+        duration: Length of the recording, s.
+        speed: Mean speed: "slow", "fast", or px/s.
+        seed: Seed of the path.
+
     Raises:
         InputError: The panorama is not positive, or the speed is unknown.
     """
 
     panorama: NDArray[np.float64]
-    size: tuple[int, int] = (128, 96)  # width, height
-    duration: float | int = 1.5  # s
-    speed: Speed | float | int = "slow"  # or px/s
+    size: tuple[int, int] = (128, 96)
+    duration: float | int = 1.5
+    speed: Speed | float | int = "slow"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -584,14 +591,22 @@ class MovingObjects:
     Surfaces are numbered: 0 is the background, higher ones are nearer. Flow and displacement are
     those of the surface at a pixel's middle, x before y.
 
+    Attributes:
+        size: Width and height of the sensor, px.
+        duration: Length of the recording, s.
+        speed: Root mean square speed of objects, px/s.
+        spread: Relative spread of their speeds, 0..1.
+        seed: Seed of the scene.
+        background: Speed of the background over `speed`.
+
     Raises:
         InputError: There are fewer than 32x32 pixels, the speed or background is negative, or the
             spread is outside [0, 1).
     """
 
-    size: tuple[int, int] = (160, 120)  # width, height, px
-    duration: float | int = 1.0  # s
-    speed: float | int = 90.0  # px/s
+    size: tuple[int, int] = (160, 120)
+    duration: float | int = 1.0
+    speed: float | int = 90.0
     spread: float | int = 0.6
     seed: int = 0
     background: float | int = 0.4

@@ -72,16 +72,16 @@ class VideoClip:
 
     def intensity(self, t: float | int) -> NDArray[np.float64]:
         """Return the luminance (height, width) at t seconds."""
-        k, u = self._between(t)
+        k, u = self._locate_frame(t)
         return (1 - u) * self._luminance[k].astype(float) + u * self._luminance[k + 1]
 
     def colour(self, t: float | int) -> NDArray[np.float64]:
         """Return the intensity of red, green and blue, (height, width, 3), at t seconds."""
-        k, u = self._between(t)
+        k, u = self._locate_frame(t)
         light = (1 - u) * _LINEAR[self.images[k]] + u * _LINEAR[self.images[k + 1]]
         return light / self.white
 
-    def _between(self, t: float | int) -> tuple[int, float]:
+    def _locate_frame(self, t: float | int) -> tuple[int, float]:
         k = min(max(math.floor(t * self.rate), 0), len(self.images) - 2)
         return k, min(max(t * self.rate - k, 0.0), 1.0)
 

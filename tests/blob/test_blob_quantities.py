@@ -140,10 +140,10 @@ def grow(times, mean, P, valid=None, **settings):
     """Growth of one signature, so that it is compiled once."""
     valid = np.ones(len(times), bool) if valid is None else valid
     settings = {"Q": 0.0, "smooth": True, **settings}
-    return quantities.growth(*map(jnp.asarray, (times, mean, P, valid)), **settings)
+    return quantities.inverse_ttc_from_size(*map(jnp.asarray, (times, mean, P, valid)), **settings)
 
 
-def test_growth_without_speed_changes_is_the_least_squares_line():
+def test_inverse_ttc_from_size_without_speed_changes_is_the_least_squares_line():
     rng = RNG(4)
     times = np.sort(rng.uniform(0, 1.5, 50))
     mean, _ = approach(times)
@@ -163,7 +163,7 @@ def test_growth_without_speed_changes_is_the_least_squares_line():
     np.testing.assert_allclose(variance, np.einsum("ti,ij,tj->t", g, C, g), rtol=5e-3)
 
 
-def test_growth_undoes_the_lag_of_a_filter():
+def test_inverse_ttc_from_size_undoes_the_lag_of_a_filter():
     """A settled filter of variance P and density Q shows what was true P / Q ago."""
     times, lag, Q_lambda = np.linspace(0, 1.2, 60), 0.03, 1.6
     late, _ = approach(times - lag)
@@ -176,7 +176,7 @@ def test_growth_undoes_the_lag_of_a_filter():
     assert (np.abs(without / true - 1)[5:] > 5e-3).all()
 
 
-def test_growth_is_the_joint_gaussian():
+def test_inverse_ttc_from_size_is_the_joint_gaussian():
     """Against conditioning the scales and rates at all times at once on three sizes."""
     times, Q, spread = np.linspace(0, 1, 50) ** 1.5, 0.4, 0.01
     valid = np.isin(np.arange(50), [0, 20, 41])
@@ -200,7 +200,7 @@ def test_growth_is_the_joint_gaussian():
 
 
 @pytest.mark.slow
-def test_growth_allows_for_errors_that_last():
+def test_inverse_ttc_from_size_allows_for_errors_that_last():
     """Sizes as a Kalman filter of a walk leaves them that measures a constant size."""
     rng = RNG(6)
     tracks, steps, dt, Q_lambda, noise = 300, 400, 0.005, 3.0, 0.54
@@ -257,7 +257,7 @@ def test_rows_that_are_not_valid_do_not_matter():
 
 
 @pytest.mark.parametrize("valid", [[], [0], [3]])
-def test_growth_of_too_few_sizes_is_not_known(valid):
+def test_inverse_ttc_from_size_of_too_few_sizes_is_not_known(valid):
     mask = np.isin(np.arange(50), valid)
     mean, P = np.full((50, 8), 4.0), np.tile(np.eye(8), (50, 1, 1))
     for times in (np.linspace(0.0, 1.0, 50), np.zeros(50)):
@@ -265,20 +265,20 @@ def test_growth_of_too_few_sizes_is_not_known(valid):
         assert np.isfinite(value).all() and (np.asarray(variance) > 10).all()
 
 
-def test_growth_in_single_precision(float32):
+def test_inverse_ttc_from_size_in_single_precision(float32):
     times = np.linspace(0, 1.5, 1500)
     mean, truth = approach(times)
     args = (jnp.asarray(x, jnp.float32) for x in (times, mean, sized(times, 0.01)))
-    value, variance = quantities.growth(*args)
+    value, variance = quantities.inverse_ttc_from_size(*args)
     assert value.dtype == jnp.float32 and np.isfinite(variance).all()
     np.testing.assert_allclose(value, truth, rtol=0.02)
 
 
-def test_growth_of_times_since_1970(float32):
+def test_inverse_ttc_from_size_of_times_since_1970(float32):
     times = np.linspace(0, 1.5, 50)
     mean, _ = approach(times)
     args = (jnp.asarray(mean, jnp.float32), jnp.asarray(sized(times, 0.01), jnp.float32))
-    late, early = (quantities.growth(t, *args)[0] for t in (1.7e9 + times, times))
+    late, early = (quantities.inverse_ttc_from_size(t, *args)[0] for t in (1.7e9 + times, times))
     np.testing.assert_allclose(late, early, rtol=1e-3)
 
 

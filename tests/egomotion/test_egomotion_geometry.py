@@ -156,7 +156,7 @@ def test_single_precision(float32, twists):
 def test_undistorted_inverts_the_distortion():
     camera = PinholeCamera(199.1, 202.4, 132.2, 110.7, (-0.368, 0.151, -3e-4, -2.8e-4, 0.0))
     x, y = (RNG.integers(0, size, 300).astype(np.uint16) for size in (240, 180))
-    points, f = geometry.undistort(camera, x, y)
+    points, f = geometry.centred_coordinates(camera, x, y)
     assert f == np.sqrt(camera.fx * camera.fy)
     # The published formula, forwards.
     a, b = points.T / f
@@ -167,13 +167,15 @@ def test_undistorted_inverts_the_distortion():
     back_y = b * radial + p1 * (r + 2 * b**2) + 2 * p2 * a * b
     np.testing.assert_allclose(camera.fx * back_x + camera.cx, x, atol=1e-9)
     np.testing.assert_allclose(camera.fy * back_y + camera.cy, y, atol=1e-9)
-    plain, f = geometry.undistort(PinholeCamera(100.0, 100.0, 20.0, 10.0), [25, 20], [10, 7])
+    plain, f = geometry.centred_coordinates(
+        PinholeCamera(100.0, 100.0, 20.0, 10.0), [25, 20], [10, 7]
+    )
     np.testing.assert_allclose(plain, [[5, 0], [0, -3]], atol=1e-12)
     folding = PinholeCamera(100.0, 100.0, 120.0, 90.0, (-0.8, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="no inverse at pixel"):
-        geometry.undistort(folding, x, y)
+        geometry.centred_coordinates(folding, x, y)
     with pytest.raises(InputError, match="focal lengths"):
-        geometry.undistort(PinholeCamera(0.0, 1.0, 0.0, 0.0), x, y)
+        geometry.centred_coordinates(PinholeCamera(0.0, 1.0, 0.0, 0.0), x, y)
 
 
 def poses_of(xi, t, start=None):

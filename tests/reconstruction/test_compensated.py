@@ -775,7 +775,7 @@ def test_the_clock_of_a_target_is_that_of_the_evidence(before, after):
     """The nearest anchor decides; halfway both do, whichever is called the nearest."""
     found, step = {10_000: before, 50_000: after}, 6_000
     estimator = object.__new__(target_motion.TrajectoryEstimator)
-    estimator._sought_motion = lambda at: target_motion.SoughtMotion(None, None, found[at])
+    estimator._anchor_motion = lambda at: target_motion.TwoClockMotion(None, None, found[at])
     estimator.schedule = instants.InstantSchedule(np.array([0, 60_000]), (0, 60_000), 100.0)
     assert estimator.schedule.step == step
     for t in (9_000, 10_000, 26_900, 29_999, 30_000, 30_001, 33_100, 50_000, 60_000):

@@ -67,11 +67,12 @@ def test_images_without_any_finite_number_are_no_output(tmp_path):
             images[:, *lost] = np.nan
             return images
 
+        options = export.ExportOptions("linear", "small", colours)
         out = tmp_path / name
         if name == "some.h5":
-            export.write_hdf5(video, times, out, "linear", "small", colours)
+            export.write_hdf5(video, times, out, options)
             assert out.exists()
         else:
             with pytest.raises(InputError, match="none.h5: .* no finite number"):
-                export.write_hdf5(video, times, out, "linear", "small", colours)
+                export.write_hdf5(video, times, out, options)
             assert not out.exists()

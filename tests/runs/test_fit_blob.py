@@ -181,7 +181,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
     tracks = tracker.estimate(
         recording, tracker.Params(**START), seeds=[(85.0, 45.0, 6.0)]
     ).filtered
-    parts = mine._windows(FitData(sources, (2, 1, 1), None))
+    parts = mine._cut_windows(FitData(sources, (2, 1, 1), None))
     assert [part.split for part in parts] == [0, 1, 0, 2, 0, 1, 0, 2]
     assert parts[0].start == recording.start and parts[-1].stop == recording.stop + 1
     assert all(a.stop == b.start for a, b in zip(parts, parts[1:], strict=False))
@@ -193,7 +193,7 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
         np.testing.assert_allclose((x, y, size), mean[[0, 1, 4]], rtol=1e-12)
         assert at == part.start
     # Without seeds and positions tracks are born in every window.
-    assert all(part.seeds is None for part in goal()._windows(FitData(sources, None, 0.05)))
+    assert all(part.seeds is None for part in goal()._cut_windows(FitData(sources, None, 0.05)))
 
 
 def test_sizes_that_are_not_given_can_be_fitted(folder):

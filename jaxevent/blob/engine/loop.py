@@ -35,12 +35,24 @@ GRID_TIME, NEXT_ID = 0, 1  # in `KernelState.counters`
 
 
 class TrackFunctions(NamedTuple):
-    """Compiled functions of a filter."""
+    """Compiled functions of a filter, of one track each.
+
+    Attributes:
+        init: Begin a track.
+        step: Predict and update the only track that is alive, with all events of a step.
+        predict: Predict a track to the step's time, with its gate and likelihoods.
+        weights_alone: Weigh the events of a track where no event is in two gates.
+        weights: Weigh one event for all tracks.
+        update: Update a track with weighted events.
+        limit: Compute the longest time without events.
+        measurement: Predict the distribution of the next events.
+        decide: Confirm, delete or keep a track.
+    """
 
     init: Any
-    step: Any  # one event and the one track that is alive
+    step: Any
     predict: Any
-    weights_alone: Any  # of events that one gate alone contains
+    weights_alone: Any
     weights: Any
     update: Any
     limit: Any
@@ -49,18 +61,33 @@ class TrackFunctions(NamedTuple):
 
 
 class LifecycleConfig(NamedTuple):
-    """Parameters of the life cycle that are not of one track."""
+    """Parameters of the life cycle that are not of one track.
 
-    size: float  # px, of new tracks
+    Attributes:
+        size: Size of new tracks, px.
+        births: Whether tracks begin of clutter.
+        tau: Time in which the grid forgets, s.
+        cell: Side of a cell of the grid, px.
+        min_events: Number of events in 3x3 cells from which a track begins.
+        alone: Whether an event in one gate alone is weighted by that track alone.
+    """
+
+    size: float
     births: bool
-    tau: float  # s, in which the grid forgets
-    cell: float  # px
-    min_events: float  # in 3x3 cells that begin a track
-    alone: bool  # whether an event in one gate alone is weighted by that track alone
+    tau: float
+    cell: float
+    min_events: float
+    alone: bool
 
 
 class TrackKernel(NamedTuple):
-    """Functions of a filter with the parameters' numbers."""
+    """Functions of a filter with the numbers of its parameters.
+
+    Attributes:
+        functions: The compiled functions.
+        numbers: Parameters, and numbers that follow from them alone.
+        config: Parameters of the life cycle.
+    """
 
     functions: TrackFunctions
     numbers: NDArray[np.float64]
@@ -68,13 +95,27 @@ class TrackKernel(NamedTuple):
 
 
 class ChunkArrays(NamedTuple):
-    """Arrays of `prepare.Features` that the loop reads."""
+    """Arrays of `prepare.Features` that the loop reads.
+
+    Attributes:
+        t: [chunks, steps, M] times, us since the chunk's start.
+        xi: [chunks, steps, M, 2] positions, px.
+        polarity: [chunks, steps, M] +1 or -1.
+        valid: [chunks, steps, M] whether an event is real rather than padding.
+        owner: [chunks, steps, M, 2] serial numbers of tracks that may own the event, or empty.
+        elapsed: [chunks] time from the start of the chunk before, us.
+        stop: [chunks] time from the chunk's start to its end, us.
+        cycle: [chunks] whether births and deaths happen at its end.
+        seed: [seeds] chunk at whose start each seed begins; -1: none of these.
+        seed_xi: [seeds, 2] positions of the seeds, px.
+        seed_size: [seeds] sizes of the seeds, px.
+    """
 
     t: NDArray[np.int32]
     xi: NDArray
     polarity: NDArray
     valid: NDArray[np.bool_]
-    owner: NDArray[np.int32]  # two of each event, or empty
+    owner: NDArray[np.int32]
     elapsed: NDArray[np.int32]
     stop: NDArray[np.int32]
     cycle: NDArray[np.bool_]
@@ -84,19 +125,36 @@ class ChunkArrays(NamedTuple):
 
 
 class KernelState(NamedTuple):
-    """The tracks and the grid of unassociated events."""
+    """The tracks and the grid of unassociated events.
 
-    reals: NDArray  # [targets, ...]
-    integers: NDArray[np.int64]  # [targets, ...]
-    sums: NDArray  # [3, rows, columns]
-    counters: NDArray[np.int64]  # the grid's time, and the next id
+    Attributes:
+        reals: [targets, ...] real numbers of the tracks, by `program.Layout`.
+        integers: [targets, ...] integers of the tracks, by `program.Layout`.
+        sums: [3, rows, columns] sums of the grid, see `lifecycle.ClutterGrid`.
+        counters: Time of the grid, us since the chunk's start, and the next serial number.
+    """
+
+    reals: NDArray
+    integers: NDArray[np.int64]
+    sums: NDArray
+    counters: NDArray[np.int64]
 
 
 class KernelOutput(NamedTuple):
-    """Report of each chunk; the association only where its arrays have room."""
+    """Report of each chunk; the association only where its arrays have room.
 
-    target: NDArray[np.int32]  # [chunks, steps, events], serial numbers; -1: none
-    weight: NDArray  # of the event for its target
+    Attributes:
+        target: [chunks, steps, events] serial numbers; -1: none.
+        weight: [chunks, steps, events] weights of the events for their targets.
+        id_before: [chunks, targets], as of `lifecycle.LifecycleLog`.
+        id_after: [chunks, targets], likewise.
+        confirmed: [chunks, targets], likewise.
+        end_reason: [chunks, targets], likewise.
+        death: [chunks, targets], likewise.
+    """
+
+    target: NDArray[np.int32]
+    weight: NDArray
     id_before: NDArray[np.int32]
     id_after: NDArray[np.int32]
     confirmed: NDArray[np.bool_]
@@ -108,16 +166,26 @@ class UpdateRecord(NamedTuple):
     """Rows: of each chunk all tracks at its start, then each after each of its updates.
 
     `count` goes on beyond the capacity. Without rows nothing is counted.
+
+    Attributes:
+        reals: [rows, ...] real numbers of the track.
+        integers: [rows, ...] integers of the track.
+        target: [rows] entry of the track in the buffer.
+        previous: [rows] row before of the same track in the chunk; -1: none.
+        step: [rows] steps of the chunk done by then.
+        begin: [chunks + 1] first row of each chunk, and the number of rows.
+        latest: [targets] last row of each track.
+        count: [1] number of rows.
     """
 
-    reals: NDArray  # [rows, ...]
-    integers: NDArray[np.int64]  # [rows, ...]
-    target: NDArray[np.int64]  # of each row
-    previous: NDArray[np.int64]  # the row before of the same track in the chunk; -1: none
-    step: NDArray[np.int64]  # steps of the chunk done by then
-    begin: NDArray[np.int64]  # the first row of each chunk, and their number
-    latest: NDArray[np.int64]  # the last row of each track
-    count: NDArray[np.int64]  # [1]
+    reals: NDArray
+    integers: NDArray[np.int64]
+    target: NDArray[np.int64]
+    previous: NDArray[np.int64]
+    step: NDArray[np.int64]
+    begin: NDArray[np.int64]
+    latest: NDArray[np.int64]
+    count: NDArray[np.int64]
 
 
 class Scratch(NamedTuple):
@@ -144,12 +212,21 @@ class _Context(NamedTuple):
 
 
 class _NewTrack(NamedTuple):
-    """A track that begins at rest."""
+    """A track that begins at rest.
 
-    x: Any  # px
+    Attributes:
+        x: Column, px.
+        y: Row, px.
+        size: Size, px.
+        time: Time of birth, us since the chunk's start.
+        id: Serial number.
+        confirmed: Whether it is confirmed at once.
+    """
+
+    x: Any
     y: Any
-    size: Any  # px
-    time: Any  # us
+    size: Any
+    time: Any
     id: Any
     confirmed: Any
 
@@ -194,7 +271,12 @@ def run(kernel, chunks, state, out, scratch, updates):
 
 @njit_noalloc_inlined
 def _begin_chunk(context, chunk):
-    """Count times from the chunk's start, and begin the tracks of its seeds."""
+    """Count times from the chunk's start, and begin the tracks of its seeds.
+
+    Args:
+        context: `_Context`, whose state is changed.
+        chunk: Index of the chunk.
+    """
     chunks, state = context.chunks, context.state
     integers, elapsed = state.integers, np.int64(chunks.elapsed[chunk])
     for k in range(len(integers)):
@@ -415,7 +497,12 @@ def _fade(sums, factor):
 
 @njit_noalloc_inlined
 def _manage_tracks(context, chunk):
-    """Confirm, delete, merge and begin tracks at a chunk's end; see `lifecycle.manage_tracks`."""
+    """Confirm, delete, merge and begin tracks at a chunk's end; see `lifecycle.manage_tracks`.
+
+    Args:
+        context: `_Context`, whose state and output are changed.
+        chunk: Index of the chunk.
+    """
     functions, pointers, out = context.functions, context.pointers, context.out
     reals, integers = context.state.reals, context.state.integers
     stop, number = np.int64(context.chunks.stop[chunk]), len(reals)

@@ -121,17 +121,17 @@ class _TrackSteps(NamedTuple):
         return {"track.state": state, "track.gate": gate}
 
     def predict(self, params: Any, track: Any, limit: Any, events: Any) -> dict[str, Any]:
-        events = self._aged(events)
+        events = self._zero_age(events)
         return {"prediction": _predict_and_gate(self.filter, params, track, limit, events)}
 
     def update(
         self, params: Any, track: Any, prediction: Any, events: Any, weight: Any
     ) -> dict[str, Any]:
-        events = self._aged(events)
+        events = self._zero_age(events)
         return {"track": _update_track(self.filter, params, track, prediction, events, weight)}
 
     def step(self, params: Any, track: Any, limit: Any, events: Any) -> dict[str, Any]:
-        events = self._aged(events)
+        events = self._zero_age(events)
         prediction = _predict_and_gate(self.filter, params, track, limit, events)
         weights = jax.vmap(functools.partial(self.filter.association_weights, params), 1, 1)
         weight = weights(prediction.inside[None], prediction.log_likelihood[None])[0]
@@ -157,7 +157,7 @@ class _TrackSteps(NamedTuple):
     def weights(self, params: Any, inside: Any, log_likelihood: Any) -> dict[str, Any]:
         return {"weight": self.filter.association_weights(params, inside, log_likelihood)}
 
-    def _aged(self, events: StepEvents) -> StepEvents:
+    def _zero_age(self, events: StepEvents) -> StepEvents:
         """Set a single event's age to 0 for the compiler too, as `track.run_steps` does."""
         if not self.single:
             return events

@@ -31,13 +31,21 @@ class ReadoutFunctions(NamedTuple):
 
 
 class ReadoutKernel(NamedTuple):
-    """Functions of a filter with the parameters' numbers."""
+    """Functions of a filter with the numbers of its parameters.
+
+    Attributes:
+        functions: The compiled functions.
+        numbers: Parameters, and numbers that follow from them alone.
+        order: (8,) components of the state, those that depend on each other side by side.
+        blocks: Index in `order` at which each block of dependent components begins, and 8.
+        smallest: Number added to correlations that rounding makes singular.
+    """
 
     functions: ReadoutFunctions
     numbers: NDArray[np.float64]
-    order: NDArray[np.int64]  # of the 8 components, those that depend on each other side by side
-    blocks: NDArray[np.int64]  # where each block of these begins, and 8
-    smallest: float  # is added to correlations, for what rounding makes singular
+    order: NDArray[np.int64]
+    blocks: NDArray[np.int64]
+    smallest: float
 
 
 class ReadoutScratch(NamedTuple):
@@ -50,17 +58,31 @@ class ReadoutScratch(NamedTuple):
 
 
 class ReadoutQuery(NamedTuple):
-    """Sorted times, and the tracks to be read out at them."""
+    """Sorted times, and the tracks to be read out at them.
+
+    Attributes:
+        chunk: [times] chunk of each time.
+        step: [times] steps of the chunk done by then.
+        time: [times] time, us since the chunk's start.
+        serial: [tracks] serial numbers.
+        requested: [times, tracks] whether the state is requested.
+    """
 
     chunk: NDArray[np.int64]
-    step: NDArray[np.int64]  # of each time: steps of the chunk done by then
-    time: NDArray[np.int64]  # us since its start
-    serial: NDArray[np.int64]  # of the tracks
-    requested: NDArray[np.bool_]  # [times, tracks]
+    step: NDArray[np.int64]
+    time: NDArray[np.int64]
+    serial: NDArray[np.int64]
+    requested: NDArray[np.bool_]
 
 
 class ReadoutArrays(NamedTuple):
-    """States that were read out, [times, tracks, ...]."""
+    """States that were read out.
+
+    Attributes:
+        mean: [times, tracks, 8] px, s and rad.
+        covariance: [times, tracks, 8, 8].
+        idle: [times, tracks] time since the last event, s.
+    """
 
     mean: NDArray
     covariance: NDArray

@@ -118,12 +118,19 @@ class ResidualWindow(eqx.Module):
 
 
 class Chi2State(eqx.Module):
-    """Joint state and window of residuals."""
+    """Joint state and window of residuals.
 
-    x: Float[Array, " d"]  # px py vx vy lambda1 lambda2 theta q [dx dy]; lambda or its log
+    Attributes:
+        x: px py vx vy lambda1 lambda2 theta q [dx dy], in px, s and rad; lambda or its logarithm.
+        P: Covariance of `x`.
+        window: Squared residuals.
+        logarithmic: Whether `x` holds log lambda.
+    """
+
+    x: Float[Array, " d"]
     P: Float[Array, "d d"]
     window: ResidualWindow
-    logarithmic: bool = eqx.field(static=True)  # whether x holds log lambda
+    logarithmic: bool = eqx.field(static=True)
 
     @property
     def size(self) -> Array:
@@ -194,36 +201,63 @@ def _predict(params: WindowParams, state: Chi2State, dt: Array, authors: bool) -
 
 
 class _Residuals(NamedTuple):
-    """Residuals of a step's events along the blob's axes, and the step's total weight m."""
+    """Residuals of a step's events along the blob's axes.
+
+    Attributes:
+        m: Total weight of the step.
+        age: Mean age of the events, s.
+        sign: Mean polarity.
+        cos: Cosine of the blob's angle.
+        sin: Sine of the blob's angle.
+        size: (2,) sizes, px.
+        mean: (2,) mean residuals, px.
+        energy: (2,) sums of squares, px^2.
+    """
 
     m: Array
-    age: Array  # s, their mean
-    sign: Array  # mean of their polarity
+    age: Array
+    sign: Array
     cos: Array
     sin: Array
-    size: Array  # (2,), px
-    mean: Array  # (2,), px
-    energy: Array  # (2,), px^2, sums of squares
+    size: Array
+    mean: Array
+    energy: Array
 
 
 class _Measurement(NamedTuple):
-    """Scalar measurement: row of the Jacobian, innovation, noise variance and weight."""
+    """Scalar measurement of the joint state.
 
-    row: Array  # (d,)
+    Attributes:
+        row: (d,) row of the Jacobian.
+        innovation: Innovation.
+        noise: Variance of the noise, in the square of the innovation's unit.
+        weight: Weight of the measurement; 0: it has no effect.
+    """
+
+    row: Array
     innovation: Array
     noise: Array
     weight: Array
 
 
 class _WindowStep(NamedTuple):
-    """Residuals of a step and the window of those before."""
+    """Residuals of a step and the window of those before.
+
+    Attributes:
+        residuals: Residuals of the step.
+        trusted: Whether the position is certain enough for the shape.
+        shape: 1 where the shape is updated, else 0.
+        past: (2,) sums of squares without this step, px^2.
+        W: Weight of the window.
+        filled: Number of steps in the window.
+    """
 
     residuals: _Residuals
-    trusted: Array  # whether the position is certain enough for the shape
-    shape: Array  # 1 where the shape is updated, else 0
-    past: Array  # (2,), px^2, sums of squares without this step
-    W: Array  # weight of the window
-    filled: Array  # steps in it
+    trusted: Array
+    shape: Array
+    past: Array
+    W: Array
+    filled: Array
 
 
 def _rotate_residuals(

@@ -11,7 +11,12 @@ from jaxevent.blob.tracker import Tracker
 
 
 class ConstantVelocityState(eqx.Module):
-    """A moving centre and its initial size."""
+    """A moving centre and its initial size.
+
+    Attributes:
+        motion: Position and velocity of the centre.
+        size: Initial size, px.
+    """
 
     motion: LinearMotion
     size: Float[Array, ""]

@@ -32,13 +32,21 @@ class Params(TrackerParams):
 
 
 class MomentState(eqx.Module):
-    """Motion, log sizes and (theta, q), without covariance between the three."""
+    """Motion, log sizes and (theta, q), without covariance between the three.
+
+    Attributes:
+        motion: Position and velocity.
+        log_size: Logarithms of lambda1 and lambda2 in px.
+        P_size: Their variances.
+        turn: theta, rad, and q, rad/s.
+        P_turn: Their covariance: theta theta, theta q, q q.
+    """
 
     motion: LinearMotion
     log_size: Float[Array, " 2"]
-    P_size: Float[Array, " 2"]  # of log_size
+    P_size: Float[Array, " 2"]
     turn: Float[Array, " 2"]
-    P_turn: Float[Array, " 3"]  # theta theta, theta q, q q
+    P_turn: Float[Array, " 3"]
 
 
 def init(params: TrackerParams, position: Array, size: Array) -> MomentState:
@@ -73,15 +81,25 @@ def predict(params: TrackerParams, state: MomentState, dt: Array) -> MomentState
 
 
 class _Residuals(NamedTuple):
-    """Residuals of a step's events along the blob's axes, and the step's total weight m."""
+    """Residuals of a step's events along the blob's axes.
+
+    Attributes:
+        m: Total weight of the step.
+        u: (2, M) residuals, px.
+        share: (M,) share of each event in the total weight.
+        age: Mean age of the events, s.
+        size: (2,) sizes, px.
+        P: (2,) variances of the centre along the axes, px^2.
+        cross: Covariance of the centre between the axes, px^2.
+    """
 
     m: Array
-    u: Array  # (2, M), px
-    share: Array  # (M,)
-    age: Array | float  # s, their mean
-    size: Array  # (2,), px
-    P: Array  # (2,), px^2: variances of the centre along the axes
-    cross: Array  # its covariance
+    u: Array
+    share: Array
+    age: Array | float
+    size: Array
+    P: Array
+    cross: Array
 
 
 def update(

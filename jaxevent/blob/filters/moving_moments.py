@@ -17,14 +17,23 @@ from jaxevent.parameters import Positive
 
 
 class WeightedMoments(eqx.Module):
-    """Weighted moments of the events; times are ages at the state's time."""
+    """Weighted moments of the events; times are ages at the state's time.
+
+    Attributes:
+        mass: Sum of weights.
+        center: Mean position, px.
+        age: Mean time, s.
+        spread: Covariance of positions, px^2.
+        drift: Covariance of position and time, px s.
+        duration: Variance of time, s^2.
+    """
 
     mass: Float[Array, ""]
-    center: Float[Array, " 2"]  # px
-    age: Float[Array, ""]  # s, mean
-    spread: Float[Array, "2 2"]  # px^2
-    drift: Float[Array, " 2"]  # px s, covariance of position and time
-    duration: Float[Array, ""]  # s^2, variance of time
+    center: Float[Array, " 2"]
+    age: Float[Array, ""]
+    spread: Float[Array, "2 2"]
+    drift: Float[Array, " 2"]
+    duration: Float[Array, ""]
 
 
 class Params(TrackerParams):

@@ -63,30 +63,63 @@ class SceneMotion:
     def to_scene(
         self, t: NDArray | float | int, corner: tuple[int, int] = (0, 0)
     ) -> NDArray[np.float64]:
-        """Return maps (..., 2, 3) from pixels at times (s) to px of the scene from a corner."""
+        """Return maps from pixels at some times to the scene.
+
+        Args:
+            t: Times, s.
+            corner: x and y, px of the scene, from which its places count.
+
+        Returns:
+            (..., 2, 3) from pixels to px of the scene.
+        """
         A, b = np.split(self.at(t), [2], -1)
         A = np.linalg.inv(A)
         return np.concatenate([A, -A @ b - np.reshape(corner, (2, 1))], -1)
 
 
 def move_places(maps: NDArray, x: Any, y: Any) -> tuple[Any, Any]:
-    """Apply maps (..., 2, 3) to places."""
+    """Apply maps (..., 2, 3) to places.
+
+    Args:
+        maps: (..., 2, 3) maps from px to px.
+        x: x of the places, px, of a shape that broadcasts with the maps'.
+        y: y of the places, px, likewise.
+
+    Returns:
+        x and y of the moved places, px.
+    """
     (a, b, e), (c, d, f) = np.moveaxis(maps, (-2, -1), (0, 1))
     return a * x + b * y + e, c * x + d * y + f
 
 
 class CellField(NamedTuple):
-    """Values of cells of the scene at one moment, for kernels."""
+    """Values of cells of the scene at one moment, for kernels.
 
-    values: NDArray[np.float64]  # (rows, columns)
-    cell_bits: int  # cells have 2^cell_bits px
+    Attributes:
+        values: (rows, columns) of cells.
+        cell_bits: Binary logarithm of a cell's side in px.
+        factor: Factor on all values.
+        map: (2, 3) map from pixels to px in the cells.
+    """
+
+    values: NDArray[np.float64]
+    cell_bits: int
     factor: float | int
-    map: NDArray[np.float64]  # (2, 3), from pixels to px in the cells
+    map: NDArray[np.float64]
 
 
 @njit_noalloc_inlined
 def value_at(field: Any, x: Any, y: Any) -> Any:
-    """Return the value of a field at a pixel."""
+    """Return the value of a field at a pixel.
+
+    Args:
+        field: `CellField`.
+        x: Column of the pixel, px.
+        y: Row of the pixel, px.
+
+    Returns:
+        The value, in the unit of the field.
+    """
     return (
         field.values[cell_at(field.map, x, y, field.cell_bits, field.values.shape)] * field.factor
     )
@@ -136,14 +169,30 @@ class Background:
         return cells * self.activity[self.slice_at(t)]
 
     def rate_field(self, t: float | int, over: int) -> CellField:
-        """Return rates of one time (s), of a moving scene as means of squares of `over` px."""
+        """Return the field of clutter rates at a time.
+
+        Args:
+            t: The time, s.
+            over: Side of the squares over which rates of a moving scene are averaged, px.
+
+        Returns:
+            The field, 1/(px s).
+        """
         factor = float(self.activity[self.slice_at(t)])
         return CellField(
             self._mean_rates(over), FINE_CELL_PX.bit_length() - 1, factor, self._map_at(t)
         )
 
     def field_of(self, values: NDArray[np.float64], t: float | int) -> CellField:
-        """Return the field of other values of the scene, in cells of 16 px, at a time (s)."""
+        """Return the field of other values of the scene at a time.
+
+        Args:
+            values: (rows, columns) of cells of 16 px.
+            t: The time, s.
+
+        Returns:
+            The field.
+        """
         return CellField(values, CELL_PX.bit_length() - 1, 1.0, self._map_at(t))
 
     def _mean_rates(self, over: int) -> NDArray[np.float64]:
@@ -188,7 +237,16 @@ class Background:
         return np.inf if self.scene is None else FINE_CELL_PX / max(self.scene.speed, 1e-9)
 
     def to_scene(self, x: Any, y: Any, t: Any) -> tuple[Any, Any]:
-        """Map pixels at times (s) to px from `corner`."""
+        """Map pixels to places of the scene.
+
+        Args:
+            x: Columns, px.
+            y: Rows, px.
+            t: Times, s, one or as many as pixels.
+
+        Returns:
+            x and y of the places, px from `corner`.
+        """
         if self.scene is None:
             return x, y
         return move_places(self.scene.to_scene(t, self.corner), x, y)
@@ -197,7 +255,16 @@ class Background:
 def spans_at_rest(
     spans: NDArray[np.float64], scene: SceneMotion | None, corner: tuple[int, int]
 ) -> CountedSpans:
-    """Divide spans (n, 2) s so that the scene is at rest in each part, counted in its span."""
+    """Divide spans so that the scene is at rest in each part, counted in its span.
+
+    Args:
+        spans: (n, 2) begin and end of each span, s.
+        scene: Motion of the scene; None: the scene is at rest.
+        corner: x and y, px of the scene, where images begin.
+
+    Returns:
+        The parts, at least one of each span.
+    """
     if scene is None:
         return CountedSpans(spans, np.tile(np.eye(2, 3), (len(spans), 1, 1)), np.arange(len(spans)))
     number = 1 + (scene.speed * np.ptp(spans, axis=1) / CONFIG.resolution_px).astype(np.int64)
@@ -210,7 +277,17 @@ def spans_at_rest(
 def count_in_slices(
     stream: Stream, shape: tuple[int, int], scene: SceneMotion | None, corner: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Count events in the fine cells (rows, columns) of a scene, in all slices."""
+    """Count the events of each fine cell of a scene in each slice.
+
+    Args:
+        stream: The events.
+        shape: Rows and columns of fine cells.
+        scene: Motion of the scene; None: it is at rest.
+        corner: x and y, px of the scene, where the cells begin.
+
+    Returns:
+        (slices, rows, columns) counts.
+    """
     cells = np.zeros((N_TIME_SLICES, *shape), np.int32)
     edges = np.linspace(0, stream.duration, N_TIME_SLICES + 1)
     spans = spans_at_rest(np.stack([edges[:-1], edges[1:]], 1), scene, corner)
@@ -219,7 +296,17 @@ def count_in_slices(
 
 
 def look_up(values: NDArray, cell: int, x: NDArray | float | int, y: NDArray | float | int) -> Any:
-    """Return values (rows, columns) of cells of `cell` px at pixels."""
+    """Look up the values of cells at pixels; pixels beyond the cells get those at the edge.
+
+    Args:
+        values: (rows, columns) of cells.
+        cell: Side of a cell, px.
+        x: Columns of the pixels, px.
+        y: Rows of the pixels, px, of the same shape.
+
+    Returns:
+        Values, of the shape of `x`.
+    """
     rows, columns = values.shape
     row = np.clip(np.asarray(y).astype(np.int64) // cell, 0, rows - 1)
     column = np.clip(np.asarray(x).astype(np.int64) // cell, 0, columns - 1)
@@ -246,7 +333,15 @@ def clutter_evidence(
 
 @njit_noalloc_inlined
 def poisson_nats(n: float | int, mu: float | int) -> float:
-    """Compute `clutter_evidence` of a dispersion of 1, for kernels."""
+    """Compute `clutter_evidence` of a dispersion of 1, for kernels.
+
+    Args:
+        n: Counted events.
+        mu: Expected events of clutter.
+
+    Returns:
+        Nats.
+    """
     return n * np.log(n / mu) - n + mu if n > mu else 0.0
 
 
@@ -290,7 +385,15 @@ def measure_background(stream: Stream) -> Background:
 
 
 def _background_of_counts(cells: NDArray[np.int32], duration: float) -> Background:
-    """Compute the background from the counts of all fine cells in all slices."""
+    """Compute the background from the counts of all fine cells in all slices.
+
+    Args:
+        cells: (slices, rows, columns) counts of cells of 4 px.
+        duration: Length of all slices, s.
+
+    Returns:
+        The background.
+    """
     N = pool(cells, CELL_PX // FINE_CELL_PX).astype(float)
     quarter, m = _calm_mean(N)
     m = np.maximum(m, max(float(np.median(m)), 0.02))
@@ -322,7 +425,15 @@ def _background_of_counts(cells: NDArray[np.int32], duration: float) -> Backgrou
 
 
 def pool(cells: NDArray, by: int) -> NDArray:
-    """Sum counts (slices, rows, columns) over blocks of by x by cells."""
+    """Sum counts over square blocks of cells.
+
+    Args:
+        cells: (slices, rows, columns) counts.
+        by: Side of a block in cells, a divisor of rows and columns.
+
+    Returns:
+        (slices, rows / by, columns / by) sums.
+    """
     slices, rows, columns = cells.shape
     return cells.reshape(slices, rows // by, by, columns // by, by).sum((2, 4))
 
@@ -373,7 +484,16 @@ def measure_dispersions(
 def _dispersion(
     N: NDArray[np.int32], background: Background, slices: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Compute the dispersion of counts (windows, rows, columns) of windows in given slices."""
+    """Compute the dispersion of the counts of windows in given slices.
+
+    Args:
+        N: (windows, rows, columns) counts of cells of 16 px.
+        background: The background.
+        slices: (windows,) slice of each window.
+
+    Returns:
+        (rows, columns) variance over mean, at least 1.
+    """
     calm, bright = background.calm[slices], background.bright
     N, active = N * calm, background.activity[slices, None, None] * calm
     mu = N.sum(0) / np.maximum(active.sum(0), 1) * active

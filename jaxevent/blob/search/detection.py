@@ -60,13 +60,21 @@ class Blobs(NamedTuple):
 
 
 class DetectionScratch(NamedTuple):
-    """Scratch memory of the detection; indices of cells are int64."""
+    """Scratch memory of the detection; cells are numbered row by row, with a border.
 
-    cell: NDArray[np.int64]  # (pixels,) cell of each pixel
-    filled: NDArray[np.int64]  # (pixels,) cells that are not empty,
-    hit: NDArray[np.int64]  # those with more events than clutter,
-    waiting: NDArray[np.int64]  # and those of a blob whose neighbours are not yet visited
-    labels: NDArray[np.int32]  # (pixels,) blob of each pixel, from 1 on; 0: none
+    Attributes:
+        cell: (pixels,) cell of each pixel.
+        filled: (pixels,) cells that are not empty.
+        hit: (pixels,) cells with more events than clutter gives.
+        waiting: (pixels,) cells of a blob whose neighbours are not yet visited.
+        labels: (pixels,) blob of each pixel, from 1 on; 0: none.
+    """
+
+    cell: NDArray[np.int64]
+    filled: NDArray[np.int64]
+    hit: NDArray[np.int64]
+    waiting: NDArray[np.int64]
+    labels: NDArray[np.int32]
 
     @classmethod
     def empty(cls, pixels: int) -> "DetectionScratch":
@@ -75,16 +83,27 @@ class DetectionScratch(NamedTuple):
 
 
 class ClutterModel(NamedTuple):
-    """Clutter of one window and the threshold of detection, for kernels."""
+    """Clutter of one window and the threshold of detection, for kernels.
 
-    rates: CellField  # 1/(px s)
-    dispersion: CellField  # variance over mean of counts in 3x3 cells
-    cell_bits: int  # cells have 2^cell_bits px
-    row_cells: int  # cells of a row, with the border
-    exposure: float | int  # s px^2, of 3x3 cells
+    Attributes:
+        rates: Rates, 1/(px s).
+        dispersion: Variance over mean of the counts in 3x3 cells.
+        cell_bits: Binary logarithm of a cell's side in px.
+        row_cells: Cells of a row, with the border.
+        exposure: Window times the area of 3x3 cells, s px^2.
+        min_dispersion: Least dispersion of the sensor.
+        min_events: Expected events of 3x3 cells where the clutter is least.
+        log_threshold: Evidence from which a cell is detected, nats.
+    """
+
+    rates: CellField
+    dispersion: CellField
+    cell_bits: int
+    row_cells: int
+    exposure: float | int
     min_dispersion: float | int
-    min_events: float | int  # expected events of 3x3 cells where the clutter is least
-    log_threshold: float | int  # nats
+    min_events: float | int
+    log_threshold: float | int
 
 
 def clutter_model(
@@ -112,7 +131,16 @@ def clutter_model(
 
 @njit_noalloc
 def clutter_at(clutter: Any, x: Any, y: Any) -> Any:
-    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel."""
+    """Return the rate, 1/(px s), and the dispersion of the clutter at a pixel.
+
+    Args:
+        clutter: `ClutterModel`.
+        x: Column of the pixel, px.
+        y: Row of the pixel, px.
+
+    Returns:
+        The rate, and the variance over the mean of counts.
+    """
     return value_at(clutter.rates, x, y), value_at(clutter.dispersion, x, y)
 
 
@@ -135,7 +163,7 @@ def detect(
     """
     scratch = DetectionScratch.empty(len(events))
     cells = zeroed_cells(shape, 1 << clutter.cell_bits)
-    number = find_blobs(events.x, events.y, _weights(events), clutter, cells, scratch)
+    number = find_blobs(events.x, events.y, _event_counts(events), clutter, cells, scratch)
     return scratch.labels, number
 
 
@@ -145,7 +173,7 @@ def zeroed_cells(shape: tuple[int, int], cell: int) -> NDArray[np.int32]:
     return _cells(rows * columns)
 
 
-def _weights(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
+def _event_counts(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
     """Return the events of each pixel, or 1 of each event."""
     return events.n if isinstance(events, PixelCounts) else np.ones(len(events), np.int32)
 
@@ -156,20 +184,41 @@ def _weights(events: WindowEvents | PixelCounts) -> NDArray[np.int32]:
 
 @njit_noalloc
 def find_blobs(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
-    """Label pixels with n events each in `scratch.labels`, and return the number of blobs.
+    """Label pixels by the blob that they belong to, and count the blobs.
 
-    `cells` are zero, and are again.
+    Args:
+        x: (pixels,) columns, px.
+        y: (pixels,) rows, px.
+        n: (pixels,) events of each pixel.
+        clutter: `ClutterModel`.
+        cells: Counts of `zeroed_cells`, zero before and after.
+        scratch: `DetectionScratch`, whose `labels` are the output.
+
+    Returns:
+        Number of blobs.
     """
-    filled = _count(x, y, n, clutter, cells, scratch)
+    filled = _count_in_cells(x, y, n, clutter, cells, scratch)
     hits = _find_hits(filled, clutter, cells, scratch)
     for i in range(filled):
         cells[scratch.filled[i]] = 0
-    return _label(len(x), hits, clutter.row_cells, cells, scratch)
+    return _label_pixels(len(x), hits, clutter.row_cells, cells, scratch)
 
 
 @njit_noalloc_inlined
-def _count(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
-    """Count events in cells, list the cells that are not empty, and return their number."""
+def _count_in_cells(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> int:
+    """Count events in cells, and list the cells that are not empty.
+
+    Args:
+        x: (pixels,) columns, px.
+        y: (pixels,) rows, px.
+        n: (pixels,) events of each pixel.
+        clutter: `ClutterModel`.
+        cells: Counts of cells, added to.
+        scratch: `DetectionScratch`; fills `cell` and `filled`.
+
+    Returns:
+        Number of cells that are not empty.
+    """
     wide, bits, count = clutter.row_cells, clutter.cell_bits, 0
     for i in range(len(x)):
         at = ((np.int64(y[i]) >> bits) + 1) * wide + (np.int64(x[i]) >> bits) + 1
@@ -183,7 +232,17 @@ def _count(x: Any, y: Any, n: Any, clutter: Any, cells: Any, scratch: Any) -> in
 
 @njit_noalloc_inlined
 def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
-    """List filled cells whose 3x3 hold more events than clutter, and return their number."""
+    """List the cells whose 3x3 surroundings hold more events than clutter.
+
+    Args:
+        filled: Number of cells that are not empty.
+        clutter: `ClutterModel`.
+        cells: Counts of cells.
+        scratch: `DetectionScratch`; fills `hit`.
+
+    Returns:
+        Number of hits.
+    """
     wide, g, hit = clutter.row_cells, 1 << clutter.cell_bits, scratch.hit
     # Fewer events are no evidence even where the clutter is least.
     few, least = 1, clutter.log_threshold * clutter.min_dispersion
@@ -206,8 +265,19 @@ def _find_hits(filled: int, clutter: Any, cells: Any, scratch: Any) -> int:
 
 
 @njit_noalloc_inlined
-def _label(pixels: int, hits: int, wide: int, labels: Any, scratch: Any) -> int:
-    """Label pixels by blobs of neighbouring hits, also across corners; return their number."""
+def _label_pixels(pixels: int, hits: int, wide: int, labels: Any, scratch: Any) -> int:
+    """Label pixels by blobs of neighbouring hits, also across corners.
+
+    Args:
+        pixels: Number of pixels.
+        hits: Number of cells in `scratch.hit`.
+        wide: Cells of a row, with the border.
+        labels: Labels of cells, zero before and after.
+        scratch: `DetectionScratch`; fills `labels`.
+
+    Returns:
+        Number of blobs.
+    """
     waiting = scratch.waiting
     for i in range(hits):
         labels[scratch.hit[i]] = -1
@@ -246,13 +316,22 @@ def measure_blobs(
         number: Number of blobs.
     """
     blobs = Blobs.zeros(number)
-    sum_blobs(events.x, events.y, _weights(events), labels, number, blobs)
+    sum_blobs(events.x, events.y, _event_counts(events), labels, number, blobs)
     return blobs
 
 
 @njit_noalloc
 def sum_blobs(x: Any, y: Any, weights: Any, labels: Any, number: int, blobs: Any) -> None:
-    """Fill in the first `number` of `blobs`, of pixels with so many events each."""
+    """Compute the moments of blobs.
+
+    Args:
+        x: (pixels,) columns, px.
+        y: (pixels,) rows, px.
+        weights: (pixels,) events of each pixel.
+        labels: (pixels,) blob of each pixel, from 1 on; 0 for none.
+        number: Number of blobs.
+        blobs: `Blobs`, output: its first `number` rows.
+    """
     _clear_blobs(blobs, number)
     # One pass: sums of whole numbers are exact.
     for i in range(len(x)):
@@ -264,7 +343,15 @@ def sum_blobs(x: Any, y: Any, weights: Any, labels: Any, number: int, blobs: Any
 
 @njit_noalloc_inlined
 def add_moments(blobs: Any, k: int, weight: float, x: float, y: float) -> None:
-    """Add a place to the sums of blob k."""
+    """Add a place to the sums of blob k.
+
+    Args:
+        blobs: `Blobs` that hold sums.
+        k: Index of the blob.
+        weight: Events at the place.
+        x: Column, px.
+        y: Row, px.
+    """
     n, p, C = blobs
     n[k] += weight
     p[k, 0] += weight * x
@@ -276,7 +363,12 @@ def add_moments(blobs: Any, k: int, weight: float, x: float, y: float) -> None:
 
 @njit_noalloc_inlined
 def finish_moments(blobs: Any, number: int) -> None:
-    """Turn the sums of the first `number` blobs to means and covariances, with a pixel's extent."""
+    """Turn sums of blobs to means and covariances, with a pixel's own extent.
+
+    Args:
+        blobs: `Blobs` that hold sums, in place.
+        number: Number of blobs, from the first on.
+    """
     n, p, C = blobs
     for k in range(number):
         over = 1 / max(n[k], 1e-9)
@@ -356,7 +448,12 @@ def split_blob(events: Any, owner: Any, k: int, two: Any) -> float:
 
 @njit_noalloc_inlined
 def _clear_blobs(blobs: Any, number: int) -> None:
-    """Set the moments of the first `number` blobs to zero."""
+    """Set the moments of blobs to zero.
+
+    Args:
+        blobs: `Blobs`, in place.
+        number: Number of blobs, from the first on.
+    """
     for k in range(number):
         blobs.n[k] = blobs.p[k, 0] = blobs.p[k, 1] = 0.0
         blobs.C[k, 0, 0] = blobs.C[k, 0, 1] = blobs.C[k, 1, 1] = 0.0
@@ -367,6 +464,15 @@ def in_contact(p: Any, C: Any, j: int, k: int) -> bool:
     """Return whether two ellipses of a list are near each other.
 
     Near is twice the sum of their standard deviations along the line between them.
+
+    Args:
+        p: (n, 2) middles of the ellipses, px.
+        C: (n, 2, 2) their covariances, px^2.
+        j: Index of the one.
+        k: Index of the other.
+
+    Returns:
+        Whether they are.
     """
     x, y, reach = p[k, 0] - p[j, 0], p[k, 1] - p[j, 1], 0.0
     for i in (j, k):

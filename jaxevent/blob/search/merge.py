@@ -94,7 +94,7 @@ class OwnFrame(NamedTuple):
         return self._replace(stream=stream)._connect(one, other)
 
     def _connect(self, one: TargetPath, other: TargetPath) -> TargetPath | None:
-        """Return the path of what connects two pieces by all events of the stream."""
+        """Return the path of the part between two pieces, by all events of the stream."""
         rows = merge_paths(one, other)
         both = [interpolate_path(path, rows.t).p for path in (one, other)]
         # Means of several windows, for pieces slide along their outline.
@@ -154,7 +154,7 @@ def _first_whole(
     """Return the indices of the first two paths that are parts of one object, and its path."""
     for k, i in itertools.combinations(range(len(paths)), 2):
         one, other = paths[k], paths[i]
-        are_parts, may_be_pieces = _compare(one, other)
+        are_parts, may_be_pieces = _compare_paths(one, other)
         if are_parts:
             return k, i, merge_paths(one, other)
         # Different parts of an outline have different balances.
@@ -166,7 +166,7 @@ def _first_whole(
     return None
 
 
-def _compare(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
+def _compare_paths(one: TargetPath, other: TargetPath) -> tuple[bool, bool]:
     """Return whether two paths are those of parts of one object, and whether they may be pieces.
 
     Pieces are those of an outline that windows do not show as one.
@@ -239,7 +239,16 @@ def _is_edge(one: TargetPath, other: TargetPath) -> bool:
 
 
 def _turn_together(p: NDArray, q: NDArray, reach: float | int) -> bool:
-    """Return whether two ways (rows, 2) px turn about each other by a whole turn, rigidly."""
+    """Return whether two paths turn about each other by a whole turn, rigidly.
+
+    Args:
+        p: (rows, 2) positions of one, px.
+        q: (rows, 2) positions of the other at the same times, px.
+        reach: Largest distance between them, px.
+
+    Returns:
+        Whether they do.
+    """
     apart = np.hypot(*(p - q).T)
     share = CONFIG.nearly_all
     low, middle, high = np.quantile(apart, (1 - share, 0.5, share))
@@ -312,7 +321,16 @@ def _continuation_evidence(
 
 
 def _inside_share(p: NDArray, C: NDArray, size: tuple[int, int]) -> float:
-    """Return about the share of a target inside the sensor."""
+    """Estimate the share of a target inside the sensor.
+
+    Args:
+        p: (2,) position, px.
+        C: (2, 2) covariance of its events, px^2.
+        size: Width and height of the sensor, px.
+
+    Returns:
+        Share, 0..1.
+    """
     away = np.minimum(p + 0.5, np.array(size) - 0.5 - p) / np.sqrt(np.diagonal(C))
     return float(np.clip(0.5 + 0.4 * away, 0, 1).prod())
 
@@ -356,7 +374,15 @@ def merge_turning(
 
 
 def _events_within(stream: Stream, there: NDArray[np.bool_]) -> Stream:
-    """Return the events inside some fine cells."""
+    """Return the events inside some fine cells.
+
+    Args:
+        stream: Events.
+        there: (rows, columns) whether a cell of 4 px is chosen.
+
+    Returns:
+        A stream of them.
+    """
     own, fine = copy.copy(stream), np.ones((FINE_CELL_PX, FINE_CELL_PX), bool)
     own.hot = stream.hot | ~np.kron(there, fine)[: stream.height, : stream.width]
     return own
@@ -393,7 +419,15 @@ def _turning_path(
 
 
 def _is_connected(moving: Background, centre: NDArray[np.float64]) -> bool:
-    """Return whether what is bright in a turning map is connected, about the point of the turn."""
+    """Return whether the bright part of a turning map is connected, about the point of the turn.
+
+    Args:
+        moving: Background in the coordinates of the object.
+        centre: (2,) point that the object turns about, px.
+
+    Returns:
+        Whether it is.
+    """
     rate = np.where(moving.visible, moving.rate - moving.rate.min(), 0)
     total = float(rate.sum())
     labels = np.zeros(rate.shape, np.int32)
@@ -415,8 +449,16 @@ def _path_of_all(
 ) -> TargetPath | None:
     """Return the path of all events of an object that stays about a place.
 
-    It has the windows (us) with more events than a background of `min_rate` (1/(px s)) gives; None
-    if none has.
+    It has the windows with more events than the background gives.
+
+    Args:
+        own: Events of the object.
+        centre: (2,) point that the object turns about, px.
+        window: Length of windows, us.
+        min_rate: Rate of the background, 1/(px s).
+
+    Returns:
+        The path; None if no window has more.
     """
     w, rows = window * 1e-6, []
     area = own.width * own.height - int(own.hot.sum())

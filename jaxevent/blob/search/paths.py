@@ -121,7 +121,15 @@ def merge_paths(one: TargetPath, other: TargetPath) -> TargetPath:
 
 
 def interpolate_path(path: TargetPath, t: NDArray[np.int64]) -> TargetPath:
-    """Interpolate a path linearly at times (us), without events before and after its life."""
+    """Interpolate a path linearly in time, without events before and after its life.
+
+    Args:
+        path: The path.
+        t: (n,) times, us.
+
+    Returns:
+        The path at those times.
+    """
 
     def at(values: NDArray) -> NDArray[np.float64]:
         flat = values.reshape(len(path.t), -1)

@@ -60,7 +60,15 @@ def drop_lamps(paths: list[TargetPath], stream: Stream) -> tuple[list[TargetPath
 
 
 def _stays(path: TargetPath, rows: NDArray[np.int64]) -> bool:
-    """Return whether a path is near one place in most of some rows."""
+    """Return whether a path is near one place in most of some rows.
+
+    Args:
+        path: The path.
+        rows: Rows of the path.
+
+    Returns:
+        Whether it is.
+    """
     if not len(rows):
         return False
     p = path.p[rows]
@@ -133,6 +141,14 @@ def _sharper_path(path: TargetPath, sums: Blobs) -> TargetPath:
     """Return the path of its sharper events, or the path itself.
 
     `sums` are those of its residuals, of OFF and of ON events by turns.
+
+    Args:
+        path: The path.
+        sums: Moments of the residuals of OFF and of ON events by turns, two rows for each of the
+            path.
+
+    Returns:
+        The path of those of one sign; the path itself if both are as sharp.
     """
     n, p, S = (value.reshape(-1, 2, *value.shape[1:]) for value in sums)
     mean = p / np.maximum(n, 1)[..., None]
@@ -164,8 +180,14 @@ def _sharper_path(path: TargetPath, sums: Blobs) -> TargetPath:
 def _add_residuals(events: Any, owner: Any, table: Any, rows: Any, sums: Any) -> None:
     """Add events' residuals to the sums of their paths' windows, OFF and ON by turns.
 
-    Events (t, x, y, p) that may belong to two paths are left out. `rows` are those of the paths
-    where the search for a window begins.
+    Events that may belong to two paths are left out.
+
+    Args:
+        events: Columns t (us), x, y (px) and p, (n,) each.
+        owner: (n, 2) likeliest paths of each event, -1: none.
+        table: `PathTable` of the paths.
+        rows: (paths,) row of each path where the search for a window begins, in place.
+        sums: `Blobs` of two rows for each row of the table, added to.
     """
     t, x, y, p = events
     for i in range(len(t)):

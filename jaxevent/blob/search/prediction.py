@@ -34,6 +34,10 @@ MAX_SQUARED_SIGMAS = 80.0  # squared standard deviations beyond which a Gaussian
 def _kernel_weights(r: float, g: int) -> NDArray[np.float64]:
     """Tabulate the kernel 3 / (pi r^2) (1 - d^2 / r^2)^2, 1/px^2.
 
+    Args:
+        r: Radius of the kernel, px.
+        g: Side of a bin, px.
+
     Returns:
         (g, g, bins, bins) weights of bins of g px around a pixel in row v and column u of its bin,
         by v and u.
@@ -62,17 +66,25 @@ class ScalePrediction(NamedTuple):
 
 
 class PredictionScore(NamedTuple):
-    """Gain of the predictions of a scale over the background alone, in nats per event."""
+    """Gain of the predictions of a scale over the background alone, in nats per event.
+
+    Attributes:
+        raw: Gain, nats per event.
+        penalised: Gain less a share for blobs in contact.
+        ellipses: Penalised gain by ellipses alone.
+        parts: (windows,) contributions to `raw`.
+        number: Number of all events of the windows.
+    """
 
     raw: float
-    penalised: float  # less a share for blobs in contact
-    ellipses: float  # penalised, by ellipses alone
-    parts: NDArray[np.float64]  # (windows,) contributions to `raw`
-    number: int  # of all events of the windows
+    penalised: float
+    ellipses: float
+    parts: NDArray[np.float64]
+    number: int
 
 
 class _PredictionScratch(NamedTuple):
-    """Scratch memory of `_predict`, for windows of so many pixels."""
+    """Scratch memory of `_add_prediction`, for windows of so many pixels."""
 
     detection: DetectionScratch
     before: Blobs
@@ -135,7 +147,7 @@ def predict(
     for clutter in clutters:
         cells = zeroed_cells(shape, 1 << clutter.cell_bits)
         density, sums = np.zeros((number, N_DENSITIES)), np.zeros(3)
-        _predict(before, scored.pixels, rows, clutter, cells, scratch, (density, sums))
+        _add_prediction(before, scored.pixels, rows, clutter, cells, scratch, (density, sums))
         out.append(ScalePrediction(density, scored, sums))
     return out
 
@@ -166,10 +178,20 @@ def score(predictions: list[ScalePrediction]) -> PredictionScore:
 
 
 @njit_noalloc
-def _predict(
+def _add_prediction(
     before: Any, scored: Any, rows: Any, clutter: Any, cells: Any, scratch: Any, out: Any
 ) -> None:
-    """Add densities (pixels, 4), and sums (3,): expected events, those in large and split blobs."""
+    """Add the predicted densities of a window's events, and the sums of `ScalePrediction`.
+
+    Args:
+        before: `PixelCounts` of the two windows before, the earlier first.
+        scored: `PixelCounts` at which the density is evaluated.
+        rows: Order of the scored pixels by their rows, and these rows, sorted.
+        clutter: `ClutterModel`.
+        cells: Counts of `zeroed_cells`, zero before and after.
+        scratch: `_PredictionScratch`.
+        out: Densities (pixels, 4), 1/px^2, and sums (3,), added to.
+    """
     (first, second), (density, sums) = before, out
     labels = scratch.detection.labels
     earlier = find_blobs(first.x, first.y, first.n, clutter, cells, scratch.detection)
@@ -189,7 +211,13 @@ def _predict(
 
 @njit_noalloc_inlined
 def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
-    """Predict the blobs of the next events."""
+    """Predict the blobs of the next window, each from the nearest one of the window before.
+
+    Args:
+        earlier: Number of blobs in `scratch.before`.
+        number: Number of blobs in `scratch.last`.
+        scratch: `_PredictionScratch`; fills `predicted`.
+    """
     (n0, p0, C0), (n, p1, C1), (new, p, S) = scratch.before, scratch.last, scratch.predicted
     for k in range(number):
         least, nearest = np.inf, -1
@@ -214,7 +242,13 @@ def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
 def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: Any) -> None:
     """Add the densities of Gaussian blobs at pixels to the first column.
 
-    `rows` are the order of pixels by their rows, and these rows: a blob visits those it reaches.
+    Args:
+        density: (pixels, 4), 1/px^2, added to.
+        scored: `PixelCounts`.
+        rows: Order of the pixels by their rows, and these rows, sorted: a blob visits those it
+            reaches.
+        number: Number of blobs.
+        scratch: `_PredictionScratch`.
     """
     (n, p, S), x, y, (order, sorted_y) = scratch.predicted, scored.x, scored.y, rows
     for k in range(number):
@@ -236,7 +270,17 @@ def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: An
 
 @njit_noalloc_inlined
 def _add_kernels(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> None:
-    """Sum kernel k about moved pixels at the scored ones; events lie in middles of bins."""
+    """Compute the density of moved events at the scored pixels by one kernel.
+
+    Events lie in the middles of bins.
+
+    Args:
+        out: (scored pixels,) output, 1/px^2.
+        scored: `PixelCounts` at which the density is evaluated.
+        pixels: `PixelCounts` of the last window, which move with their blobs.
+        k: Index of the kernel.
+        scratch: `_PredictionScratch`, whose bins are zero before and after.
+    """
     table, counts = scratch.tables[k], scratch.bins[k]
     g, reach = len(table), table.shape[2] // 2
     _add_counts(counts, pixels, 1, (g, reach), scratch)
@@ -257,7 +301,12 @@ def _add_kernels(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> No
 def _add_counts(counts: Any, pixels: Any, sign: int, bins: Any, scratch: Any) -> None:
     """Add the events of blobs' pixels, which move along with them, to bins, or take them away.
 
-    `bins` are their side and the number of those beyond the sensor.
+    Args:
+        counts: (rows, columns) of bins, added to.
+        pixels: `PixelCounts` of the last window.
+        sign: 1: add; -1: take away.
+        bins: Side of a bin, px, and number of bins beyond the sensor on either side.
+        scratch: `_PredictionScratch`.
     """
     (rows, columns), (g, reach) = counts.shape, bins
     p, last = scratch.predicted.p, scratch.last.p
@@ -275,6 +324,13 @@ def _count_split(number: int, scratch: Any) -> tuple[float, float]:
     """Count events in large blobs, and in those in contact with another one.
 
     Pieces along an outline are in contact with each other, both of its sides are not.
+
+    Args:
+        number: Number of blobs in `scratch.last`.
+        scratch: `_PredictionScratch`; fills `touches`.
+
+    Returns:
+        Both numbers of events.
     """
     (n, p, C), touches = scratch.last, scratch.touches
     least, large, split = CONFIG.min_blob_events, 0.0, 0.0

@@ -62,7 +62,7 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
         if reference is None:
             reference = image
             continue
-        motion = _align(reference, image, _shift(reference, image) if motion is None else motion)
+        motion = _align(reference, image, _offset(reference, image) if motion is None else motion)
         turn, shift = _rigid_motion(motion, shape)
         middle = corner + (bins * shape[::-1] - 1) / 2
         moved = bins * shift + middle - turn @ middle
@@ -79,24 +79,49 @@ def measure_scene_motion(stream: Stream, window: float | int) -> SceneMotion:
 def _event_image(
     events: WindowEvents, corner: NDArray, bins: int, shape: NDArray
 ) -> NDArray[np.float64]:
-    """Return roots of counts in bins of so many px, whose noise is the same everywhere."""
+    """Return roots of event counts in bins, whose noise is the same everywhere.
+
+    Args:
+        events: Events of a window.
+        corner: (2,) x and y, px, where the image begins.
+        bins: Side of a bin, px.
+        shape: (2,) rows and columns of the image.
+
+    Returns:
+        (rows, columns).
+    """
     row, column = (events.y - corner[1]) // bins, (events.x - corner[0]) // bins
     counts = np.bincount(row * shape[1] + column, minlength=int(shape.prod()))
     return np.sqrt(counts.reshape(shape))
 
 
 def _rigid_motion(motion: NDArray, shape: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the turn (2, 2) about the middle of an image, and the shift (2,) bins, of a motion.
+    """Return the rotation and shift of a motion.
 
     `_normal_equations` moves both images by half of it.
+
+    Args:
+        motion: (3,) motion, see `_normal_equations`.
+        shape: (2,) rows and columns of the image.
+
+    Returns:
+        Rotation (2, 2) about the middle of the image, and shift (2,) in bins.
     """
     half = motion[0] / (shape.sum() / 2) * np.array([[0, -1], [1, 0]])
     after_half = np.linalg.inv(np.eye(2) - half)
     return after_half @ (np.eye(2) + half), after_half @ motion[1:]
 
 
-def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
-    """Return the motion (3,) without turn at which two images correlate most."""
+def _offset(one: NDArray, other: NDArray) -> NDArray[np.float64]:
+    """Return the motion (3,) without turn at which two images correlate most.
+
+    Args:
+        one: (rows, columns) image.
+        other: (rows, columns) image.
+
+    Returns:
+        Motion from `one` to `other`, (0, right, down), bins.
+    """
     a, b = (np.fft.rfft2(ndimage.gaussian_filter(i, 3) - i.mean()) for i in (one, other))
     correlation = np.fft.irfft2(b * a.conj(), one.shape)
     at = np.unravel_index(correlation.argmax(), correlation.shape)
@@ -105,7 +130,16 @@ def _shift(one: NDArray, other: NDArray) -> NDArray[np.float64]:
 
 
 def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]:
-    """Estimate the motion (3,), see `_normal_equations`, that takes one image to the other."""
+    """Estimate the motion that takes one image to the other.
+
+    Args:
+        one: (rows, columns) image, NaN where unknown.
+        other: (rows, columns) image.
+        motion: (3,) initial motion, see `_normal_equations`.
+
+    Returns:
+        (3,) motion.
+    """
     for blur in BLUR_SIGMAS_BINS:
         a, b = (ndimage.gaussian_filter(image, blur, mode="constant") for image in (one, other))
         for _ in range(MAX_GAUSS_NEWTON_STEPS):
@@ -122,8 +156,16 @@ def _align(one: NDArray, other: NDArray, motion: NDArray) -> NDArray[np.float64]
 def _normal_equations(a: Any, b: Any, motion: Any) -> Any:
     """Return J^T W J and J^T W e of Gauss and Newton, of two images each moved half the way.
 
-    A motion is a turn about the middle, of which one unit moves what is a quarter of the sides'
-    sum away by one bin, and shifts right and down.
+    A motion is a turn about the middle, of which one unit moves what is a quarter of the sides' sum
+    away by one bin, and shifts right and down.
+
+    Args:
+        a: (rows, columns) image.
+        b: (rows, columns) image.
+        motion: (3,) motion.
+
+    Returns:
+        (3, 3) matrix and (3,) right-hand side.
     """
     rows, columns = a.shape
     quarter = (rows + columns) / 4
@@ -134,8 +176,8 @@ def _normal_equations(a: Any, b: Any, motion: Any) -> Any:
         for column in range(columns):
             x = (column - (columns - 1) / 2) / quarter
             half_x, half_y = (motion[1] - motion[0] * y) / 2, (motion[2] + motion[0] * x) / 2
-            before = _interpolate(a, row - half_y, column - half_x)
-            after = _interpolate(b, row + half_y, column + half_x)
+            before = _interpolate_pixel(a, row - half_y, column - half_x)
+            after = _interpolate_pixel(b, row + half_y, column + half_x)
             difference = after - before
             e[row, column] = difference  # NaN where one was not seen
             if difference == difference:
@@ -166,8 +208,17 @@ def _normal_equations(a: Any, b: Any, motion: Any) -> Any:
 
 
 @njit_inlined
-def _interpolate(image: Any, y: float, x: float) -> float:
-    """Interpolate an image linearly; NaN outside."""
+def _interpolate_pixel(image: Any, y: float, x: float) -> float:
+    """Interpolate an image linearly; NaN outside.
+
+    Args:
+        image: (rows, columns).
+        y: Row, px.
+        x: Column, px.
+
+    Returns:
+        The value.
+    """
     rows, columns = image.shape
     if not (0 <= y <= rows - 1 and 0 <= x <= columns - 1):
         return np.nan
@@ -246,7 +297,7 @@ def _required_gain(moving: Background) -> float | None:
 
 
 def map_gain(stream: Stream, moving: Background, w: float | int) -> float:
-    """Compute what a map gains by moving, in most windows.
+    """Compute the gain of a map that moves over one at rest, in most windows.
 
     Things that move differently are no scene: where they are, some places gain, and others lose.
 
@@ -299,7 +350,15 @@ def _count_filled_tiles(stream: Stream, background: Background, selection: Scale
 
 
 def _edge_share(rate: NDArray[np.float64], mean: float) -> float:
-    """Compute the share of the bright that is long or large: edges, and not possible targets."""
+    """Compute the share of the bright that is long or large: edges, and not possible targets.
+
+    Args:
+        rate: (rows, columns) rates of cells, 1/(px s).
+        mean: Mean rate, 1/(px s).
+
+    Returns:
+        Share, 0..1.
+    """
     excess = np.where(rate > CONFIG.edge_rate * mean, rate - mean, 0)
     labels = np.zeros(rate.shape, np.int32)
     ndimage.label(excess > 0, np.ones((3, 3)), labels)
@@ -403,7 +462,16 @@ def measure_moving_background(stream: Stream, scene: SceneMotion) -> Background:
 
 
 def _slice_activity(N: NDArray, calm: NDArray, seen: NDArray) -> NDArray[np.float64]:
-    """Compute the activity of each slice: the median ratio of its counts to calm ones."""
+    """Compute the activity of each slice: the median ratio of its counts to calm ones.
+
+    Args:
+        N: (slices, rows, columns) counts.
+        calm: (slices, rows, columns) whether a cell is without target.
+        seen: (slices, rows, columns) whether a cell is seen.
+
+    Returns:
+        (slices,) ratios.
+    """
     mean = np.where(calm, N, 0).sum(0) / np.maximum(calm.sum(0), 1)
     full = mean >= CONFIG.min_dispersion_events
     ratios = np.array([

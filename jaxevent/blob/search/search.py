@@ -103,7 +103,7 @@ class TargetSearchResult:
             text += f", {len(turns)} {verb} in place at {' and '.join(turns)} rad/s"
         if not len(self):
             return text
-        size, speed, rate, _ = (self._quantile(values) for values in self._numbers())
+        size, speed, rate, _ = (self._quantile(values) for values in self._typical_values())
         windows = [f"{p.selection.scale.window * 1e3:g}" for p in self.passes if p.targets]
         return (
             f"{text}; size {size:.3g} px, speed {speed:.3g} px/s, {rate:,.0f} events/s each; "
@@ -145,7 +145,7 @@ class TargetSearchResult:
         check_accuracy(accuracy)
         if not len(self):
             return {}
-        sizes, _, rates, windows = self._numbers()
+        sizes, _, rates, windows = self._typical_values()
         largest, smallest = self._quantile(sizes, 0.95), self._quantile(sizes, 0.05)
         W = self._quantile(windows)
         begin, end = self._lives()
@@ -177,7 +177,7 @@ class TargetSearchResult:
 
     def _target_values(self) -> dict[str, NDArray[np.float64]]:
         """Values of parameters for each target."""
-        L, v, rate, W = self._numbers()
+        L, v, rate, W = self._typical_values()
         sensor = self.recording.width * self.recording.height
         density = self.background / sensor
         # Within three sizes there may be more clutter than events of the target.
@@ -210,7 +210,7 @@ class TargetSearchResult:
         noise = np.array([path.velocity_noise for path in self.paths])
         return max_events_per_step(accuracy, size, rate, noise) * (along @ rate) / rate
 
-    def _numbers(self) -> NDArray[np.float64]:
+    def _typical_values(self) -> NDArray[np.float64]:
         """Longer size (px), speed (px/s), events/s and window (s) of each target, (4, targets)."""
         rows = []
         for path in self.paths:
@@ -219,7 +219,15 @@ class TargetSearchResult:
         return np.array(rows).T
 
     def _quantile(self, values: NDArray, part: float | int = 0.5) -> float:
-        """Compute a quantile of values of targets, weighted by their events."""
+        """Compute a quantile of values of targets, weighted by their events.
+
+        Args:
+            values: (targets,).
+            part: Share of the events up to the quantile, 0..1.
+
+        Returns:
+            The quantile.
+        """
         events = np.array([path.n.sum() for path in self.paths])
         order = np.argsort(values)
         total = np.cumsum(events[order])

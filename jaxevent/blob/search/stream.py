@@ -133,7 +133,7 @@ class Stream:
             yield part, owner_candidates(part, table, sigmas)
 
     def _leave_out(self, masks: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
-        """Leave out events, told by the first row of each batch and a mask of its events."""
+        """Leave out events, given by the first row of each batch and a mask of its events."""
         kept = np.ones(self._last - self._first, bool)
         if self._kept is not None:
             kept &= self._kept[: len(kept)]
@@ -213,7 +213,7 @@ class Stream:
         return first, last
 
     def _read(self, first: int, last: int) -> Events:
-        """Return those of a range of rows that are not left out."""
+        """Return the events of a range of rows, without those left out."""
         events = self._events[first:last]
         if self._kept is None:
             return events
@@ -227,7 +227,17 @@ class Stream:
 
 @njit_noalloc
 def _count_pixels(x: Any, y: Any, counts: Any, out: Any) -> int:
-    """Fill in the pixels of events, and return their number; `counts` are zero, and are again."""
+    """List the distinct pixels of events, and count the events of each.
+
+    Args:
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        counts: (height, width) zero before and after.
+        out: `PixelCounts`, output, with room for n pixels.
+
+    Returns:
+        Number of pixels.
+    """
     pixels = 0
     for i in range(len(x)):
         counts[y[i], x[i]] += 1
@@ -242,9 +252,17 @@ def _count_pixels(x: Any, y: Any, counts: Any, out: Any) -> int:
 
 @njit_noalloc_inlined
 def cell_at(A: Any, x: Any, y: Any, bits: int, shape: Any) -> tuple[int, int]:
-    """Return the cell (row, column) to which a map (2, 3) takes a pixel, or the nearest one.
+    """Return the cell to which a map takes a pixel, or the nearest one.
 
-    The side of a cell is 2^bits px.
+    Args:
+        A: (2, 3) map from pixels to px in the cells.
+        x: Column of the pixel, px.
+        y: Row of the pixel, px.
+        bits: Binary logarithm of a cell's side in px.
+        shape: Rows and columns of cells.
+
+    Returns:
+        Row and column of the cell.
     """
     row = int(A[1, 0] * x + A[1, 1] * y + A[1, 2]) >> bits
     column = int(A[0, 0] * x + A[0, 1] * y + A[0, 2]) >> bits
@@ -253,7 +271,16 @@ def cell_at(A: Any, x: Any, y: Any, bits: int, shape: Any) -> tuple[int, int]:
 
 @njit_noalloc
 def _add_to_cells(x: Any, y: Any, limits: Any, spans: Any, bits: int, counts: Any) -> None:
-    """Add the events between `limits` (n, 2) to their images."""
+    """Count events of spans in the cells of their images.
+
+    Args:
+        x: (n,) columns, px.
+        y: (n,) rows, px.
+        limits: (spans, 2) first event of each span, and the one after its last.
+        spans: `CountedSpans`.
+        bits: Binary logarithm of a cell's side in px.
+        counts: (images, rows, columns), added to.
+    """
     for k in range(len(limits)):
         own, A = counts[spans.image[k]], spans.maps[k]
         for i in range(limits[k, 0], limits[k, 1]):

@@ -35,22 +35,40 @@ from jaxevent.progress import bar
 
 
 class TrackTable(NamedTuple):
-    """Tracks of one moment; arrays begin with the number of tracks."""
+    """Tracks of one moment; arrays begin with the number of tracks.
 
-    id: NDArray[np.int64]  # serial number
-    t: NDArray[np.float64]  # s, time of the last detection
-    p: NDArray[np.float64]  # (n, 2) px
-    v: NDArray[np.float64]  # (n, 2) px/s
-    P: NDArray[np.float64]  # (n, 3) of each axis: variance of p, covariance, variance of v
-    C: NDArray[np.float64]  # (n, 2, 2) px^2, covariance of events
-    n: NDArray[np.float64]  # events per window,
-    max_n: NDArray[np.float64]  # and the most of them, slowly forgotten
-    q: NDArray[np.float64]  # px^2/s^3, velocity noise
-    nis: NDArray[np.float64]  # mean normalised innovation squared
-    born: NDArray[np.float64]  # s
-    hits: NDArray[np.int64]  # windows with a detection
-    misses: NDArray[np.int64]  # windows without, since the last detection
-    nats: NDArray[np.float64]  # evidence against clutter
+    Attributes:
+        id: Serial numbers.
+        t: Times of the last detections, s.
+        p: (n, 2) positions, px.
+        v: (n, 2) velocities, px/s.
+        P: (n, 3) variance of p, covariance of p and v, and variance of v, of each axis.
+        C: (n, 2, 2) covariances of events, px^2.
+        n: Events per window.
+        max_n: Largest number of events per window, slowly forgotten.
+        q: Velocity noise, px^2/s^3.
+        nis: Mean normalised innovation squared.
+        born: Times of birth, s.
+        hits: Windows with a detection.
+        misses: Windows without one since the last detection.
+        nats: Evidence against clutter, nats.
+        confirmed: Whether the track is confirmed.
+    """
+
+    id: NDArray[np.int64]
+    t: NDArray[np.float64]
+    p: NDArray[np.float64]
+    v: NDArray[np.float64]
+    P: NDArray[np.float64]
+    C: NDArray[np.float64]
+    n: NDArray[np.float64]
+    max_n: NDArray[np.float64]
+    q: NDArray[np.float64]
+    nis: NDArray[np.float64]
+    born: NDArray[np.float64]
+    hits: NDArray[np.int64]
+    misses: NDArray[np.int64]
+    nats: NDArray[np.float64]
     confirmed: NDArray[np.bool_]
 
     def take(self, rows: NDArray) -> "TrackTable":
@@ -284,7 +302,12 @@ def predict_gates(
 
 @njit_noalloc
 def _predict_gates(tracks: Any, gates: Any) -> None:
-    """Fill in the predictions and gates of all tracks."""
+    """Predict all tracks, and compute their gates.
+
+    Args:
+        tracks: `TrackTable`.
+        gates: `TrackGates`, output.
+    """
     for k in range(len(tracks.n)):
         C, known = tracks.C[k], tracks.confirmed[k]
         _predict_track(tracks, k, gates)
@@ -304,7 +327,13 @@ def _predict_gates(tracks: Any, gates: Any) -> None:
 
 @njit_noalloc_inlined
 def _predict_track(tracks: Any, k: int, gates: Any) -> None:
-    """Predict one track; no noise drives a target that stands still."""
+    """Predict one track; no noise drives a target that stands still.
+
+    Args:
+        tracks: `TrackTable`.
+        k: Index of the track.
+        gates: `TrackGates`; fills `p` and `P` of the track.
+    """
     dt, q, P = gates.t - tracks.t[k], 0.0, gates.P
     if tracks.misses[k] < CONFIG.still_windows:
         q = tracks.q[k] * min(max(tracks.nis[k], 0.05), 50.0)
@@ -336,7 +365,15 @@ def assign(gates: TrackGates, events: WindowEvents, labels: NDArray, blobs: int)
 
 @njit_noalloc
 def _assign(events: Any, labels: Any, gates: Any, scratch: Any, out: Any) -> None:
-    """Fill in assignments; `scratch` is the tracks that share events, and a number for each."""
+    """Assign events to tracks, and compute the moments of their residuals.
+
+    Args:
+        events: `WindowEvents`.
+        labels: (events,) blob of each event, from 1 on; 0 for none.
+        gates: `TrackGates`.
+        scratch: Indices of the tracks that share events, and a number for each.
+        out: `Assignments`, output.
+    """
     _assign_owners(events, labels, gates, out)
     _sum_residuals(events, labels, True, gates, scratch, out)
     for k in range(len(gates.p)):
@@ -347,7 +384,17 @@ def _assign(events: Any, labels: Any, gates: Any, scratch: Any, out: Any) -> Non
 
 @njit_noalloc_inlined
 def _residual(gates: Any, k: int, events: Any, i: int) -> tuple[float, float, float]:
-    """Return the distance of an event from a track's place at that time, px, and its square."""
+    """Return the distance of an event from a track's place at that time, px, and its square.
+
+    Args:
+        gates: `TrackGates`.
+        k: Index of the track.
+        events: `WindowEvents`.
+        i: Index of the event.
+
+    Returns:
+        Distance along x and y, px, and the squared distance in standard deviations.
+    """
     late, inverse = events.t[i] - gates.t, gates.inverse[k]
     ex = events.x[i] - gates.p[k, 0] - gates.v[k, 0] * late
     ey = events.y[i] - gates.p[k, 1] - gates.v[k, 1] * late
@@ -359,6 +406,12 @@ def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
     """Assign events to tracks, and the rest of a blob to the tracks that own most of it.
 
     A target may grow at once or leave its gate.
+
+    Args:
+        events: `WindowEvents`.
+        labels: (events,) blob of each event, from 1 on; 0 for none.
+        gates: `TrackGates`.
+        out: `Assignments`; fills `owner`, `table` and `owns`.
     """
     owner, table, counts, owns = out.owner, out.table, out.counts, out.owns
     tracks, inverse, gate = len(gates.p), gates.inverse, CONFIG.gate_sigmas
@@ -399,7 +452,16 @@ def _assign_owners(events: Any, labels: Any, gates: Any, out: Any) -> None:
 def _sum_residuals(
     events: Any, labels: Any, in_blobs: bool, gates: Any, scratch: Any, out: Any
 ) -> None:
-    """Compute the moments of residuals; tracks in contact share events in both gates."""
+    """Compute the moments of residuals; tracks in contact share events in both gates.
+
+    Args:
+        events: `WindowEvents`.
+        labels: (events,) blob of each event, from 1 on; 0 for none.
+        in_blobs: Whether events outside blobs are left out.
+        gates: `TrackGates`.
+        scratch: Indices of the tracks that share events, and a number for each.
+        out: `Assignments`; fills `in_blobs` or `gated`.
+    """
     blobs, gate = out.in_blobs if in_blobs else out.gated, CONFIG.gate_sigmas
     shared, share = scratch
     for i in range(len(labels)):
@@ -451,7 +513,18 @@ def update_tracks(
 
 @njit_noalloc_inlined
 def _gate_clutter(gates: Any, clutter: Any, x: float, y: float, determinant: float) -> Any:
-    """Return the expected clutter events in a gate, and their dispersion."""
+    """Return the expected clutter events in a gate, and their dispersion.
+
+    Args:
+        gates: `TrackGates`.
+        clutter: `ClutterModel`.
+        x: Column of the gate's middle, px.
+        y: Row of the gate's middle, px.
+        determinant: Determinant of the gate's covariance, px^4.
+
+    Returns:
+        Expected events, and their variance over mean.
+    """
     gate = CONFIG.gate_sigmas
     area = np.pi * gate * gate * np.sqrt(max(determinant, 0.0))
     rate, dispersion = clutter_at(clutter, x, y)
@@ -462,7 +535,16 @@ def _gate_clutter(gates: Any, clutter: Any, x: float, y: float, determinant: flo
 def _update_tracks(
     tracks: Any, gates: Any, clutter: Any, in_blobs: Any, gated: Any, out: Any
 ) -> None:
-    """Fill in the measurements, and update each track as detected or missed."""
+    """Compute the measurements, and update each track as detected or missed.
+
+    Args:
+        tracks: `TrackTable`, in place.
+        gates: `TrackGates`.
+        clutter: `ClutterModel`.
+        in_blobs: `Blobs` of the residuals of events in blobs.
+        gated: `Blobs` of the residuals of all events.
+        out: `TrackMeasurements`, output.
+    """
     for k in range(len(tracks.n)):
         (n, z, D), in_blob = (in_blobs.n[k], in_blobs.p[k], in_blobs.C[k]), True
         C, variance = tracks.C[k], gates.P[k, 0]
@@ -490,10 +572,20 @@ def _update_tracks(
 
 @njit_noalloc_inlined
 def _passes_gate(tracks: Any, k: int, n: float, z: Any, variance: float) -> bool:
-    """Return whether n events with innovation z may be those of a track.
+    """Return whether the events of a measurement may be those of a track.
 
     A known target is not where few events are that its motion does not lead to, except for parts of
     it that are seen by turns. Most of its events may follow a turn, but no farther than it allows.
+
+    Args:
+        tracks: `TrackTable`.
+        k: Index of the track.
+        n: Number of events.
+        z: (2,) innovation, px.
+        variance: Its variance by the prediction, px^2.
+
+    Returns:
+        Whether they may.
     """
     offset, square = CONFIG.part_offset_sizes, larger_variance_of(tracks.C[k])
     if n >= CONFIG.majority * tracks.n[k]:
@@ -508,6 +600,11 @@ def _update_missed(tracks: Any, gates: Any, k: int) -> None:
     """Update a track without detection.
 
     A target that stands still goes on, if at all, no faster than before.
+
+    Args:
+        tracks: `TrackTable`, in place.
+        gates: `TrackGates`.
+        k: Index of the track.
     """
     tracks.misses[k] += 1
     if tracks.misses[k] == CONFIG.still_windows:
@@ -523,8 +620,13 @@ def _update_missed(tracks: Any, gates: Any, k: int) -> None:
 def _update_detected(tracks: Any, gates: Any, clutter: Any, k: int, measurement: Any) -> None:
     """Update a track with a measurement.
 
-    The measurement is the number of events, their mean and covariance about the prediction, the
-    variance of one event, and whether the events are in blobs.
+    Args:
+        tracks: `TrackTable`, in place.
+        gates: `TrackGates`.
+        clutter: `ClutterModel`.
+        k: Index of the track.
+        measurement: Number of events, their mean (2,), px, and covariance (2, 2), px^2, about the
+            prediction, the variance of one event, px^2, and whether the events are in blobs.
     """
     (n, z, D, square, in_blob), P, alone = measurement, gates.P[k], not gates.shared[k]
     error = CONFIG.mean_error_sizes

@@ -125,19 +125,33 @@ class Params(Parameters):
 
 
 class Window(eqx.Module):
-    """The events of a window, padded to a fixed number by events without weight."""
+    """The events of a window, padded to a fixed number by events without weight.
 
-    xi: Float[Numeric, "N 2"]  # px, see `pixel_coordinates`
-    t: Float[Numeric, " N"]  # s from the middle
-    weight: Float[Numeric, " N"]  # by polarity; 0 for padding
-    shuffled: Float[Numeric, " N"]  # s, the times in random order
-    mask: Float[Numeric, "height width"]  # 1 where the image counts; see `mask_visible`
-    ends: Float[Numeric, "2"]  # s from the middle
-    scale: Float[Numeric, " dimension"]  # motion per px of displacement at the window's end
+    Attributes:
+        xi: Positions, px, see `pixel_coordinates`.
+        t: Times from the middle of the window, s.
+        weight: Weights by polarity; 0 for padding.
+        shuffled: The times in random order, s.
+        mask: 1 where the image counts; see `mask_visible`.
+        ends: Begin and end of the window from its middle, s.
+        scale: Motion per px of displacement at the window's end.
+        model: Motion model.
+        shape: Height and width of the image, px.
+        offset: Position of its pixel [0, 0], px.
+        box: Extent of the events, x0, y0, x1, y1, px.
+    """
+
+    xi: Float[Numeric, "N 2"]
+    t: Float[Numeric, " N"]
+    weight: Float[Numeric, " N"]
+    shuffled: Float[Numeric, " N"]
+    mask: Float[Numeric, "height width"]
+    ends: Float[Numeric, "2"]
+    scale: Float[Numeric, " dimension"]
     model: Model
-    shape: tuple[int, int] = eqx.field(static=True)  # of the image, height and width
-    offset: tuple[float, float] = eqx.field(static=True)  # px, position of its pixel [0, 0]
-    box: tuple[float, float, float, float] = eqx.field(static=True)  # px, x0, y0, x1, y1 of events
+    shape: tuple[int, int] = eqx.field(static=True)
+    offset: tuple[float, float] = eqx.field(static=True)
+    box: tuple[float, float, float, float] = eqx.field(static=True)
 
     def warp(self, xi: Array, t: Array, motion: Array) -> Float[Array, "n 2"]:
         """Move positions from their times to the middle.
@@ -368,12 +382,19 @@ def ascend(
 
 
 class WindowEstimate(NamedTuple):
-    """The motion of a window."""
+    """Motion of a window, estimated by contrast maximisation.
+
+    Attributes:
+        motion: (d,) motion at the maximum.
+        contrast: The objective relative to that with shuffled times.
+        covariance: (d, d), see `covariance`.
+        is_observable: Whether the maximum is one along all axes.
+    """
 
     motion: NDArray[np.float64]
-    contrast: float  # the objective relative to that with shuffled times
-    covariance: NDArray[np.float64] | None  # see `covariance`
-    is_observable: bool  # whether the maximum is one along all axes
+    contrast: float
+    covariance: NDArray[np.float64] | None
+    is_observable: bool
 
 
 def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> WindowEstimate:

@@ -17,7 +17,12 @@ MIN_RELATIVE_INFORMATION = 0.02  # of the largest, below which a direction is un
 
 
 class Fit(NamedTuple):
-    """A motion (d,) and its covariance (d, d)."""
+    """A motion and its covariance.
+
+    Attributes:
+        mean: (d,) motion.
+        covariance: (d, d).
+    """
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]

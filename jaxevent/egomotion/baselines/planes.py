@@ -98,7 +98,7 @@ def normal_flow(
         The normal flow.
 
     Raises:
-        InputError: The distortion has no inverse; see `geometry.undistort`.
+        InputError: The distortion has no inverse; see `geometry.centred_coordinates`.
     """
     params = params or Params()
     xi, _ = pixel_coordinates(recording.width, recording.height, camera or recording.camera)
@@ -201,7 +201,19 @@ class EventSurface(NamedTuple):
 
 
 class PlaneRules(NamedTuple):
-    """Numbers of `Params` for kernels, times in us."""
+    """Numbers of `Params` for kernels.
+
+    Attributes:
+        first: Whether the surface keeps the first event of a burst, else the latest.
+        apart: Time within which events of a pixel are one burst, us.
+        oldest: Largest age of a plane's neighbours, us.
+        radius: Largest distance of neighbours in x and y, px.
+        fewest: Least number of neighbours of a plane.
+        iterations: Number of times that outliers are removed.
+        tolerance: As of `Params`.
+        rough: As of `Params`.
+        speed_max: Largest speed of an edge, px/s.
+    """
 
     first: bool
     apart: int

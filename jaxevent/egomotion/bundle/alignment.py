@@ -28,18 +28,31 @@ CELL_EDGE_LOG_DEPTH = 0.3  # a larger difference of log depth between cells is a
 
 
 class WindowEvents(NamedTuple):
-    """Events (n,) of a window, and the sensor and the cells in the reference view."""
+    """Events of a window, and the sensor and the cells in the reference view.
 
-    x: NDArray  # px, undistorted, from the principal point
+    Attributes:
+        x: (n,) undistorted columns from the principal point, px.
+        y: (n,) undistorted rows from the principal point, px.
+        tau: (n,) times from the reference time, s.
+        p: (n,) polarities, +1 or -1.
+        f: Focal length, px.
+        half: Half the length of the window, s.
+        box: Extent of the sensor, x0, x1, y0, y1, px.
+        shape: Height and width of the reference view, px.
+        corner: Position of its pixel [0, 0], px.
+        cell: Side of a cell, px.
+    """
+
+    x: NDArray
     y: NDArray
-    tau: NDArray  # s from the reference time
-    p: NDArray  # +-1
-    f: float  # px
-    half: float  # s
-    box: tuple[float, float, float, float]  # px, sensor's extent: x0, x1, y0, y1
-    shape: tuple[int, int]  # of the reference view, px
-    corner: tuple[float, float]  # px, position of its pixel [0, 0]
-    cell: int  # px
+    tau: NDArray
+    p: NDArray
+    f: float
+    half: float
+    box: tuple[float, float, float, float]
+    shape: tuple[int, int]
+    corner: tuple[float, float]
+    cell: int
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -56,10 +69,16 @@ class WindowEvents(NamedTuple):
 
 
 class ImageScratch(NamedTuple):
-    """Scratch for images of events."""
+    """Scratch for images of events.
 
-    images: NDArray  # (2, height, width): signed, and numbers of events
-    work: NDArray  # (height, width)
+    Attributes:
+        images: (2, height, width) sums of polarities, and numbers of events.
+        work: (height, width) scratch of filters.
+        sums: Sums by part of the image.
+    """
+
+    images: NDArray
+    work: NDArray
     sums: NDArray
 
     @classmethod
@@ -78,7 +97,12 @@ class ImageScratch(NamedTuple):
 
 
 class ContrastMaps(NamedTuple):
-    """Contrast (sum of squares of the signed image) and number of events, by part of the image."""
+    """Contrast and number of events, by part of the image.
+
+    Attributes:
+        contrast: Sums of squares of the signed image.
+        number: Numbers of events.
+    """
 
     contrast: NDArray[np.float64]
     number: NDArray[np.float64]
@@ -92,7 +116,14 @@ class Displacements(NamedTuple):
 
 
 class VisibleRegion(NamedTuple):
-    """Region of the sensor, px of the image, and shifts (S, cells) of cells to segments' times."""
+    """Region of the sensor in the image, and displacements of cells to the times of segments.
+
+    Attributes:
+        low: (2,) least x and y, px of the image.
+        high: (2,) largest x and y, px of the image.
+        left: (S, cells) displacements along x, px.
+        top: (S, cells) displacements along y, px.
+    """
 
     low: NDArray
     high: NDArray

@@ -32,7 +32,13 @@ N_CACHED_VALUES = 1024  # of all columns that a core's own memory holds together
 
 
 class BlockVector(NamedTuple):
-    """Unknowns: map (height, width), path with skew and plane (n,), depths (rows, columns)."""
+    """Unknowns of the bundle adjustment, or as many numbers.
+
+    Attributes:
+        map: (height, width) of the map.
+        t: (n,) of the path, with the skew and the plane.
+        depth: (rows, columns) of the depths.
+    """
 
     map: NDArray
     t: NDArray[np.float64]
@@ -44,26 +50,46 @@ class System(NamedTuple):
 
     `coefficient_jacobian` makes polynomials' coefficients of the path's unknowns. Bonds are weights
     of the squared differences of log depth to the nodes before.
+
+    Attributes:
+        jacobian: Derivatives of the residuals.
+        weight: (E,) weights of the residuals.
+        information: Information of an event of weight 1.
+        begin: (series + 1,) first row of each series of events, and E.
+        coefficient_jacobian: Derivatives of polynomials' coefficients by the path's unknowns.
+        path_prior: (n, n) priors on the path's unknowns, with damping.
+        flat: Weight of squared differences of the map's pixels.
+        ridge: Weight of the map's squares.
+        map_damping: (height, width) damping of the map.
+        depth_damping: (rows, columns) damping of the depths.
+        across: (rows, columns) bonds to the column before.
+        down: (rows, columns) bonds to the row before.
+        preconditioner_map: (height, width) preconditioner of the map.
+        preconditioner_depth: (rows, columns) preconditioner of the depths.
+        preconditioner_coarse: (m, m) Cholesky factor of P' H P.
+        coefficients: (6, N_COEFFICIENT_ROWS) scratch.
+        more: (n - 6 N_COEFFICIENT_ROWS,) scratch.
+        side: (m,) scratch.
     """
 
     jacobian: ResidualJacobian
-    weight: NDArray  # (E,)
-    information: float  # of an event of weight 1
+    weight: NDArray
+    information: float
     begin: NDArray[np.int64]
     coefficient_jacobian: NDArray[np.float64]
-    path_prior: NDArray[np.float64]  # (n, n), with damping
+    path_prior: NDArray[np.float64]
     flat: float
-    ridge: float  # weight of the map's squares
-    map_damping: NDArray  # (height, width)
-    depth_damping: NDArray  # (rows, columns)
-    across: NDArray  # (rows, columns), bonds to the column before
-    down: NDArray  # and to the row before
-    preconditioner_map: NDArray  # (height, width)
-    preconditioner_depth: NDArray  # (rows, columns)
-    preconditioner_coarse: NDArray[np.float64]  # (m, m), Cholesky factor of P' H P
-    coefficients: NDArray  # (6, N_COEFFICIENT_ROWS), scratch
-    more: NDArray  # (n - 6 N_COEFFICIENT_ROWS,), scratch
-    side: NDArray[np.float64]  # (m,), scratch
+    ridge: float
+    map_damping: NDArray
+    depth_damping: NDArray
+    across: NDArray
+    down: NDArray
+    preconditioner_map: NDArray
+    preconditioner_depth: NDArray
+    preconditioner_coarse: NDArray[np.float64]
+    coefficients: NDArray
+    more: NDArray
+    side: NDArray[np.float64]
 
 
 def coarse_shape(rows: int, columns: int) -> tuple[int, int]:
@@ -309,7 +335,15 @@ def multiply(system, vector, value, out):
 
 @njit_fastmath_inlined
 def _dot(a, b):
-    """Return the scalar product of two vectors."""
+    """Return the scalar product of two vectors.
+
+    Args:
+        a: (n,).
+        b: (n,).
+
+    Returns:
+        a' b.
+    """
     s = 0.0
     for i in range(len(a)):
         s += a[i] * b[i]
@@ -400,7 +434,12 @@ def _conjugate_gradients(system, vectors, steps, tolerance, value):
 
 
 class ColumnVectors(NamedTuple):
-    """Several vectors: unknowns of the path (S, n), and map and depths in one (S, N)."""
+    """Several vectors of unknowns.
+
+    Attributes:
+        t: (S, n) of the path.
+        rest: (S, N) of the map and the depths.
+    """
 
     t: NDArray[np.float64]
     rest: NDArray

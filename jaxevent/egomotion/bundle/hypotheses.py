@@ -41,7 +41,7 @@ from jaxevent.egomotion.bundle.photometric_ba import (
 )
 from jaxevent.egomotion.bundle.residuals import PixelSeries, Scene, subtract_mean
 from jaxevent.egomotion.bundle.warp import Path, Prior
-from jaxevent.egomotion.bundle.windows import Params, Windows
+from jaxevent.egomotion.bundle.windows import Params, WindowReader
 from jaxevent.recording import Recording
 
 MAX_FLOW_EVENTS = 15_000  # of windows for patches' flows
@@ -58,12 +58,18 @@ class Stage(NamedTuple):
 
     A flatter map and a stiffer path leave less freedom, so the fit converges sooner, and a short
     window, which hardly determines changes of the motion, does not lead away from the truth.
+
+    Attributes:
+        sigma: Standard deviation of residuals, C.
+        steps: Number of steps.
+        flatness: Factor of the map's prior.
+        stiffness: Factor of the prior on changes of the twist.
     """
 
-    sigma: float  # C
+    sigma: float
     steps: int
-    flatness: float | int = 1  # factor of the map's prior
-    stiffness: float | int = 1  # factor of the prior on changes of the twist
+    flatness: float | int = 1
+    stiffness: float | int = 1
 
 
 # Stages of new hypotheses, each after a search of depths, and of the rest.
@@ -82,12 +88,19 @@ MAX_SELECTIVE_SIGMA = 0.5  # C, of stages that select: before, the true motion m
 
 
 class PlanarStages(NamedTuple):
-    """Stages of motions before a plane, on a part of the window."""
+    """Stages of the fit of a motion before a plane, on a part of the window.
 
-    share: float  # of the window's length
+    Attributes:
+        share: Part of the window's length, 0..1.
+        events: Most events.
+        stages: The stages, one after another.
+        max_cost: Largest cost of a scene that is a plane, C^2.
+    """
+
+    share: float
     events: int
     stages: tuple[Stage, ...]
-    max_cost: float  # C^2, of a scene that is a plane
+    max_cost: float
 
 
 # Scenes that are no plane cost 1.8e-2 and more after the first of these, planes 7e-3 and less; in
@@ -137,14 +150,22 @@ class WindowFit(NamedTuple):
 
     The covariance counts errors that differ from one part of the image to another (24 px). Beside
     plain shapes, where they do not, errors are far larger.
+
+    Attributes:
+        path: Path with log depths at nodes.
+        covariance: (6, 6) of heading and Omega.
+        agreement: Share of events that the fit explains.
+        cost: Robust cost per event, C^2.
+        map: (height, width) log intensity, in units of the mean threshold.
+        ambiguity: Spread of the headings that are not refuted, weighted by likelihood, rad.
     """
 
-    path: Path  # with log depths at nodes
-    covariance: NDArray[np.float64]  # (6, 6) of heading and Omega
-    agreement: float  # share of events that the fit explains
-    cost: float  # C^2, robust, per event
+    path: Path
+    covariance: NDArray[np.float64]
+    agreement: float
+    cost: float
     map: NDArray[np.floating]
-    ambiguity: float = 0.0  # rad, of headings that are not refuted, by their likelihood
+    ambiguity: float = 0.0
 
 
 Hypothesis = tuple[Scene, FitReport]
@@ -166,8 +187,8 @@ def error_inflation(inliers: float) -> float:
     ) ** 2
 
 
-class WindowFitter(Windows):
-    """Windows of a recording, and the fit of each."""
+class WindowFitter(WindowReader):
+    """Fits of the windows of a recording."""
 
     @functools.cached_property
     def rotation(self) -> Callable[[int], NDArray[np.float64]]:
@@ -525,7 +546,7 @@ def _without_heading(
 def _ambiguity_covariance(
     test: "HeldOutTest", path: Path, best: Scene, others: list[tuple[Path, Scene]]
 ) -> NDArray[np.float64]:
-    """Return what other motions add to a path's covariance, by their likelihood, exp(-z^2 / 2).
+    """Return the covariance that other motions add, by their likelihood exp(-z^2 / 2).
 
     Args:
         test: Test with held-out pixels.
@@ -727,7 +748,7 @@ class HeldOutTest:
         return other if self.z(one, other) > 0 else one
 
     def z(self, one: Scene, other: Scene) -> float:
-        """Return by how much held-out events prefer one scene to another.
+        """Compare two scenes by the cost of held-out events.
 
         Args:
             one: A scene.
@@ -784,7 +805,13 @@ class MotionGuess(NamedTuple):
 
 
 class WindowTest(NamedTuple):
-    """Test of a translation in a window that holds events [first, last)."""
+    """Test of a translation in a window.
+
+    Attributes:
+        z: Test statistic, standard normal if nothing translates.
+        first: First event of the window.
+        last: Event after its last one.
+    """
 
     z: float
     first: int

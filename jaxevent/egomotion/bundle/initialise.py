@@ -318,7 +318,13 @@ def sharpest_rotation(window: WindowEvents) -> NDArray[np.float64]:
 
 
 class PlanarMotion(NamedTuple):
-    """A motion before a plane: rho = normal . (x, y, f) / f, in 1/m if T is in m/s."""
+    """A motion before a plane: rho = normal . (x, y, f) / f.
+
+    Attributes:
+        T: (3,) translation, m/s or in units of |T|.
+        normal: (3,) normal of the plane over its distance, 1/m if T is in m/s.
+        Omega: (3,) angular velocity, rad/s.
+    """
 
     T: NDArray[np.float64]
     normal: NDArray[np.float64]

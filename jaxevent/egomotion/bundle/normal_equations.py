@@ -247,13 +247,21 @@ def map_diagonal(jacobian, weight, diagonal):
 
 
 class Problem(NamedTuple):
-    """Data and settings of a bundle adjustment, the same in all of its steps."""
+    """Data and settings of a bundle adjustment, the same in all of its steps.
+
+    Attributes:
+        series: Events of the window.
+        prior: Prior knowledge.
+        sigma: Standard deviation of residuals, C.
+        plane: Whether depths are a plane's.
+        typical_cost: Cost of positions from which events count less, C^2.
+    """
 
     series: PixelSeries
     prior: warp.Prior
-    sigma: float  # C, of residuals
-    plane: bool  # whether depths are a plane's
-    typical_cost: float  # C^2, of positions from which events count less
+    sigma: float
+    plane: bool
+    typical_cost: float
 
     @property
     def loss(self) -> RobustLoss:
@@ -286,14 +294,23 @@ class Problem(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Residuals, weights and cost of a scene."""
+    """Residuals, weights and cost of a scene.
+
+    Attributes:
+        scene: The scene.
+        samples: Projections of events, and the map's values there.
+        residual: (E,) residuals before the means of series are subtracted, C.
+        weight: (E,) weights.
+        objective: Sum that steps reduce: robust cost and priors.
+        cost: Robust cost per event, C^2.
+    """
 
     scene: Scene
     samples: MapSamples
-    residual: NDArray  # (E,) C, before the means of series are subtracted
-    weight: NDArray  # (E,)
-    objective: float  # that steps reduce: robust cost and priors
-    cost: float  # robust, C^2 per event
+    residual: NDArray
+    weight: NDArray
+    objective: float
+    cost: float
 
 
 def path_unknowns(scene: Scene, unit: NDArray) -> NDArray[np.float64]:
@@ -364,25 +381,45 @@ def evaluate(
 
 
 class NormalEquations(NamedTuple):
-    """Equations H d = -gradient at a scene: blocks of H, which is never made as a whole."""
+    """Equations H d = -gradient at a scene: blocks of H, which is never made as a whole.
+
+    Attributes:
+        problem: The problem.
+        evaluation: Residuals and weights at the scene.
+        jacobian: Derivatives of the residuals.
+        coefficient_jacobian: Derivatives of polynomials' coefficients by the path's unknowns.
+        unit: Units of the path's rows.
+        t: (n,) unknowns of the path.
+        residual: (E,) residuals less the means of series, C.
+        diagonal: (height, width) diagonal of the map's block, approximately.
+        path_prior: (n, n) matrix of the priors on the path's unknowns.
+        path_prior_side: (n,) such that path_prior @ t - path_prior_side is the priors' gradient.
+        regularisation: Regularisation of the path's block.
+        path_block: (n, n) with priors and regularisation.
+        coupling: (coarse nodes, n) depths by path.
+        coarse_block: (coarse nodes, coarse nodes) depths without priors.
+        lumped: (rows, columns) sums of the rows of the depths' block.
+        across: (rows, columns) bonds to the columns before.
+        down: (rows, columns) bonds to the rows before.
+    """
 
     problem: Problem
     evaluation: Evaluation
     jacobian: ResidualJacobian
     coefficient_jacobian: NDArray[np.float64]
-    unit: NDArray[np.float64]  # of the path's rows
-    t: NDArray[np.float64]  # the path's unknowns
-    residual: NDArray  # (E,) C, less the means of series
-    diagonal: NDArray  # of the map's block, approximately
-    path_prior: NDArray[np.float64]  # matrix of the priors on the path's unknowns
-    path_prior_side: NDArray[np.float64]  # path_prior @ t - path_prior_side is their gradient
-    regularisation: NDArray[np.float64]  # of the path's block
-    path_block: NDArray[np.float64]  # with priors and regularisation
-    coupling: NDArray[np.float64]  # (coarse nodes, n), depths by path
-    coarse_block: NDArray[np.float64]  # (coarse nodes, coarse nodes), depths without priors
-    lumped: NDArray[np.float64]  # (rows, columns), sums of the rows of the depths' block
-    across: NDArray[np.float64]  # bonds to the columns before
-    down: NDArray[np.float64]  # bonds to the rows before
+    unit: NDArray[np.float64]
+    t: NDArray[np.float64]
+    residual: NDArray
+    diagonal: NDArray
+    path_prior: NDArray[np.float64]
+    path_prior_side: NDArray[np.float64]
+    regularisation: NDArray[np.float64]
+    path_block: NDArray[np.float64]
+    coupling: NDArray[np.float64]
+    coarse_block: NDArray[np.float64]
+    lumped: NDArray[np.float64]
+    across: NDArray[np.float64]
+    down: NDArray[np.float64]
 
     @property
     def n(self) -> int:

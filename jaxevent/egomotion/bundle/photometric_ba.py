@@ -65,7 +65,12 @@ DEPTH_SEARCH_SQUARE_PX = 12  # of the square about a node whose contrast counts
 
 
 class StepControl(NamedTuple):
-    """State of the step control: Nesterov's count of gaining steps, and the damping."""
+    """State of the step control.
+
+    Attributes:
+        momentum: Nesterov's count of gaining steps.
+        damping: Damping of the normal equations.
+    """
 
     momentum: int
     damping: float

@@ -20,22 +20,38 @@ class PixelSeries(NamedTuple):
     """Events of a window as one series per pixel; arrays of events are (E,).
 
     Rows from `n_events` on are pixels of frames, with `count` and `p` 0: a series for each frame.
+
+    Attributes:
+        x: Undistorted columns from the principal point, px.
+        y: Undistorted rows from the principal point, px.
+        tau: Times from the reference time, s.
+        level: Sum of the series' polarities up to and with the event.
+        count: Number of these.
+        p: Polarities, +1 or -1.
+        precision: Noise of an event over that of the row, at most 1.
+        n_events: Number of rows that are events.
+        begin: (series + 1,) first row of each series, and E.
+        f: Focal length, px.
+        half: Half the length of the window, s.
+        shape: Height and width of the map, px.
+        corner: Position of the map's pixel [0, 0], px.
+        node: Distance of the nodes of depth, px.
     """
 
-    x: NDArray  # px, undistorted, from the principal point
+    x: NDArray
     y: NDArray
-    tau: NDArray  # s from the reference time
-    level: NDArray  # sum of the series' polarities up to and with the event
-    count: NDArray  # number of these
-    p: NDArray  # +-1
-    precision: NDArray  # noise of an event over that of the row, at most 1
+    tau: NDArray
+    level: NDArray
+    count: NDArray
+    p: NDArray
+    precision: NDArray
     n_events: int
-    begin: NDArray[np.int64]  # (series + 1,) first row of each series, and E
-    f: float  # px
-    half: float  # s
-    shape: tuple[int, int]  # of the map
-    corner: tuple[float, float]  # px, position of the map's pixel [0, 0]
-    node: int  # px between nodes of depth
+    begin: NDArray[np.int64]
+    f: float
+    half: float
+    shape: tuple[int, int]
+    corner: tuple[float, float]
+    node: int
 
     @property
     def points(self) -> warp.Points:
@@ -66,24 +82,40 @@ class Scene(NamedTuple):
     """Unknowns: path with log depths at nodes, map of log intensity, skew of the thresholds.
 
     The map is in units of the mean threshold C; C (1 + skew) is that of ON, C (1 - skew) of OFF.
+
+    Attributes:
+        path: Path with log depths at nodes.
+        map: (height, width) log intensity.
+        skew: Skew of the thresholds.
     """
 
     path: warp.Path
-    map: NDArray  # (height, width)
+    map: NDArray
     skew: float
 
 
 class MapSamples(NamedTuple):
-    """Projections of events (E,) to the reference view, and the map's values there."""
+    """Projections of events (E,) to the reference view, and the map's values there.
 
-    X: NDArray  # px
+    Attributes:
+        X: Positions along x, px.
+        Y: Positions along y, px.
+        log_rho: Log inverse depths.
+        first: Index of the first of the nine splines about the position.
+        u: Distance from the middle spline along x, px.
+        v: Distance from the middle spline along y, px.
+        inside: 1 inside the map, else 0.
+        value: Values of the map, C.
+    """
+
+    X: NDArray
     Y: NDArray
     log_rho: NDArray
-    first: NDArray[np.int32]  # first of the nine splines about the position
-    u: NDArray  # px beside the middle one
+    first: NDArray[np.int32]
+    u: NDArray
     v: NDArray
-    inside: NDArray  # 1 inside the map, else 0
-    value: NDArray  # C
+    inside: NDArray
+    value: NDArray
 
 
 class RobustLoss(NamedTuple):
@@ -95,10 +127,19 @@ class RobustLoss(NamedTuple):
 
 
 class WeightScratch(NamedTuple):
-    """Scratch memory of `robust_weights`, of the map's shape and of the events'."""
+    """Scratch memory of `robust_weights`.
+
+    Attributes:
+        image: (height, width).
+        rows: (height, width + 4).
+        sums: (height, width).
+        number: (height, width).
+        residual: (E,).
+        cost: (E,).
+    """
 
     image: NDArray
-    rows: NDArray  # four columns wider
+    rows: NDArray
     sums: NDArray
     number: NDArray
     residual: NDArray
@@ -345,7 +386,13 @@ class FreeUnknowns(NamedTuple):
 
 
 class MapField(NamedTuple):
-    """Map of log intensity (height * width,), log depths at nodes, and where both lie."""
+    """Map of log intensity and depths, and the positions of both.
+
+    Attributes:
+        image: (height * width,) map, C.
+        log_rho: (nodes,) log inverse depths.
+        grid: Positions of pixels and nodes.
+    """
 
     image: NDArray
     log_rho: NDArray
@@ -353,11 +400,18 @@ class MapField(NamedTuple):
 
 
 class Direction(NamedTuple):
-    """A change of the unknowns, or a gradient, flat: map, coefficients (6, rows), more, depth."""
+    """A change of the unknowns, or a gradient.
+
+    Attributes:
+        map: (height * width,) of the map.
+        coefficients: (6, rows) of the path's polynomials.
+        more: Of the skew and of a plane's normal.
+        depth: (nodes,) of the depths.
+    """
 
     map: NDArray
     coefficients: NDArray
-    more: NDArray  # the skew and the normal of a plane
+    more: NDArray
     depth: NDArray
 
 
@@ -367,20 +421,34 @@ class ResidualJacobian(NamedTuple):
     By the map: nine splines about `first`, `u` and `v` px beside the middle one. By the path's
     coefficients: `base` times powers of `tau`, from the first on. By log depth: `by_depth`, shared
     among the four nodes from `node` on.
+
+    Attributes:
+        first: (E,) index of the first spline.
+        u: (E,) distance from the middle spline along x, px.
+        v: (E,) distance from the middle spline along y, px.
+        base: (6, E) derivatives by the path's first coefficients.
+        tau: (E,) times, in half windows.
+        more: (n, E) derivatives by the skew and the normal of a plane.
+        node: (E,) index of the first node.
+        across: (E,) weight of the next column's nodes.
+        down: (E,) weight of the next row's nodes.
+        by_depth: (E,) derivatives by log depth.
+        width: Width of the map, px.
+        columns: Columns of nodes.
     """
 
     first: NDArray[np.int32]
     u: NDArray
     v: NDArray
-    base: NDArray  # (6, E)
-    tau: NDArray  # half windows
-    more: NDArray  # (n, E), by the skew and the normal of a plane
+    base: NDArray
+    tau: NDArray
+    more: NDArray
     node: NDArray[np.int32]
-    across: NDArray  # weight of the next column's nodes
-    down: NDArray  # and of the next row's
+    across: NDArray
+    down: NDArray
     by_depth: NDArray
-    width: int  # of the map
-    columns: int  # of nodes
+    width: int
+    columns: int
 
 
 @njit_fastmath

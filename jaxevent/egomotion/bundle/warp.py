@@ -36,19 +36,35 @@ MAX_LOG_DEPTH_STEP = 0.5  # of log depth, in one step
 
 
 class MapGrid(NamedTuple):
-    """Positions of the map's pixels and of the nodes of depth in the reference view."""
+    """Positions of the map's pixels and of the nodes of depth in the reference view.
 
-    x: float  # px from the principal point, of pixel and node [0, 0]
+    Attributes:
+        x: Position of pixel and node [0, 0] along x, px from the principal point.
+        y: Position of pixel and node [0, 0] along y, px from the principal point.
+        height: Height of the map, px.
+        width: Width of the map, px.
+        node: Distance of nodes, px.
+        rows: Rows of nodes.
+        columns: Columns of nodes.
+    """
+
+    x: float
     y: float
-    height: int  # of the map, px
+    height: int
     width: int
-    node: float  # px between nodes
-    rows: int  # of nodes
+    node: float
+    rows: int
     columns: int
 
 
 class Points(NamedTuple):
-    """Pixels (n,) in px from the principal point, undistorted, and times tau (s)."""
+    """Pixels at their times.
+
+    Attributes:
+        x: (n,) undistorted columns from the principal point, px.
+        y: (n,) undistorted rows from the principal point, px.
+        tau: (n,) times from the reference time, s.
+    """
 
     x: NDArray
     y: NDArray
@@ -56,31 +72,56 @@ class Points(NamedTuple):
 
 
 class Positions(NamedTuple):
-    """Positions (n,) in the reference view, px from the principal point."""
+    """Positions in the reference view.
+
+    Attributes:
+        X: (n,) columns from the principal point, px.
+        Y: (n,) rows from the principal point, px.
+    """
 
     X: NDArray
     Y: NDArray
 
 
 class CameraMotion(NamedTuple):
-    """Polynomials of a path for compiled functions: factors of tau, tau^2, ..., (rows, 3)."""
+    """Polynomials of a path for compiled functions.
+
+    Attributes:
+        phi: (rows, 3) factors of tau, tau^2, ... of the rotation vector, rad/s^k.
+        C: (rows, 3) factors of tau, tau^2, ... of the camera's position, in units of |T|.
+        f: Focal length, px.
+    """
 
     phi: NDArray[np.float64]
     C: NDArray[np.float64]
-    f: float  # px
+    f: float
 
 
 class CellGrid(NamedTuple):
-    """Square cells of the reference view, row by row."""
+    """Square cells of the reference view, row by row.
 
-    corner: tuple[float, float]  # px, position of the first pixel of the first cell
-    size: int  # px
+    Attributes:
+        corner: Position of the first pixel of the first cell, px.
+        size: Side of a cell, px.
+        rows: Rows of cells.
+        columns: Columns of cells.
+    """
+
+    corner: tuple[float, float]
+    size: int
     rows: int
     columns: int
 
 
 class DepthField(NamedTuple):
-    """Log inverse depths at nodes (nodes,), and their bounds about each node."""
+    """Log inverse depths at nodes, and their bounds about each node.
+
+    Attributes:
+        log_rho: (nodes,) log inverse depths.
+        nearest: (nodes,) bound of the nearest depths.
+        farthest: (nodes,) bound of the farthest depths.
+        grid: Positions of the nodes.
+    """
 
     log_rho: NDArray
     nearest: NDArray
@@ -502,19 +543,33 @@ def warp(
 
 
 class Prior(NamedTuple):
-    """Prior knowledge about a window; weights of squares, as in the estimator's parameters."""
+    """Prior knowledge about a window.
+
+    Attributes:
+        smooth: Weight of squared differences of log depth between cells.
+        relief: Weight of squared differences of log depth from its mean.
+        change: Weight of squared changes of the twist, 1/px^2.
+        gyro: (N_WINDOW_SEGMENTS, 3) Omega at the segments' middles, rad/s.
+        gyro_weight: Weight of the gyro, 1 / (rad/s)^2; 0: none.
+        bond: Weight of squared differences of log depth between nodes.
+        flat: Weight of squared differences of log intensity between pixels, 1/C^2.
+        alike: Number of events that count as one.
+        skew: Expected skew of the thresholds.
+        skew_weight: Weight of squared differences from it.
+        moves: Whether translation and depths are estimated, else they are held.
+    """
 
     smooth: float
     relief: float
     change: float
-    gyro: NDArray[np.float64]  # (N_WINDOW_SEGMENTS, 3) Omega, rad/s, at the segments' middles
-    gyro_weight: float  # 1 / (rad/s)^2, 0: none
+    gyro: NDArray[np.float64]
+    gyro_weight: float
     bond: float
     flat: float
     alike: float
-    skew: float = 0.0  # of the thresholds
+    skew: float = 0.0
     skew_weight: float = 10.0
-    moves: bool = True  # else translation and depths are held
+    moves: bool = True
 
 
 def normalise(path: Path) -> Path:

@@ -302,8 +302,8 @@ def _contrast_threshold(
     return float(np.sqrt(yn / nn * np.sqrt(yy / nn)))
 
 
-class Windows:
-    """Windows of a recording, each given by its centre (us) and half its length (s)."""
+class WindowReader:
+    """Data of a recording in windows, each given by its centre (us) and half its length (s)."""
 
     def __init__(
         self,

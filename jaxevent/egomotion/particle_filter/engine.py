@@ -131,7 +131,15 @@ class Layout:
 
 
 def _with_focal_length(model: Model, f: Any) -> Model:
-    """Return the model with another focal length: an input, so that one program serves all."""
+    """Return the model with another focal length: an input, so that one program serves all.
+
+    Args:
+        model: The model.
+        f: Focal length, px.
+
+    Returns:
+        The model.
+    """
     model = copy.copy(model)
     object.__setattr__(model, "f", f)
     return model
@@ -275,7 +283,16 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
 def _add_event(
     tracer: FunctionTracer, name: str, searching: bool, event: Any, cloud: Any, each: Any
 ) -> None:
-    """Translate the steps of one event: before, for and after its candidates, and of their ages."""
+    """Translate the steps of one event: before, for and after its candidates, and of their ages.
+
+    Args:
+        tracer: Tracer, to which functions are added.
+        name: Beginning of their names.
+        searching: Whether the motion is searched for.
+        event: An event without candidates.
+        cloud: Shapes of the motions that are scored.
+        each: Shapes of their weights.
+    """
     key, shape = f"{name}_votes", tracer.shape
 
     def init(params, model, event, motions, motion_weights):

@@ -45,7 +45,15 @@ NODES_COUNTER, WAIT_COUNTER, BATCH_COUNTER, INTERPOLATED_COUNTER = range(4)
 
 
 class ModelFunctions(NamedTuple):
-    """Compiled functions of a model."""
+    """Compiled functions of a model, of all particles each.
+
+    Attributes:
+        predict: Predict the particles to the batch.
+        track: Score events for a block of motions, near a known motion.
+        search: Score events for a block of motions, in a search.
+        reweight: Update the weights by the batch.
+        restart: Begin a search.
+    """
 
     predict: Any
     track: Any
@@ -55,29 +63,62 @@ class ModelFunctions(NamedTuple):
 
 
 class RowIndices(NamedTuple):
-    """Rows of `work` that the loop reads and writes, and cells of the report."""
+    """Rows of `work` that the loop reads and writes, and cells of the report.
+
+    Attributes:
+        particles: (d,) rows of the particles.
+        normal: (d,) rows of the normal random numbers.
+        predicted: (d,) rows of the predicted particles.
+        motions: (d,) rows of the motions that are scored: particles, or nodes and checks.
+        cloud: (d,) rows of the random numbers of a search.
+        restarted: (d,) rows of the particles that a search begins with.
+        log_weights: Row of the log weights before the batch.
+        weights: Row of the weights after it.
+        motion_weights: Row of the weights of the motions that are scored.
+        total: Row of the log-likelihoods of motions.
+        log_likelihood: Row of the log-likelihoods of particles.
+        new_log_weights: Row of the log weights after the batch.
+        youngest: Row of the ages of the motions of a search; -1: they are all the same.
+        mean: Cells of the mean and then of the covariance.
+        widest: Cells of the mean and covariance of a search.
+    """
 
     particles: NDArray[np.int64]
     normal: NDArray[np.int64]
     predicted: NDArray[np.int64]
-    motions: NDArray[np.int64]  # that are scored: particles, or nodes and checks
+    motions: NDArray[np.int64]
     cloud: NDArray[np.int64]
     restarted: NDArray[np.int64]
     log_weights: int
     weights: int
     motion_weights: int
-    total: int  # log-likelihood of motions
-    log_likelihood: int  # of particles
+    total: int
+    log_likelihood: int
     new_log_weights: int
-    youngest: int  # ages of the motions of a search; -1: they are all the same
-    mean: NDArray[np.int64]  # cells, of the mean and then of the covariance
+    youngest: int
+    mean: NDArray[np.int64]
     widest: NDArray[np.int64]
 
 
 class BatchArrays(NamedTuple):
-    """The arrays of `Candidates`, and random numbers."""
+    """Arrays of `Candidates`, and random numbers.
 
-    d: NDArray  # (batches, K, C, 2)
+    Attributes:
+        d: (batches, K, C, 2) displacement from candidate to event, px.
+        age: (batches, K, C) age of each candidate, s; 0: unused.
+        xi: (batches, K, 2) positions of events, px.
+        bounds: (batches, K, 2, 2) least and largest displacement within the sensor, px.
+        valid: (batches, K) whether an event is scored.
+        scale: (batches, K) number of candidates that each stands for.
+        rate: (batches, K) candidates per time of age, 1/s.
+        elapsed: (batches,) time from the last event of the batch before to this one's, s.
+        history: (batches,) age up to which all candidates are known, s.
+        normal: (batches, N, d) normal random numbers.
+        uniform: (batches,) uniform random numbers, 0..1.
+        cloud: (N, d) random numbers of a search, -1..1.
+    """
+
+    d: NDArray
     age: NDArray
     xi: NDArray
     bounds: NDArray
@@ -92,7 +133,17 @@ class BatchArrays(NamedTuple):
 
 
 class InfoArrays(NamedTuple):
-    """The arrays of `filtering.BatchInfo`, to be filled."""
+    """Arrays of `filtering.BatchInfo`, to be filled.
+
+    Attributes:
+        mean: (batches, d) before resampling.
+        covariance: (batches, d, d) of the weighted particles.
+        searching: (batches,) whether the motion is searched for.
+        contrast: (batches,) votes relative to chance.
+        lag: (batches,) time by which the observed motion precedes the last event, s.
+        evidence: (batches,) log of the mean likelihood.
+        cloud: (batches, n_cloud, d) some particles, drawn by weight.
+    """
 
     mean: NDArray
     covariance: NDArray
@@ -220,7 +271,7 @@ def _score(context, b, nodes):
     if not searching and _can_interpolate(nodes, d, count):
         lanes = _place_nodes(nodes, work, rows, count)
         lag = _score_events(context, b, lanes)
-        if _interpolate(nodes, work, rows, lanes, count):
+        if _interpolate_log_likelihoods(nodes, work, rows, lanes, count):
             return lag
     order = np.arange(work.shape[1])
     if rows.youngest >= 0 and searching:
@@ -493,7 +544,7 @@ def _place_nodes(nodes, work, rows, count):
 
 
 @njit_inlined
-def _interpolate(nodes, work, rows, lanes, count):
+def _interpolate_log_likelihoods(nodes, work, rows, lanes, count):
     """Interpolate particles' log-likelihoods from those of the nodes.
 
     Args:

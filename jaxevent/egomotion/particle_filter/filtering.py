@@ -35,47 +35,85 @@ MIN_RUN_ESTIMATES = 16  # in a row, from which such means are undone
 
 
 class RandomNumbers(eqx.Module):
-    """All random numbers of some batches."""
+    """All random numbers of some batches.
+
+    Attributes:
+        normal: Normal numbers that move the particles.
+        uniform: Uniform numbers for resampling, 0..1.
+        cloud: Uniform numbers in [-1, 1], for a search that begins in these batches.
+    """
 
     normal: Float[Array, "batches N d"]
     uniform: Float[Array, " batches"]
-    cloud: Float[Array, "N d"]  # in [-1, 1], for a search that begins in these batches
+    cloud: Float[Array, "N d"]
 
 
 class ParticleState(eqx.Module):
-    """State that is carried from batch to batch."""
+    """State that is carried from batch to batch.
+
+    Attributes:
+        particles: Motions, in the units of the model.
+        log_weights: Normalised log weights.
+        searching: Whether the motion is searched for.
+        votes: Recent votes for the particles.
+        chance: Recent votes that are expected by chance.
+        mean_contrast: Mean of votes / chance since the motion was found.
+        age: Batches since then.
+    """
 
     particles: Float[Array, "N d"]
-    log_weights: Float[Array, " N"]  # normalised
+    log_weights: Float[Array, " N"]
     searching: Bool[Array, ""]
-    votes: Float[Array, ""]  # recent votes for the particles
-    chance: Float[Array, ""]  # recent votes that are expected by chance
-    mean_contrast: Float[Array, ""]  # mean of votes / chance since the motion was found
-    age: Float[Array, ""]  # batches since then
+    votes: Float[Array, ""]
+    chance: Float[Array, ""]
+    mean_contrast: Float[Array, ""]
+    age: Float[Array, ""]
 
 
 class BatchInfo(eqx.Module):
-    """Results that are reported for a batch; an axis of batches leads where stacked."""
+    """Results that are reported for a batch; an axis of batches leads where stacked.
 
-    mean: Float[Array, "*batches d"]  # before resampling
-    covariance: Float[Array, "*batches d d"]  # of the weighted particles
+    Attributes:
+        mean: Mean motion before resampling.
+        covariance: Covariance of the weighted particles.
+        searching: Whether the motion is searched for.
+        contrast: Votes relative to chance.
+        lag: Time by which the observed motion precedes the last event, s.
+        evidence: Log of the mean likelihood of the batch.
+        cloud: Some particles, drawn by weight.
+    """
+
+    mean: Float[Array, "*batches d"]
+    covariance: Float[Array, "*batches d d"]
     searching: Bool[Array, "*batches"]
-    contrast: Float[Array, "*batches"]  # votes relative to chance
-    lag: Float[Array, "*batches"]  # s, by which the observed motion precedes the last event
-    evidence: Float[Array, "*batches"]  # log of the mean likelihood of the batch
-    cloud: Float[Array, "*batches n_cloud d"]  # some particles, drawn by weight
+    contrast: Float[Array, "*batches"]
+    lag: Float[Array, "*batches"]
+    evidence: Float[Array, "*batches"]
+    cloud: Float[Array, "*batches n_cloud d"]
 
 
 class BatchTiming(eqx.Module):
-    """Times of a batch, and whether it holds an event."""
+    """Times of a batch, and whether it holds an event.
 
-    elapsed: Float[Array, ""]  # s
-    history: Float[Array, ""]  # s
+    Attributes:
+        elapsed: Time from the last event of the batch before to this one's, s.
+        history: Age up to which all candidates are known, s.
+        has_events: Whether the batch holds an event.
+    """
+
+    elapsed: Float[Array, ""]
+    history: Float[Array, ""]
     has_events: Bool[Array, ""]
 
 
 class BatchLikelihood(eqx.Module):
-    """Likelihood of all events of a batch; see `EventScores`."""
+    """Likelihood of all events of a batch; see `EventScores`.
+
+    Attributes:
+        log_likelihood: Log-likelihood of the batch for each particle.
+        votes: Mean over particles of the sum of votes over events.
+        chance: Votes expected by chance.
+    """
 
     log_likelihood: Float[Array, " N"]
     votes: Float[Array, ""]
@@ -83,7 +121,24 @@ class BatchLikelihood(eqx.Module):
 
 
 class ReweightResult(eqx.Module):
-    """Weights after a batch, and what becomes of the state and the report."""
+    """Weights after a batch, and the changes of the state and the report.
+
+    Attributes:
+        log_weights: Normalised log weights.
+        mean: Mean motion.
+        covariance: Covariance of the particles.
+        contrast: Votes relative to chance.
+        evidence: Log of the mean likelihood of the batch.
+        is_finite: Whether the weights are finite.
+        lost: Whether the motion is lost.
+        reported_searching: Whether the report says that the motion is searched for.
+        searching: Whether it is in the state after the batch.
+        resample: Whether to resample the particles.
+        votes: Recent votes for the particles.
+        chance: Recent votes that are expected by chance.
+        mean_contrast: Mean of votes / chance since the motion was found.
+        age: Batches since then.
+    """
 
     log_weights: Float[Array, " N"]
     mean: Float[Array, " d"]
@@ -93,7 +148,7 @@ class ReweightResult(eqx.Module):
     is_finite: Bool[Array, ""]
     lost: Bool[Array, ""]
     reported_searching: Bool[Array, ""]
-    searching: Bool[Array, ""]  # in the state
+    searching: Bool[Array, ""]
     resample: Bool[Array, ""]
     votes: Float[Array, ""]
     chance: Float[Array, ""]
@@ -330,7 +385,13 @@ def restart(
 
 
 class BatchNoise(eqx.Module):
-    """Random numbers of one batch, see `RandomNumbers`."""
+    """Random numbers of one batch, see `RandomNumbers`.
+
+    Attributes:
+        normal: Normal numbers that move the particles.
+        uniform: Uniform number for resampling, 0..1.
+        cloud: Uniform numbers in [-1, 1], for a search that begins in this batch.
+    """
 
     normal: Float[Array, "N d"]
     uniform: Float[Array, ""]

@@ -27,16 +27,31 @@ CANDIDATES_PER_BLOCK = 8  # candidates per event that are scored together
 
 
 class EventScores(NamedTuple):
-    """Log-likelihoods of a batch for all particles, and votes compared with chance."""
+    """Log-likelihoods of a batch for all particles, and votes compared with chance.
+
+    Attributes:
+        log_likelihood: Log-likelihood of each event for each particle.
+        votes: Mean over particles of the sum of votes over events.
+        chance: Votes expected by chance.
+        lag: Time by which the observed motion precedes the last event, s.
+    """
 
     log_likelihood: Float[Array, "K N"]
-    votes: Float[Array, ""]  # mean over particles, sum over events
-    chance: Float[Array, ""]  # votes expected by chance
-    lag: Float[Array, ""]  # s
+    votes: Float[Array, ""]
+    chance: Float[Array, ""]
+    lag: Float[Array, ""]
 
 
 class Event(eqx.Module):
-    """One event, or K, without its candidates; see `Candidates`."""
+    """One event, or K, without candidates; see `Candidates`.
+
+    Attributes:
+        xi: Positions, px.
+        bounds: Least and largest displacement within the sensor, px.
+        valid: Whether the event is scored.
+        scale: Number of candidates that each stands for.
+        rate: Candidates per time of age, 1/s.
+    """
 
     xi: Float[Array, "*K 2"]
     bounds: Float[Array, "*K 2 2"]
@@ -54,25 +69,45 @@ class CommonRange(eqx.Module):
 
 
 class AgeRange(eqx.Module):
-    """Least and largest age of the candidates that vote, s."""
+    """Least and largest age of the candidates that vote.
+
+    Attributes:
+        youngest: Least age, s.
+        oldest: Largest age, s.
+    """
 
     youngest: Float[Array, "*K_N"]
     oldest: Float[Array, "*K_N"]
 
 
 class Votes(eqx.Module):
-    """Expectations of particles for the candidates of an event, or K, before they vote."""
+    """Expectations of particles for the candidates of an event, or K, before they vote.
 
-    U: Float[Array, "*K 2 N"]  # px/s
-    line: Float[Array, "*K 2 N"] | None  # direction of the half-line
+    Attributes:
+        U: Flow, px/s.
+        line: Direction of the half-line; None: there is none.
+        ages: Ages of the candidates that vote.
+        rate: Factor of the votes in a band; else 1.
+        counts: Whether the event counts.
+        tau: Largest age of candidates that vote, s.
+    """
+
+    U: Float[Array, "*K 2 N"]
+    line: Float[Array, "*K 2 N"] | None
     ages: AgeRange
-    rate: Float[Array, "*K_N"]  # factor of the votes in a band; else 1
-    counts: Bool[Array, "*K"]  # whether the event counts
-    tau: Float[Array, "*K"]  # s
+    rate: Float[Array, "*K_N"]
+    counts: Bool[Array, "*K"]
+    tau: Float[Array, "*K"]
 
 
 class EventLikelihood(NamedTuple):
-    """Log-likelihoods of an event, or K, for all particles, and votes compared with chance."""
+    """Log-likelihoods of an event, or of K, for all particles, and votes compared with chance.
+
+    Attributes:
+        log_likelihood: Log-likelihood for each particle.
+        votes: Mean over particles of the votes.
+        chance: Votes expected by chance.
+    """
 
     log_likelihood: Float[Array, "*K N"]
     votes: Float[Array, "*K"]
@@ -227,7 +262,7 @@ def init_votes(
     weights: Float[Array, " N"],
     searching: Bool[Array, ""] | bool,
 ) -> Votes:
-    """Compute what each particle expects of the candidates of one event.
+    """Compute each particle's expectation of the candidates of one event.
 
     Args:
         params: The parameters.

@@ -54,13 +54,13 @@ def estimate_common_motion(
     if _deviation(_subtract_parabola(steps, s)) < MIN_DEVIATION_PX:
         return None
     L = pyramid[SEARCH_LEVEL][..., 0]
-    starts = [_search(L[k], L[k + 1]) * 2**SEARCH_LEVEL for k in pairs]
+    starts = [_find_shift(L[k], L[k + 1]) * 2**SEARCH_LEVEL for k in pairs]
     steps = [_register(pyramid, k, starts[k], FINE_LEVELS, cost) for k in pairs]
     rest = _subtract_parabola(steps, s)
     return CommonMotion(t, rest) if _deviation(rest) > MIN_DEVIATION_PX else None
 
 
-def _search(image: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float64]:
+def _find_shift(image: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float64]:
     """Find the whole pixels by which one image best fits another one.
 
     Args:

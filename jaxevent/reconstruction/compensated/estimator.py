@@ -93,17 +93,28 @@ MAX_PIXELS_AT_ONCE = 1 << 19
 
 
 class PreparedTarget(NamedTuple):
-    """The instants of a target, and the motion of its points; of several, stacked."""
+    """The instants of a target, and the motion of its points; of several, stacked.
 
-    rows: Int[Numeric, "*times k"]  # its instants among all
+    Attributes:
+        rows: Indices of its instants among all.
+        layout: Layout of its instants.
+        noise_rows: Rows of `PreparedTargets.noise` of its instants.
+        noise_shape: See `event_noise.InstantPlaces.shape`.
+        p: Trajectories of nodes, px.
+        path_index: Flat index of the pixel whose path each pixel takes.
+        exposures: Exposures of the frames next to the target.
+        steady: 1 where frames keep their brightness, else 0.
+        brightness: Brightness of the target beside that of the frames.
+    """
+
+    rows: Int[Numeric, "*times k"]
     layout: InstantLayout
-    # Rows of `PreparedTargets.noise` of its instants, and `event_noise.InstantPlaces.shape`.
     noise_rows: Int[Numeric, "*times k"]
     noise_shape: Float[Numeric, "*times k"]
-    p: Float[Numeric, "*times rows columns 4"]  # trajectories of nodes, px
-    path_index: Int[Numeric, "*times h w"]  # the pixel whose path each one takes
+    p: Float[Numeric, "*times rows columns 4"]
+    path_index: Int[Numeric, "*times h w"]
     exposures: AdjacentExposures
-    steady: Float[Numeric, "*times"]  # 1 where frames keep their brightness, else 0
+    steady: Float[Numeric, "*times"]
     brightness: BrightnessPrior
 
 
@@ -123,7 +134,7 @@ class PreparedTargets(ShortRepr):
 
 
 @jax.jit
-def _carry(images: Array, times: PathTimes, paths: Array) -> Array:
+def _warp_images(images: Array, times: PathTimes, paths: Array) -> Array:
     """Read images along trajectories.
 
     Args:
@@ -226,7 +237,7 @@ class CompensatedVideo(ImageSequence[Params]):
             yield target
 
     def _begin(self, t: int) -> Callable[[], Target]:
-        """Begin the target at a time (us); return what refines it, on any thread."""
+        """Begin the target at a time (us); return the function that refines it, on any thread."""
         latest = self._latest
         if latest is not None and latest.t == t:
             return lambda: latest
@@ -302,7 +313,7 @@ class CompensatedVideo(ImageSequence[Params]):
         if target.smooth is not None:
             L, M = L - gaussian_blur(L), M - gaussian_blur(M)
         warped = warp_images(L, V, clear, there, target.paths)
-        carried = _carry(np.asarray(images, np.float32), there, target.paths)
+        carried = _warp_images(np.asarray(images, np.float32), there, target.paths)
         return np.asarray(carried), np.asarray(_visibility(self.params, M, warped))
 
     @synchronized

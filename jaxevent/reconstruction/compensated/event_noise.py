@@ -106,7 +106,7 @@ class EventNoise:
         if interval in self._cache:
             self._cache.move_to_end(interval)
         else:
-            self._cache[interval] = self._measure(interval)
+            self._cache[interval] = self._measure_interval(interval)
             if len(self._cache) > N_CACHED_INTERVALS:
                 self._cache.popitem(last=False)
         return self._cache[interval]
@@ -128,7 +128,7 @@ class EventNoise:
                 V[k] *= noise.factor
                 V[k] += shape * noise.excess
 
-    def _measure(self, interval: int) -> IntervalNoise:
+    def _measure_interval(self, interval: int) -> IntervalNoise:
         size = self._images.image_shape
         if len(self._frames) < 2:
             return IntervalNoise(np.ones(size, np.float32), np.zeros(size, np.float32), 1.0)

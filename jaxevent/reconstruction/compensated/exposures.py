@@ -58,13 +58,21 @@ SPEED_MARGIN = 2.0  # times the measured speed, for which exposures are sampled
 
 
 class AdjacentExposures(NamedTuple):
-    """Exposures of the n frames next to a target: before, and after or at its time."""
+    """Exposures of the n frames next to a target: before, and after or at its time.
 
-    frame: Int[Numeric, " n"]  # index in the recording
-    s: Float[Numeric, " n"]  # mid-exposures, relative to the target as `InstantLayout.s`
-    half: Float[Numeric, " n"]  # half of the exposures, on the same clock
-    present: Float[Numeric, " n"]  # 1, or 0 where there is none
-    # Along x and y, px: common displacement of all points, and its change over `half`.
+    Attributes:
+        frame: Index of the frame in the recording.
+        s: Mid-exposure relative to the target, as `InstantLayout.s`.
+        half: Half of the exposure, on the same clock.
+        present: 1, or 0 where there is no frame.
+        common: Common displacement of all points along x and y, px.
+        drift: Change of the common displacement over `half`, px.
+    """
+
+    frame: Int[Numeric, " n"]
+    s: Float[Numeric, " n"]
+    half: Float[Numeric, " n"]
+    present: Float[Numeric, " n"]
     common: Float[Numeric, "n 2"]
     drift: Float[Numeric, "n 2"]
 
@@ -75,7 +83,15 @@ class AdjacentExposures(NamedTuple):
 
 
 class AdjacentFrames(NamedTuple):
-    """The images of these frames as the camera gave them, as in `features.FrameFeatures`."""
+    """Images of the n frames next to a target as the camera gave them.
+
+    Attributes:
+        grey: Grey values, see `features.FrameFeatures`.
+        intensity: Intensity.
+        response: Camera response by grey value.
+        gain: Brightness of each frame relative to one in which intensity 1 is white.
+        white: Ends of the grey values beyond which pixels are clipped; None: not known.
+    """
 
     grey: Float[Numeric, "n pixels"]
     intensity: Float[Numeric, "n pixels"]
@@ -94,9 +110,15 @@ class _FrameEvidence(NamedTuple):
 
 
 class _ClippedSide(NamedTuple):
-    """Clipped pixels as `smoother.one_sided_message` reads them."""
+    """Clipped pixels as `smoother.one_sided_message` reads them.
 
-    side: Float[Array, "n h w"]  # +1, -1: B lies above, below `bound`; 0: nothing known
+    Attributes:
+        side: +1, -1: B lies above, below `bound`; 0: nothing is known.
+        bound: Bound of the log intensity.
+        excess: Expected log intensity beyond the bound; None: not known.
+    """
+
+    side: Float[Array, "n h w"]
     bound: Float[Array, "n h w"]
     excess: Float[Array, "n #h #w"] | None
 
@@ -289,7 +311,7 @@ def blur_by_motion_adjoint(error: NDArray, shares: NDArray, D: NDArray) -> NDArr
 
 
 def exposure_displacements(exposures: AdjacentExposures, paths: Array, samples: int) -> Array:
-    """Return how far points move from mid-exposure to the samples of each exposure.
+    """Return the displacements of points from mid-exposure to the samples of each exposure.
 
     Args:
         exposures: The n exposures.
@@ -355,7 +377,7 @@ def clipped_part(params: Params, model: ExposureModel) -> Array | None:
 
 
 def clipped_variance(params: Params, fused: FusedImage, model: ExposureModel) -> Array:
-    """Return the variance of an image, no less than events alone can tell of points at white.
+    """Return the variance of an image, at white no less than that by events alone.
 
     A point that all frames next to the target show clipped is known by events, to within a
     threshold, and by frames that showed it darker, if they did: no evidence that it is as dark.
@@ -490,7 +512,7 @@ def constrain_image_jax(
     return dataclasses.replace(fused, L=image, P=P)
 
 
-def _single(values: Any) -> NDArray[np.float32]:
+def _to_float32(values: Any) -> NDArray[np.float32]:
     return np.asarray(values, np.float32)
 
 
@@ -515,15 +537,15 @@ def constrain_image(
         The image with other `L` and `P`.
     """
     fused = dataclasses.replace(fused, P=_compiled_variance(params, fused, model))
-    L, P = _single(fused.L), _single(fused.P)
-    D = _single(_compiled_displacements(model.exposures, model.paths, samples))
+    L, P = _to_float32(fused.L), _to_float32(fused.P)
+    D = _to_float32(_compiled_displacements(model.exposures, model.paths, samples))
     B, _ = blur_by_motion(L, D)
     evidence, image = _compiled_evidence(params, model, D, B, fused), L
     for _ in range(N_CONSTRAINT_STEPS):
         B, shares = blur_by_motion(image, D)
-        pull, information = map(_single, _compiled_pull(params, evidence, B))
+        pull, information = map(_to_float32, _compiled_pull(params, evidence, B))
         back = blur_by_motion_adjoint(pull, shares, D)
         image = image + ((L - image) / P + back) / (1 / P + information)
     B, _ = blur_by_motion(image, D)
-    P = P + _single(params.smear) * _single(_compiled_squared_blur(evidence, image, B))
+    P = P + _to_float32(params.smear) * _to_float32(_compiled_squared_blur(evidence, image, B))
     return dataclasses.replace(fused, L=jnp.asarray(image), P=jnp.asarray(P))

@@ -37,38 +37,53 @@ MIN_SQUARED_DIFFERENCE = 1e-4  # (ln I)^2, below which features do not distingui
 # chosen on cut recordings of the scenes that HDR parameters are fitted to. The same of one frame,
 # where frames are on one side alone: of 0.1, 0.03 and 0.01 chosen with the last images of slow pans
 # of the scenes that are scored in view, where clipped pixels had most of the error.
-CLIPPED_VARIANCE, CLIPPED_VARIANCE_BEYOND = 0.1, 0.03
+MAX_IN_PLACE_VARIANCE, MAX_IN_PLACE_VARIANCE_BEYOND = 0.1, 0.03
 MAX_STATIONARY_PX = 0.25  # motion over all instants of a point that stays in its place
 NOISE_EVENT_SIGMA_PX = 4.0  # of the Gaussian around a pixel in which a noise event is alone
 
 
-class ReferenceImages(NamedTuple):
-    """Images that the robust mean is compared with, each (h, w), and numbers of the target, ()."""
+class FusionInputs(NamedTuple):
+    """A target's images beside the robust mean, each (h, w), and its numbers, ().
 
-    target: Float[Numeric, "h w"]  # the target's own image, in place
-    V: Float[Numeric, "h w"]  # its variance
-    blend_variance: Float[Numeric, "h w"]  # of the blend of the two frames, in place
-    # Of the frames before and after, in place. Where frames are on one side alone `before` is that,
-    # and `after` the target's own image: what is known at the other end.
+    Attributes:
+        target: The target's own image in place, log intensity.
+        V: Its variance, (ln I)^2.
+        blend_variance: Variance of the blend of the two frames in place, (ln I)^2.
+        before: The frame before in place; where frames are on one side alone, that one.
+        after: The frame after in place; where frames are on one side alone, the target's own image.
+        frame_difference: Squared difference of the frames `before` and `other` of the layout, along
+            trajectories.
+        in_both: 1 where both are inside the image, else 0.
+        inside_before: 1, or 0 beyond the border of the frame before.
+        inside_after: 1, or 0 beyond the border of the frame after.
+        after_weight: Weight of the frame after in the blend of the two.
+        beyond: 1 where frames are on one side of the target alone, else 0.
+        rest: See `TargetInstants.rest`.
+        squared_reach: Squared displacement of points, px^2, (h, w) or (); see `warp.squared_reach`.
+        intervals_away: Distance of the target from the nearest frame, in intervals from that to
+            `other`, where frames are on one side alone; else 1.
+        noise: Factor on the variance of the events' images, (h, w) or (); see
+            `event_noise.IntervalNoise`.
+    """
+
+    target: Float[Numeric, "h w"]
+    V: Float[Numeric, "h w"]
+    blend_variance: Float[Numeric, "h w"]
     before: Float[Numeric, "h w"]
     after: Float[Numeric, "h w"]
-    # Squared difference of the frames `before` and `other` of the layout, along trajectories.
     frame_difference: Float[Numeric, "h w"]
-    in_both: Float[Numeric, "h w"]  # 1 where both are inside the image, else 0
-    inside_before: Float[Numeric, "h w"]  # 1, or 0 beyond the image's border
+    in_both: Float[Numeric, "h w"]
+    inside_before: Float[Numeric, "h w"]
     inside_after: Float[Numeric, "h w"]
-    after_weight: Numeric  # of the frame after in the blend of the two
-    beyond: Numeric  # 1 where frames are on one side of the target alone, else 0
-    rest: Numeric  # `TargetInstants.rest`
-    squared_reach: Numeric | float  # px^2, (h, w) or (); see `warp.squared_reach`
-    # Distance of the target from the nearest frame, in intervals from that to `other`, where frames
-    # are on one side alone; else 1.
+    after_weight: Numeric
+    beyond: Numeric
+    rest: Numeric
+    squared_reach: Numeric | float
     intervals_away: Numeric
-    # Factor on the variance of the events' images, (h, w) or (); `event_noise.IntervalNoise`.
     noise: Numeric | float = 1.0
 
 
-def reference_images(
+def fusion_inputs(
     L: Numeric,
     V: Numeric,
     warped: WarpedImages,
@@ -76,7 +91,7 @@ def reference_images(
     squared_reach: Numeric | float = np.inf,
     *,
     noise: Numeric | float = 1.0,
-) -> ReferenceImages:
+) -> FusionInputs:
     """Collect the images that the robust mean is compared with.
 
     Args:
@@ -95,7 +110,7 @@ def reference_images(
     beyond = jnp.where(a == b, jnp.float32(1), 0)
     weight = after_weight(layout)
     interval = jnp.where(a == c, 1, abs(layout.s[a] - layout.s[c]))
-    return ReferenceImages(
+    return FusionInputs(
         target=L[layout.target],
         V=V[layout.target],
         blend_variance=(1 - weight) ** 2 * V[a] + weight**2 * V[b],
@@ -139,14 +154,14 @@ class FusionFeatures(ShortRepr):
     shares: Float[Array, "3 h w"]  # of the mean along trajectories: frames before, after, events
     visible: Float[Array, "2 h w"]  # as in `FusedImage`
     image_variance: Float[Array, "h w"]  # of single images along trajectories
-    beyond: Float[Array, ""]  # as in `ReferenceImages`
+    beyond: Float[Array, ""]  # as in `FusionInputs`
     rest: Float[Array, ""]
     stationary: Float[Array, "..."]  # 1 where points stay in their places, else 0
-    intervals_away: Float[Array, ""]  # as in `ReferenceImages`
-    noise: Float[Array, "..."]  # as in `ReferenceImages`
+    intervals_away: Float[Array, ""]  # as in `FusionInputs`
+    noise: Float[Array, "..."]  # as in `FusionInputs`
 
 
-def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures:
+def fusion_features(mean: RobustMean, images: FusionInputs) -> FusionFeatures:
     """Compute the candidates and the features by which `fuse_candidates` blends them.
 
     Args:
@@ -194,7 +209,7 @@ def fusion_features(mean: RobustMean, images: ReferenceImages) -> FusionFeatures
         for n in FEATURE_NAMES
     ]
     beyond = jnp.asarray(images.beyond)
-    clipped = jnp.where(beyond > 0, CLIPPED_VARIANCE_BEYOND, CLIPPED_VARIANCE)
+    clipped = jnp.where(beyond > 0, MAX_IN_PLACE_VARIANCE_BEYOND, MAX_IN_PLACE_VARIANCE)
     squared_reach = jnp.asarray(images.squared_reach, jnp.float32)
     return FusionFeatures(
         candidates=jnp.stack([M, images.target, blend]),
@@ -240,10 +255,10 @@ def fuse_candidates(params: Params, given: FusionFeatures) -> FusedImage:
     quiet = MIN_SQUARED_DIFFERENCE / jnp.exp(X[FEATURE_NAMES.index("activity")])
     # A point that stays where nothing happens is in its pixel's smoother with all frames, not only
     # with those around the target.
-    q = _shift_weight(q, given.stationary * given.in_place * quiet / given.noise, 1)
+    q = _move_weight_to(q, given.stationary * given.in_place * quiet / given.noise, 1)
     # At rest it is as the frame shows it, also where a noise event is alone.
     alone = gaussian_blur(quiet, NOISE_EVENT_SIGMA_PX)
-    q = _shift_weight(q, given.rest * jnp.maximum(quiet, alone), 2)
+    q = _move_weight_to(q, given.rest * jnp.maximum(quiet, alone), 2)
     features = variance_features(X, given.in_place, beyond, given.intervals_away)
     weights = jnp.where(beyond, params.doubt_beyond, params.doubt)
     P = jnp.exp(jnp.tensordot(weights, features, 1))
@@ -281,7 +296,7 @@ def variance_features(X: Array, in_place: Array, beyond: Array, intervals_away: 
     return jnp.stack(rows)
 
 
-def _shift_weight(q: list[Array], part: Array, to: int) -> list[Array]:
+def _move_weight_to(q: list[Array], part: Array, to: int) -> list[Array]:
     """Give a part of the weights of all candidates to one of them.
 
     Args:
@@ -322,5 +337,5 @@ def fuse(
     L, V = jnp.asarray(L), jnp.asarray(V)
     warped, layout = jax.tree.map(jnp.asarray, (warped, layout))
     mean = robust_mean_jax(params, L, warped, layout)
-    images = reference_images(L, V, warped, layout, squared_reach, noise=noise)
+    images = fusion_inputs(L, V, warped, layout, squared_reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, images))

@@ -70,7 +70,7 @@ class InstantSmoother(Smoother[Params]):
 
     has_unseen_errors: ClassVar[bool] = False  # the fusion has a variance of its own
 
-    def frame_info(
+    def readout_inputs(
         self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any
     ) -> FrameLevels:
         z, V = measured.z, (params.sigma_pixel * measured.slope) ** 2 + 1e-4

@@ -159,7 +159,7 @@ def fit_motion_clock(
 
 
 def common_motion_fraction(counts: NDArray[np.floating]) -> float:
-    """Estimate how far the parts of the image move in common.
+    """Estimate the fraction of the motion that all parts of the image have in common.
 
     Returns the slope of a regression: of the deviation of a part's rate of events from a constant
     one, on that of all other parts.
@@ -237,7 +237,7 @@ class CommonMotion:
         Returns:
             (n, 2) along x and y, px.
         """
-        moved = self._interpolate(np.append(times, start))
+        moved = self._displacement_at(np.append(times, start))
         return (moved[:-1] - moved[-1]).astype(np.float32)
 
     def velocity(self, time: int, span: int) -> NDArray[np.float32]:
@@ -250,33 +250,45 @@ class CommonMotion:
         Returns:
             (2,) along x and y, px/s.
         """
-        before, after = self._interpolate(np.array([time - span, time + span]))
+        before, after = self._displacement_at(np.array([time - span, time + span]))
         return ((after - before) / (2e-6 * span)).astype(np.float32)
 
     @functools.cached_property
     def _course(self) -> Akima1DInterpolator:
         return Akima1DInterpolator((self.t - self.t[0]) * 1e-6, self.displacement)
 
-    def _interpolate(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _displacement_at(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
         return self._course((times.clip(self.t[0], self.t[-1]) - self.t[0]) * 1e-6)
 
 
 @dataclasses.dataclass(frozen=True)
 class TargetInstants:
-    """The instants of one target, sorted, and their times on a clock."""
+    """The instants of one target, sorted, and their times on a clock.
 
-    t: NDArray[np.int64]  # us
-    target: int  # index of the target
-    before: int  # index of the nearest frames; where there is none on a side, the other one
+    Attributes:
+        t: (K,) times of the instants, us.
+        target: Index of the target.
+        before: Index of the nearest frame before; where there is none, of the one after.
+        after: Index of the nearest frame after; where there is none, of the one before.
+        s: (K,) times relative to the target on the clock, -1..1.
+        unit: Time that 1 stands for, s.
+        first_horizon: Horizon at which motion is first estimated, in units of `s`.
+        clock: The clock.
+        rest: 1 where the scene is at rest between the target and frames on one side of it alone,
+            else 0; 0 where frames are on both sides.
+        common: Motion common to all points, which trajectories do not explain; None: none is known.
+    """
+
+    t: NDArray[np.int64]
+    target: int
+    before: int
     after: int
-    s: NDArray[np.float32]  # times relative to the target on the clock, -1..1
-    unit: float  # s, what 1 stands for
-    first_horizon: float  # in units of `s`, at which motion is first sought
+    s: NDArray[np.float32]
+    unit: float
+    first_horizon: float
     clock: MotionClock
-    # 1 where the scene is at rest between the target and frames on one side of it alone, else 0;
-    # 0 where frames are on both sides.
     rest: float = 0.0
-    common: CommonMotion | None = None  # of all points, which trajectories do not explain
+    common: CommonMotion | None = None
 
     @functools.cached_property
     def path_times(self) -> PathTimes:
@@ -369,7 +381,7 @@ class InstantSchedule:
         frames = self.frames
         right = int(np.searchsorted(frames, t, "right"))  # of frames at t, none is left or right
         left = int(np.searchsorted(frames, t, "left"))
-        times = np.array(sorted({t, *self._near_frames(t), *self._grid(t)}), np.int64)
+        times = np.array(sorted({t, *self._near_frames(t), *self._grid_times(t)}), np.int64)
         target = int(np.searchsorted(times, t))
         nearest = [
             int(np.searchsorted(times, frames[k]))
@@ -401,7 +413,7 @@ class InstantSchedule:
                 chosen.add(int(frames[k]))
         return chosen
 
-    def _grid(self, t: int) -> set[int]:
+    def _grid_times(self, t: int) -> set[int]:
         """Return the times (us) of a common grid, between the frames next to a time (us)."""
         frames, step, (first, last) = self.frames, self.step, self.span
         right = int(np.searchsorted(frames, t, "right"))

@@ -47,14 +47,23 @@ CG_ITERATIONS, BICGSTAB_ITERATIONS = 30, 8
 
 
 class CostParams(NamedTuple):
-    """Parameters of the cost that trajectories minimise; `Params` has their meanings."""
+    """Parameters of the cost that trajectories minimise; `Params` has their meanings.
 
-    floor: Numeric  # (ln I)^2
+    Attributes:
+        floor: Least variance of an image read between pixels, (ln I)^2.
+        robust: Standardised squared residual beyond which weights fall.
+        smooth: Weight of differences between nodes, 1 / px^2.
+        jump: Difference of motion beyond which costs are linear, px.
+        edge: Gradient across which motion may change, ln I / px.
+        straight: Weight of acceleration, 1 / px^2.
+    """
+
+    floor: Numeric
     robust: Numeric
-    smooth: Numeric  # 1 / px^2
-    jump: Numeric  # px
-    edge: Numeric  # ln I / px
-    straight: Numeric  # 1 / px^2
+    smooth: Numeric
+    jump: Numeric
+    edge: Numeric
+    straight: Numeric
 
     @classmethod
     def of(cls, params: Params, convert: Callable[[Any], Any] = np.float32) -> "CostParams":
@@ -71,11 +80,20 @@ class CostParams(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """The equations of all nodes at some trajectories."""
+    """The equations of all nodes at some trajectories.
 
-    N: Float[Numeric, "rows columns *matrix"]  # (4, 4), or the 10 entries of its upper triangle
+    Attributes:
+        N: (4, 4) matrix of each node, or the 10 entries of its upper triangle.
+        b: Right-hand side of each node.
+        across: Weights of differences with the node right; for numba (rows, columns).
+        down: Weights of differences with the node below; for numba (rows, columns).
+        smooth: Weight of the differences of each component.
+        ridge: Weight of the square of each component.
+    """
+
+    N: Float[Numeric, "rows columns *matrix"]
     b: Float[Numeric, "rows columns 4"]
-    across: Float[Numeric, "rows columns-1"]  # weights of differences; numba: (rows, columns)
+    across: Float[Numeric, "rows columns-1"]
     down: Float[Numeric, "rows-1 columns"]
     smooth: Float[Numeric, " 4"]
     ridge: Float[Numeric, " 4"]
@@ -240,7 +258,7 @@ def _sample_row(y, begin, inputs, scratch, points, means):
 
 
 @njit_noalloc
-def _sample(begin, end, inputs, scratch, out):
+def _sample_rows(begin, end, inputs, scratch, out):
     """Read packed images along the trajectories of some rows of pixels.
 
     Args:
@@ -271,7 +289,7 @@ def sample_trajectories(
     points, M = np.empty((h, 4, count, w), np.float32), np.empty((h, w), np.float32)
     samples = TrajectorySamples(points, M)
     scratch = _SampleScratch.allocate(h, count, w)
-    run_over_rows(_sample, h, (images, p, cost), scratch, samples)
+    run_over_rows(_sample_rows, h, (images, p, cost), scratch, samples)
     return samples
 
 
@@ -774,7 +792,7 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
     return NormalEquations(N, b, weights(1), weights(0), cost.smooth * jnp.ones(4, p.dtype), ridge)
 
 
-def _pull(eq: NormalEquations, q: Array) -> Array:
+def _apply_smoothness(eq: NormalEquations, q: Array) -> Array:
     """Return (smooth Laplacian + ridge) q.
 
     Args:
@@ -803,7 +821,7 @@ def normal_equation_residual(p: Array, images: MotionImages, cost: CostParams) -
         F, (rows, columns, 4).
     """
     eq = linearise_jax(p, images, cost)
-    return eq.b - _pull(eq, p)
+    return eq.b - _apply_smoothness(eq, p)
 
 
 @full_precision
@@ -823,7 +841,7 @@ def _solve_jax(eq: NormalEquations, right: Array) -> Array:
     blocks = jnp.linalg.inv(eq.N + diagonal[..., None] * jnp.eye(4, dtype=right.dtype))
 
     def times(q: Array) -> Array:
-        return jnp.einsum("ijab,ijb->ija", eq.N, q) + _pull(eq, q)
+        return jnp.einsum("ijab,ijb->ija", eq.N, q) + _apply_smoothness(eq, q)
 
     def precondition(q: Array) -> Array:
         return jnp.einsum("ijab,ijb->ija", blocks, q)

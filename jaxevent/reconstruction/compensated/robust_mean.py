@@ -323,19 +323,34 @@ def blur_image(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float3
 
 
 class _MeanInputs(NamedTuple):
-    """Inputs of the kernels of `robust_mean`."""
+    """Inputs of the kernels of `robust_mean`.
 
-    L: NDArray[np.float32]  # (K, h, w), in place
+    Attributes:
+        L: (K, h, w) log intensity in place.
+        warped: The images along trajectories.
+        layout: Layout of the instants, with indices as int.
+        weights: (K,) weights with which the mean begins.
+        taps: Taps of the Gaussian filter.
+        low: First instant of the range of activity.
+        high: Instant after its last one.
+        information: Weight of an instant without frame.
+        floor: Least variance of an image read between pixels, (ln I)^2.
+        place_variance: Variance of the positions of points, px^2.
+        between_variance: Variance between pixels, (ln I)^2.
+        tolerance: Standardised squared difference beyond which a point is hidden.
+    """
+
+    L: NDArray[np.float32]
     warped: WarpedImages
-    layout: InstantLayout  # indices are int
-    weights: NDArray[np.float32]  # (K,), with which the mean begins
+    layout: InstantLayout
+    weights: NDArray[np.float32]
     taps: NDArray[np.float32]
-    low: int  # range of activity
+    low: int
     high: int
     information: np.float32
     floor: np.float32
-    place_variance: np.float32  # px^2, of the place of points
-    between_variance: np.float32  # (ln I)^2, between pixels
+    place_variance: np.float32
+    between_variance: np.float32
     tolerance: np.float32
 
 
@@ -371,7 +386,7 @@ def _fill_variance(inputs, k, y, steepness, out):
 
 @njit_noalloc_inlined
 def _fill_visibility(residual, tolerance, most, out):
-    """Write how far points are visible, by residuals around them.
+    """Write the visibility of points, by residuals around them.
 
     Args:
         residual: (w,) blurred squared residuals in units of their variance.
@@ -511,7 +526,7 @@ def _add_excess(inputs, k, y, residual, variance, sums):
 
 @njit_noalloc
 def _finish(begin, end, inputs, scratch, out):
-    """Write all but the scatter of some rows, and what the scatter is gathered from.
+    """Write all outputs but the scatter of some rows, and the sums for the scatter.
 
     Args:
         begin: First row.

@@ -23,7 +23,7 @@ from jaxevent.reconstruction.compensated.fusion import (
     after_weight,
     fuse_candidates,
     fusion_features,
-    reference_images,
+    fusion_inputs,
 )
 from jaxevent.reconstruction.compensated.images import (
     BrightnessPrior,
@@ -153,12 +153,18 @@ class NodeMotion(NamedTuple):
         return p
 
 
-class SoughtMotion(NamedTuple):
-    """The motion of a target's points on two clocks, and on which of them frames agree better."""
+class TwoClockMotion(NamedTuple):
+    """The motion of a target's points on two clocks, and on which of them frames agree better.
 
-    on_clock: NodeMotion  # of the schedule
+    Attributes:
+        on_clock: Motion on the schedule's clock.
+        on_time: Motion on the clock of time.
+        evidence: Log of the cost on time over the cost on the schedule's clock.
+    """
+
+    on_clock: NodeMotion
     on_time: NodeMotion
-    evidence: float  # for the schedule's clock: log of the cost on time over the cost on that clock
+    evidence: float
 
     def on(self, timed: bool) -> NodeMotion:
         """Return the motion on the clock of time, or on the schedule's."""
@@ -166,7 +172,7 @@ class SoughtMotion(NamedTuple):
 
 
 class Anchor(NamedTuple):
-    """A target whose motion was sought from nothing, and its image."""
+    """A target whose motion was estimated without an initial value, and its image."""
 
     motion: NodeMotion  # at full resolution
     L: NDArray[np.float32]  # (h, w), ln I
@@ -175,17 +181,27 @@ class Anchor(NamedTuple):
 
 
 class TrajectoryEstimate(NamedTuple):
-    """A target, the images at its instants, and the motion of its points."""
+    """A target, the images at its instants, and the motion of its points.
+
+    Attributes:
+        instants: The instants.
+        L: (K, h, w) log intensity.
+        V: (K, h, w) its variance, (ln I)^2.
+        clear: (K, h, w) 1 where a frame shows the pixel unclipped, else 0.
+        p: (rows, columns, 4) trajectories of nodes, px at s = 1.
+        path_index: (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
+        smooth: (K, h, w) smooth part that was subtracted from `L`; None: nothing was.
+        noise: (h, w) or (), as of `fusion.FusionInputs`.
+    """
 
     instants: TargetInstants
-    L: NDArray[np.float32]  # (K, h, w), log intensity
-    V: NDArray[np.float32]  # (K, h, w), its variance
-    clear: NDArray[np.float32]  # (K, h, w), 1 where a frame shows the pixel unclipped
-    p: NDArray[np.float32]  # (rows, columns, 4), of nodes, px at s = 1
-    # (h, w), as of `trajectories.select_paths`; None: each pixel takes its own path.
+    L: NDArray[np.float32]
+    V: NDArray[np.float32]
+    clear: NDArray[np.float32]
+    p: NDArray[np.float32]
     path_index: NDArray[np.int32] | None = None
-    smooth: NDArray[np.float32] | None = None  # (K, h, w), subtracted from L; None: nothing is
-    noise: NDArray[np.float32] | float = 1.0  # (h, w), as of `fusion.ReferenceImages`
+    smooth: NDArray[np.float32] | None = None
+    noise: NDArray[np.float32] | float = 1.0
 
     @property
     def paths(self) -> NDArray[np.float32]:
@@ -208,7 +224,7 @@ class InitialTarget(NamedTuple):
 
     instants: TargetInstants
     images: InstantStack
-    noise: NDArray[np.float32] | float  # (h, w), as of `fusion.ReferenceImages`
+    noise: NDArray[np.float32] | float  # (h, w), as of `fusion.FusionInputs`
     # (rows, columns, 4), trajectories of nodes known beforehand, px; None: those of anchors.
     known: NDArray[np.float32] | None
     anchor: Anchor | None
@@ -294,8 +310,11 @@ class TrajectoryEstimator:
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
         self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
         cached = functools.lru_cache(N_CACHED_ANCHORS)  # by their times
-        self._anchor, self._sought_motion = cached(self._make_anchor), cached(self._seek_motion)
-        self._frame_motion = cached(self._seek_by_frames)
+        self._anchor, self._anchor_motion = (
+            cached(self._make_anchor),
+            cached(self._estimate_anchor_motion),
+        )
+        self._frame_motion = cached(self._estimate_frame_motion)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
         self._latest: tuple[NDArray[np.int64], Any] | None = None  # times, and images
         self._anchors: list[int] = []  # times of those whose images were read last, us
@@ -324,7 +343,7 @@ class TrajectoryEstimator:
         interval, shape = self.event_noise.locate(np.array([t]))
         return self.event_noise(int(interval[0])).factor if shape[0] > 0 else 1.0
 
-    def _cautious(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
+    def _raise_variance(self, V: NDArray, clear: NDArray) -> NDArray[np.float32]:
         """Raise variances for the estimation of motion, except of pixels that frames show.
 
         Args:
@@ -355,20 +374,20 @@ class TrajectoryEstimator:
         beside = place + (1 if t >= times[place] else -1)
         return [times[n] for n in (place, beside) if 0 <= n < count]
 
-    def _seek_motion(self, at: int) -> SoughtMotion:
-        """Seek the motion of the target at a time (us) from nothing, at half resolution."""
+    def _estimate_anchor_motion(self, at: int) -> TwoClockMotion:
+        """Estimate a target's motion without an initial value, at half resolution."""
         instants = self.schedule(at)
         L, V, clear, _ = self._images(instants)
-        pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
-        p = self._seek(pyramid, instants.path_times, instants.first_horizon)
+        pyramid = ImagePyramid(L, self._raise_variance(V, clear), PYRAMID_VARIANCE_FACTOR)
+        p = self._estimate_trajectories(pyramid, instants.path_times, instants.first_horizon)
         doubt = 1 - self.event_noise.trust(at) ** 4
-        other = self._motion_of_frames(at) if doubt > MIN_DOUBT else None
+        other = self._motion_between_frames(at) if doubt > MIN_DOUBT else None
         if other is not None:
             images = PackedImages.of(pyramid[1], instants.path_times.at_level(1))
             several = p, other.carry(instants)
             p = choose_trajectories(images, several, self._cost, (1.0, doubt))
         found = self._improve(pyramid[1], NodeMotion(instants, p))
-        beside = self._seek_beside_common_motion(pyramid, instants)
+        beside = self._estimate_beside_common_motion(pyramid, instants)
         if beside is None:
             return found
         costs = [
@@ -377,15 +396,15 @@ class TrajectoryEstimator:
         ]
         return beside if costs[1] < MAX_COMMON_COST * costs[0] else found
 
-    def _seek_beside_common_motion(
+    def _estimate_beside_common_motion(
         self, pyramid: ImagePyramid, instants: TargetInstants
-    ) -> SoughtMotion | None:
-        """Seek motion beside that of all points; None where trajectories explain all of it."""
+    ) -> TwoClockMotion | None:
+        """Estimate motion beside that of all points; None where trajectories explain all of it."""
         common = estimate_common_motion(pyramid, instants.t, instants.s, self._cost)
         if common is None:
             return None
         instants = instants.with_common_motion(common)
-        p = self._seek(pyramid, instants.path_times, instants.first_horizon)
+        p = self._estimate_trajectories(pyramid, instants.path_times, instants.first_horizon)
         return self._improve(pyramid[1], NodeMotion(instants, p))
 
     def _frame_cost(self, pixels: NDArray[np.float32], motion: NodeMotion) -> float:
@@ -407,7 +426,7 @@ class TrajectoryEstimator:
         times = instants.path_times.take(judges).at_level(1)
         return robust_cost(PackedImages.of(pixels[judges], times), p, self._cost)
 
-    def _motion_of_frames(self, t: int) -> NodeMotion | None:
+    def _motion_between_frames(self, t: int) -> NodeMotion | None:
         """Return the motion halfway between two frames by frames alone, at half resolution."""
         frames = self.schedule.frames
         after = int(np.searchsorted(frames, t, "right"))
@@ -415,17 +434,21 @@ class TrajectoryEstimator:
             return None
         return self._frame_motion(int(frames[after - 1] + frames[after]) // 2)
 
-    def _seek_by_frames(self, at: int) -> NodeMotion:
-        """Seek the motion of the target at a time (us) from nothing, by frames alone."""
+    def _estimate_frame_motion(self, at: int) -> NodeMotion:
+        """Estimate a target's motion at a time (us) without an initial value, by frames alone."""
         instants = self.schedule(at)
         L, V, _, _ = self._images(instants)
         framed = np.isin(instants.t, self.schedule.frames)
         frames = ImagePyramid(L[framed], V[framed], PYRAMID_VARIANCE_FACTOR)
         nearest = float(np.abs(instants.s[[instants.before, instants.after]]).max())
-        return NodeMotion(instants, self._seek(frames, instants.path_times.take(framed), nearest))
+        return NodeMotion(
+            instants, self._estimate_trajectories(frames, instants.path_times.take(framed), nearest)
+        )
 
-    def _seek(self, pyramid: ImagePyramid, times: PathTimes, horizon: float) -> NDArray[np.float32]:
-        """Seek trajectories from nothing, up to half resolution.
+    def _estimate_trajectories(
+        self, pyramid: ImagePyramid, times: PathTimes, horizon: float
+    ) -> NDArray[np.float32]:
+        """Estimate trajectories without initial values, up to half resolution.
 
         Args:
             pyramid: Images at the instants.
@@ -449,7 +472,7 @@ class TrajectoryEstimator:
         Returns:
             The target.
         """
-        motion = self._sought_motion(at).on(timed)
+        motion = self._anchor_motion(at).on(timed)
         return self._refine(motion, self._images(motion.instants), self._noise(at))
 
     def _refine(
@@ -460,7 +483,7 @@ class TrajectoryEstimator:
         Args:
             motion: Motion of nodes at half resolution.
             images: Images at its instants.
-            noise: (h, w) or (), as of `fusion.ReferenceImages`.
+            noise: (h, w) or (), as of `fusion.FusionInputs`.
 
         Returns:
             The target with the motion at full resolution, and its fused image.
@@ -485,13 +508,13 @@ class TrajectoryEstimator:
         Returns:
             The images at full resolution.
         """
-        own, V = target.instants.target, self._cautious(target.V, target.clear)
+        own, V = target.instants.target, self._raise_variance(target.V, target.clear)
         pixels = pack_images(target.L, V)
         V = FUSED_VARIANCE_FACTOR * P + self._cost.floor
         pixels[own] = pack_images(image[None], V[None])[0]
         return PackedImages.of(pixels, target.instants.path_times)
 
-    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> SoughtMotion:
+    def _improve(self, pixels: NDArray[np.float32], motion: NodeMotion) -> TwoClockMotion:
         """Take a few steps at half resolution on both clocks, and compare how frames agree.
 
         Args:
@@ -511,12 +534,12 @@ class TrajectoryEstimator:
 
         found = improved(instants, p)
         if not instants.clock.event_share:
-            return SoughtMotion(found, found, 0.0)
+            return TwoClockMotion(found, found, 0.0)
         timed = instants.with_clock(TIME_CLOCK)
         other = improved(timed, change_clock(p, instants.s, timed.s))
         costs = [max(self._frame_cost(pixels, one), MIN_CLOCK_COST) for one in (other, found)]
         evidence = math.log(costs[0] / costs[1])
-        return SoughtMotion(found, other, evidence)
+        return TwoClockMotion(found, other, evidence)
 
     def _prefers_time(self, t: int, anchors: list[int]) -> bool:
         """Return whether a target is put on the clock of time.
@@ -530,7 +553,7 @@ class TrajectoryEstimator:
         Returns:
             Whether it is; else it is on the schedule's clock.
         """
-        evidence = [self._sought_motion(at).evidence for at in anchors]
+        evidence = [self._anchor_motion(at).evidence for at in anchors]
         if len(anchors) == 1:
             return evidence[0] <= 0
         nearest, other = (abs(at - t) for at in anchors)
@@ -556,7 +579,7 @@ class TrajectoryEstimator:
         images, noise = self._images(instants), self._noise(t)
         timed = self._prefers_time(t, anchors)
         anchor = self._anchor(nearest, timed)
-        beside = self._sought_motion(others[0]).on(timed) if others else None
+        beside = self._anchor_motion(others[0]).on(timed) if others else None
         instants = instants.with_common_motion(anchor.motion.instants.common)
         if timed:
             instants = instants.with_clock(TIME_CLOCK)
@@ -569,7 +592,7 @@ class TrajectoryEstimator:
         if known is not None:
             if self.start is None or not self.start.refine:
                 return TrajectoryEstimate(instants, L, V, clear, known, smooth=smooth, noise=noise)
-            pyramid = ImagePyramid(L, self._cautious(V, clear), PYRAMID_VARIANCE_FACTOR)
+            pyramid = ImagePyramid(L, self._raise_variance(V, clear), PYRAMID_VARIANCE_FACTOR)
             half = NodeTrajectories(known, 0).at_level(1, size).p
             found = self._improve(pyramid[1], NodeMotion(instants, half))
             timed = found.evidence <= 0
@@ -652,13 +675,13 @@ def _fuse(
         mean: Robust mean along the trajectories.
         images: L and V of these images, each (k, h, w), the images warped, and their instants.
         paths: (h, w, 4) paths of all pixels, px.
-        noise: (h, w) or (), as of `fusion.ReferenceImages`.
+        noise: (h, w) or (), as of `fusion.FusionInputs`.
 
     Returns:
         The image.
     """
     reach = squared_reach(paths, images[3].common)
-    compared = reference_images(*images, reach, noise=noise)
+    compared = fusion_inputs(*images, reach, noise=noise)
     return fuse_candidates(params, fusion_features(mean, compared))
 
 

@@ -48,10 +48,15 @@ class LogChanges(NamedTuple):
 
 
 class ThresholdDeviations(NamedTuple):
-    """Relative deviations of ON and OFF thresholds of pixels, each (2, pixels)."""
+    """Relative deviations of ON and OFF thresholds of pixels.
+
+    Attributes:
+        d: (2, pixels) deviations.
+        remaining: (2, pixels) part of their prior variance that is left, 0..1.
+    """
 
     d: NDArray[np.floating]
-    remaining: NDArray[np.floating]  # part of their prior variance that is left, 0..1
+    remaining: NDArray[np.floating]
 
 
 def regress_deviations(changes: LogChanges, prior_sigma: float) -> ThresholdDeviations:

@@ -100,12 +100,12 @@ def pack_images(L: NDArray, V: NDArray) -> NDArray[np.float32]:
     """
     out = np.empty((*L.shape, 4), np.float32)
     given = (read_only(np.asarray(values, np.float32)) for values in (L, V))
-    run_over_rows(_pack, L.shape[1], *given, out)
+    run_over_rows(_pack_rows, L.shape[1], *given, out)
     return out
 
 
 @njit_noalloc
-def _pack(begin, end, L, V, out):
+def _pack_rows(begin, end, L, V, out):
     """Pack some rows of images with their gradients.
 
     Args:
@@ -186,6 +186,16 @@ class ImagePyramid:
 
 @njit_noalloc_inlined
 def _median(a, b, c):
+    """Return the median of three numbers.
+
+    Args:
+        a: The first.
+        b: The second.
+        c: The third.
+
+    Returns:
+        The median.
+    """
     return max(min(a, b), min(max(a, b), c))
 
 
@@ -510,12 +520,22 @@ class _SearchScratch(NamedTuple):
 
 
 class _SearchInputs(NamedTuple):
-    """One pass of `select_paths`."""
+    """One pass of `select_paths`.
+
+    Attributes:
+        images: Packed images.
+        paths: (h, w, 4) paths of every `spacing`-th pixel, px.
+        spacing: Distance of these pixels, px.
+        offsets: (n, 2) distances of the pixels whose paths are tried, px.
+        cost: Parameters of the cost.
+        taps: Taps of the Gaussian filter.
+        min_gain: Least gain from which another path is taken.
+    """
 
     images: PackedImages
-    paths: NDArray[np.float32]  # (h, w, 4), of every `spacing`-th pixel
+    paths: NDArray[np.float32]
     spacing: int
-    offsets: NDArray[np.int64]  # (n, 2), of the pixels whose paths are tried
+    offsets: NDArray[np.int64]
     cost: CostParams
     taps: NDArray[np.float32]
     min_gain: np.float32
@@ -683,7 +703,7 @@ def _evaluate_paths(begin, end, inputs, scratch, out):
 
 
 @njit_noalloc
-def _select(begin, end, inputs, found, scratch, out):
+def _write_selected_paths(begin, end, inputs, found, scratch, out):
     """Write the paths that pixels take.
 
     Args:
@@ -742,7 +762,7 @@ def select_paths(
         scratch = _SearchScratch.allocate(shape, len(images.times.s), len(taps))
         run_over_rows(_evaluate_paths, shape[0], inputs, scratch, costs)
         out = np.empty_like(path_index)
-        run_over_rows(_select, shape[0], inputs, (costs, path_index), scratch, out)
+        run_over_rows(_write_selected_paths, shape[0], inputs, (costs, path_index), scratch, out)
         path_index = out
     return path_index
 

@@ -28,7 +28,7 @@ CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
 
 
 class PathTimes(NamedTuple):
-    """Instants on the clock of paths, and how far all points have moved beside their paths."""
+    """Instants on the clock of paths, and displacements of all points beside their paths."""
 
     s: Float[Numeric, " k"]  # relative to the target, -1..1
     common: Float[Numeric, "k 2"]  # displacement along x and y that all points share, px
@@ -353,7 +353,7 @@ def _read_bicubic(image, pixel, weights, out):
 
 
 @njit_noalloc
-def _warp(begin, end, inputs, scratch, cubic, out):
+def _warp_rows(begin, end, inputs, scratch, cubic, out):
     """Read images along the paths of some rows of pixels.
 
     Args:
@@ -406,7 +406,7 @@ def warp_images(
     _, h, w = L.shape
     out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
     inputs = (read_only(L), read_only(V), clear, clear.any((1, 2)), times, paths)
-    run_over_rows(_warp, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
+    run_over_rows(_warp_rows, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
     return out
 
 

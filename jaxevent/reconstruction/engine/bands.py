@@ -37,36 +37,64 @@ N_IMAGE_BUFFERS = 2  # the last images are held while the next ones are made
 
 
 class EventBands(NamedTuple):
-    """Events divided among bands, and the rows of each band."""
+    """Events divided among bands, and the rows of each band.
 
-    events: NDArray[np.int64]  # time since the recording's start (us), place in the band, polarity
-    weights: NDArray  # events that each one stands for; empty: one
-    first: NDArray[np.int64]  # of each band's events, and one more
-    edges: NDArray[np.int64]  # rows of the image, and one more
+    Attributes:
+        events: (n,) time since the recording's start (us), place in the band and polarity, packed
+            in one number.
+        weights: (n,) events that each one stands for; empty: one.
+        first: (bands + 1,) first event of each band, and n.
+        edges: (bands + 1,) first row of each band, and the number of rows.
+        width: Width of the sensor, px.
+        stride: Pixels of a band, with its border.
+    """
+
+    events: NDArray[np.int64]
+    weights: NDArray
+    first: NDArray[np.int64]
+    edges: NDArray[np.int64]
     width: int
     stride: int
 
 
 class FrameRows(NamedTuple):
-    """Frames of a window or segment."""
+    """Frames of a window or segment.
 
-    images: NDArray  # [frames, pixels], levels; or empty
-    tables: NDArray  # [3, levels]: grey value, intensity, certainty
-    values: NDArray  # [3, frames, pixels], the same where there are no levels
+    Attributes:
+        images: [frames, pixels] grey levels; or empty.
+        tables: [3, levels] grey value, intensity and certainty.
+        values: [3, frames, pixels] the same where there are no levels.
+        gain: [frames] brightness, see `Recording.gain`.
+        left: [frames] begins of the exposures, us, exact.
+        mid: [frames] middles of the exposures, us.
+        right: [frames] ends of the exposures, us.
+        number: Number of the first frame in the recording.
+    """
+
+    images: NDArray
+    tables: NDArray
+    values: NDArray
     gain: NDArray
-    left: NDArray[np.float64]  # us, exact
+    left: NDArray[np.float64]
     mid: NDArray[np.float64]
     right: NDArray[np.float64]
-    number: int  # of the first frame in the recording
+    number: int
 
 
 class ImageBuffers(NamedTuple):
-    """Images [times, pixels], and derivatives of those that have any."""
+    """Images and derivatives of those that have any.
+
+    Attributes:
+        mean: [times, pixels].
+        variance: [times, pixels], (ln I)^2.
+        valid: [times, pixels] whether the image is known.
+        derivatives: [times, pixels, images, lanes].
+    """
 
     mean: NDArray
     variance: NDArray
     valid: NDArray[np.uint8]
-    derivatives: NDArray  # [times, pixels, images, lanes]
+    derivatives: NDArray
 
     @classmethod
     def empty(
@@ -126,7 +154,12 @@ _UNUSED = _count_references((np.empty(1), np.empty(1), np.empty(1)))
 
 @dataclasses.dataclass(frozen=True)
 class BandLayout:
-    """Division of a sensor's rows into bands; depends on nothing but its size."""
+    """Division of a sensor's rows into bands; depends on nothing but its size.
+
+    Attributes:
+        stride: Pixels of a band, with its border.
+        edges: (bands + 1,) first row of each band, and the number of rows.
+    """
 
     stride: int
     edges: NDArray[np.int64]
@@ -333,7 +366,7 @@ class PartitionedRecording:
         return self.windows.clock.origin
 
     def fixed_inputs(self, frame_delay: Any, has_variance: bool) -> dict[str, NDArray]:
-        """Return what kernels know beside parameters.
+        """Return the inputs of kernels beside parameters.
 
         Args:
             frame_delay: Time added to the frames' stamps that windows were made for, s.
@@ -507,7 +540,7 @@ def ceil_to_us(time_us):
 
 @njit_noalloc_inlined
 def load_frame_image(frames, table_kind, frame, bands, band, out_field):
-    """Write what a table says of a frame's pixels into a field of a band.
+    """Write the values of a frame's pixels, by a table, into a field of a band.
 
     Args:
         frames: `FrameRows`.

@@ -46,17 +46,29 @@ from jaxevent.reconstruction.stream import StreamState
 
 
 class Timeline(NamedTuple):
-    """Intervals of a window in which points lie in one piece, after one frame."""
+    """Intervals of a window in which points lie in one piece, after one frame.
 
-    start: NDArray[np.int64]  # us since the recording's start
-    frame: NDArray[np.int64]  # of the piece, -1 before the first exposure
+    Attributes:
+        start: [intervals] begin of each interval, us since the recording's start.
+        frame: [intervals] frame of the piece, -1 before the first exposure.
+        variant: [intervals] index of the variant, see `filter_program.Variant`.
+        begin: [intervals] begin of the piece, us.
+        rate: [intervals] reciprocal length of the piece, 1/us.
+        mid: [intervals] middle of the frame before, us.
+        blend_rate: [intervals] reciprocal time from that to the next middle, 1/us.
+        uniform: [intervals, ...] inputs of tables that are equal for all pixels.
+        opening: Start of the window, us.
+    """
+
+    start: NDArray[np.int64]
+    frame: NDArray[np.int64]
     variant: NDArray[np.int64]
-    begin: NDArray[np.float64]  # of the piece, us
-    rate: NDArray[np.float64]  # 1/us
-    mid: NDArray[np.float64]  # of the frame before, us
-    blend_rate: NDArray[np.float64]  # 1/us
-    uniform: NDArray  # [intervals, ...], inputs of tables that are equal for all pixels
-    opening: int  # us, the window's start
+    begin: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    mid: NDArray[np.float64]
+    blend_rate: NDArray[np.float64]
+    uniform: NDArray
+    opening: int
 
 
 class BandedWindow(NamedTuple):
@@ -270,30 +282,30 @@ class _FrameEntry:
                 yield STEP_MOVE, to * places.stride, of * places.stride
         fresh = 0 if not follows else 3 if frame == 0 else 2
         for row in range(fresh, 3):
-            yield from self._images(base + row - number, row, rows)
+            yield from self._image_steps(base + row - number, row, rows)
         for row in range(fresh, 3):
             left = mid = right = 0
             if row < rows:
                 k = base + row - number
                 left, mid, right = self.left[k], self.mid[k], self.right[k]
-            yield from self._count(places.head[:, row], left, mid)
-            yield from self._count(places.tail[:, row], mid, right)
+            yield from self._count_steps(places.head[:, row], left, mid)
+            yield from self._count_steps(places.tail[:, row], mid, right)
         for row in range(0 if not follows else 2 if frame == 0 else 1, 2):
             left = right = 0
             if row + 1 < rows:  # another frame follows
                 k = base + row - number
                 left, right = self.left[k], self.right[k + 1]
-            yield from self._count(places.span[:, row], left, right)
+            yield from self._count_steps(places.span[:, row], left, right)
             if places.around[row] >= 0:
                 fields = places.around[row], *places.span[:, row]
                 yield STEP_AROUND, *(int(field) * places.stride for field in fields)
         # The piece counts from its exposure's left edge, before the first from the window's start.
         begin = self.left[frame - number] if frame >= 0 else now
-        yield from self._count(np.array([places.on, places.off]), begin, now)
+        yield from self._count_steps(np.array([places.on, places.off]), begin, now)
         if frame < 0 and count > 0:
-            yield from self._count(places.before, self.opening, self.right[0])
+            yield from self._count_steps(places.before, self.opening, self.right[0])
 
-    def _images(self, k: int, row: int, rows: int) -> Iterator[tuple[int, ...]]:
+    def _image_steps(self, k: int, row: int, rows: int) -> Iterator[tuple[int, ...]]:
         """List the steps for the images of one frame of a piece, and for its exposure's sums.
 
         Args:
@@ -318,7 +330,9 @@ class _FrameEntry:
         if len(places.total) and row < rows:
             yield STEP_SUM, row, k
 
-    def _count(self, fields: NDArray[np.int64], left: int, right: int) -> Iterator[tuple[int, ...]]:
+    def _count_steps(
+        self, fields: NDArray[np.int64], left: int, right: int
+    ) -> Iterator[tuple[int, ...]]:
         """List the step that counts events of a span of time; none where a method needs no counts.
 
         Args:
@@ -500,7 +514,13 @@ def filter_events(begin, end, inputs, memory, request):
 
 @dataclasses.dataclass(frozen=True)
 class PixelStates:
-    """State of all pixels, band by band."""
+    """State of all pixels, band by band.
+
+    Attributes:
+        cells: Real numbers of all pixels, band by band; see `filter_program.FieldPlaces`.
+        whole: Whole numbers of all pixels, likewise.
+        last: Times of the last events, us, likewise.
+    """
 
     cells: NDArray
     whole: NDArray

@@ -80,7 +80,15 @@ class FilterMethod(Protocol):
 
 
 class FilterFunctions(NamedTuple):
-    """Functions of a module, which `filter_loop` calls."""
+    """Functions of a module, which `filter_loop` calls.
+
+    Attributes:
+        events: Pass over the events of a piece.
+        images: Make an image.
+        tables: Compute what is constant in a piece.
+        image_tables: Compute what is constant in a piece for the variance of images.
+        excess: Sum over the segments of an exposure.
+    """
 
     events: Any
     images: Any
@@ -90,11 +98,18 @@ class FilterFunctions(NamedTuple):
 
 
 class KernelKind(NamedTuple):
-    """Properties on which a kernel depends beside the method and its parameters."""
+    """Properties on which a kernel depends beside the method and its parameters.
 
-    exposed: bool  # whether exposures are known
-    dtype: np.dtype  # of real numbers
-    stride: int  # pixels of a band, with its border
+    Attributes:
+        exposed: Whether exposures are known.
+        dtype: Type of real numbers.
+        stride: Pixels of a band, with its border.
+        directions: Numbers by which derivatives are taken.
+    """
+
+    exposed: bool
+    dtype: np.dtype
+    stride: int
     directions: DerivativeDirections = DerivativeDirections()
 
 
@@ -233,12 +248,12 @@ class FilterProgram:
         return [] if self.derivatives is None else self.derivatives.factors_of(*names)
 
     def results(self) -> list[Node]:
-        """Return what is computed at a point."""
+        """Return the nodes that are computed at a point."""
         names = [] if self.derivatives is None else [*self.derivatives.factors]
         return [*self.state.values(), self.mean, self.variance, *self.factors(*names)]
 
     def table_derivatives(self, variant: int) -> list[tuple[int, int, Node]]:
-        """Return what a piece adds to derivatives: vector, direction, expression."""
+        """Return the terms that a piece adds to derivatives: vector, direction, expression."""
         changes = [] if self.derivatives is None else self.derivatives.changes
         return [
             (k, lane, nodes[variant])
@@ -413,7 +428,7 @@ def _input(
 
 
 def _substitute(results: dict[str, Node], known: dict[Node, Node], graph: Graph) -> Any:
-    """Put other nodes in place of some, and simplify what uses them."""
+    """Replace some nodes by others, and simplify the nodes that use them."""
     new = dict(known)
     for node in find_dependencies([*results.values()]):
         arguments = [a for a in node.args if isinstance(a, Node)]
@@ -428,7 +443,7 @@ def _slots(results: dict[str, Node]) -> list[Node]:
 
 
 def _fill_slots(results: dict[str, Node], table: list[Node], graph: Graph) -> dict[str, Node]:
-    """Put what slots hold in place of the slots."""
+    """Replace slots by the nodes that they hold."""
     while slots := _slots(results):
         results = _substitute(results, {slot: table[slot.args[0]] for slot in slots}, graph)
     return results
@@ -457,21 +472,38 @@ def _drop_zeros(
 
 
 class FieldPlaces(NamedTuple):
-    """Places of the fields of `cells`, in strides; -1 where a method needs none."""
+    """Places of the fields of `cells`, in strides; -1 where a method needs none.
+
+    Attributes:
+        stride: Pixels of a band, with its border.
+        factors: Factors of derivatives of images, for each pixel of a row.
+        table_scratch: Numbers for derivatives of tables.
+        on: ON events since the left edge of the piece's exposure.
+        off: OFF events since the left edge of the piece's exposure.
+        before: [2] ON and OFF events from the window's start to the end of the first exposure.
+        image: [3, rows] grey value, intensity and certainty of each frame.
+        total: [sums, rows] sums over the exposure of each frame.
+        span: [2, rows] ON and OFF events from a frame's left edge to the right edge of the next
+            one.
+        head: [2, rows] ON and OFF events from a frame's left edge to its middle.
+        tail: [2, rows] ON and OFF events from a frame's middle to its right edge.
+        around: [rows] sum of the events of `span` over 3x3 pixels.
+        shifted: [fields, 2] field to which one moves when a frame follows, and the field that
+            moves.
+    """
 
     stride: int
-    factors: int  # of derivatives of images, for each pixel of a row
-    table_scratch: int  # numbers, for derivatives of tables
+    factors: int
+    table_scratch: int
     on: int
     off: int
-    before: NDArray[np.int64]  # [2], ON and OFF
-    image: NDArray[np.int64]  # [3, rows]: grey value, intensity, certainty
-    total: NDArray[np.int64]  # [sums, rows]
-    span: NDArray[np.int64]  # [2, rows]
+    before: NDArray[np.int64]
+    image: NDArray[np.int64]
+    total: NDArray[np.int64]
+    span: NDArray[np.int64]
     head: NDArray[np.int64]
     tail: NDArray[np.int64]
-    around: NDArray[np.int64]  # [rows]
-    # To where a field moves when a frame follows, and from: [fields, 2].
+    around: NDArray[np.int64]
     shifted: NDArray[np.int64]
 
 

@@ -43,18 +43,31 @@ from jaxevent.reconstruction.stream import StreamState
 
 
 class SmootherPlaces(NamedTuple):
-    """Places of fields, in strides."""
+    """Places of fields, in strides.
+
+    Attributes:
+        stride: Pixels of a band, with its border.
+        work: Number of fields of the frame that a pass has come to.
+        row: Number of fields that are stored for each frame.
+        image: Fields of grey value, intensity and certainty.
+        total: Fields of the sums over exposures, and of their derivatives.
+        inside: Field of events within exposures; -1: not needed.
+        side: Field of the side on which a pixel is clipped.
+        counts: Fields of ON and OFF events, and of those of the neighbours.
+        exposed: Whether exposures are known.
+        censored: Whether clipped frames measure anything.
+    """
 
     stride: int
-    work: int  # fields of the frame that a pass has come to
-    row: int  # fields that are stored for each frame
-    image: NDArray[np.int64]  # grey value, intensity, certainty
-    total: NDArray[np.int64]  # sums over exposures, and their derivatives
-    inside: int  # events within exposures; -1: not needed
+    work: int
+    row: int
+    image: NDArray[np.int64]
+    total: NDArray[np.int64]
+    inside: int
     side: int
-    counts: NDArray[np.int64]  # ON, OFF, and those of the neighbours
-    exposed: bool  # whether exposures are known
-    censored: bool  # whether clipped frames measure anything
+    counts: NDArray[np.int64]
+    exposed: bool
+    censored: bool
 
 
 class FrameTimeline(NamedTuple):
@@ -90,13 +103,21 @@ class SegmentInputs(NamedTuple):
 
 
 class ImageTimes(NamedTuple):
-    """Times of images (us since the recording's start) and their positions among the frames."""
+    """Times of images and their positions among the frames.
+
+    Attributes:
+        time: [times] us since the recording's start.
+        frame: [times] frame before, -1 before the first.
+        elapsed: [times] time since then, s.
+        seconds: [times] time until the next frame, s; 0 after the last.
+        here: [times] 1 in the middle of the frame's exposure, else 0.
+    """
 
     time: NDArray[np.int64]
-    frame: NDArray[np.int64]  # the one before, -1 before the first
-    elapsed: NDArray[np.float64]  # s since then
-    seconds: NDArray[np.float64]  # until the next; 0 after the last
-    here: NDArray[np.float64]  # 1 in the middle of the frame's exposure
+    frame: NDArray[np.int64]
+    elapsed: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    here: NDArray[np.float64]
 
 
 class LastEvents(NamedTuple):
@@ -126,6 +147,15 @@ def spread_rates(bands: EventBands, reach_us: int) -> NDArray[np.float64]:
 
 @njit_noalloc
 def _fill_spread_rates(bands, reach, ahead, rates):
+    """Compute the rates of changes that are spread over the time between two events of a pixel.
+
+    Args:
+        bands: `EventBands`.
+        reach: Longest time over which a change is spread, us.
+        ahead: Scratch for each pixel of a band.
+        rates: (n,) output, from each event to its pixel's next one, signed events per us; others
+            stay.
+    """
     events, weights, first = bands.events, bands.weights, bands.first
     for band in range(len(first) - 1):
         for z in range(len(ahead)):
@@ -556,7 +586,7 @@ def _neighbour_fractions(layout: BandLayout, width: int, height: int) -> NDArray
 
 
 class SmootherPasses:
-    """A smoother's kernel for a recording, and what passes over its frames take.
+    """A smoother's kernel for a recording, and the inputs of passes over its frames.
 
     Args:
         recording: The recording, divided among bands.

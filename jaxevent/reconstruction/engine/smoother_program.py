@@ -91,7 +91,19 @@ class SmoothingMethod(ImageMethod, Protocol):
 
 
 class SmootherFunctions(NamedTuple):
-    """Functions of a module, which `smoother_loop` calls."""
+    """Functions of a module, which `smoother_loop` calls for all pixels of a band.
+
+    Attributes:
+        start: Set the state at the recording's start.
+        frame: Update the state by a frame.
+        clipped: Update the state by a frame that is clipped somewhere.
+        move: Predict the state to the next frame.
+        link: Compose the map of messages through the segment with that of a frame.
+        back: Pass the message of later frames back over a frame.
+        show: Make an image after a frame.
+        before: Make an image before the first frame.
+        excess: Sum over the segments of an exposure.
+    """
 
     start: Any
     frame: Any

@@ -28,10 +28,15 @@ LEAST_CORRELATION = 0.4  # of changes by events and by the frame, from which a f
 
 
 class FrameScale(NamedTuple):
-    """The relation between the log image and frames, ln(I + I0) = factor M + level."""
+    """The relation between the log image and frames, ln(I + I0) = factor M + level.
+
+    Attributes:
+        factor: ln I per unit of the log image.
+        image: (height, width) F at the time of the log image, NaN: unknown.
+    """
 
     factor: float
-    image: NDArray[np.float32]  # (height, width) F at the time of the log image, NaN: unknown
+    image: NDArray[np.float32]
 
     def level(self, log_image: NDArray) -> float:
         """Return the level that fits a log image (height, width) to the frame."""
@@ -39,7 +44,7 @@ class FrameScale(NamedTuple):
 
 
 @runtime_checkable
-class Windows(Protocol):
+class PathSource(Protocol):
     """A source of a recording's paths and equations."""
 
     def paths(self, start: int, stop: int, at: int) -> WindowPaths:
@@ -72,7 +77,7 @@ class FrameMeasurements:
     """
 
     def __init__(
-        self, windows: Windows, recording: Recording, I0: float, frame_delay: float, causal: bool
+        self, windows: PathSource, recording: Recording, I0: float, frame_delay: float, causal: bool
     ):
         assert recording.frames is not None
         self.windows, self.frames, self.causal = windows, recording.frames, causal
@@ -111,7 +116,7 @@ class FrameMeasurements:
         variances = numbers.noise(1e-6 * abs(t - at), threshold, numbers.blur)
         paths = self.windows.paths(min(t, at), max(t, at), at)
         measured = GradientPrior(gradient.astype(np.float32), information)
-        return carry(measured, paths, t, variances), FrameScale(factor, _sample(F, paths, t))
+        return carry(measured, paths, t, variances), FrameScale(factor, _warp_frame(F, paths, t))
 
     def _read(self, frame: int) -> tuple[NDArray, NDArray]:
         """Return ln(I + I0) of a frame, NaN where it is clipped, and its standard deviation."""
@@ -127,8 +132,8 @@ class FrameMeasurements:
         rows = self.windows.rows_around(t)
         best, found = LEAST_CORRELATION, None
         for at in (stamp + OFFSETS_US).tolist():
-            moved = _sample(F, self.windows.paths(min(t, at), max(t, at), at), t)
-            S, D = _changes(rows, moved)
+            moved = _warp_frame(F, self.windows.paths(min(t, at), max(t, at), at), t)
+            S, D = _sum_changes(rows, moved)
             square = float((S**2).sum() * (D**2).sum())
             product = float((S * D).sum())
             if square > 0 and product / square**0.5 > best:
@@ -136,7 +141,7 @@ class FrameMeasurements:
         return found
 
 
-def _sample(F: NDArray, paths: WindowPaths, t: int) -> NDArray[np.float32]:
+def _warp_frame(F: NDArray, paths: WindowPaths, t: int) -> NDArray[np.float32]:
     """Sample a frame at the end of paths.
 
     Args:
@@ -151,7 +156,7 @@ def _sample(F: NDArray, paths: WindowPaths, t: int) -> NDArray[np.float32]:
     return map_coordinates(F, places, order=1, mode="constant", cval=np.nan).astype(np.float32)
 
 
-def _changes(rows: Rows, F: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
+def _sum_changes(rows: Rows, F: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
     """Return the change of each pixel between its first and last event, by events and by a frame.
 
     Args:

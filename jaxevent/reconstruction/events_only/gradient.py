@@ -41,11 +41,17 @@ LEAST_STUDENT_SHAPE = 0.6  # at 0.5 the distribution has no integral
 
 
 class Perturbation(NamedTuple):
-    """Normal numbers that perturb the equations of a window, for the variance; of each sample."""
+    """Normal numbers that perturb the equations of a window, for the variance.
+
+    Attributes:
+        rows: Numbers of the rows.
+        pixels: Numbers of the differences to the right and below, and of the leak.
+        pull: Numbers of the gradient by other windows, times the root of `information`.
+    """
 
     rows: Float[Numeric, "*times samples rows"]
-    pixels: Float[Numeric, "*times samples 3 height width"]  # across, down, leak
-    pull: Float[Numeric, "*times samples height width 2"]  # times the root of `information`
+    pixels: Float[Numeric, "*times samples 3 height width"]
+    pull: Float[Numeric, "*times samples height width 2"]
 
     @classmethod
     def draw(cls, n_rows: int, shape: tuple[int, int]) -> "Perturbation":
@@ -70,19 +76,35 @@ class Perturbation(NamedTuple):
 
 
 class WindowEquations(NamedTuple):
-    """Equations of one window, or of several, stacked; thresholds are left open."""
+    """Equations of one window, or of several, stacked; thresholds are left open.
+
+    Attributes:
+        corner: Flat index of the look-up's pixel above and left.
+        fraction: Distance from there along x and y, px.
+        on: Change, in ON thresholds.
+        off: Change, in OFF thresholds.
+        weight: Weight of rows of events.
+        silent: Weight of the other rows, in `silence`.
+        pull: Gradient by other windows, thresholds / px.
+        information: Its information, (px / threshold)^2.
+        start: The host's solution, thresholds.
+        unseen: Variance of the solution where rows say little, thresholds^2.
+        relative: Mean of the learned thresholds of ON and OFF events, relative to those of the
+            parameters.
+        noise: Numbers that perturb the equations.
+    """
 
     corner: Int[Numeric, "*times rows 2"]
     fraction: Float[Numeric, "*times rows 2 2"]
-    on: Float[Numeric, "*times rows"]  # change, in ON thresholds
-    off: Float[Numeric, "*times rows"]  # and in OFF thresholds
-    weight: Float[Numeric, "*times rows"]  # of rows of events
-    silent: Float[Numeric, "*times rows"]  # weight of the others, in `silence`
-    pull: Float[Numeric, "*times height width 2"]  # gradient by other windows, thresholds / px
-    information: Float[Numeric, "*times height width 2 2"]  # of it, (px / threshold)^2
-    start: Float[Numeric, "*times height width"]  # the host's solution, thresholds
-    unseen: Float[Numeric, "*times height width"]  # its variance where rows say little
-    relative: Float[Numeric, "*times 2"]  # mean of the learned thresholds, of ON and OFF events
+    on: Float[Numeric, "*times rows"]
+    off: Float[Numeric, "*times rows"]
+    weight: Float[Numeric, "*times rows"]
+    silent: Float[Numeric, "*times rows"]
+    pull: Float[Numeric, "*times height width 2"]
+    information: Float[Numeric, "*times height width 2 2"]
+    start: Float[Numeric, "*times height width"]
+    unseen: Float[Numeric, "*times height width"]
+    relative: Float[Numeric, "*times 2"]
     noise: Perturbation
 
 
@@ -164,7 +186,7 @@ def _gradient(u: Array) -> Array:
     return jnp.stack([along(1), along(0)], -1)
 
 
-def _cells(u: Array) -> Array:
+def _mean_squares(u: Array) -> Array:
     """Mean squares q of the differences of cells, (height - 1, width - 1)."""
     across, down = jnp.diff(u, axis=1) ** 2, jnp.diff(u, axis=0) ** 2
     return (across[:-1] + across[1:] + down[:, :-1] + down[:, 1:]) / 2
@@ -184,7 +206,7 @@ def energy(u: Array, equations: WindowEquations, params: Params) -> Array:
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
     total = (weight * numbers.tail**2 * jnp.log1p(e**2 / (2 * numbers.tail**2))).sum()
-    total += numbers.gradient / 2 * jnp.log1p(_cells(u) / numbers.edge**2).sum()
+    total += numbers.gradient / 2 * jnp.log1p(_mean_squares(u) / numbers.edge**2).sum()
     return total + _quadratic(u, equations, jnp.asarray(numbers.leak))
 
 
@@ -200,10 +222,12 @@ def _residuals(u: Array, equations: WindowEquations, params: Params) -> tuple[Ar
         Weights and residuals, each (rows,), residuals in thresholds.
     """
     weight = equations.weight + params.silence * equations.silent
-    return weight, look_up(u, equations.corner, equations.fraction) - _changes(equations, params)
+    return weight, look_up(u, equations.corner, equations.fraction) - _event_changes(
+        equations, params
+    )
 
 
-def _changes(equations: WindowEquations, params: Params) -> Array:
+def _event_changes(equations: WindowEquations, params: Params) -> Array:
     """Return the changes that rows show, in mean thresholds.
 
     Args:
@@ -248,11 +272,17 @@ def _quadratic(u: Array, equations: WindowEquations, leak: Array) -> Array:
 
 
 class _Weights(NamedTuple):
-    """Weights of the reweighted problem at an image: of rows, and of differences of pixels."""
+    """Weights of the reweighted problem at an image.
+
+    Attributes:
+        rows: (rows,) weights of rows.
+        across: (height, width - 1) weights of differences with the pixel right.
+        down: (height - 1, width) weights of differences with the pixel below.
+    """
 
     rows: Array
-    across: Array  # (height, width - 1)
-    down: Array  # (height - 1, width)
+    across: Array
+    down: Array
 
 
 def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
@@ -268,7 +298,7 @@ def _weights(u: Array, equations: WindowEquations, params: Params) -> _Weights:
     """
     numbers = params.solver()
     weight, e = _residuals(u, equations, params)
-    s = numbers.gradient / (2 * (_cells(u) + numbers.edge**2))
+    s = numbers.gradient / (2 * (_mean_squares(u) + numbers.edge**2))
     across = jnp.pad(s, [(0, 1), (0, 0)]) + jnp.pad(s, [(1, 0), (0, 0)])
     down = jnp.pad(s, [(0, 0), (0, 1)]) + jnp.pad(s, [(0, 0), (1, 0)])
     return _Weights(weight / (1 + e**2 / (2 * numbers.tail**2)), across, down)
@@ -300,7 +330,17 @@ def _product(
 
 
 class _Problem(NamedTuple):
-    """Equations with their parameters in place, from which the host makes an `Energy`."""
+    """Equations with their parameters in place, from which the host makes an `Energy`.
+
+    Attributes:
+        corner: (rows, 2) flat index of the look-up's pixel above and left.
+        fraction: (rows, 2, 2) distance from there along x and y, px.
+        weight: (rows,) weights.
+        change: (rows,) changes, thresholds.
+        pull: (height, width, 2) gradient by other windows, thresholds / px.
+        information: (height, width, 2, 2) its information, (px / threshold)^2.
+        params: Parameters of the solver.
+    """
 
     corner: Array
     fraction: Array
@@ -316,7 +356,7 @@ def _set_parameters(equations: WindowEquations, params: Params) -> _Problem:
         equations.corner,
         equations.fraction,
         equations.weight + params.silence * equations.silent,
-        _changes(equations, params),
+        _event_changes(equations, params),
         equations.pull,
         equations.information,
         params.solver(),

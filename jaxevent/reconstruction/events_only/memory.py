@@ -58,7 +58,7 @@ class MemoryParams(NamedTuple):
 
 
 def measure_gradient(rows: Rows, silence: float) -> GradientPrior:
-    """Return what the rows of a window say of the gradient at each pixel (4).
+    """Measure the gradient at each pixel by the rows of a window (4).
 
     Args:
         rows: Equations of the window.
@@ -109,7 +109,7 @@ def _add_row(a, b, change, weight, information, eta):
 
 @njit_noalloc
 def _add_rows(rows, weight, c, information, eta):
-    """Add what rows say of the gradient, each shared out among the pixels between its two look-ups.
+    """Add the evidence of rows on the gradient, each shared out between its two look-ups' pixels.
 
     Args:
         rows: `Rows` of a window.
@@ -380,7 +380,7 @@ def _carry(places, memory, noise, out):
 
 
 @runtime_checkable
-class Windows(Protocol):
+class WindowSource(Protocol):
     """A source of a recording's events, their thresholds and their paths."""
 
     shape: tuple[int, int]  # (height, width)
@@ -426,7 +426,13 @@ class KeyMemories:
     """
 
     def __init__(
-        self, windows: Windows, recording: Recording, step: int, *, silence: float, threshold: float
+        self,
+        windows: WindowSource,
+        recording: Recording,
+        step: int,
+        *,
+        silence: float,
+        threshold: float,
     ):
         self.windows, self.recording, self.step = windows, recording, step
         self.silence, self.threshold, self.params = silence, threshold, MemoryParams()
@@ -448,7 +454,7 @@ class KeyMemories:
         return min(-(-row // self.step), self.last)
 
     def prior(self, rows: Rows, at: int, first: int, last: int | None) -> GradientPrior:
-        """Return what the windows before and after one say of its image.
+        """Return the prior of a window's gradient by the windows before and after it.
 
         Where images are causal, a window begins at least two steps before its image: flow for the
         memory rests on so many events after the key.
@@ -463,7 +469,7 @@ class KeyMemories:
             The memories together; where no window saw anything the information is 0.
         """
         ends = [(first, 1)] + ([] if last is None else [(last, -1)])
-        found = [self._carried(self._at_key(k, s), k, at, at, self.params.blur) for k, s in ends]
+        found = [self._carry_to(self._at_key(k, s), k, at, at, self.params.blur) for k, s in ends]
         known = [memory for memory in found if memory is not None]
         if not known:
             zeros = np.zeros((*rows.shape, 2), np.float32)
@@ -473,7 +479,7 @@ class KeyMemories:
         joint = discount(joint, new, self.threshold, self.params.tail)
         return joint._replace(information=np.float32(self.params.independent) * joint.information)
 
-    def _carried(
+    def _carry_to(
         self, memory: GradientPrior | None, key: int, at: int, until: int, blur: float = 0.0
     ) -> GradientPrior | None:
         """Carry the memory at a key to another time.
@@ -541,13 +547,13 @@ class KeyMemories:
             The memory at `key + side`.
         """
         new = self._measure(key, side)
-        carried = self._carried(memory, key, self.time(key + side), self.time(key + side + 2))
+        carried = self._carry_to(memory, key, self.time(key + side), self.time(key + side + 2))
         if carried is None:
             return new
         return fuse(discount(carried, new, self.threshold, self.params.tail), new, self.threshold)
 
     def _measure(self, key: int, side: int) -> GradientPrior:
-        """Return what the events from a key to the next one on the way say of the gradient there.
+        """Measure the gradient by the events from a key to the next one on the way.
 
         A pixel's first row begins at its last event before the key, if it has one since the key
         before: otherwise windows of few events would find gradients too small. Silence after a

@@ -72,16 +72,27 @@ class Paths(Protocol):
 
 
 class Rows(NamedTuple):
-    """Equations (1) of one window; positions are those of the look-ups at t_b and t_a."""
+    """Equations (1) of one window; positions are those of the look-ups at t_b and t_a.
 
-    shape: tuple[int, int]  # (height, width)
-    threshold: float  # ln I, mean of both polarities
-    corner: UInt32[np.ndarray, "rows 2"]  # flat index of the look-up's pixel above and left
-    fraction: Float[np.ndarray, "rows 2 2"]  # px from there, x before y
-    change: Float[np.ndarray, " rows"]  # in thresholds
-    weight: Float[np.ndarray, " rows"]  # reciprocal variance, against that of a common row
+    Attributes:
+        shape: Height and width of the image.
+        threshold: Mean threshold of both polarities, ln I.
+        corner: Flat index of the look-up's pixel above and left.
+        fraction: Distance from there along x and y, px.
+        change: Change, in thresholds.
+        weight: Reciprocal variance relative to that of a common row.
+        kind: (rows,) kind of the row, such as `EVENT`.
+        pixel: Flat index of the pixel x.
+    """
+
+    shape: tuple[int, int]
+    threshold: float
+    corner: UInt32[np.ndarray, "rows 2"]
+    fraction: Float[np.ndarray, "rows 2 2"]
+    change: Float[np.ndarray, " rows"]
+    weight: Float[np.ndarray, " rows"]
     kind: NDArray[np.uint8]
-    pixel: Int32[np.ndarray, " rows"]  # flat index of the pixel x
+    pixel: Int32[np.ndarray, " rows"]
 
 
 def carry_pixels(

@@ -68,29 +68,52 @@ class Solution(NamedTuple):
 
 
 class Energy(NamedTuple):
-    """The energy (3) of one window in thresholds; rows that look up near pixels lie together."""
+    """The energy (3) of one window in thresholds; rows that look up near pixels lie together.
+
+    Attributes:
+        corner: Flat index of the look-up's pixel above and left.
+        fraction: Distance from there along x and y, px.
+        weight: Weights w_k.
+        change: Changes d_k, thresholds.
+        information: Lambda: xx, xy, yy, (px / threshold)^2.
+        pull: Transpose of the gradient times Lambda g.
+        params: Parameters of the solver.
+    """
 
     corner: UInt32[np.ndarray, "rows 2"]
     fraction: Float[np.ndarray, "rows 2 2"]
-    weight: Float[np.ndarray, " rows"]  # w_k
-    change: Float[np.ndarray, " rows"]  # d_k
-    information: Float[np.ndarray, "3 rows_or_0 width"]  # Lambda: xx, xy, yy
-    pull: Float[np.ndarray, "height width"]  # the transposed of the gradient times Lambda g
+    weight: Float[np.ndarray, " rows"]
+    change: Float[np.ndarray, " rows"]
+    information: Float[np.ndarray, "3 rows_or_0 width"]
+    pull: Float[np.ndarray, "height width"]
     params: SolverParams
 
 
 class _System(NamedTuple):
-    """The matrix A of a reweighted problem, or the second derivative of the energy."""
+    """The matrix A of a reweighted problem, or the second derivative of the energy.
+
+    Attributes:
+        corner: (rows, 2) flat index of the look-up's pixel above and left.
+        fraction: (rows, 2, 2) distance from there along x and y, px.
+        weight: (rows,) weights.
+        across: (height, width) weights of differences with the pixel right.
+        down: (height, width) weights of differences with the pixel below.
+        information: (3, height, width) xx, xy, yy, or without rows if none.
+        curvature: (height - 1, width - 1) phi'' of cells, or without rows.
+        image: (height, width) image at which the matrix is taken.
+        flux: (2, width) scratch.
+        leak: Weight of the image's square.
+    """
 
     corner: NDArray[np.uint32]
     fraction: NDArray[np.floating]
     weight: NDArray[np.floating]
-    across: NDArray[np.floating]  # (height, width) weights of differences with the pixel right
-    down: NDArray[np.floating]  # and with the pixel below
-    information: NDArray[np.floating]  # (3, height, width) xx, xy, yy, or without rows if none
-    curvature: NDArray[np.floating]  # (height - 1, width - 1) phi'' of cells, or without rows
-    image: NDArray[np.floating]  # (height, width) at which it is taken
-    flux: NDArray[np.floating]  # (2, width), to work in
+    across: NDArray[np.floating]
+    down: NDArray[np.floating]
+    information: NDArray[np.floating]
+    curvature: NDArray[np.floating]
+    image: NDArray[np.floating]
+    flux: NDArray[np.floating]
     leak: np.floating
 
 
@@ -202,11 +225,18 @@ def pack_prior(gradient: NDArray, information: NDArray) -> tuple[NDArray, NDArra
 
 
 class _Minimum(NamedTuple):
-    """The reweighted problem at the image of least energy."""
+    """The reweighted problem at the image of least energy.
+
+    Attributes:
+        system: The reweighted problem.
+        preconditioner: Its preconditioner.
+        residual: (rows,) residuals, thresholds.
+        iterations: Number of iterations.
+    """
 
     system: _System
     preconditioner: _Preconditioner
-    residual: NDArray[np.floating]  # of rows, in their order
+    residual: NDArray[np.floating]
     iterations: int
 
 
@@ -264,7 +294,14 @@ def _set_up(energy: Energy) -> _System:
 
 
 def _reweight_at(u: NDArray, energy: Energy, system: _System, residual: NDArray) -> None:
-    """Write the residuals at the image u, and the weights of rows and differences there."""
+    """Write the residuals at the image u, and the weights of rows and differences there.
+
+    Args:
+        u: (height, width) image, thresholds.
+        energy: The energy.
+        system: The reweighted problem, whose weights are written.
+        residual: (rows,) output, thresholds.
+    """
     params, convert = energy.params, energy.weight.dtype.type
     data = read_only(energy.change), read_only(energy.weight)
     numbers = convert(params.tail), convert(params.gradient), convert(params.edge)
@@ -312,7 +349,7 @@ def solve_linear(
     if exact:
         share = residual**2 / (2 * energy.params.tail**2)
         system.weight[:] = energy.weight * (1 - share) / (1 + share) ** 2
-        system = system._replace(curvature=_bend_cells(u, energy.params), image=read_only(u))
+        system = system._replace(curvature=_prior_curvature(u, energy.params), image=read_only(u))
     z, rho = np.zeros_like(right), 0.0
     least = tolerance * np.linalg.norm(right)
     for _ in range(MAX_STEPS // SAMPLE_STEPS):
@@ -322,7 +359,7 @@ def solve_linear(
     return z
 
 
-def _bend_cells(u: NDArray, params: SolverParams) -> NDArray:
+def _prior_curvature(u: NDArray, params: SolverParams) -> NDArray:
     """Return phi''(q), the second derivative of the prior (2), of the cells of an image.
 
     Args:
@@ -410,7 +447,7 @@ def _sample_variance(system, preconditioner, order, rng):
 
 
 @njit_fastmath_inlined
-def _row(system, k):
+def _row_coefficients(system, k):
     """Return the pixels that a row looks up, and their coefficients.
 
     Args:
@@ -457,8 +494,8 @@ def _look_up(pixels, a, u):
     """Return the difference of the two look-ups of a row.
 
     Args:
-        pixels: Eight flat indices, of `_row`.
-        a: Eight coefficients, of `_row`.
+        pixels: Eight flat indices, of `_row_coefficients`.
+        a: Eight coefficients, of `_row_coefficients`.
         u: (pixels,) flat image.
 
     Returns:
@@ -470,12 +507,12 @@ def _look_up(pixels, a, u):
 
 
 @njit_fastmath_inlined
-def _spread(pixels, a, value, out):
+def _add_transposed_row(pixels, a, value, out):
     """Add the transposed of a row times a value to an image.
 
     Args:
-        pixels: Eight flat indices, of `_row`.
-        a: Eight coefficients, of `_row`.
+        pixels: Eight flat indices, of `_row_coefficients`.
+        a: Eight coefficients, of `_row_coefficients`.
         value: The value.
         out: (pixels,) flat image, added to.
     """
@@ -500,8 +537,8 @@ def _add_transposed(system, values, out):
     """
     flat = out.reshape(-1)
     for k in range(len(values)):
-        pixels, a = _row(system, k)
-        _spread(pixels, a, values[k], flat)
+        pixels, a = _row_coefficients(system, k)
+        _add_transposed_row(pixels, a, values[k], flat)
 
 
 @njit_fastmath_inlined
@@ -576,7 +613,7 @@ def _add_cell(image, curvature, u, y, x, out):
 
 
 @njit_fastmath
-def _apply(system, u, out):
+def _apply_matrix(system, u, out):
     """Write A u.
 
     Args:
@@ -627,8 +664,8 @@ def _apply(system, u, out):
             _add_cell(system.image, system.curvature[y, x], u, y, x, out)
     flat, image = out.reshape(-1), u.reshape(-1)
     for k in range(len(system.weight)):
-        pixels, a = _row(system, k)
-        _spread(pixels, a, system.weight[k] * _look_up(pixels, a, image), flat)
+        pixels, a = _row_coefficients(system, k)
+        _add_transposed_row(pixels, a, system.weight[k] * _look_up(pixels, a, image), flat)
 
 
 @njit_fastmath
@@ -643,7 +680,7 @@ def _add_row_diagonal(system, diagonal, bend):
     width = system.across.shape[1]
     reciprocal, half = np.float32(1) / np.float32(width), np.float32(0.5)
     for k in range(len(system.weight)):
-        pixels, a = _row(system, k)
+        pixels, a = _row_coefficients(system, k)
         ya = np.floor((np.float32(pixels[0]) + half) * reciprocal)
         yb = np.floor((np.float32(pixels[4]) + half) * reciprocal)
         dy = ya + system.fraction[k, 0, 1] - yb - system.fraction[k, 1, 1]
@@ -710,7 +747,7 @@ def _coarse_rows(y, n):
 
 @njit_fastmath_inlined
 def _restrict(fine, coarse, line):
-    """Add a grid to one of half its nodes each way, the transpose of `_interpolate`.
+    """Add a grid to one of half its nodes each way, the transpose of `_add_prolongated`.
 
     Args:
         fine: (height, width) values.
@@ -736,7 +773,7 @@ def _restrict(fine, coarse, line):
 
 
 @njit_fastmath_inlined
-def _interpolate(coarse, fine, line):
+def _add_prolongated(coarse, fine, line):
     """Add a grid to one of twice its nodes each way, bilinear between centres of cells.
 
     Args:
@@ -805,7 +842,7 @@ def _precondition(scratch, r, z):
         if bits > 1:
             rows, columns = ((height - 1) >> (bits - 1)) + 1, ((width - 1) >> (bits - 1)) + 1
             fine = grids[begin - rows * columns : begin].reshape(rows, columns)
-        _interpolate(coarse, fine, scratch.line)
+        _add_prolongated(coarse, fine, scratch.line)
         end = begin
 
 
@@ -824,7 +861,7 @@ def _reweight(system, u, data, numbers, residual):
     tail, gradient, edge = numbers
     image = u.reshape(-1)
     for k in range(len(change)):
-        pixels, a = _row(system, k)
+        pixels, a = _row_coefficients(system, k)
         e = _look_up(pixels, a, image) - change[k]
         residual[k] = e
         system.weight[k] = base[k] / (1 + e * e / (2 * tail * tail))
@@ -845,7 +882,7 @@ def _reweight(system, u, data, numbers, residual):
 
 
 @njit_fastmath
-def _turn(r, before, z, rho, p):
+def _update_direction(r, before, z, rho, p):
     """Turn the direction of conjugate gradients by a preconditioned residual.
 
     As the matrix changes, directions are those of Polak and Ribiere.
@@ -915,14 +952,14 @@ def _conjugate_gradients(system, b, u, scratch, stage):
     rho, steps = convert(stage[0]), stage[1]
     _, residual, _, direction, product, preconditioned = scratch.images
     r, before, p, Ap, z = scratch.images[1:].reshape(5, -1)
-    _apply(system, u, product)
+    _apply_matrix(system, u, product)
     np.subtract(b, product, out=residual)
     for _ in range(steps):
         _precondition(scratch, residual, preconditioned)
-        rho = convert(_turn(r, before, z, rho, p))
+        rho = convert(_update_direction(r, before, z, rho, p))
         if rho <= 0:
             break
-        _apply(system, direction, product)
+        _apply_matrix(system, direction, product)
         if not _advance(p, Ap, u.reshape(-1), r, before):
             return convert(0)
     return rho

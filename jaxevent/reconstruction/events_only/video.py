@@ -21,7 +21,12 @@ GREY = 0.5  # intensity where the log image is at its mean: events alone tell it
 
 
 class IntensityScale(NamedTuple):
-    """Scales of images: ln(I + I0) = factor (L - mean L) + level."""
+    """Scales of images: ln(I + I0) = factor (L - mean L) + level.
+
+    Attributes:
+        factor: ln I per unit of L.
+        level: Mean log intensity.
+    """
 
     factor: Float[Numeric, " images"]
     level: Float[Numeric, " images"]
