@@ -33,6 +33,11 @@ def plural(noun: str, number: int) -> str:
     return noun if number == 1 else noun + "s"
 
 
+def format_count(number: int, noun: str) -> str:
+    """Write a number of things: "1 track", "2,000 tracks"."""
+    return f"{number:,} {plural(noun, number)}"
+
+
 def format_seconds(us: Any) -> str:
     """Write a time of microseconds in seconds, to the microsecond: 250000 is "0.25"."""
     return f"{int(us) / 1e6:.6f}".rstrip("0").removesuffix(".")

@@ -810,7 +810,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:  # not TOML, not UTF-8, or an integer without end
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is no text; give a file in TOML") from None
+    except ValueError as error:  # not TOML, or an integer without end
         raise InputError(f"{path}: is not TOML ({error}); mend that line") from None
 
 

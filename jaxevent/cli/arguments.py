@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from jaxevent.display import format_count
 from jaxevent.errors import InputError, InputWarning
 
 
@@ -397,6 +398,6 @@ def check_seed(number: int) -> None:
 
 
 def print_stored(recording: Any, path: Path) -> None:
-    frames = len(recording.frames) if recording.frames else 0
-    size_mb = path.stat().st_size / 1e6
-    print(f"{path}: {len(recording.events):,} events, {frames} frames, {size_mb:.1f} MB")
+    events = format_count(len(recording.events), "event")
+    frames = format_count(len(recording.frames) if recording.frames else 0, "frame")
+    print(f"{path}: {events}, {frames}, {path.stat().st_size / 1e6:.1f} MB")

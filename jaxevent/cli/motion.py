@@ -9,6 +9,7 @@ from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
+from jaxevent.display import format_count
 from jaxevent.errors import InputError
 
 N_PLOTTED_PARTICLES = 64  # particles of an estimate that are kept for the plot
@@ -199,7 +200,7 @@ def _write(options: Options, kind: Any) -> None:
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)
     print(
-        f"\n{', '.join(written.files)} in {options.out}: {count:,} events in "
+        f"\n{', '.join(written.files)} in {options.out}: {format_count(count, 'event')} in "
         f"{arguments.describe_speed(count, seconds)}"
     )
 

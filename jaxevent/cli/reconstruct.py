@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
+from jaxevent.display import format_count
 from jaxevent.errors import InputError
 
 
@@ -223,6 +224,6 @@ def run(
     how = write(video, chosen, out, ExportOptions(shown, name, colours))
     seconds = time.perf_counter() - clock
     print(
-        f"{out}: {len(chosen):,} images{how}, "
+        f"{out}: {format_count(len(chosen), 'image')}{how}, "
         f"{arguments.describe_speed(len(recording.events), seconds)}"
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
-from jaxevent.display import plural
+from jaxevent.display import format_count
 from jaxevent.errors import InputError
 
 
@@ -205,7 +205,7 @@ def run(
     how = ", ".join(written.files) + f" in {out}" if not out.suffix else str(out)
     slow = "" if written.slow is None else f"; the video plays at {written.slow:.3g} of real time"
     print(
-        f"\n{how}: {len(tracks):,} {plural('track', len(tracks))}, {count:,} events in "
+        f"\n{how}: {format_count(len(tracks), 'track')}, {format_count(count, 'event')} in "
         f"{arguments.describe_speed(count, seconds)}{slow}"
     )
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command
+from jaxevent.display import format_count
 from jaxevent.errors import InputError
 
 
@@ -60,4 +61,4 @@ def run(
         raise InputError(f"{path}: holds no events, or none from --start to --stop")
     view(recording, *results, out=out, window=window / 1e3)
     if out is not None:
-        print(f"{out}: {len(recording.events):,} events; open it with: rerun {out}")
+        print(f"{out}: {format_count(len(recording.events), 'event')}; open it with: rerun {out}")

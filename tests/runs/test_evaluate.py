@@ -195,6 +195,11 @@ def test_configurations_are_refused(folder, text, said):
     assert not (folder / "out").exists()
 
 
+def test_a_recording_is_no_configuration(folder):
+    with pytest.raises(jaxevent.InputError, match=r"small.h5: is no text; give a file in TOML"):
+        evaluate(folder / "small.h5", folder / "out")
+
+
 def test_a_failure_leaves_earlier_results(folder, float32):
     out = folder / "out"
     evaluate(write_config(folder, ONE), out)
