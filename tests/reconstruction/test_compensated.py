@@ -1036,7 +1036,7 @@ def test_bad_input():
     with pytest.raises(InputError, match="were requested"):
         video()(np.array([-5_000_000]))
     with pytest.raises(InputError, match="no option"):
-        mc.estimate(recording, params(), window_events=1)
+        mc.estimate(recording, params(), seeds=())
 
 
 @pytest.mark.slow
