@@ -108,7 +108,7 @@ def allgather(message: Any) -> list[Any]:
 
     Arrays are exact. Raises `InputError` for a message that `serialise` would not make.
     """
-    if jax.process_count() == 1:
+    if is_single():
         return [message]
     from jax.experimental.multihost_utils import process_allgather
 
@@ -178,7 +178,7 @@ def on_process_zero(compute: Callable[[], T]) -> T:
 
     An `InputError` there is raised on all processes.
     """
-    if jax.process_count() == 1:
+    if is_single():
         return compute()
     message: tuple[str, Any] = ("", None)
     if is_process_zero():
@@ -194,7 +194,7 @@ def on_process_zero(compute: Callable[[], T]) -> T:
 
 def on_all_processes(compute: Callable[[], T]) -> T:
     """Compute on each process; an `InputError` on one is raised on all."""
-    if jax.process_count() == 1:
+    if is_single():
         return compute()
     value: Any = None
     error = None

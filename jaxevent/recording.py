@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxevent import arrays
 from jaxevent.camera import PinholeCamera, Response, TableResponse, UnknownResponse
-from jaxevent.display import HtmlRepr, describe_type, format_seconds, format_span, plural
+from jaxevent.display import HtmlRepr, describe_type, format_count, format_seconds, format_span
 from jaxevent.errors import InputError, InputWarning, OrderError
 from jaxevent.time_units import doubt_given_unit
 
@@ -114,7 +114,7 @@ def _describe_span(what: str, number: int, t: Any) -> str:
     Returns:
         The description.
     """
-    text = f"{number:,} {plural(what, number)}"
+    text = format_count(number, what)
     if number < 2:
         return f"{text} at {format_seconds(t[0])} s" if number else text
     return f"{text} from {format_span(t)}"

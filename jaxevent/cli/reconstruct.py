@@ -134,7 +134,8 @@ def _default_times(
     estimator: Any,
     values: Any,
     rate: float | int | None,
-    *span: float | int | None,
+    start: float | int | None,
+    stop: float | int | None,
 ) -> Any:
     """Return times (us) of images, where no file gives them, from a start to a stop (s)."""
     from jaxevent.events.clocks import check_clocks, compare_clocks
@@ -150,7 +151,7 @@ def _default_times(
         check_clocks(recording, values.clock_offset)
     elif compare_clocks(recording, values.clock_offset) is not None:
         spanned = dataclasses.replace(recording, frames=None)
-    return image_times(spanned, 100.0 if rate is None else rate, *span)
+    return image_times(spanned, 100.0 if rate is None else rate, start, stop)
 
 
 def run(

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.display import plural
+from jaxevent.display import format_count
 from jaxevent.errors import InputError, OrderError
 
 DEFAULT_MAX_LATE_US = 10_000  # us that an event may be late where sorting has no bound of its own
@@ -173,13 +173,13 @@ class Disorder:
             )
         if self.outliers:
             n = self.dropped
-            yield "drop", f"{n:,} {plural('event', n)} far from the times around {_pronoun(n)}"
+            yield "drop", f"{format_count(n, 'event')} far from the times around {_pronoun(n)}"
         if self.late:
             n, bound = self.late, max(self.bound, self.latest)
             sort = "sort" if bound == DEFAULT_MAX_LATE_US else f"sort:{bound}"
             yield (
                 sort,
-                f"{n:,} {plural('event', n)} late by at most {self.latest:,} us (jitter)",
+                f"{format_count(n, 'event')} late by at most {self.latest:,} us (jitter)",
             )
 
     def refuse_rest(self, repair: Repair, source: str) -> None:
@@ -210,9 +210,7 @@ class Disorder:
         if repair.unwrap and self.wraps:
             row, period = self.wraps[0]
             touched = self.events - row
-            made.append(
-                f"{touched:,} {plural('event', touched)} moved by multiples of {_period(period)}"
-            )
+            made.append(f"{format_count(touched, 'event')} moved by multiples of {_period(period)}")
         begin, end = self.kept_rows(repair)
         if end - begin < self.events:
             made.append(
@@ -220,11 +218,10 @@ class Disorder:
                 f"{end - 1} stay)"
             )
         if repair.drop and self.outliers:
-            made.append(f"{self.dropped:,} {plural('outlier', self.dropped)} dropped")
+            made.append(f"{format_count(self.dropped, 'outlier')} dropped")
         if repair.sort and self.late:
             made.append(
-                f"{self.late:,} late {plural('event', self.late)} sorted (by at most "
-                f"{self.latest:,} us)"
+                f"{format_count(self.late, 'late event')} sorted (by at most {self.latest:,} us)"
             )
         return f"repaired event times: {', '.join(made) or 'none went back'}"
 

@@ -25,7 +25,6 @@ from jaxevent.estimator import ShortRepr
 
 TILE_SHAPES = ((8, 4096), (64, 512), (512, 64))  # ranks and lanes of the three kinds of tile
 N_TILE_SLOTS = 8 * 4096  # of every tile
-MIN_TILE_LANES = 64  # of the narrowest tile
 
 # Prepared on the host, where they stay until a jitted function takes them.
 if TYPE_CHECKING:

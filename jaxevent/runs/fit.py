@@ -265,7 +265,7 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
         data = processes.on_all_processes(lambda: _load_all(plan, progress))
         plan = processes.on_all_processes(lambda: calibrated_plan(plan, data))
         key = ""
-        if out is not None or jax.process_count() > 1:
+        if out is not None or not processes.is_single():
             key = processes.on_all_processes(plan.digest)
         if len(set(processes.allgather(key))) > 1:
             raise InputError(

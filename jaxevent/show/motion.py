@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from jaxevent.display import plural
+from jaxevent.display import format_count
 from jaxevent.egomotion import flow as event_flow
 from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model, find_model
@@ -417,7 +417,7 @@ class WrittenMotion:
     def _count(self) -> str:
         """Count the estimates, without those that are held."""
         number = len(self.motion) - self.motion.n_extended
-        return f"{number:,} {plural('estimate', number)}"
+        return format_count(number, "estimate")
 
     def _describe_motion(self) -> list[str]:
         """Return lines about when the motion was found, its components and errors."""
