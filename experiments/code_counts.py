@@ -17,6 +17,24 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 MOST_ARGUMENTS = 6  # positional ones of a function
 
+# Functions of more than six positional arguments, and the reason.
+_LOOP = "a compiled loop over columns and its outputs, called once or twice"
+_FIT = "public since the first release, in the order of `optimise`"
+LONG_SIGNATURES = {
+    "_add_prediction": _LOOP, "_interpolate_counts": _LOOP, "_area": _LOOP, "_add_moments": _LOOP,
+    "_accumulate_votes": _LOOP, "_warp_and_vote": _LOOP, "_accumulate": _LOOP,
+    "make_vector_sums._.function": "numbers and pointers, as LLVM passes them",
+    "half_line_residual": "the letters of one equation, public since the first release",
+    "confidence_intervals": _FIT, "optimise": _FIT,
+    "fit": "public since the first release: all settings of a configuration",
+    "_fit_file": "the settings of `fit` for a configuration in a file",
+}  # fmt: skip
+
+# An annotation without a shape or a unit, and a text that states a unit.
+OPEN_ANNOTATION = r"\b(Any|float|ndarray|NDArray|ArrayLike|Array)\b"
+SHAPED_ANNOTATION = r"\b(Float|Int|Bool|Shaped|Num)\["
+UNIT_TEXT = r"\b(px|s|us|rad|Hz|m|ln I)\b"
+
 # A docstring that begins so has to be solved before it is read.
 STARTS = ("What", "Where", "Whether", "How", "Which", "Of", "Whose", "The same", "As", "By how")
 
@@ -139,6 +157,15 @@ class Definition:
         )
 
     @property
+    def open_arguments(self) -> list[str]:
+        """Names of the arguments of a function whose annotation leaves shape or unit open."""
+        if isinstance(self.node, ast.ClassDef):
+            return []
+        signature = self.node.args
+        arguments = [*signature.posonlyargs, *signature.args, *signature.kwonlyargs]
+        return [a.arg for a in arguments if a.arg not in ("self", "cls") and is_open(a.annotation)]
+
+    @property
     def docstring(self) -> str:
         return ast.get_docstring(self.node) or ""
 
@@ -147,6 +174,35 @@ class Definition:
         """True for a variant or a setter of a function that is documented elsewhere."""
         marks = {ast.unparse(one).split(".")[-1] for one in self.node.decorator_list}
         return bool(marks & {"overload", "setter"})
+
+
+def is_open(annotation: ast.expr | None) -> bool:
+    """Return true if an annotation leaves a shape or a unit open."""
+    text = "Any" if annotation is None else ast.unparse(annotation)
+    return bool(re.search(OPEN_ANNOTATION, text)) and not re.search(SHAPED_ANNOTATION, text)
+
+
+def unexplained_fields(one: Definition) -> list[str]:
+    """Names of the open fields of a class that neither a comment nor the docstring explains."""
+    lines = one.path.read_text().splitlines()
+    found = []
+    for node in one.node.body:
+        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
+            continue
+        near = [lines[node.lineno - 2].strip(), *lines[node.lineno - 1 : node.end_lineno]]
+        has_comment = near[0].startswith("#") or any("#" in line for line in near[1:])
+        if is_open(node.annotation) and not has_comment:
+            if not re.search(rf"\b{node.target.id}\b", one.docstring):
+                found.append(node.target.id)
+    return found
+
+
+def needs_arguments(one: Definition) -> bool:
+    """Return true if a documented function leaves shapes or units of its arguments open."""
+    if not one.docstring or "Args:" in one.docstring or not one.open_arguments:
+        return False
+    several = len(one.arguments) + len(one.keywords) >= 2
+    return several and not re.search(UNIT_TEXT, one.docstring)
 
 
 def files_of(*folders: str) -> list[Path]:
@@ -330,6 +386,7 @@ def broken_rules(paths: list[Path]) -> dict[str, list[str]]:
         "docstring begins badly": [], "public surface without docstring": [],
         "public surface without Args or Returns": [], "more than six positional arguments": [],
         "class is no noun": [], "word of the old glossary": [],
+        "shape or unit open without Args": [], "field without unit": [],
         "text names an unknown constant": unknown_constants(paths),
     }  # fmt: skip
     for path in paths:
@@ -339,9 +396,16 @@ def broken_rules(paths: list[Path]) -> dict[str, list[str]]:
             if begins_badly(one.docstring):
                 found["docstring begins badly"].append(one.place)
             if len(one.arguments) > MOST_ARGUMENTS:
+                reason = LONG_SIGNATURES.get(one.place.split()[-1], "no reason is known")
                 found["more than six positional arguments"].append(
-                    f"{one.place} {len(one.arguments)}"
+                    f"{one.place} {len(one.arguments)}: {reason}"
                 )
+            if isinstance(one.node, ast.ClassDef):
+                found["field without unit"] += [
+                    f"{one.place}.{field}" for field in unexplained_fields(one)
+                ]
+            elif needs_arguments(one) and not is_documented_by_base(one, bases, methods):
+                found["shape or unit open without Args"].append(one.place)
             if isinstance(one.node, ast.ClassDef) and is_no_noun(one.name):
                 found["class is no noun"].append(one.place)
             if one.name in GLOSSARY and one.name not in KEPT_WORDS:

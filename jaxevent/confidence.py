@@ -269,7 +269,15 @@ class _Sample:
         return {name: jnp.asarray(v, self.found.raw[name].dtype) for name, v in leaves.items()}
 
     def losses(self, params: Parameters, batches: Sequence[Any] | None = None):
-        """Compute the loss of every part and its weight, both (parts,)."""
+        """Compute the loss and the weight of every part.
+
+        Args:
+            params: Parameters of the loss.
+            batches: Batches of the loss; None: those of the sample.
+
+        Returns:
+            Losses and weights, (parts,) each; the loss of a part of weight 0 is 0.
+        """
         batches = self.batches if batches is None else batches
         if not isinstance(self.loss, PartwiseLoss):
             found = map_batches(lambda batch: evaluate_loss(self.loss, params, batch), batches)

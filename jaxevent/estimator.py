@@ -106,8 +106,8 @@ class Result(Protocol):
 class OptionKind(NamedTuple):
     """Domain of an option: a test of values, and its description."""
 
-    fits: Callable[[Any], bool]
-    text: str
+    fits: Callable[[Any], bool]  # test of a value
+    text: str  # description of the domain, for messages
 
 
 def option_of_class(kind: type, optional: bool = True) -> OptionKind:
@@ -393,7 +393,15 @@ CHECKED_METHODS = frozenset({"prepare", "prepare_images", "estimate", "live", "r
 
 
 def _check_arguments(step: str, method: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a step of an estimator so that wrong arguments are refused in a sentence."""
+    """Wrap a step of an estimator so that wrong arguments are refused in a sentence.
+
+    Args:
+        step: Name of the step, such as "estimate".
+        method: Function that computes the step, with `self`.
+
+    Returns:
+        A function of the same arguments that raises `InputError` for wrong ones.
+    """
     signature = inspect.signature(method)
     kinds = signature.parameters.items()
     rest = next((name for name, one in kinds if one.kind is one.VAR_KEYWORD), "")

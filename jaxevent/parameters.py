@@ -255,7 +255,15 @@ else:
 
 
 def _make_inherited_init(base: Any, owner: str) -> Any:
-    """Make an `__init__` of a class's own that calls its base's."""
+    """Make an `__init__` for a class that calls that of its base.
+
+    Args:
+        base: Class whose `__init__` is called.
+        owner: Qualified name of the class that gets the function.
+
+    Returns:
+        The function.
+    """
 
     def init(self, *, preset: str | None = None, **values: Any):
         base.__init__(self, preset=preset, **values)
@@ -270,7 +278,8 @@ def _make_inherited_init(base: Any, owner: str) -> Any:
 class _ParameterArrays(_Module):
     """State of `Parameters`."""
 
-    raw: dict[str, Array]
+    raw: dict[str, Array]  # numbers in unconstrained form, by name
+    # choices and counts, by name
     chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
     followed: frozenset[str] = eqx.field(static=True)  # see `Parameters.with_derivatives`
     # The homogeneous coordinate of `raw`: 1 of parameters, 0 of what is derived by them, and of
@@ -299,7 +308,7 @@ class Parameters(_ParameterArrays):
 
     numbers: ClassVar[Mapping[str, Number]] = {}
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of values
     calibrated: ClassVar[tuple[str, ...]] = ()  # names that calibrations of recordings determine
     # Where frames are clipped or blurred, or events contradict them at the defaults.
     calibrated_if_needed: ClassVar[tuple[str, ...]] = ()
@@ -577,7 +586,19 @@ class Parameters(_ParameterArrays):
     def _take_calibration(
         cls, calibration: Any, table: Mapping[str, Any], params: "Parameters"
     ) -> dict[str, Any]:
-        """Return what a table `[calibration]` says of the names that another table leaves open."""
+        """Select the values of a calibration that complete the settings of a method.
+
+        Args:
+            calibration: Table `[calibration]` of a file, by `jaxevent calibrate`.
+            table: Settings of the user; they have precedence.
+            params: Parameters by `table` alone.
+
+        Returns:
+            Values of the calibration for the parameters that `table` leaves open.
+
+        Raises:
+            InputError: The calibration is no table, or the method has none of its parameters.
+        """
         if not isinstance(calibration, dict):
             raise InputError(
                 f"calibration is {str(calibration)[:40]!r}; give the table that jaxevent calibrate "

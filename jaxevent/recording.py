@@ -629,7 +629,17 @@ def _integer_times(values: Any, what: str) -> NDArray[np.int64]:
 def _set_rows(
     part: Any, what: str, may_be_nan: str | None = None, **columns: tuple[tuple[int, ...], Any]
 ) -> None:
-    """Set checked times and, by name, columns of a shape per row and a type; or `InputError`."""
+    """Check times and columns of measurements, and store them with their types.
+
+    Args:
+        part: Frozen dataclass with `t` (us) and the columns; changed in place.
+        what: Name of a row for messages.
+        may_be_nan: Column that may hold NaN.
+        columns: Shape of a row and type, by the name of the column.
+
+    Raises:
+        InputError: Times are not sorted, or a column has another shape or is not finite.
+    """
     t = _integer_times(part.t, f"{what}: t")
     row = arrays.first_decrease(t)
     if row is not None:
@@ -656,7 +666,7 @@ def _set_rows(
 class _TimedRows:
     """Rows of measurements at sorted times; subclasses have further columns."""
 
-    t: NDArray[np.int64]
+    t: NDArray[np.int64]  # (n,) us
 
     def __len__(self) -> int:
         return len(self.t)

@@ -288,7 +288,7 @@ class _Contradiction(NamedTuple):
 
     unit: str
     text: str
-    nats: float
+    nats: float  # log-likelihood ratio of the units
 
 
 def _contradiction(
@@ -329,12 +329,12 @@ def _doubt(source: str, numbers: "_Numbers", unit: str, other: str) -> str:
 class _Numbers(NamedTuple):
     """Properties of a column of event times, in its own unit."""
 
-    count: int
-    pixels: int
-    span: float
-    largest: float
-    median: float  # without sign
-    repetition: float | None
+    count: int  # of events
+    pixels: int  # of the sensor
+    span: float  # sum of steps forwards, without one gap that exceeds all others by far
+    largest: float  # largest magnitude
+    median: float  # median magnitude
+    repetition: float | None  # 5 % quantile of times between a pixel's events; None: unknown
     digits: int | None  # decimal places, negative for multiples of ten; None for any number
     is_float: bool
     rounding: float  # distance between neighbouring numbers, as of `time_step`

@@ -245,7 +245,15 @@ def format_toml(
 
 
 def _read(key: str, of_bytes: Callable[[bytes], Any]) -> Any:
-    """Return the value that is stored under a key; None where it is missing or damaged."""
+    """Return the value that is stored under a key; None if it is missing or damaged.
+
+    Args:
+        key: Key of the value, the name of its file.
+        of_bytes: Function that decodes a file's bytes.
+
+    Returns:
+        The value, or None.
+    """
     folder = cache.folder_for_calibrations()
     with contextlib.suppress(Exception):  # whatever NumPy says of damaged archives
         if folder is not None:

@@ -295,7 +295,12 @@ class _PrintCompletion(argparse.Action):
 
 
 def _complete_files(parser: argparse.ArgumentParser, how: Any) -> None:
-    """Have all words that are paths completed by the names of files, of commands too."""
+    """Have shells complete the names of files in all arguments that are paths.
+
+    Args:
+        parser: A parser; those of its subcommands are changed, too.
+        how: shtab's commands that complete a file's name, by shell.
+    """
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for one in action.choices.values():

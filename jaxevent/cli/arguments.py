@@ -60,7 +60,15 @@ class CommandParser(argparse.ArgumentParser):
         super().error(message)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as argparse does; a command refuses what it does not know itself."""
+        """Parse as argparse does; a command refuses what it does not know itself.
+
+        Args:
+            args: Words of the command line; None: the program's own.
+            namespace: Object that gets the options; None: a new one.
+
+        Returns:
+            The options, and the words that the parser left.
+        """
         found, unknown = super().parse_known_args(args, namespace)
         if unknown and self._subparsers is None:
             options = [name for name in self._option_string_actions if name.startswith("--")]
@@ -76,9 +84,17 @@ class CommandParser(argparse.ArgumentParser):
 def command(
     commands: Any, run: Callable, description: str, *examples: str, part: str = ""
 ) -> argparse.ArgumentParser:
-    """Add a command, named by the module of `run`, which takes the parsed options.
+    """Add a command, named by the module of `run`.
 
-    `part` is the name of a subcommand, as in `jaxevent camera merge`.
+    Args:
+        commands: The subparsers of `argparse` that get the command.
+        run: Function that takes the parsed options by name.
+        description: Text of its help; the first sentence is its line in the list of commands.
+        examples: Arguments of examples, shown below the help.
+        part: Name of a subcommand, as in `jaxevent camera merge`; "" for a command.
+
+    Returns:
+        Parser of the command, to which options are added.
     """
     name = run.__module__.rpartition(".")[2] + f" {part}" * bool(part)
     lines = "".join(f"\n  jaxevent {name} {example}".rstrip() for example in examples)
@@ -153,7 +169,18 @@ def refuse_with_live(given: Mapping[str, bool]) -> None:
 
 
 def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
-    """Open what --live reads: a recording that describes the sensor, and chunks of events."""
+    """Open the input of --live.
+
+    Args:
+        path: The recording; "-" is standard input.
+        reading: Options of `add_reading`; of standard input `size` must be known.
+
+    Returns:
+        A recording that describes the sensor, and an iterator over chunks of events.
+
+    Raises:
+        InputError: The events come from standard input, and --size is missing.
+    """
     from jaxevent.events import live
 
     if str(path) != "-":
@@ -173,7 +200,13 @@ def open_live(path: Path, reading: dict[str, Any]) -> tuple[Any, Iterator[Any]]:
 
 
 def add_frames(one: Any, name: str, source: str) -> None:
-    """Add the option that chooses the frames of a recording, named in its help as `source`."""
+    """Add the option that chooses the frames of a recording.
+
+    Args:
+        one: Parser of a command.
+        name: Name of the option.
+        source: Name of the recording in the help.
+    """
     one.add_argument(
         name,
         metavar="NAME",
@@ -211,14 +244,31 @@ def describe_calibration(values: Any) -> str:
 
 
 def open_recording(path: Path, reading: dict[str, Any], **more: Any) -> Any:
-    """Open a recording with the options of `add_reading`; events and images stay in its file."""
+    """Open a recording with the options of `add_reading`; events and images stay in its file.
+
+    Args:
+        path: The recording.
+        reading: Options of `add_reading`, arguments of `jaxevent.load`.
+        more: Further arguments of `jaxevent.load`.
+
+    Returns:
+        The recording.
+    """
     from jaxevent.io import load
 
     return load(path, in_memory=False, progress=show_progress(), **reading, **more)
 
 
 def open_named(path: Path, reading: dict[str, Any]) -> tuple[Any, str]:
-    """Open a recording as `open_recording`, named by its path for messages; return its name too."""
+    """Open a recording as `open_recording` does, and name it by its path for messages.
+
+    Args:
+        path: The recording.
+        reading: Options of `add_reading`.
+
+    Returns:
+        The recording, whose name is its path, and its own name.
+    """
     recording = open_recording(path, reading)
     return dataclasses.replace(recording, name=str(path)), recording.name
 
@@ -263,9 +313,18 @@ def add_output(
 def guard_outputs(options: dict[str, Any], words: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Check the outputs of a command, and yield the options that its `run` takes.
 
-    All paths among the options that are no outputs are inputs. Within the block, written files
-    record that the command line `words` made them from these inputs. Raises `InputError` like
-    `jaxevent.io.output.check_outputs`.
+    Within the block, written files record the command line and the inputs they were made from.
+
+    Args:
+        options: Options of the command by name. Those that `options["outputs"]` names are outputs,
+            all other paths are inputs.
+        words: Words of the command line, which written files record.
+
+    Yields:
+        The options without `outputs`, with those of `add_reading` as one, `reading`.
+
+    Raises:
+        InputError: As `jaxevent.io.output.check_outputs` does.
     """
     outputs = options.get("outputs", {})
     force = options.get("force", False)

@@ -92,7 +92,12 @@ def _numbers_of_methods(recording: Any) -> dict[str, dict[str, float]]:
 
 
 def _write(path: Path, content: Any) -> None:
-    """Write a text, or a figure."""
+    """Write a text or a figure.
+
+    Args:
+        path: File to write.
+        content: The text, or a figure of matplotlib, which is stored as PNG.
+    """
     if isinstance(content, str):
         path.write_text(content, encoding="utf-8")
     else:

@@ -5,12 +5,22 @@ import math
 import time
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
 from jaxevent.display import format_count
 from jaxevent.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from jaxevent.egomotion.estimator import MotionEstimator
+    from jaxevent.egomotion.model_selection import ModelSelection
+    from jaxevent.egomotion.models import Model
+    from jaxevent.egomotion.motion import MotionEstimate
+    from jaxevent.recording import Recording
 
 N_PLOTTED_PARTICLES = 64  # particles of an estimate that are kept for the plot
 
@@ -129,20 +139,20 @@ class Options:
     params: Path | None
     seed: int
     truth: Path | str | None
-    depth: float | int | None
+    depth: float | int | None  # m, of the plane in front of the camera
     imu: bool
     imu_rotation: str | None
-    still: tuple[float, float] | None
-    rate: float | int
+    still: tuple[float, float] | None  # s, first and last time
+    rate: float | int  # rows per second
     causal: bool
     centred: bool
     smooth: bool
-    start: float | int | None
-    stop: float | int | None
+    start: float | int | None  # s
+    stop: float | int | None  # s
     flow: bool
-    focal: float | int | None
+    focal: float | int | None  # px
     live: bool
-    reading: dict[str, Any]
+    reading: dict[str, Any]  # options of `arguments.add_reading`
     out: Path | None
 
 
@@ -157,7 +167,7 @@ def run(**given: Any) -> None:
         _write(options, kind)
 
 
-def _write(options: Options, kind: Any) -> None:
+def _write(options: Options, kind: "type[Model] | None") -> None:
     """Write the motion of a recording; without a `kind` its model is chosen."""
     from jaxevent.egomotion.truth import imu_rotation as rotation_of
     from jaxevent.runs.egomotion import find_estimator
@@ -205,7 +215,7 @@ def _write(options: Options, kind: Any) -> None:
     )
 
 
-def _check_options(options: Options, kind: Any) -> None:
+def _check_options(options: Options, kind: "type[Model] | None") -> None:
     """Raise `InputError` for options that exclude each other, before anything is read."""
     from jaxevent.runs.egomotion import find_estimator
 
@@ -218,7 +228,7 @@ def _check_options(options: Options, kind: Any) -> None:
     arguments.check_seed(options.seed)
 
 
-def _open(options: Options) -> Any:
+def _open(options: Options) -> "Recording":
     """Open the recording with its camera; it must hold events, and the IMU that options need."""
     path = options.path
     recording, _ = arguments.open_named(path, options.reading)
@@ -233,7 +243,7 @@ def _open(options: Options) -> Any:
     return recording
 
 
-def _gyro_bias(options: Options, recording: Any) -> Any:
+def _gyro_bias(options: Options, recording: "Recording") -> "NDArray[np.float64] | None":
     """Return the gyro's rates (3,), rad/s, while the camera is still; None without --still."""
     from jaxevent.egomotion.truth import gyro_bias
 
@@ -242,7 +252,7 @@ def _gyro_bias(options: Options, recording: Any) -> Any:
     return gyro_bias(recording.imu, *options.still)
 
 
-def _select_model(recording: Any) -> tuple[Any, Any, Any]:
+def _select_model(recording: "Recording") -> "tuple[type[Model], Recording, ModelSelection]":
     """Select a model by the recording; return it, the recording with its lens, and the test."""
     from jaxevent.egomotion.model_selection import select_model
 
@@ -253,8 +263,13 @@ def _select_model(recording: Any) -> tuple[Any, Any, Any]:
     return choice.model, recording, choice
 
 
-def _include_doubts(motion: Any, recording: Any, choice: Any, focal: float | None) -> Any:
-    """Add the uncertainty of model, focal length and parts of the image to a motion."""
+def _include_doubts(
+    motion: "MotionEstimate",
+    recording: "Recording",
+    choice: "ModelSelection | None",
+    focal: float | None,
+) -> "MotionEstimate":
+    """Add the uncertainty of model, focal length (px) and parts of the image to a motion."""
     if choice is not None:
         motion = choice.include_doubt(motion)
     if focal is not None:
@@ -265,7 +280,7 @@ def _include_doubts(motion: Any, recording: Any, choice: Any, focal: float | Non
     return motion
 
 
-def _print_live(options: Options, kind: Any) -> None:
+def _print_live(options: Options, kind: "type[Model] | None") -> None:
     """Print rows of motion.csv as events come, each as soon as an estimate after it is there."""
     from jaxevent.egomotion import voting
     from jaxevent.show.motion import LiveTable
@@ -293,7 +308,7 @@ def _print_live(options: Options, kind: Any) -> None:
     print(table.rows(), end="", flush=True)
 
 
-def _check(estimator: Any, kind: Any, options: Options) -> None:
+def _check(estimator: "MotionEstimator", kind: "type[Model]", options: Options) -> None:
     """Raise `InputError` for a model or an option that the method does not know."""
     from jaxevent.methods import names
     from jaxevent.runs.egomotion import find_estimator
@@ -308,7 +323,9 @@ def _check(estimator: Any, kind: Any, options: Options) -> None:
             )
 
 
-def _crop_events(recording: Any, start: float | int | None, stop: float | int | None) -> Any:
+def _crop_events(
+    recording: "Recording", start: float | int | None, stop: float | int | None
+) -> "Recording":
     """Return a recording's events from start to stop (s), with the poses and the IMU of all."""
     if start is None and stop is None:
         return recording
@@ -321,7 +338,7 @@ def _crop_events(recording: Any, start: float | int | None, stop: float | int | 
     return part
 
 
-def _with_camera(recording: Any, focal: float | int | None) -> Any:
+def _with_camera(recording: "Recording", focal: float | int | None) -> "Recording":
     """Return the recording with a camera of the focal length (px) that was given, if any was."""
     from jaxevent.camera import PinholeCamera
 
@@ -335,15 +352,15 @@ def _with_camera(recording: Any, focal: float | int | None) -> Any:
     return dataclasses.replace(recording, camera=PinholeCamera(focal, focal, *centre))
 
 
-def _truth_hint(recording: Any, kind: Any) -> list[str]:
+def _truth_hint(recording: "Recording", kind: "type[Model]") -> list[str]:
     """Return a line that recommends --truth if the recording holds its true motion, else none."""
     has = {"poses": recording.poses, "gyro": recording.imu}
     sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.truth_sources
-    known = [name for name in sources if has[name] is not None and len(has[name])]
+    known = [name for name in sources if (rows := has[name]) is not None and len(rows)]
     return [f"the recording's {known[0]} can show errors: add --truth"] if known else []
 
 
-def _need_camera(recording: Any, kind: Any) -> None:
+def _need_camera(recording: "Recording", kind: "type[Model]") -> None:
     from jaxevent.egomotion import MODELS
 
     if kind.needs_camera and recording.camera is None:
@@ -355,7 +372,9 @@ def _need_camera(recording: Any, kind: Any) -> None:
         )
 
 
-def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[str]]:
+def _parameters(
+    estimator: "MotionEstimator", kind: "type[Model]", path: Path | None
+) -> tuple[Any, set[str]]:
     """Return the parameters, and the names of those that a file gives."""
     from jaxevent.parameters import read_toml
 
@@ -367,13 +386,13 @@ def _parameters(estimator: Any, kind: Any, path: Path | None) -> tuple[Any, set[
 
 
 def estimate_or_fall_back(
-    estimator: Any,
-    recording: Any,
+    estimator: "MotionEstimator",
+    recording: "Recording",
     params: Path | None,
     settings: dict[str, Any],
     gyro: Any,
     other: bool,
-) -> tuple[Any, Any, Any]:
+) -> "tuple[MotionEstimator, MotionEstimate, Any]":
     """Estimate the motion; try the model's other method if the first half has no estimate.
 
     Args:
@@ -414,8 +433,12 @@ def estimate_or_fall_back(
 
 
 def _estimate(
-    estimator: Any, recording: Any, values: Any, settings: dict[str, Any], gyro: Any
-) -> Any:
+    estimator: "MotionEstimator",
+    recording: "Recording",
+    values: Any,
+    settings: dict[str, Any],
+    gyro: Any,
+) -> "MotionEstimate":
     """Estimate the motion by a method.
 
     Args:
@@ -442,14 +465,32 @@ def _estimate(
 
 
 def _gyro(
-    estimator: Any, recording: Any, values: Any, settings: Any, bias: Any, turned: Any
+    estimator: "MotionEstimator",
+    recording: "Recording",
+    values: Any,
+    settings: dict[str, Any],
+    bias: "NDArray[np.float64] | None",
+    turned: "NDArray[np.float64] | None",
 ) -> Any:
-    """Return the gyro's rates without bias; an unknown bias is found by a first estimate."""
+    """Return the gyro's rates without bias.
+
+    Args:
+        estimator: The method of the first estimate.
+        recording: The recording, with an IMU.
+        values: Parameters.
+        settings: Options of `estimate`.
+        bias: (3,) rad/s; None: by a first estimate.
+        turned: (3, 3) rotation from the gyro's axes to the camera's, or None.
+
+    Returns:
+        The measured rates, less the bias.
+    """
     import numpy as np
 
     from jaxevent.egomotion import from_gyro
     from jaxevent.egomotion.truth import fit_gyro_bias
 
+    assert recording.imu is not None  # see `_open`
     zero = np.zeros(3) if bias is None else bias
     measured = from_gyro(recording.imu, zero, turned)
     if bias is not None:

@@ -119,7 +119,19 @@ def _choose_method(has_frames: bool, pixels: int, missing: str = "") -> str:
 
 
 def _read_table(params: Path | None, estimator: Any, method: str | None) -> dict[str, Any]:
-    """Read the settings of --params; without a method the file must be a calibration."""
+    """Read the settings of --params; without a method the file must be a calibration.
+
+    Args:
+        params: File of --params, or None.
+        estimator: The method.
+        method: Name of the method if the user gave one, else None.
+
+    Returns:
+        Settings by name; empty without a file.
+
+    Raises:
+        InputError: No method is named, and the file holds parameters of one.
+    """
     from jaxevent.parameters import CALIBRATION_TABLE, read_toml
 
     if params is None:
@@ -137,7 +149,19 @@ def _default_times(
     start: float | int | None,
     stop: float | int | None,
 ) -> Any:
-    """Return times (us) of images, where no file gives them, from a start to a stop (s)."""
+    """Return the times of images where no file gives them.
+
+    Args:
+        recording: The recording.
+        estimator: The method.
+        values: Parameters of the method.
+        rate: Images per second; None: at the frames if there are any, else 100.
+        start: Time of the first image, s on the clock of the recording; None: its start.
+        stop: Time of the last image, s, likewise; None: its stop.
+
+    Returns:
+        (images,) times, us.
+    """
     from jaxevent.events.clocks import check_clocks, compare_clocks
     from jaxevent.runs.protocols import frame_times
     from jaxevent.show.export import image_times

@@ -210,7 +210,17 @@ def _simulate_frames(
     duration: float | int | None,
     size: tuple[int, int] | None,
 ) -> None:
-    """Simulate a camera over a scene; without a scene, moving objects."""
+    """Simulate a camera over a scene; without a scene, moving objects.
+
+    Args:
+        scene: Number or name of a scene; None: moving objects.
+        out: File to write.
+        sensor: `jaxevent.simulate.Sensor`, the properties of the camera.
+        seed: Seed of the noise, and of the objects.
+        speed: "slow" or "fast" for a scene, px/s for objects; None: slow, or 90 px/s.
+        duration: s; None: 1.5 for a scene, 1 for objects.
+        size: (width, height), px; None: (128, 96) for a scene, (160, 120) for objects.
+    """
     from jaxevent import simulate as sim
     from jaxevent.io import save
     from jaxevent.io.output import complete

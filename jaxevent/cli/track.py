@@ -152,7 +152,8 @@ def run(
         arguments.refuse_with_live({name: value is not None for name, value in options.items()})
         if seeds is None and not detect:
             raise InputError("--live cannot search all events for targets; add --seed or --detect")
-        _print_live(path, tracker, given, seeds, detect, float(rate), reading)
+        chosen = {"seeds": seeds, "detect": detect, "rate": float(rate)}
+        _print_live(path, tracker, given, **chosen, reading=reading)
         return
     if out is None:
         raise InputError("there is nowhere to write; give a folder or file, --out, or --live")
@@ -214,12 +215,23 @@ def _print_live(
     path: Path,
     tracker: Any,
     params: Any,
+    *,
     seeds: list[tuple[float, ...]] | None,
     detect: bool,
     rate: float,
     reading: dict[str, Any],
 ) -> None:
-    """Print rows of tracks.csv as events come, those of a time with the first event after it."""
+    """Print rows of tracks.csv as events come, those of a time with the first event after it.
+
+    Args:
+        path: The recording; "-" is standard input.
+        tracker: The method.
+        params: Parameters of the method.
+        seeds: (x, y, ...) of known targets, see `jaxevent.blob.tracker`; None: there are none.
+        detect: Whether to look for targets.
+        rate: Rows per second.
+        reading: Options of `arguments.add_reading`.
+    """
     from jaxevent.show.track_tables import LiveTable
 
     recording, chunks = arguments.open_live(path, reading)

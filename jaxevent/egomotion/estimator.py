@@ -357,7 +357,7 @@ class StackedRuns(TrainingRuns):
     """Runs of any differentiable estimator, each from the start of the segment."""
 
     prepared: tuple[tuple[Any, Any], ...]  # features and read-out of every run
-    method: Any = eqx.field(static=True)
+    method: Any = eqx.field(static=True)  # estimator of the runs
 
     def estimates(self, params: Any) -> tuple[Array, Array]:
         means = []
@@ -371,7 +371,7 @@ class StackedRuns(TrainingRuns):
 class FixedEstimates(TrainingRuns):
     """Runs of an estimator on the host, computed when the segment was prepared."""
 
-    mean: Float[Array | np.ndarray, "runs T d"]
+    mean: Float[Array | np.ndarray, "runs T d"]  # components, in the model's units
 
     def estimates(self, params: Any) -> tuple[Array, Array]:
         mean = jnp.asarray(self.mean)

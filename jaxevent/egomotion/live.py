@@ -31,8 +31,8 @@ DROPPED_EVENTS = 1 << 15  # from so many on they are dropped
 class ChunkRunner(Protocol):
     """The filter over the chunks of a recording, see `particle_filter.estimator`."""
 
-    params: Any
-    sampler: Any
+    params: Any  # parameters of the filter
+    sampler: Any  # `CandidateSampler` of the filter
 
     def has_chunk(self) -> bool:
         """Return whether the next chunk is complete."""

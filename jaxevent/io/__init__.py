@@ -167,7 +167,15 @@ def load(
 
 
 def _as_path(path: Any, call: str) -> Path:
-    """Return a path; raise `InputError` for what is none."""
+    """Return a path; raise `InputError` for anything else.
+
+    Args:
+        path: A path, or what a caller took for one.
+        call: "load" or "save", for the message.
+
+    Returns:
+        The path.
+    """
     if not isinstance(path, str | os.PathLike):
         order = {"load": "load(path)", "save": "save(recording, path)"}[call]
         raise InputError(f"the path is {describe_type(path)}; call jaxevent.{order}")
@@ -184,7 +192,15 @@ def _is_size(size: Any) -> bool:
 
 
 def _as_camera(camera: Any, recording: Recording) -> PinholeCamera:
-    """Return a camera, as given or of a file; raise `InputError` for what is neither."""
+    """Return a camera, or read it from a file; raise `InputError` for anything else.
+
+    Args:
+        camera: A camera, or the path of a calibration.
+        recording: The recording; its size scales a calibration.
+
+    Returns:
+        The camera.
+    """
     if isinstance(camera, PinholeCamera):
         return camera
     if not isinstance(camera, str | os.PathLike):

@@ -110,12 +110,12 @@ class _Header:
 class _Readout:
     """The samples of one kind of one frame: the rows of their records, and their times."""
 
-    first: int
-    last: int
-    samples: int
-    mean: float
-    begin: int
-    end: int
+    first: int  # row of the first record
+    last: int  # row of the last record
+    samples: int  # number of records
+    mean: float  # mean time of the samples, us
+    begin: int  # time of the first sample, us
+    end: int  # time of the last sample, us
 
 
 def read_aedat2(path: Path, options: ReadOptions) -> Recording:

@@ -163,7 +163,15 @@ def _read_member(archive: zipfile.ZipFile, name: str, source: str) -> NDArray:
 
 
 def _read_header(stream: Any, source: str) -> tuple[tuple[int, ...] | None, np.dtype | None]:
-    """Read the shape and type of an array, both None of one that holds objects."""
+    """Read the header of NumPy's file of an array.
+
+    Args:
+        stream: File of NumPy (.npy), open for reading bytes at its start.
+        source: Name of the file for messages.
+
+    Returns:
+        Shape and type of the numbers; both None if the array holds objects.
+    """
     major, _ = np.lib.format.read_magic(stream)
     read_one = {
         1: np.lib.format.read_array_header_1_0,
@@ -301,7 +309,16 @@ class _NumberedImages:
 def _camera(
     meta: Mapping[str, Any], source: str
 ) -> tuple[PinholeCamera | None, tuple[int, int], dict[str, str]]:
-    """Return the calibration, (width, height), and the entry of `left_out`."""
+    """Read the calibration and the size of the sensor.
+
+    Args:
+        meta: Content of EVIMO2's meta file.
+        source: Name of the file for messages.
+
+    Returns:
+        The camera, None if its lens is unknown; (width, height), px; and the entry of
+        `Recording.left_out`.
+    """
     about = meta["meta"]
     model = str(about.get("dist_model"))
     lens = LENS_MODELS.get(find_model(model) or "")
@@ -546,7 +563,13 @@ class _PixelGrid:
     """
 
     def __init__(self, size: tuple[int, int], x: NDArray, y: NDArray):
-        """Infer the coordinates from those of some events, (events,) each."""
+        """Infer the unit of coordinates from some events.
+
+        Args:
+            size: (width, height), px.
+            x: (events,) columns of some events as they are stored, px or parts of one.
+            y: (events,) rows, likewise.
+        """
         self._size = size
         outside = (x >= size[0]) | (y >= size[1]) | (x < 0) | (y < 0)
         is_fine = bool(len(x)) and float(outside.mean()) > _MIN_MISPLACED_SHARE

@@ -452,7 +452,16 @@ def _read_open(file: h5py.File, path: Path, options: ReadOptions) -> Recording:
 def _stored_size(
     file: h5py.File, source: str, attributes: Mapping[str, Any]
 ) -> tuple[int, int] | None:
-    """Return the size of the sensor by a file's attributes, its events or its kind."""
+    """Return the size of the sensor by a file's attributes, its events or its kind.
+
+    Args:
+        file: The file.
+        source: Name of the file for messages.
+        attributes: Attributes of the file, by name.
+
+    Returns:
+        (width, height), px; None if the file does not state it.
+    """
     if "width" in attributes and "height" in attributes:
         return whole_size(attributes["width"], attributes["height"], source)
     if "events/width" in file and "events/height" in file:
@@ -496,7 +505,16 @@ def _read_events(
 def _read_parts(
     file: h5py.File, source: str, stored_times: Callable[[str, str], NDArray[np.int64]]
 ) -> dict[str, Any]:
-    """Return frames, camera, poses, IMU samples and triggers, as far as a file holds them."""
+    """Read frames, camera, poses, IMU samples and triggers.
+
+    Args:
+        file: The file.
+        source: Name of the file for messages.
+        stored_times: Function (dataset, name of a row) that reads times, us.
+
+    Returns:
+        Arguments of `Recording` by name; those that the file lacks are missing.
+    """
 
     def arrays(group: str, *names: str) -> list[NDArray]:
         return [array(file, f"{group}/{name}", source) for name in names]

@@ -73,9 +73,19 @@ def open_file(path: Path) -> h5py.File:
 
 
 def attribute(of: Any, name: str) -> Any:
-    """Read an attribute of a file, group or dataset, text as str; None if there is none.
+    """Read an attribute.
 
     Only numbers and strings are read: of a damaged type HDF5 2.0 reads memory that is not there.
+
+    Args:
+        of: File, group or dataset of h5py.
+        name: Name of the attribute.
+
+    Returns:
+        A number, an array of numbers, or a text; None if there is no such attribute.
+
+    Raises:
+        ValueError: The attribute is of another type.
     """
     if name not in of.attrs:
         return None

@@ -129,7 +129,15 @@ def _read_open(file: Any, path: Path, options: ReadOptions) -> Recording:
 
 
 def _read_triggers(file: Any, source: str) -> Triggers | None:
-    """Read the external triggers of Metavision."""
+    """Read the external triggers of Metavision.
+
+    Args:
+        file: The file, of h5py.
+        source: Name of the file for messages.
+
+    Returns:
+        The triggers; None if there are none.
+    """
     name = "EXT_TRIGGER/events"
     found = file.get(name)
     if not isinstance(found, h5py.Dataset) or not {"t", "p", "id"} <= set(found.dtype.names or ()):
@@ -257,7 +265,15 @@ def _read_mvsec(file: Any, path: Path, options: ReadOptions, group: str) -> Reco
 
 
 def _fields(file: Any, name: str) -> Mapping[str, str] | None:
-    """Find the names of t, x, y and p in a group or records; None if they are not there."""
+    """Find the stored names of times, coordinates and polarities.
+
+    Args:
+        file: The file, of h5py.
+        name: Name of a group or of a dataset of records; "" is the file itself.
+
+    Returns:
+        Stored names by "t", "x", "y" and "p"; None if one of them is missing.
+    """
     found = file.get(name) if name else file
     if isinstance(found, h5py.Group):
         return find_fields(list(found))
@@ -282,7 +298,15 @@ def _open_columns(file: Any, name: str, source: str) -> dict[str, Column]:
 
 
 def _stated_size(file: Any, source: str) -> tuple[int, int] | None:
-    """Read (width, height) from the attributes of a file."""
+    """Read the size of the sensor from the attributes of a file.
+
+    Args:
+        file: The file, of h5py.
+        source: Name of the file for messages.
+
+    Returns:
+        (width, height), px; None if no attribute states it.
+    """
     with reading(f"{source}: attributes"):
         if (size := attribute(file, "sensor_resolution")) is not None:
             if np.size(size) == 3:  # height, width, channels
@@ -306,7 +330,15 @@ def _check_size(values: Any, source: str) -> tuple[int, int]:
 
 
 def _open_images_of_v2e(file: Any, source: str) -> tuple[NDArray | None, StoredImages | None]:
-    """Open the frames that v2e keeps beside its events, and their times; None without times."""
+    """Open the frames that v2e keeps beside its events.
+
+    Args:
+        file: The file, of h5py.
+        source: Name of the file for messages.
+
+    Returns:
+        (images,) times in the file's unit, and the images; both None if there are no times.
+    """
     stored = dataset(file, "frame", source)
     if stored.ndim != 3 or not isinstance(file.get("frame_ts"), h5py.Dataset):
         return None, None
@@ -320,7 +352,15 @@ def _open_images_of_v2e(file: Any, source: str) -> tuple[NDArray | None, StoredI
 
 
 def _open_numbered_images(file: Any, source: str) -> tuple[NDArray | None, DecodedImages | None]:
-    """Open the images of event_utils, one dataset each, in the order of their names."""
+    """Open the images of event_utils, one dataset each, in the order of their names.
+
+    Args:
+        file: The file, of h5py.
+        source: Name of the file for messages.
+
+    Returns:
+        (images,) times in the file's unit, and the images; both None if there are none.
+    """
     with reading(f"{source}: images"):
         names = sorted(file["images"])
         if not names:

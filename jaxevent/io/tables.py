@@ -328,7 +328,18 @@ def _separator(line: str) -> str | None:
 
 
 def _read_head(file: Any, source: str) -> _Table:
-    """Read the lines before the first event, and infer how the events are written."""
+    """Read the lines before the first event, and infer how the events are written.
+
+    Args:
+        file: File open for reading bytes, at its start; afterwards behind the first event.
+        source: Name of the file for messages.
+
+    Returns:
+        Layout of the table, and where its first event begins.
+
+    Raises:
+        InputError: The file holds no table of events.
+    """
     size = None
     names: list[str] | None = None
     while True:

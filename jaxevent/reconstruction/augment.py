@@ -632,12 +632,12 @@ class AugmentedFrame(LogIntensityModel):
 
     Params = AugmentParams
     params: AugmentParams
-    from_base: Float[Array, "pieces pixels"]
-    from_ratio: Float[Array, "pieces pixels"]
-    to_base: Float[Array, "pieces pixels"]
+    from_base: Float[Array, "pieces pixels"]  # ln I, of the line that counts at a piece's start
+    from_ratio: Float[Array, "pieces pixels"]  # calibrated over nominal threshold, of that line
+    to_base: Float[Array, "pieces pixels"]  # ln I, of the line that counts at a piece's end
     to_ratio: Float[Array, "pieces pixels"]
     tilt: Float[Array, "pieces pixels"] | None
-    lag: Float[Array, " pieces"]
+    lag: Float[Array, " pieces"]  # of the frames' clock, as a fraction of the piece
 
     def __init__(
         self,
@@ -713,7 +713,7 @@ class EventIntegral(LogIntensityModel):
     """The latest deblurred frame plus the events since, with nominal thresholds (EDI)."""
 
     params: FrameParams
-    base: Float[Array, "pieces pixels"]
+    base: Float[Array, "pieces pixels"]  # ln I at the left edge of the piece's exposure
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
         left, right = deblur_frames(params, frames)
@@ -729,7 +729,7 @@ class EventIntegral(LogIntensityModel):
 class ZeroOrderHold(LogIntensityModel):
     """The last frame whose mid-exposure has passed; before it, the first one."""
 
-    level: Float[Array, "frames pixels"]
+    level: Float[Array, "frames pixels"]  # ln(I + I0)
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
         self.level = jnp.log(frames.intensity + params.I0)
@@ -741,7 +741,7 @@ class ZeroOrderHold(LogIntensityModel):
 class LinearBlend(LogIntensityModel):
     """Intensity linear in time between two frames."""
 
-    I0: Float[Array, ""]
+    I0: Float[Array, ""]  # offset of intensity, as in ln(I + I0)
     image: "FrameInterpolation"
 
     def __init__(self, params: FrameParams, frames: FrameFeatures):
@@ -771,8 +771,8 @@ class FrameInterpolation(eqx.Module):
         table: (frames, pixels) values at mid-exposure.
     """
 
-    here: Float[Array, "frames pixels"]
-    there: Float[Array, "frames pixels"]
+    here: Float[Array, "frames pixels"]  # values at mid-exposure of a frame, of the table's unit
+    there: Float[Array, "frames pixels"]  # values at mid-exposure of the next one
 
     def __init__(
         self, params: FrameParams, frames: FrameFeatures, table: Float[Array, "frames pixels"]

@@ -31,7 +31,15 @@ class PreparedImages(Protocol):
     """
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
-        """Return the images; without `variance` there is none, nor derivatives of it."""
+        """Compute the images at the prepared times.
+
+        Args:
+            params: Parameters of the method.
+            variance: Whether to compute the variance and its derivatives.
+
+        Returns:
+            Mean (ln I), variance (ln I)^2 and `valid`, each (times, pixels).
+        """
         ...
 
     def take(self, rows: NDArray) -> "PreparedImages":
@@ -42,9 +50,9 @@ class PreparedImages(Protocol):
 class ScannedImages(eqx.Module):
     """`PreparedImages` by a method's `run` and `read`."""
 
-    features: Any
-    out: Any
-    method: Any = eqx.field(static=True)
+    features: Any  # inputs of the method's `run`
+    out: Any  # times of images, as the method's `read` takes them
+    method: Any = eqx.field(static=True)  # the method
 
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
         trajectory, _ = self.method.run(params, self.features)

@@ -39,7 +39,7 @@ class Points(eqx.Module):
     weight: Float[Numeric, "*#points"]  # position in the piece, 0 to 1
     blend: Float[Numeric, "*#points"]  # position between the mid-exposures of two frames, 0 to 1
     on: Float[Numeric, "*points"]  # ON events since the left edge of the piece's exposure
-    off: Float[Numeric, "*points"]
+    off: Float[Numeric, "*points"]  # OFF events, likewise
 
     @abc.abstractmethod
     def gather_piece(self, table: Float[Array, "pieces pixels"]) -> Float[Array, "..."]:
@@ -85,7 +85,7 @@ class EventPoints(Points):
 class ImagePoints(Points):
     """All pixels at a few times; `weight` and `blend` are (times, 1)."""
 
-    piece: Int[Numeric, " times"]
+    piece: Int[Numeric, " times"]  # the piece that holds the time
     frame: Int[Numeric, " times"]  # the frame before
     elapsed: Float[Numeric, " times"]  # s since mid-exposure of the frame before; negative: none is
 
@@ -120,7 +120,7 @@ class ExposureSegments(eqx.Module):
     share: Float[Numeric, " segments"]  # fraction of the exposure that the segment fills
     edge: Float[Numeric, " segments"]  # d share / d clock_offset, 1/s
     on: Float[Numeric, " segments"]  # ON events from mid-exposure to the segment, negative before
-    off: Float[Numeric, " segments"]
+    off: Float[Numeric, " segments"]  # OFF events, likewise
 
 
 class FrameFeatures(ShortRepr):

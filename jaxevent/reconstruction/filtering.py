@@ -60,11 +60,11 @@ def init_without_variance(params: FrameParams, level: Array) -> PixelState:
 class Observation(eqx.Module):
     """Evidence of the frames at a point: log intensity and its information rate, 1/s."""
 
-    level: Float[Numeric, "*points"]
-    rate: Float[Numeric, "*points"]
+    level: Float[Numeric, "*points"]  # ln I
+    rate: Float[Numeric, "*points"]  # 1/s
     # A bound and the rate (1/s) that pulls to it states below (positive) or above it (negative).
     bound: Float[Numeric, "*points"] | None = None
-    push: Float[Numeric, "*points"] | None = None
+    push: Float[Numeric, "*points"] | None = None  # 1/s, with the sign of the side of the bound
     excess: Float[Numeric, "*points"] | None = None  # of states beyond the bound, expected; ln I
     # Of errors of the level that last, to be added to the state's in images; (ln I)^2.
     variance: Float[Numeric, "*points"] | None = None
@@ -82,8 +82,8 @@ class Event(eqx.Module):
 class LaneBlock(eqx.Module):
     """Kind and first lane of tiles (`features.EventTiles`)."""
 
-    kind: Int[Array, " tiles"]
-    lane: Int[Array, " tiles"]
+    kind: Int[Array, " tiles"]  # as in `EventTiles`
+    lane: Int[Array, " tiles"]  # as in `EventTiles`
 
 
 @renamed_methods(outset="initial_level")
@@ -156,8 +156,8 @@ class Filter(KernelEstimator[P]):
     predict: Callable[[P, Any, Array, Observation], Any]
     event_update: Callable[[P, Any, Event], Any] | None = None
     readout: Callable[[P, Any], tuple[Array, Array]] = readout_log_intensity
-    kernel_video: ClassVar[Any] = FilterVideo
-    kernel_images: ClassVar[Any] = FilterImages
+    kernel_video: ClassVar[Any] = FilterVideo  # class of the kernel of a video
+    kernel_images: ClassVar[Any] = FilterImages  # class of the kernel of images at given times
 
     @property
     def is_event_driven(self) -> bool:
@@ -361,7 +361,17 @@ def _filter_lanes(method: Filter, params: Any, events: Event, lanes: Any, block:
 
 
 def _step_all(method: Filter, params: Any, at: Any, event: Event) -> Any:
-    """Map the filter's step over all axes of states and events."""
+    """Apply the filter's step to all states and events.
+
+    Args:
+        method: The filter.
+        params: Parameters of the filter.
+        at: States, a pytree of arrays with the axes of `event`.
+        event: Events, of any axes.
+
+    Returns:
+        The states after the events.
+    """
     step = functools.partial(method.step, params)
     for _ in range(event.since.ndim):
         step = jax.vmap(step)
@@ -443,7 +453,15 @@ def _real(state: Any) -> list[Array]:
 
 
 def _real_tangents(state: Any, tangent: Any) -> list[Array]:
-    """Return the tangents of the leaves of a state that have derivatives."""
+    """Return the tangents of the leaves of a state that have derivatives.
+
+    Args:
+        state: A pytree.
+        tangent: Its tangent, of the same structure.
+
+    Returns:
+        Tangents of the floating-point leaves, in order.
+    """
     pairs = zip(jax.tree.leaves(state), jax.tree.leaves(tangent), strict=True)
     return [d for leaf, d in pairs if eqx.is_inexact_array(leaf)]
 

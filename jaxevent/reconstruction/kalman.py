@@ -134,11 +134,11 @@ class AugmentedFrameModel(FrameModel):
     image: FrameInterpolation | None
     density: FrameInterpolation
     share: FrameInterpolation | None  # of the rate, where frames clip
-    I0: Float[Array, ""]
-    present: Float[Array, ""]
-    clipped: Float[Array, "frames pixels"]
-    begin: Float[Array, "frames pixels"]
-    bound: Float[Array, "frames pixels"] | None
+    I0: Float[Array, ""]  # offset of intensity, as in ln(I + I0)
+    present: Float[Array, ""]  # 1, or 0 if the recording has no frames
+    clipped: Float[Array, "frames pixels"]  # 1 where the frame is clipped, else 0
+    begin: Float[Array, "frames pixels"]  # state of a clipped pixel at the start, ln I
+    bound: Float[Array, "frames pixels"] | None  # as in `Observation`
     push: Float[Array, "frames pixels"] | None
     excess: Float[Array, "frames pixels"] | None
     errors: AugmentedFrameErrors

@@ -683,8 +683,8 @@ class Smoother(KernelEstimator[AnyParams]):
 
     has_likelihood: ClassVar[bool] = True
     has_unseen_errors: ClassVar[bool] = True  # whether the variance is that of `image_variance`
-    kernel_video: ClassVar[Any] = SmootherVideo
-    kernel_images: ClassVar[Any] = SmootherImages
+    kernel_video: ClassVar[Any] = SmootherVideo  # class of the kernel of a video
+    kernel_images: ClassVar[Any] = SmootherImages  # class of the kernel of images at given times
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "compiler", "factors"}), kw_only=True
     )

@@ -61,7 +61,7 @@ class StreamState:
     # The first row of the events in the frames' exposures, and `last` before it. Kept where events
     # are weighted by the gap to the one before.
     context: int = 0
-    context_last: NDArray[np.int64] | None = None
+    context_last: NDArray[np.int64] | None = None  # us, at each pixel
     frames: int = 1  # number of frames of the recording that windows have used
 
     @classmethod

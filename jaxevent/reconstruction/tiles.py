@@ -45,7 +45,7 @@ class SlotMap(NamedTuple):
     lane: NDArray[np.int32]  # per pixel, within its kind
     round_tile: NDArray[np.int32]  # per kind and round of ranks: the first tile
     round_first: NDArray[np.int64]  # per kind: index of its first round in `round_tile`
-    shapes: NDArray[np.int64]
+    shapes: NDArray[np.int64]  # [kinds, 2], `TILE_SHAPES`
 
     @classmethod
     def empty(cls, n_pixels: int) -> "SlotMap":

@@ -180,7 +180,7 @@ class FilteredWindow(NamedTuple):
 
     window: EventWindow
     reader: ImageReader
-    trajectory: Any
+    trajectory: Any  # result of the method's `run`
 
     def contains(self, time: int) -> bool:
         """Return whether a time (us) lies in the window."""
@@ -213,7 +213,7 @@ class ImageSequence(HtmlRepr, abc.ABC, Generic[P]):
         is_checked: Whether events were compared with frames, or need not be.
     """
 
-    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
+    _made_of: tuple[tuple[Any, ...], dict[str, Any]]  # arguments by position and by name
 
     def __new__(cls: type[S], *given: Any, **options: Any) -> S:
         self = object.__new__(cls)

@@ -64,7 +64,7 @@ from jaxevent.runs.family import (
     batches_by_split,
     windows,
 )
-from jaxevent.show.tables import legend, results_table
+from jaxevent.show.tables import Row, legend, results_table
 from jaxevent.tuning import Batches
 
 LOSS_NAMES = ("likelihood", "positions")
@@ -177,7 +177,7 @@ class TrackGoal(Goal):
                 row["events"] = int(weights.sum())
                 yield {**row, "params": values_of(params)}
 
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+    def table(self, rows: Sequence[Row]) -> str:
         columns = [("NLL", "nll", 1, 4), ("windows", "windows", 1, 0), ("events", "events", 1, 0)]
         if any("rmse" in row for row in rows):
             columns[1:1] = [("RMSE px", "rmse", 1, 3), ("median px", "median", 1, 3)]

@@ -90,10 +90,13 @@ OPTIONAL_COLUMNS = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "r
 
 @dataclasses.dataclass(frozen=True)
 class KnownPositions:
-    """Given positions: times (T,) us, xi (T, targets, 2) in px, NaN where unknown.
+    """True positions of targets.
 
-    `more` are further columns, of `OPTIONAL_COLUMNS`, (T, targets) each, and `id` the targets'
-    numbers.
+    Attributes:
+        t: (T,) times, us.
+        xi: (T, targets, 2) positions, px, NaN where unknown.
+        more: Further columns, of `OPTIONAL_COLUMNS`, (T, targets) each.
+        id: (targets,) numbers of the targets.
     """
 
     t: NDArray[np.int64]

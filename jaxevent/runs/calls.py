@@ -157,7 +157,15 @@ def _with_labels(tables: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def format_setting(name: str, value: Any) -> str:
-    """Format a setting for a label."""
+    """Format a setting for a label.
+
+    Args:
+        name: Name of the setting.
+        value: Its value; a number is shown with six digits.
+
+    Returns:
+        The label, such as "window 0.1".
+    """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return f"{name} {value:g}" if number else f"{name} {value}"
 

@@ -170,7 +170,15 @@ SIZE_CHECK: Check = (
 
 
 def check(table: Mapping[str, Any], known: Mapping[str, Check]) -> None:
-    """Check settings; raise `InputError` for an unknown one, or for a value of the wrong kind."""
+    """Check the names and values of settings.
+
+    Args:
+        table: Settings by name.
+        known: Possible settings: a test of values, and its description for messages.
+
+    Raises:
+        InputError: A name is unknown, or a value is not possible.
+    """
     for name, value in table.items():
         check_choice(name, "setting", known)
         accepts, text = known[name]

@@ -161,7 +161,12 @@ def digest(thing: Any) -> str:
 
 
 def _feed(thing: Any, update: Callable[[Any], None]) -> None:
-    """Feed a hash a value, with its kind and its length, so that no two values feed the same."""
+    """Feed a hash a value, with its kind and its length, so that no two values feed the same.
+
+    Args:
+        thing: The value: a number, a text, an array, events, or a container of these.
+        update: Function that adds bytes to the hash.
+    """
 
     def begin(kind: str, *about: Any) -> None:
         update(f"{kind} {' '.join(map(repr, about))};".encode())

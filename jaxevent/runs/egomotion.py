@@ -94,11 +94,12 @@ from jaxevent.runs.family import (
     Goal,
     LastBatches,
     Protocol,
+    Settings,
     batches_by_split,
     windows,
 )
 from jaxevent.runs.own import MethodFunction, Metric, find_metrics, own_names
-from jaxevent.show.tables import legend, results_table
+from jaxevent.show.tables import Row, legend, results_table
 from jaxevent.tuning import Batches
 
 MOTION_SETTINGS: dict[str, Check] = {
@@ -131,12 +132,12 @@ RECORDED_TRUTHS = ("poses", "gyro")  # truth that recordings hold themselves
 TRUTH_SETTINGS = ("gyro_bias", "imu_rotation", "depth")  # settings of the ground truth
 
 
-def model_of(options: Mapping[str, Any]) -> type[Model]:
+def model_of(options: Settings) -> type[Model]:
     """Return the motion model in the settings; raise `InputError` for an unknown one."""
     return find_model(options.get("model", "planar"))
 
 
-def check_settings(options: Mapping[str, Any]) -> None:
+def check_settings(options: Settings) -> None:
     """Raise `InputError` for settings that are missing or not possible together."""
     model_of(options)
     _rotation(options)
@@ -147,16 +148,32 @@ def check_settings(options: Mapping[str, Any]) -> None:
         )
 
 
-def truth_files_of(path: Path, options: Mapping[str, Any]) -> list[Path]:
-    """Return further files that a row of the recording depends on."""
+def truth_files_of(path: Path, options: Settings) -> list[Path]:
+    """Return the files of the true motion of a recording.
+
+    Args:
+        path: The recording.
+        options: Settings of the protocol; `truth` is "poses", "gyro", or files of tables.
+
+    Returns:
+        Files of the true motion; empty if the recording holds it.
+    """
     truth = options["truth"]
     if isinstance(truth, str) and truth in RECORDED_TRUTHS:
         return []
     return truth_files(truth, str(path))
 
 
-def true_motion(recording: Recording, options: Mapping[str, Any]) -> KnownMotion:
-    """Return the true motion of a recording, whose name is its path."""
+def true_motion(recording: Recording, options: Settings) -> KnownMotion:
+    """Return the true motion of a recording.
+
+    Args:
+        recording: The recording; its name is its path.
+        options: Settings of the protocol: `truth`, `model`, `gyro_bias`, `imu_rotation`, `depth`.
+
+    Returns:
+        The true motion.
+    """
     source = options["truth"]
     if not (isinstance(source, str) and source in RECORDED_TRUTHS):
         source = truth_table(source, recording.name)
@@ -170,12 +187,12 @@ def true_motion(recording: Recording, options: Mapping[str, Any]) -> KnownMotion
     )
 
 
-def _rotation(options: Mapping[str, Any]) -> NDArray[np.float64] | None:
+def _rotation(options: Settings) -> NDArray[np.float64] | None:
     axes = options.get("imu_rotation")
     return None if axes is None else imu_rotation(axes)
 
 
-def _bias(options: Mapping[str, Any]) -> NDArray[np.float64]:
+def _bias(options: Settings) -> NDArray[np.float64]:
     return np.asarray(options.get("gyro_bias", (0.0, 0.0, 0.0)), np.float64)
 
 
@@ -184,14 +201,14 @@ class MotionProtocol(Protocol):
 
     settings = MOTION_SETTINGS
 
-    def check(self, options: Mapping[str, Any]) -> None:
+    def check(self, options: Settings) -> None:
         check_settings(options)
         find_metrics(options.get("metrics", ()), MEASURE_NAMES)
 
-    def check_method(self, method: MotionEstimator, options: Mapping[str, Any]) -> None:
+    def check_method(self, method: MotionEstimator, options: Settings) -> None:
         method.find_model(model_of(options))
 
-    def files(self, path: Path, options: Mapping[str, Any]) -> list[Path]:
+    def files(self, path: Path, options: Settings) -> list[Path]:
         return truth_files_of(path, options)
 
     def score(
@@ -199,7 +216,7 @@ class MotionProtocol(Protocol):
         recording: Recording,
         method: MotionEstimator | MethodFunction,
         params: Parameters | None,
-        options: Mapping[str, Any],
+        options: Settings,
         progress: bool | None = None,
     ) -> dict[str, Any]:
         """Score a method; raises `InputError` where there is no truth or no events."""
@@ -259,7 +276,7 @@ class MotionProtocol(Protocol):
 def _settings(
     recording: Recording,
     method: MotionEstimator,
-    options: Mapping[str, Any],
+    options: Settings,
     bias: NDArray[np.float64],
 ) -> dict[str, Any]:
     """Choose the settings of the protocol that a method's `estimate` takes.
@@ -320,7 +337,17 @@ def _of_function(
 def _own(
     metrics: Sequence[Metric], mean: NDArray, truth: NDArray, recording: str
 ) -> dict[str, float | None]:
-    """Compute the user's metrics; None where no motion was found."""
+    """Compute the user's metrics of a motion.
+
+    Args:
+        metrics: The metrics.
+        mean: (times, d) estimates of the components of the motion.
+        truth: (times, d) true components.
+        recording: Name of the recording.
+
+    Returns:
+        Values by name; None without times.
+    """
     return {one.name: one(mean, truth, recording) if len(mean) else None for one in metrics}
 
 
@@ -369,7 +396,7 @@ class MotionGoal(Goal):
     model: str
     truth: str
     runs: int
-    settle: float | int
+    settle: float | int  # s after the first event before errors count
     of_truth: Mapping[str, Any]  # gyro_bias, imu_rotation, depth
     # Forwards: in reverse every candidate's vote would be kept.
     forward = True
@@ -431,7 +458,7 @@ class MotionGoal(Goal):
                 row["windows"] = len(chosen)
                 yield {**row, "params": values_of(params)}
 
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+    def table(self, rows: Sequence[Row]) -> str:
         columns = [("error %", "error", 1, 2), ("lost", "lost", 1, 3), ("windows", "windows", 1, 0)]
         for part in self.kind.parts:
             if part.direction and any(part.name in row for row in rows):

@@ -294,7 +294,22 @@ def _evaluate(
     retries: int = 2,
     replace: bool = True,
 ) -> Evaluation:
-    """Compute the rows of a plan; see `evaluate`."""
+    """Compute the rows of a plan; see `evaluate`.
+
+    Args:
+        plan: Recordings, methods and protocol.
+        source: Text of the configuration, and the files it comes from.
+        out: Folder for the results; None: none is written.
+        progress: Whether to show progress; None: on a terminal.
+        workers: Number of processes; None: this one.
+        cluster: A cluster of Dask, or None.
+        scheduler_file: File that names Dask's scheduler, or None.
+        retries: Number of further attempts after a worker is lost.
+        replace: Whether results of another evaluation may be replaced.
+
+    Returns:
+        The rows.
+    """
     if out is not None:
         own = (Path(out) / "tasks").is_dir()
         check_folder(Path(out), RESULT_FILES, source.files, replace=replace, own=own)
@@ -498,7 +513,7 @@ class Plan:
     methods: list["Entry"]
     name: str
     protocol: Protocol
-    options: dict[str, Any]
+    options: dict[str, Any]  # settings of the protocol, by name
     size: tuple[int, int] | None
     stream: str | None
 

@@ -69,12 +69,13 @@ MAX_FITTED_PIXELS = 1 << 13  # pixels that the brightness is fitted to, at most
 class ExternalImages(Source):
     """Images of another program: their place and format; see the text of this module."""
 
-    images: str
-    timestamps: str | None = None
-    gamma: float | int = 1.0
+    images: str  # path of the images of a recording, with {recording} or *
+    timestamps: str | None = None  # file of their times; None: timestamps.txt or images.txt
+    gamma: float | int = 1.0  # images are intensity ** (1 / gamma)
+    # value of intensity 1; None: the largest of integers, 1 of floats
     white: float | int | None = None
-    tolerance: float | int = 0.001
-    clock_offset: float | int = 0.0
+    tolerance: float | int = 0.001  # s, between an image and the time asked for
+    clock_offset: float | int = 0.0  # s, added to the images' times
     folder: str = "."  # to which the paths are relative
 
     name = "external"

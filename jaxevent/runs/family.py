@@ -19,10 +19,12 @@ from jaxevent.parameters import Parameters, check_choice, suggest_name
 from jaxevent.processes import partition_batches
 from jaxevent.recording import Recording
 from jaxevent.runs.config import Check
+from jaxevent.show.tables import Row
 from jaxevent.tuning import Batches, Loss
 
 SPLIT_NAMES = ("fit", "validation", "test")
 Sources = Mapping[str, Sequence[tuple[str, Recording]]]  # (as given, recording) by split
+Settings = Mapping[str, Any]  # of a protocol and a method, by name; see `Protocol.settings`
 Shares = tuple[int, ...] | None  # of fit, validation, test; None: they have their own recordings
 
 
@@ -70,23 +72,23 @@ class Protocol(abc.ABC):
     own: ClassVar[Mapping[str, Check]] = {}
     sources: ClassVar[Mapping[str, type[Source]]] = {}
 
-    def check(self, options: Mapping[str, Any]) -> None:  # noqa: B027
+    def check(self, options: Settings) -> None:  # noqa: B027
         """Raise `InputError` for settings that are missing or not possible together."""
 
-    def available(self, options: Mapping[str, Any]) -> dict[str, Any]:
+    def available(self, options: Settings) -> dict[str, Any]:
         """Return the settings without optional ones whose extra is not installed."""
         return dict(options)
 
     def check_method(  # noqa: B027
-        self, method: Estimator, options: Mapping[str, Any]
+        self, method: Estimator, options: Settings
     ) -> None:
         """Raise `InputError` if the settings ask for something that the method cannot do."""
 
-    def label(self, options: Mapping[str, Any]) -> str:
+    def label(self, options: Settings) -> str:
         """Return the ending of a method's label, from settings of the protocol and the method."""
         return ""
 
-    def files(self, path: Path, options: Mapping[str, Any]) -> list[Path]:
+    def files(self, path: Path, options: Settings) -> list[Path]:
         """Return further files that a row of the recording depends on."""
         return []
 
@@ -96,7 +98,7 @@ class Protocol(abc.ABC):
         recording: Recording,
         method: Any,
         params: Any,
-        options: Mapping[str, Any],
+        options: Settings,
         progress: bool | None = None,
     ) -> dict[str, Any]:
         """Score a method on a recording.
@@ -156,9 +158,14 @@ class LastBatches:
 
 
 def batches_by_split(parts: Sequence[Any], batches: Sequence[Any]) -> Batches:
-    """Return the batches to fit to and to validate on, by the parts' `split`.
+    """Divide batches into those to fit to and those to validate on.
 
-    Remote ones marked so.
+    Args:
+        parts: Parts of recordings; `split` is 0 for the fit and 1 for validation.
+        batches: Batch of each part.
+
+    Returns:
+        Batches to fit to, and batches to validate on; those of other processes are marked.
     """
     pairs = list(zip(parts, batches, strict=True))
     fit, validation = (
@@ -218,7 +225,7 @@ class Goal(abc.ABC):
         """
 
     @abc.abstractmethod
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+    def table(self, rows: Sequence[Row]) -> str:
         """Format rows, which now have the key method too, as a Markdown table."""
 
 

@@ -71,6 +71,7 @@ class Plan:
     size: tuple[int, int] | None
     stream: str | None
     split: Shares
+    # s, length of a window that is fitted; None: the default of the family
     window: float | int | None
 
     def inputs(self) -> list[Path]:

@@ -51,7 +51,7 @@ class Metric:
     """A user's metric and its name in results."""
 
     name: str
-    function: Callable[[Any, Any], Any]
+    function: Callable[[Any, Any], Any]  # function (estimate, truth) that returns a number
 
     @property
     def higher_is_better(self) -> bool | None:
@@ -63,6 +63,7 @@ class Metric:
         """Compute the metric.
 
         The function gets copies, so that it cannot change the input of other metrics.
+
         Args:
             estimate: The estimate.
             truth: The truth that it is compared with.

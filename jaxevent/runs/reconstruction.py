@@ -44,7 +44,7 @@ from jaxevent.runs.protocols import (
     is_gap,
 )
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
-from jaxevent.show.tables import legend, markdown_table, results_table
+from jaxevent.show.tables import Row, legend, markdown_table, results_table
 from jaxevent.tuning import Batches
 
 ERROR_KINDS = ("linear", "log", "nll")
@@ -55,17 +55,17 @@ class ImageBatch(eqx.Module):
     """A batch: images as a function of parameters, the true images, and the weights of values."""
 
     prepared: PreparedImages
-    truth: Float[Numeric, "times pixels"]
-    weights: Float[Numeric, "times #pixels"]
+    truth: Float[Numeric, "times pixels"]  # intensity, 0 where unknown
+    weights: Float[Numeric, "times #pixels"]  # 0 where there is no truth
     white: Float[Numeric, ""]  # the brightest intensity that the truth can show
     weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
 
 
 class LikelihoodBatch(eqx.Module):
-    """A batch for the likelihood: features, and the number of measured frame pixels."""
+    """A batch for the likelihood of frames."""
 
-    features: Any
-    weight: Float[Numeric, ""]
+    features: Any  # inputs of the method's `run`
+    weight: Float[Numeric, ""]  # number of measured frame pixels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,9 +111,14 @@ class Objective:
     def parts(
         self, params: FrameParams, batch: Any
     ) -> tuple[Float[Array, " parts"], Float[Array, " parts"]]:
-        """Compute the loss of every image and its weight.
+        """Compute the loss and the weight of every image.
 
-        For the likelihood of frames one part in all.
+        Args:
+            params: Parameters of the method.
+            batch: `ImageBatch`, or for the likelihood `LikelihoodBatch`.
+
+        Returns:
+            Losses and weights, (images,) each; the likelihood of frames is one part.
         """
         if self.error is None:
             return self._of_frames(params, batch)[None], jnp.ones(1)
@@ -410,8 +415,8 @@ class ImageGoal(Goal):
     method: ImageEstimator
     loss: Objective
     protocol: str
-    warm_up: float | int
-    weights: Mapping[str, float | int] | None
+    warm_up: float | int  # s, prepared before and after a window
+    weights: Mapping[str, float | int] | None  # of `REGION_NAMES`, without unit
     gap: int = DEFAULT_GAP_FRAMES
 
     @property
@@ -465,7 +470,7 @@ class ImageGoal(Goal):
                 if (shared == place).any():
                     yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
 
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+    def table(self, rows: Sequence[Row]) -> str:
         return markdown_table(rows)
 
 
@@ -512,7 +517,7 @@ class EventGoal(Goal):
                     "nll": nll,
                 }
 
-    def table(self, rows: Sequence[Mapping[str, Any]]) -> str:
+    def table(self, rows: Sequence[Row]) -> str:
         columns = [("NLL", "nll", 1, 4), ("windows", "windows", 1, 0), ("events", "events", 1, 0)]
         return results_table(rows, columns) + legend(columns)
 

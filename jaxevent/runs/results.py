@@ -26,7 +26,7 @@ from jaxevent.confidence import ParameterInterval, confidence_intervals
 from jaxevent.io.output import finite
 from jaxevent.runs.family import SPLIT_NAMES
 from jaxevent.runs.fit_config import Plan, Task
-from jaxevent.show.tables import format_aligned_table
+from jaxevent.show.tables import Row, format_aligned_table
 from jaxevent.tuning import Batches, FitResult, RoughNumber, Run, begin
 
 Write = Callable[[str, bytes], None]
@@ -200,10 +200,17 @@ INDEPENDENT_MEASUREMENTS = "measurements, taken as independent"
 def find_intervals(
     task: Task, one: FitResult, problem: Callable[[Any], Batches]
 ) -> list[dict[str, Any]]:
-    """Return a row for each number that a fit found or searched, as results.json holds it.
+    """Compute the confidence intervals of a fit, as results.json holds them.
 
-    `low` and `high` are the ends of the interval, None where it is open or there is none;
-    `interval` describes it in words, and `of` names the parts that it rests on.
+    Args:
+        task: Fit of a method.
+        one: Result of the fit.
+        problem: Function that makes the batches for parameters; see `confidence_intervals`.
+
+    Returns:
+        A row for each number that the fit estimated or searched. `low` and `high` are the ends of
+        the interval, None if it is open or undetermined; `interval` describes it in words, and `of`
+        names the independent parts of the data.
     """
     fitted = confidence_intervals(
         task.loss, task.params, one.params, task.names, problem, task.search,
@@ -236,8 +243,17 @@ def _row(
     }
 
 
-def compute_gains(tasks: Sequence[Task], rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the error of each method before and after its fit, over the rows; None if unknown."""
+def compute_gains(tasks: Sequence[Task], rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Compute the mean error of each method before and after its fit.
+
+    Args:
+        tasks: Fits of methods.
+        rows: Scores before and after the fits.
+
+    Returns:
+        For each method `method`, `measure`, `split`, and the error `before` and `after`; None if
+        unknown.
+    """
     found = []
     for task in tasks:
         name = task.goal.measure
@@ -259,7 +275,15 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping[str, Any]]) -> str:
-    """Format the table of the numbers found, and a line for each method's gain."""
+    """Format a table of the numbers found, and a line for the gain of each method.
+
+    Args:
+        found: Rows of `find_intervals`.
+        gained: Rows of `compute_gains`.
+
+    Returns:
+        The text.
+    """
     table: list[list[str]] = [list(INTERVAL_COLUMNS)]
     for row in found:
         cells = (row["method"], row["parameter"], f"{row['start']:.4g}", f"{row['found']:.4g}")

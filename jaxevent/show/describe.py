@@ -92,7 +92,15 @@ def _value(values: Any) -> str:
 
 
 def _truth(recording: Recording, extra: Mapping[str, NDArray]) -> str:
-    """List the ground truth that a recording holds."""
+    """List the ground truth that a recording holds.
+
+    Args:
+        recording: The recording.
+        extra: Further arrays of its file, by name.
+
+    Returns:
+        Names, separated by commas; "none" if there is none.
+    """
     known = ["poses"] if recording.poses is not None and len(recording.poses) else []
     known += [name for name in extra if name.startswith(_TRUTH_NAMES)]
     return ", ".join(known) or "none"

@@ -191,7 +191,16 @@ def _tone_values(
 
 
 def _check_kind(function: str, thing: Any, kind: type) -> None:
-    """Raise `InputError`, which names the function to use, unless a thing is of a kind."""
+    """Check the class of an object that is to be drawn.
+
+    Args:
+        function: Name of the function that draws.
+        thing: Object to draw.
+        kind: Class that the function draws.
+
+    Raises:
+        InputError: It has another class; the message names the function for it.
+    """
     if isinstance(thing, kind):
         return
     others = {
@@ -387,7 +396,16 @@ def _(motion: MotionEstimate) -> str:
 def _format_block(
     title: str, rows: Sequence[tuple[str, str]], picture: Callable[[], Any] | None
 ) -> str:
-    """Format a title, a table and a picture as HTML."""
+    """Format a title, a table and a picture as HTML.
+
+    Args:
+        title: The title.
+        rows: Names and texts of the table.
+        picture: Function that draws a figure of matplotlib, or None.
+
+    Returns:
+        A block of HTML.
+    """
     cells = "".join(
         f"<tr><th>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
         for name, text in rows

@@ -400,7 +400,7 @@ class WrittenMotion:
     """Result of `Output.write`: names of files, the rows of motion.csv, errors."""
 
     files: list[str]
-    times: NDArray[np.int64]
+    times: NDArray[np.int64]  # (rows,) us
     estimated: Estimate
     motion: MotionEstimate
     errors: MotionScores | None

@@ -69,7 +69,7 @@ def motion_figure(
     for column, part in enumerate(model.parts):
         for row, i in enumerate(range(len(model.components))[part.rows]):
             _draw_particles(grid[row, column], motion, i, centred)
-            _plot_component(grid[row, column], i, part, model, times, estimated, truth)
+            _plot_component(grid[row, column], i, part, model, times, estimated, truth=truth)
     for k, (label, series) in enumerate(extra):
         _plot_extra(grid[rows, min(k, columns - 1)], seconds, label, series)
     empty = range(len(extra), columns) if extra else ()
@@ -102,6 +102,7 @@ def _plot_component(
     model: type[Model],
     times: NDArray[np.int64],
     estimated: Estimate,
+    *,
     truth: KnownMotion | None,
 ) -> None:
     """Plot a component of a part of the model with its band and its truth.
@@ -218,7 +219,14 @@ def _contrasts(
 def _draw_particles(
     axis: Any, motion: MotionEstimate, component: int, centred: bool | None
 ) -> None:
-    """Draw some of the particles of a component."""
+    """Draw some of the particles of a component.
+
+    Args:
+        axis: Axes of matplotlib.
+        motion: The motion; without a cloud nothing is drawn.
+        component: Index of the component.
+        centred: Whether to shift particles by the lag of the estimates; None: unless it is causal.
+    """
     cloud = motion.cloud
     if cloud is None or not len(cloud):
         return

@@ -22,6 +22,7 @@ from jaxevent.show.tables import (
     COLUMNS,
     COST_COLUMNS,
     Column,
+    Row,
     column_mean,
     columns_of,
     format_number,
@@ -61,12 +62,14 @@ class Cell(NamedTuple):
     title: str = ""
 
 
+# Time "t" (us), and "image", "truth", "error" and more, base64 of PNG; see `picture`.
+Picture = Mapping[str, Any]
 Table = tuple[list[str], list[list[Cell]], int]  # titles, lines, how many columns are text
 
 
 def page(
-    rows: Sequence[Mapping[str, Any]],
-    pictures: Sequence[Sequence[Mapping[str, Any]] | None],
+    rows: Sequence[Row],
+    pictures: Sequence[Sequence[Picture] | None],
     protocol: str,
     config: str,
     hosts: Sequence[str],
@@ -212,9 +215,7 @@ def _png(image: Any) -> str:
     return base64.b64encode(held.getvalue()).decode()
 
 
-def _list_failures(
-    rows: Sequence[Mapping[str, Any]], names: Mapping[str, str]
-) -> list[tuple[str, list[str]]]:
+def _list_failures(rows: Sequence[Row], names: Mapping[str, str]) -> list[tuple[str, list[str]]]:
     """List what failed and what was skipped, with titles."""
     parts = []
     for how in ("failed", "skipped"):
@@ -228,7 +229,7 @@ def _list_failures(
     return parts
 
 
-def _own_metrics(rows: Sequence[Mapping[str, Any]]) -> dict[str, bool | None]:
+def _own_metrics(rows: Sequence[Row]) -> dict[str, bool | None]:
     """Return for each metric of the user's own whether higher is better, None if not known."""
     return {name: higher for row in rows for name, higher in row.get("own_metrics", {}).items()}
 
@@ -238,7 +239,7 @@ def _higher_is_better(measure: str, own: Mapping[str, bool | None]) -> bool | No
     return own.get(measure, measure in HIGHER_IS_BETTER)
 
 
-def _tabulate_means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
+def _tabulate_means(rows: Sequence[Row], columns: Sequence[Column]) -> Table:
     """Tabulate the means of each method, the best of every measure marked.
 
     Metrics of the user's own are marked where they say whether higher is better.
@@ -268,7 +269,7 @@ def _tabulate_means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]
 
 
 def _tabulate_rows(
-    rows: Sequence[Mapping[str, Any]], columns: Sequence[Column], names: Mapping[str, str]
+    rows: Sequence[Row], columns: Sequence[Column], names: Mapping[str, str]
 ) -> Table:
     """Tabulate all rows."""
     lines = []
@@ -284,7 +285,7 @@ def _tabulate_rows(
     return ["recording", "method", *(title for title, _, _, _ in columns)], lines, 2
 
 
-def _tabulate_parameters(rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> Table:
+def _tabulate_parameters(rows: Sequence[Row], methods: Sequence[str]) -> Table:
     """Tabulate the parameters of each method."""
     lines = []
     for method in methods:
@@ -322,8 +323,8 @@ def _computed(hosts: Sequence[str]) -> Table:
 
 
 def _collect_recordings(
-    rows: Sequence[Mapping[str, Any]],
-    pictures: Sequence[Sequence[Mapping[str, Any]] | None],
+    rows: Sequence[Row],
+    pictures: Sequence[Sequence[Picture] | None],
     methods: Sequence[str],
     measure: str,
     names: Mapping[str, str],
@@ -362,7 +363,7 @@ def _collect_recordings(
     return found
 
 
-def _choose_pictures(pictures: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
+def _choose_pictures(pictures: Sequence[Picture], most: int) -> list[Picture]:
     """Choose pictures at even intervals, the middle one among them."""
     return [pictures[row] for row in spread_rows(len(pictures), most)]
 
@@ -373,11 +374,11 @@ def spread_rows(count: int, most: int) -> list[int]:
     return [(2 * k + 1) * count // (2 * most) for k in range(most)]
 
 
-def _picture_column(kind: str, pictures: Sequence[Mapping[str, Any]]) -> list[str | None]:
+def _picture_column(kind: str, pictures: Sequence[Picture]) -> list[str | None]:
     return [one.get(kind) for one in pictures]
 
 
-def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
+def _plotted(rows: Sequence[Row]) -> tuple[list[str], str]:
     """Choose two measures whose means are plotted, and the one plotted over time."""
     pairs = {
         "log_mse": (["log_mse", "log_ssim"], "log_mse"),
@@ -392,7 +393,7 @@ def _plotted(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], str]:
     return ["mse", "ssim"], "mse"
 
 
-def _series(row: Mapping[str, Any]) -> Mapping[str, Any]:
+def _series(row: Row) -> Mapping[str, Any]:
     """Return the values of a row by image or time; none of published numbers."""
     return row.get("per_frame") or row.get("per_time") or {}
 
@@ -403,19 +404,35 @@ def _rounded(values: Any) -> Any:
 
 
 def _is_logarithmic(higher_is_better: bool | None, values: NDArray[np.float64]) -> bool:
-    """Return whether a plot of an error needs a logarithmic scale."""
+    """Return whether a plot of an error needs a logarithmic scale.
+
+    Args:
+        higher_is_better: Whether higher is better; None if unknown.
+        values: (values,) all finite values of the plot.
+
+    Returns:
+        True for errors that are positive and differ by more than the factor `MIN_LOG_RATIO`.
+    """
     if higher_is_better is not False or not len(values):
         return False
     return bool(values.min() > 0 and values.max() > MIN_LOG_RATIO * values.min())
 
 
 def _summarise_measures(
-    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measures: Sequence[str]
+    rows: Sequence[Row], methods: Sequence[str], measures: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Summarise each measure over all images, or times, of all recordings, by method.
 
     A box reaches from the first to the third quartile, whiskers to the last value within 1.5 times
     the box's length. The mean is that of the table, in the table's unit.
+
+    Args:
+        rows: Rows without an error.
+        methods: Labels of the methods.
+        measures: Measures to be plotted first.
+
+    Returns:
+        For each measure a title, the kind of its axis, and a box or None by method.
     """
     own = _own_metrics(rows)
     places = {place for _, place, _, _ in COLUMNS}
@@ -461,7 +478,7 @@ def _summarise_measures(
 
 
 def _collect_curves(
-    rows: Sequence[Mapping[str, Any]], methods: Sequence[str], measure: str
+    rows: Sequence[Row], methods: Sequence[str], measure: str
 ) -> dict[str, Any] | None:
     """Collect the error of every method over the time of one recording."""
     title, _, factor, _ = _column(measure)

@@ -13,6 +13,7 @@ from jaxevent.io.output import complete
 from jaxevent.metrics import MEASURE_MEANINGS
 
 Column = tuple[str, str, float | int, int]
+Row = Mapping[str, Any]  # of an evaluation: recording, method, params, and measures by their names
 
 # Columns of a row of an evaluation: title, place in the row, factor, digits.
 REQUIRED_COLUMNS = {"mse", "ssim", "frames", "seconds"}  # of images, None too
@@ -66,7 +67,7 @@ COLUMNS: list[Column] = [
 COST_COLUMNS = {"frames", "missing", "seconds", "times"}  # columns that measure no quality
 
 
-def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+def columns_of(rows: Sequence[Row]) -> list[Column]:
     """Choose the columns of a table: those that rows have, and those of `REQUIRED_COLUMNS`.
 
     Metrics of the user's own, which rows name in `own_metrics`, follow the other measures.
@@ -82,17 +83,32 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
     return [*known[:work], *((name, name, 1, 4) for name in own), *known[work:]]
 
 
-def column_mean(rows: Sequence[Mapping[str, Any]], place: str) -> float | None:
-    """Compute the mean of a number over the rows that have it; None if none has."""
+def column_mean(rows: Sequence[Row], place: str) -> float | None:
+    """Compute the mean of a number over rows.
+
+    Args:
+        rows: Rows of an evaluation.
+        place: Place of the number in a row, such as "regions.well.mse".
+
+    Returns:
+        The mean over the rows that have the number; None if no row has.
+    """
     values = [nested_value(row, place) for row in rows]
     values = [float(value) for value in values if value is not None]
     return float(np.mean(values)) if values else None
 
 
-def rows_of_method(
-    rows: Sequence[Mapping[str, Any]], method: str, columns: Sequence[Column]
-) -> list[Mapping[str, Any]]:
-    """Choose the rows of a method with a number in any column that measures quality."""
+def rows_of_method(rows: Sequence[Row], method: str, columns: Sequence[Column]) -> list[Row]:
+    """Choose the rows of a method with a number in any column that measures quality.
+
+    Args:
+        rows: Rows of an evaluation.
+        method: Label of the method.
+        columns: Columns of the table.
+
+    Returns:
+        The rows, in their order.
+    """
     places = [place for _, place, _, _ in columns if place not in COST_COLUMNS]
     return [
         row
@@ -101,7 +117,7 @@ def rows_of_method(
     ]
 
 
-def means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def means(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Compute the means of each method over recordings.
 
     Args:
@@ -121,7 +137,7 @@ def means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
+def markdown_table(rows: Iterable[Row]) -> str:
     """Format the results of an evaluation as a Markdown table, aligned as plain text too.
 
     A table of each method's means follows if there are several recordings, then the meanings of the
@@ -153,7 +169,7 @@ def markdown_table(rows: Iterable[Mapping[str, Any]]) -> str:
     )
 
 
-def _table_of_means(rows: Sequence[Mapping[str, Any]]) -> str:
+def _table_of_means(rows: Sequence[Row]) -> str:
     """Format a table of each method's means; empty where no method has several recordings."""
     found = means(rows)
     if all(row["recordings"] < 2 for row in found):
@@ -182,7 +198,7 @@ def short_names(recordings: Iterable[str]) -> dict[str, str]:
     }
 
 
-def results_table(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> str:
+def results_table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
     """Format rows of results as a Markdown table.
 
     Args:
@@ -227,13 +243,29 @@ def align_cells(table: Sequence[Sequence[str]]) -> list[str]:
 
 
 def format_number(value: float | int | None, column: Column) -> str:
-    """Format a number of a column; "-" if it is None or NaN."""
+    """Format a number of a column.
+
+    Args:
+        value: The number, in the unit of a row.
+        column: Its column: factor and digits.
+
+    Returns:
+        The text; "-" for None and NaN.
+    """
     _, _, factor, digits = column
     return "-" if value is None or math.isnan(value) else f"{factor * value:.{digits}f}"
 
 
-def nested_value(row: Mapping[str, Any], path: str) -> Any:
-    """Return the value of a nested row at a place such as "regions.well.mse", or None."""
+def nested_value(row: Row, path: str) -> Any:
+    """Return the value at a place of a nested row, or None.
+
+    Args:
+        row: A row.
+        path: Place in the row, such as "regions.well.mse".
+
+    Returns:
+        The value, or None.
+    """
     value: Any = row
     for key in path.split("."):
         if key not in value:
@@ -242,7 +274,7 @@ def nested_value(row: Mapping[str, Any], path: str) -> Any:
     return value
 
 
-def flatten(row: Mapping[str, Any]) -> dict[str, Any]:
+def flatten(row: Row) -> dict[str, Any]:
     """Return a row with nested names joined by dots, those of the outermost level first."""
     flat: dict[str, Any] = {}
     pending = [("", row)]
@@ -256,11 +288,15 @@ def flatten(row: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_parquet(path: Path, rows: Sequence[Row]) -> None:
     """Write rows as Parquet, with nested names joined by dots.
 
     Lists of numbers, as `per_frame.mse`, are columns of lists; values of several kinds are JSON
-    text. Without the extra "parquet" no file is written, and an older one is removed.
+    text.
+
+    Args:
+        path: File to write; without the extra "parquet" it is removed.
+        rows: Rows of an evaluation.
     """
     try:
         import pyarrow

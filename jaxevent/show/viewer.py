@@ -210,7 +210,18 @@ _Layer = tuple[str, Callable[[_Sender, str], None]]
 
 
 def _layer(result: Any, recording: Recording) -> _Layer:
-    """Return the name of a result and the function that sends it."""
+    """Make the layer of a result.
+
+    Args:
+        result: Tracks, a motion, a video, or the path of a file or folder of these.
+        recording: The recording.
+
+    Returns:
+        Name of the layer, and the function that sends it to the viewer.
+
+    Raises:
+        InputError: A path holds no result.
+    """
     if isinstance(result, Tracks):
         table = _table_of_tracks(result)
         return "tracks", lambda send, _: send.tracks(table)

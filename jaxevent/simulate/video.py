@@ -254,7 +254,18 @@ def _read_folder(
     start: float | int,
     stop: float | int | None,
 ) -> tuple[NDArray[np.uint8], float]:
-    """Read a folder of images as `_read_video` reads a video."""
+    """Read a folder of images as `_read_video` reads a video.
+
+    Args:
+        path: The folder.
+        max_size: Longest side of the images, px; larger ones are reduced.
+        rate: Images per second; None: the default for folders.
+        start: Time of the first image, s after that of the folder.
+        stop: Time after the last image, s, likewise; None: the end.
+
+    Returns:
+        (images, height, width) or in colour, and images per second.
+    """
     found = float(_FOLDER_RATE_HZ if rate is None else rate)
 
     def order(file: Path) -> list[str | int]:

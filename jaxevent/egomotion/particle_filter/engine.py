@@ -195,7 +195,17 @@ class FunctionTracer:
     def _lay_out(
         self, key: str, tree: Any, translated: TracedFunction | None = None, alias: bool = False
     ) -> Any:
-        """Give each number of a tree a cell or a row, and return the tree's shapes."""
+        """Assign each number of a tree a cell or a row of the work memory.
+
+        Args:
+            key: Name of the tree.
+            tree: Tree of shapes.
+            translated: Function whose results the numbers are; None: inputs.
+            alias: Whether results that are inputs stay where these are.
+
+        Returns:
+            The tree, with the shapes that later functions see.
+        """
         leaves = []
         for name, leaf in named_leaves(key, tree).items():
             names = number_names(name, leaf)

@@ -178,11 +178,11 @@ class Context(NamedTuple):
     """Everything that the parts of the loop share."""
 
     functions: ModelFunctions
-    pointers: Any
+    pointers: Any  # addresses of cells, work, parameters, votes and ages, and of candidates in use
     rows: RowIndices
     batches: BatchArrays
-    cells: NDArray
-    work: NDArray
+    cells: NDArray  # (cells,) numbers common to all particles; `FunctionTracer` places them
+    work: NDArray  # (rows, N) numbers of particles, likewise
 
 
 def init_interpolation(

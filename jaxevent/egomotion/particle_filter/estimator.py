@@ -78,7 +78,7 @@ class ReadoutTimes(eqx.Module):
 
     before: Any  # (times,) batch
     after: Any  # (times,) batch
-    fraction: Float[Array | np.ndarray, " times"]
+    fraction: Float[Array | np.ndarray, " times"]  # of the interval from batch `before` to `after`
     inside: Bool[Array | np.ndarray, " times"]  # of the recording, from the first batch on
 
 
@@ -748,9 +748,9 @@ def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
 class CandidateRange(NamedTuple):
     """Candidates that the next batches can need; see `CandidateSampler.sample`."""
 
-    youngest: float | NDArray[np.floating]
-    oldest: float | NDArray[np.floating]
-    expected: ExpectedFlow | None
+    youngest: float | NDArray[np.floating]  # least age, s; an array: of each part of the sensor
+    oldest: float | NDArray[np.floating]  # largest age, s, likewise
+    expected: ExpectedFlow | None  # flow that candidates must fit; None: any
 
 
 def candidate_range(

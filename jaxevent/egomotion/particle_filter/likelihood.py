@@ -292,7 +292,16 @@ def init_votes(
 def _has_own_ranges(
     params: Params, model: Model, searching: Bool[Array, ""] | bool
 ) -> Bool[Array, ""] | bool:
-    """Return whether every hypothesis has its own range of ages."""
+    """Return whether every hypothesis has its own range of ages.
+
+    Args:
+        params: Parameters; `likelihood` decides.
+        model: Motion model.
+        searching: Whether the filter searches the whole range of motions.
+
+    Returns:
+        True or false; an array if `searching` is one and decides.
+    """
     if model.half_line:
         return False
     return True if params.likelihood == "band" else searching

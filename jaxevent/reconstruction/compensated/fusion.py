@@ -139,7 +139,7 @@ def after_weight(layout: InstantLayout) -> Numeric:
 class FusedImage(ShortRepr):
     """An image of log intensity, its variance and its sources."""
 
-    L: Float[Array, "h w"]
+    L: Float[Array, "h w"]  # log intensity, ln I
     P: Float[Array, "h w"]  # its variance, (ln I)^2
     sources: Float[Array, "5 h w"]  # shares of `SOURCE_NAMES`; their sum is 1
     visible: Float[Array, "2 h w"]  # 1 where the frame before, after, sees the point, else 0
@@ -155,7 +155,7 @@ class FusionFeatures(ShortRepr):
     visible: Float[Array, "2 h w"]  # as in `FusedImage`
     image_variance: Float[Array, "h w"]  # of single images along trajectories
     beyond: Float[Array, ""]  # as in `FusionInputs`
-    rest: Float[Array, ""]
+    rest: Float[Array, ""]  # as in `FusionInputs`
     stationary: Float[Array, "..."]  # 1 where points stay in their places, else 0
     intervals_away: Float[Array, ""]  # as in `FusionInputs`
     noise: Float[Array, "..."]  # as in `FusionInputs`

@@ -89,9 +89,9 @@ class RobustMean(NamedTuple):
     M: Float[Numeric, "h w"]  # log intensity
     information: Float[Numeric, "h w"]  # 1 / (ln I)^2
     scatter: Float[Numeric, "h w"]  # variance beyond that of the images, (ln I)^2
-    near_mean: Float[Numeric, "h w"]  # of the near instants
-    near_information: Float[Numeric, "h w"]
-    frame_information: Float[Numeric, "h w"]
+    near_mean: Float[Numeric, "h w"]  # log intensity by the near instants
+    near_information: Float[Numeric, "h w"]  # of the near instants, 1 / (ln I)^2
+    frame_information: Float[Numeric, "h w"]  # of the instants of frames, 1 / (ln I)^2
     activity: Float[Numeric, "h w"]  # squared changes in place over `activity_range`
     shares: Float[Numeric, "3 h w"]  # in M: of frames before, frames after, all others
     visible: Float[Numeric, "2 h w"]  # 1 where the frame before, after, sees the point, else 0

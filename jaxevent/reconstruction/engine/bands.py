@@ -258,10 +258,10 @@ class _Rows(NamedTuple):
     Bands are unsigned, as other places are tried for being negative; one too many is none.
     """
 
-    own: NDArray[np.uint64]
-    own_place: NDArray[np.int64]
-    next_to: NDArray[np.uint64]
-    next_place: NDArray[np.int64]
+    own: NDArray[np.uint64]  # (height,) band that owns the row
+    own_place: NDArray[np.int64]  # (height,) twice the place of the row's first pixel in that band
+    next_to: NDArray[np.uint64]  # (height,) band whose border the row is; the number of bands: none
+    next_place: NDArray[np.int64]  # (height,) the place there, likewise
 
 
 @njit_noalloc
@@ -618,7 +618,7 @@ class ExposureSums(NamedTuple):
     """Arguments of `sum_exposure_segments`."""
 
     excess: Any  # function of the module
-    numbers: NDArray
+    numbers: NDArray  # (numbers,) parameters' numbers, of the type of the kernel
     totals: NDArray[np.int64]  # fields of the sums, in strides
     counts: NDArray  # [3, stride], scratch
     bound: NDArray[np.float64]  # [stride], scratch

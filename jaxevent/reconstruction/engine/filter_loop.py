@@ -369,7 +369,7 @@ class WindowInputs(NamedTuple):
     frames: FrameRows
     totals: NDArray[np.int64]  # [sums, rows], fields of sums over exposures, in strides
     functions: FilterFunctions
-    numbers: NDArray
+    numbers: NDArray  # (numbers,) parameters' numbers, of the type of the kernel
 
 
 @njit_noalloc_inlined

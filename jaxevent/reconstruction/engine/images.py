@@ -582,7 +582,7 @@ class KernelImages(eqx.Module):
     """Images made by kernels as a function of parameters; see `PreparedImages`."""
 
     number: Int[Numeric, ""]  # of the kernel
-    rows: Int[Numeric, " times"]
+    rows: Int[Numeric, " times"]  # of the images that the kernel makes
     kernel: ImageKernel = eqx.field(static=True)
 
     @classmethod
@@ -719,7 +719,16 @@ def _images(about: Any, number: Any, rows: Any, params: Any) -> Any:
 
 @full_precision
 def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
-    """Return the changes of images: derivatives by numbers times the numbers' changes, summed."""
+    """Compute images and their tangents: derivatives times the tangents of parameters, summed.
+
+    Args:
+        about: As in `_call_kernel`.
+        primals: Number of the kernel, rows of images, and parameters.
+        tangents: Tangents of these; only those of parameters count.
+
+    Returns:
+        Mean, variance and valid, each (times, pixels), and their tangents.
+    """
     number, rows, params = primals
     changes = jax.tree.leaves(tangents[2], is_leaf=_is_zero)
     moving = [k for k, change in enumerate(changes) if not _is_zero(change)]
@@ -743,7 +752,19 @@ def _with_derivatives(about: Any, number: Any, rows: Any, params: Any) -> Any:
 
 
 def _with_derivatives_jvp(about: Any, primals: Any, tangents: Any) -> Any:
-    """Refuse second derivatives, which no kernel carries; a change of nothing changes nothing."""
+    """Refuse second derivatives, which kernels do not have.
+
+    Args:
+        about: As in `_call_kernel`, and `numbers`.
+        primals: Number of the kernel, rows of images, and parameters.
+        tangents: Tangents of these, all symbolic zeros.
+
+    Returns:
+        Images with derivatives, and tangents that are 0.
+
+    Raises:
+        InputError: A tangent is not zero.
+    """
     if not all(map(_is_zero, jax.tree.leaves(tangents, is_leaf=_is_zero))):
         raise InputError(
             f"the kernel of the method {about[0].method.name!r} has first derivatives only; for "

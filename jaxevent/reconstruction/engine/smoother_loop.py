@@ -95,7 +95,7 @@ class SegmentInputs(NamedTuple):
     frames: FrameRows
     places: SmootherPlaces
     functions: SmootherFunctions
-    numbers: NDArray
+    numbers: NDArray  # (numbers,) parameters' numbers, of the type of the kernel
     slot: NDArray[np.int64]  # of each band in the memory
     rates: NDArray[np.float64]  # see `spread_rates`; empty: no change is spread
     reach: int  # us, the longest time over which a change is spread
