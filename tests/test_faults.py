@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 import jaxevent
 from jaxevent.calibration.correspondence import TRANSFORMS
-from jaxevent.calibration.hot import find_hot_pixels
+from jaxevent.calibration.hot import find_hot_pixels, measure_dead_share
 from jaxevent.calibration.light import common_change
 from jaxevent.calibration.sampling import count_between, take_sample
 from jaxevent.events import filter_refractory
@@ -28,6 +28,7 @@ NAMES = {
     "polarity random": "lost polarity",
     "polarity all ON": "lost polarity",
     "20 % hot pixels": "hot pixels",
+    "half of the pixels dead": "dead pixels",
     "rows flipped": "flipped or swapped axes",
     "columns flipped": "flipped or swapped axes",
     "axes swapped": "flipped or swapped axes",
@@ -247,6 +248,29 @@ def test_hot_pixels_are_those_that_fire_in_all_parts():
     hot = rng.random((50, 50)) < 0.2
     found = find_hot_pixels(counts + hot * rng.poisson(15, counts.shape))
     assert found[hot].mean() > 0.99 and not found[~hot].any()
+
+
+@pytest.mark.parametrize("shape", ["disc", "rows", "dots"])
+def test_regions_at_rest_are_not_dead(shape):
+    """Pixels count as dead between busy ones that see the same edges, not between hot ones."""
+    y, x = np.mgrid[:60, :80]
+    moving = {
+        "disc": np.hypot(y - 30, x - 40) < 20,
+        "rows": y % 8 < 3,
+        "dots": (y % 6 == 0) & (x % 6 == 0),
+    }[shape]
+    rng = np.random.default_rng(0)
+    rate = gaussian_filter(rng.normal(size=(8, 60, 80)), (0, 3, 3))
+    rate = 5 * np.exp(rate / rate.std())
+    counts, hot = rng.poisson(rate * moving), np.zeros(moving.shape, bool)
+    assert measure_dead_share(counts, hot) == 0
+    broken = rng.random(moving.shape) < 0.3
+    share = measure_dead_share(counts * ~broken, hot)
+    assert share == (0 if shape == "dots" else pytest.approx(0.3, abs=0.05))
+    assert measure_dead_share(counts * ~broken, broken) == 0
+    random = rng.poisson(10 * (rng.random(moving.shape) < 0.3), counts.shape)
+    assert measure_dead_share(random, hot) == 0
+    assert find_hot_pixels(random).sum() > 0.9 * random.any(0).sum()
 
 
 def test_faulty_recordings_are_what_they_are_called(sound):

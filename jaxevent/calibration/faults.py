@@ -4,6 +4,7 @@ Limits come from chance, from geometry or from simulated scenes; docs/faults.md 
 reason. All checks use one sample of the recording, so that they cost seconds however long it is.
 """
 
+import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -21,10 +22,11 @@ from jaxevent.calibration.correspondence import (
     turn_events,
 )
 from jaxevent.calibration.gaps import MAX_MISSED_EVENTS, find_gaps
-from jaxevent.calibration.hot import MAX_EVENTS_SHARE
+from jaxevent.calibration.hot import MAX_DEAD_SHARE, MAX_EVENTS_SHARE
 from jaxevent.calibration.light import common_change
 from jaxevent.calibration.sampling import Sample, count_between, log_changes, take_sample
 from jaxevent.display import plural
+from jaxevent.errors import InputWarning
 from jaxevent.events.clocks import MIN_OVERLAP_SHARE, MIN_SPAN_RATIO, compare_clocks
 from jaxevent.recording import Events, Recording, check_recording
 from jaxevent.time_units import WINNING_NATS, doubt_microseconds
@@ -52,8 +54,8 @@ MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 
 # Faults of the events alone, whether frames revealed them or not.
 EVENT_FAULTS = (
-    *("hot pixels", "unusual clock", "missing events", "event bursts", "repeated events"),
-    *("lost polarity", "inverted polarity", "flipped or swapped axes"),
+    *("hot pixels", "dead pixels", "unusual clock", "missing events", "event bursts"),
+    *("repeated events", "lost polarity", "inverted polarity", "flipped or swapped axes"),
 )
 
 
@@ -101,6 +103,7 @@ def check_consistency(recording: Recording, sample: Sample | None = None) -> tup
         fault
         for found in (
             _check_hot_pixels(sample),
+            _check_dead_pixels(sample),
             _check_unit(recording),
             _check_times(recording, sample),
             _check_repeated_events(sample),
@@ -130,6 +133,23 @@ def _check_hot_pixels(sample: Sample) -> Iterator[Fault]:
         "remove them: jaxevent filter --hot-pixels, or events.remove_hot_pixels with "
         "calibrate(recording).hot_pixels",
     )  # fmt: skip
+
+
+def _check_dead_pixels(sample: Sample) -> Iterator[Fault]:
+    """Check the share of pixels without an event, of those between busy ones."""
+    yield Fault(
+        "dead pixels", sample.dead_share, MAX_DEAD_SHARE,
+        f"{100 * sample.dead_share:.3g} % of the pixels between busy ones have no event at all",
+        "look for pixels that are broken, or masked by the camera or a filter; images of their "
+        "places rest on the frames",
+    )  # fmt: skip
+
+
+def warn_of_unit(recording: Recording) -> None:
+    """Warn if the times of events look like those of another unit than microseconds."""
+    for fault in _check_unit(recording):
+        if fault.statistic > fault.limit:
+            warnings.warn(f"{recording.name}: {fault}", InputWarning, stacklevel=3)
 
 
 def _check_unit(recording: Recording) -> Iterator[Fault]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.calibration.hot import find_hot_pixels
+from jaxevent.calibration.hot import find_hot_pixels, measure_dead_share
 from jaxevent.codegen import njit_noalloc
 from jaxevent.recording import EventSource, Recording
 
@@ -73,6 +73,7 @@ class Sample(NamedTuple):
     size: tuple[int, int]  # width, height
     hot: NDArray[np.bool_]  # (height, width)
     counts: NDArray[np.int64]  # (2, height, width) ON and OFF events of all pixels and segments
+    dead_share: float  # of the pixels between busy ones, without an event
 
 
 def choose_pixels(
@@ -278,7 +279,8 @@ def take_sample(recording: Recording) -> Sample:
         s._replace(clear=(s.grey > dark) & (s.grey < bright)).without(is_out) for s in found
     )
     return Sample(
-        segments, places, tile, (width, height), hot, counts.sum(1, dtype=np.int64)
+        segments, places, tile, (width, height), hot, counts.sum(1, dtype=np.int64),
+        measure_dead_share(counts.sum(0), hot),
     )  # fmt: skip
 
 

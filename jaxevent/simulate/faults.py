@@ -171,6 +171,22 @@ def add_hot_pixels(
     return dataclasses.replace(recording, events=Events(*(column[order] for column in new)))
 
 
+def silence_pixels(recording: Recording, seed: int = 0, *, share: float | int = 0.5) -> Recording:
+    """Remove all events of some pixels, as where these are broken or masked.
+
+    Args:
+        recording: The recording.
+        seed: Seed of their places.
+        share: Share of the pixels that are silent.
+
+    Returns:
+        The recording without the events of these pixels.
+    """
+    rng, events = np.random.default_rng(seed), recording.events[:]
+    dead = rng.random((recording.height, recording.width)) < share
+    return _with_events(recording, ~dead[events.y, events.x])
+
+
 def flip_rows(recording: Recording, seed: int = 0) -> Recording:
     """Flip the events upside down, and leave the frames.
 
@@ -306,6 +322,7 @@ FAULTS: Mapping[str, Callable[[Recording, int], Recording]] = MappingProxyType(
         "polarity random": randomise_polarity,
         "polarity all ON": set_polarity_on,
         "20 % hot pixels": add_hot_pixels,
+        "half of the pixels dead": silence_pixels,
         "rows flipped": flip_rows,
         "columns flipped": flip_columns,
         "axes swapped": swap_axes,
