@@ -25,7 +25,7 @@ mends both. Of numbers of the same kind as the event times, the unit of these co
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -230,10 +230,9 @@ def doubt_given_unit(
     """
     if len(t) < MIN_EVENTS:
         return None
-    rows = np.append(np.arange(min(len(t) - 1, JUDGED_EVENTS)), len(t) - 1)
-    sample = {name: part[rows] for name, part in (("t", t), ("x", x), ("y", y))}
     least = WINNING_NATS if unit is None else _CONTRADICTION_NATS
-    numbers, unit = _Numbers.from_sample(sample, len(t), size), unit or "us"
+    numbers = _numbers_of_ends(lambda rows: (t[rows], x[rows], y[rows]), len(t), size)
+    unit = unit or "us"
     found = _contradiction(numbers, unit, least)
     if found is None:
         return None
@@ -270,9 +269,12 @@ def doubt_microseconds(events: "EventSource", size: tuple[int, int]) -> ClockDou
     count = len(events)
     if count < MIN_EVENTS:
         return None
-    ends = events[: min(count - 1, JUDGED_EVENTS)], events[count - 1 :]
-    sample = {name: np.concatenate([getattr(end, name) for end in ends]) for name in "txy"}
-    found = _contradiction(_Numbers.from_sample(sample, count, size), "us", WINNING_NATS)
+
+    def read(rows: slice) -> tuple[NDArray, NDArray, NDArray]:
+        part = events[rows]
+        return part.t, part.x, part.y
+
+    found = _contradiction(_numbers_of_ends(read, count, size), "us", WINNING_NATS)
     if found is None:
         return None
     scale = US_PER_UNIT[found.unit]
@@ -281,6 +283,24 @@ def doubt_microseconds(events: "EventSource", size: tuple[int, int]) -> ClockDou
         remedy = f"divide the times by {1 / scale:,.0f}"
     text = f"the times look like {UNIT_NAMES[found.unit]}, not microseconds: {found.text}"
     return ClockDoubt(found.nats, text, remedy)
+
+
+def _numbers_of_ends(
+    read: Callable[[slice], tuple[NDArray, NDArray, NDArray]], count: int, size: tuple[int, int]
+) -> "_Numbers":
+    """Compute the statistics by which the unit of a recording is doubted.
+
+    Args:
+        read: Function that returns times, columns and rows of some events.
+        count: Number of events, of which the first `JUDGED_EVENTS` and the last one are read.
+        size: (width, height) of the sensor in pixels.
+
+    Returns:
+        The statistics.
+    """
+    ends = read(slice(min(count - 1, JUDGED_EVENTS))), read(slice(count - 1, count))
+    columns = [np.concatenate(parts) for parts in zip(*ends, strict=True)]
+    return _Numbers.from_sample(dict(zip("txy", columns, strict=True)), count, size)
 
 
 class _Contradiction(NamedTuple):

@@ -37,7 +37,12 @@ def add(commands: Any) -> None:
         "drone.h5 --model general --imu --start 2 --stop 3 --out drone",
         "- --live --size 240,180 --model rotation --focal 200",
     )
-    one.add_argument("path", metavar="PATH", type=Path, help="a recording; frames are not needed")
+    one.add_argument(
+        "path",
+        metavar="PATH",
+        type=Path,
+        help="a recording; only the methods batch and frames use its frames",
+    )
     one.add_argument(
         "--model",
         metavar="MODEL",
@@ -206,7 +211,8 @@ def _write(options: Options, kind: "type[Model] | None") -> None:
     }  # fmt: skip
     made = {"method": estimator.name, "params": values}
     written = output.write(recording, motion, about, true, progress=show_progress(), **made)
-    hint = _truth_hint(whole, kind) if options.truth is None else []
+    hint = _frames_hint(whole, estimator, values)
+    hint += _truth_hint(whole, kind) if options.truth is None else []
     print("\n".join([f"{kind.title} by {estimator.name}:", *written.summary(), *hint]))
     count = len(recording.events)
     print(
@@ -235,6 +241,7 @@ def _open(options: Options) -> "Recording":
     recording = _with_camera(recording, options.focal)
     if not len(recording.events):
         raise InputError(f"{path}: holds no events; choose another recording")
+    recording.refuse_one_time(str(path))
     if recording.imu is None and (options.imu or options.still is not None):
         raise InputError(
             f"{path}: holds no IMU{recording.describe_left_out('imu')}; leave out "
@@ -358,6 +365,23 @@ def _truth_hint(recording: "Recording", kind: "type[Model]") -> list[str]:
     sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.truth_sources
     known = [name for name in sources if (rows := has[name]) is not None and len(rows)]
     return [f"the recording's {known[0]} can show errors: add --truth"] if known else []
+
+
+def _frames_hint(recording: "Recording", estimator: "MotionEstimator", values: Any) -> list[str]:
+    """Return a line that the recording's frames are not used, if there are any, else none.
+
+    Args:
+        recording: The recording.
+        estimator: The method.
+        values: Its parameters.
+
+    Returns:
+        The line, or an empty list.
+    """
+    if recording.frames is None or estimator.needs_frames or values.values().get("frames"):
+        return []
+    count = format_count(len(recording.frames), "frame")
+    return [f"by the events alone, without the recording's {count}"]
 
 
 def _need_camera(recording: "Recording", kind: "type[Model]") -> None:

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.calibration.faults import warn_of_unit
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_methods
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
     ImageSpeed,
-    describe_unit_doubt,
     describe_windows,
     measure_image_speed,
 )
@@ -209,7 +209,7 @@ class MotionEstimator(Estimator[P]):
 
         Raises:
             InputError: The model is unknown or not supported, it needs a camera and there is none,
-                or the recording lacks what the method needs.
+                the recording lacks what the method needs, or all events are at one time.
         """
         self.check_options(model=model, camera=camera)
         if model is None:
@@ -218,6 +218,8 @@ class MotionEstimator(Estimator[P]):
         if found.needs_camera:
             camera = recording.require_camera(camera, found.title)
         self.check(recording)
+        if not self.needs_frames:
+            recording.refuse_one_time()
         return found, camera
 
     def check_against(
@@ -284,11 +286,9 @@ class MotionEstimator(Estimator[P]):
             return AdaptedParams(params, speed, "", "")
         speed = speed or measure_image_speed(recording, camera)
         if speed is None:
-            still = (
-                f"nothing was seen to move {describe_windows(recording)}; windows are as by default"
-                f"{describe_unit_doubt(recording)}"
-            )
-            return AdaptedParams(params, None, still, "")
+            warn_of_unit(recording)  # a clock that is too fast or too slow may be the cause
+            still = f"nothing was seen to move {describe_windows(recording)}"
+            return AdaptedParams(params, None, f"{still}; windows are as by default", "")
         chosen = self.lengths(params, speed)
         chosen = {name: value for name, value in chosen.items() if name not in given}
         settings = self.Params.settings()

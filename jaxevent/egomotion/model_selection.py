@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.calibration.faults import warn_of_unit
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
 from jaxevent.egomotion.bundle.hypotheses import MotionGuess, translation_z
@@ -29,7 +30,6 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
     FIT_WINDOW_DISPLACEMENT_PX,
     PatchSharpness,
-    describe_unit_doubt,
     describe_windows,
     fit_general,
     fit_planar,
@@ -118,10 +118,10 @@ def select_model(recording: Recording, camera: PinholeCamera | None = None) -> M
     speed = measure_image_speed(recording, camera)
     windows = [] if speed is None else measure_windows(recording, speed, camera)
     if not windows:
+        warn_of_unit(recording)  # a clock that is too fast or too slow may be the cause
         raise InputError(
             f"{recording.name}: nothing is seen to move {describe_windows(recording)}; this "
             "may be noise; if something moves, name the model of its motion"
-            f"{describe_unit_doubt(recording)}"
         )
     if camera is None:
         line = (

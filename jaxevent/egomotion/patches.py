@@ -38,7 +38,6 @@ from jaxevent.egomotion.candidates import pixel_coordinates
 from jaxevent.egomotion.geometry import A, rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Imu, Recording
-from jaxevent.time_units import doubt_microseconds
 
 PATCH_PX = 24
 MAX_GRID_DISPLACEMENT_PX = 7  # of the grid, in x and y
@@ -168,15 +167,6 @@ def describe_windows(recording: Recording) -> str:
     ends = sorted({fitting[0], fitting[-1]})
     words = [f"{1e3 * one:.2g} ms" if one < 0.1 else f"{one:.2g} s" for one in ends]
     return f"in windows of {' to '.join(words)}"
-
-
-def describe_unit_doubt(recording: Recording) -> str:
-    """Describe a doubt of the unit of times, after a semicolon; an empty string if there is none.
-
-    Where nothing is seen to move, a clock that runs too fast or too slowly may be the cause.
-    """
-    doubt = doubt_microseconds(recording.events, (recording.width, recording.height))
-    return "" if doubt is None else f"; {doubt.text}; if so, {doubt.remedy}"
 
 
 def window_durations(recording: Recording) -> NDArray[np.float64]:

@@ -106,3 +106,16 @@ def check_clocks(recording: Recording, clock_offset: Any = 0.0) -> None:
         InputWarning,
         stacklevel=3,
     )
+
+
+def warn_of_clocks(recording: Recording) -> None:
+    """Warn if the clock of the frames differs, for a method that leaves out frames that misfit."""
+    mismatch = compare_clocks(recording)
+    if mismatch is not None:
+        warnings.warn(
+            f"{recording.name}: {mismatch.text}, which is unlikely of one clock and unit; frames "
+            "that do not fit the events are left out; check their times, or estimate the offset by "
+            "jaxevent register",
+            InputWarning,
+            stacklevel=3,
+        )

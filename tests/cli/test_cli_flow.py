@@ -171,12 +171,12 @@ def test_what_cannot_be_is_refused(stored, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.toml", "times.csv"]
 
 
-@pytest.mark.parametrize("name", ["flow", "track"])
+@pytest.mark.parametrize("name", ["flow", "motion", "track"])
 def test_events_at_one_time_are_refused(name, tmp_path, capsys):
     path, n = tmp_path / "once.npz", 300
     x, y = np.arange(n) % 20, np.arange(n) // 20
     np.savez(path, t=np.full(n, 1000), x=x, y=y, p=x % 2, width=20, height=15)
-    out = ("--time-unit", "us", "--out", tmp_path / "out.h5")
+    out = ("--time-unit", "us", "--out", tmp_path / "out")
     fails(capsys, [name, path, *out], path, "all 300 events are at one time, 1000 us")
 
 

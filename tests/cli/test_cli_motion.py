@@ -19,7 +19,7 @@ import jaxevent
 from jaxevent import cli, egomotion, methods
 from jaxevent.camera import PinholeCamera
 from jaxevent.cli import motion as command
-from jaxevent.egomotion import model_selection, voting
+from jaxevent.egomotion import batch, frames, model_selection, voting
 from jaxevent.egomotion.estimator import AdaptedParams, MotionEstimator
 from jaxevent.egomotion.models import MODELS, General, Planar
 from jaxevent.egomotion.motion import MotionEstimate
@@ -108,6 +108,20 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsy
     assert "planar motion by planes" in printed and "never found" not in printed
     assert cli.main([*words[:-1], str(folder / "other"), "--method", "voting"]) == 0
     assert "never found" in capsys.readouterr().out  # a method that was asked for stays
+
+
+def test_frames_that_a_method_does_not_use_are_told(folder):
+    recording = jaxevent.load(folder / "planar.h5")
+    stamps = np.array([recording.start, recording.stop])
+    images = np.zeros((2, recording.height, recording.width), np.uint8)
+    framed = dataclasses.replace(recording, frames=Frames(stamps, images, np.zeros(2, np.int64)))
+    without = dataclasses.replace(recording, frames=None)
+    (line,) = command._frames_hint(framed, voting, voting.Params())
+    assert line == "by the events alone, without the recording's 2 frames"
+    assert command._frames_hint(without, voting, voting.Params()) == []
+    assert command._frames_hint(framed, batch, batch.Params()) == []
+    assert command._frames_hint(framed, batch, batch.Params(frames=False)) == [line]
+    assert command._frames_hint(framed, frames, frames.Params()) == []
 
 
 @pytest.mark.parametrize(

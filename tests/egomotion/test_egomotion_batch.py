@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -671,3 +672,23 @@ def test_what_cannot_be_estimated_is_refused():
         sequence.batch.estimate(dataclasses.replace(seen(), camera=None), PARAMS)
     with pytest.raises(InputError, match="general"):
         sequence.batch.estimate(seen(), PARAMS, model="generl")
+
+
+@pytest.mark.parametrize("is_used", [True, False])
+def test_frames_of_another_clock_are_not_left_out_in_silence(monkeypatch, recwarn, is_used):
+    events = np.arange(200)
+    kept = Events(1000 * events, events % 20, events // 20, events % 2 == 0)
+    stamps = 3600 * 10**6 + 10_000 * np.arange(3)
+    frames = Frames(stamps, np.zeros((3, 15, 20), np.uint8), np.zeros(3, np.int64))
+    camera = PinholeCamera(20.0, 20.0, 9.5, 7.0)
+    recording = Recording("two clocks", 20, 15, kept, frames, camera=camera)
+
+    def fit(*_):
+        raise InterruptedError
+
+    monkeypatch.setattr(sequence, "WindowFitter", fit)
+    warnings.simplefilter("always")
+    with pytest.raises(InterruptedError):
+        sequence.batch.estimate(recording, sequence.batch.Params(frames=is_used))
+    told = [str(one.message) for one in recwarn if "frames last from 3600" in str(one.message)]
+    assert len(told) == is_used

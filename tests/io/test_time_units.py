@@ -19,7 +19,16 @@ import jaxevent
 from jaxevent import cli
 from jaxevent.errors import InputWarning
 from jaxevent.io.images import read_times
-from jaxevent.time_units import infer_unit, numbers_of_dates, to_microseconds, unit_of_name
+from jaxevent.recording import Events
+from jaxevent.time_units import (
+    JUDGED_EVENTS,
+    doubt_given_unit,
+    doubt_microseconds,
+    infer_unit,
+    numbers_of_dates,
+    to_microseconds,
+    unit_of_name,
+)
 
 SIZE = (48, 32)
 COUNT = 600
@@ -521,3 +530,18 @@ def test_bad_times(text: str, said: str, tmp_path: Path):
     path = tmp_path / "times.txt"
     path.write_text(text)
     assert said in refuses("times.txt", read_times, path)
+
+
+@pytest.mark.parametrize("n", [JUDGED_EVENTS // 2, 3 * JUDGED_EVENTS])
+def test_arrays_and_events_are_doubted_by_the_same_rows(n):
+    """Beyond the first events only the last one counts, in both."""
+    rng, size = np.random.default_rng(0), (20, 15)
+    t = np.sort(rng.integers(0, 40_000_000 * n // JUDGED_EVENTS, n)) * 1000
+    x, y = rng.integers(0, size[0], n), rng.integers(0, size[1], n)
+    found = doubt_microseconds(Events(t, x, y, x % 2 == 0), size)
+    text = doubt_given_unit(t, x, y, size, None)
+    assert found is not None and text is not None
+    assert found.text.partition(": ")[2] in text
+    t[JUDGED_EVENTS + 1 : -1] = t[-1]
+    assert doubt_microseconds(Events(t, x, y, x % 2 == 0), size) == found
+    assert doubt_given_unit(t, x, y, size, None) == text

@@ -14,6 +14,7 @@ from jaxevent.egomotion.estimator import COMMON_OPTIONS, HostEstimator, HostInpu
 from jaxevent.egomotion.models import General
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import ImageSpeed
+from jaxevent.events.clocks import warn_of_clocks
 from jaxevent.progress import bar
 
 # Motion of the image in a window, with which the default length stays.
@@ -44,6 +45,8 @@ def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
     assert camera is not None
     if not len(recording.events):
         return MotionEstimate.empty(given.model)
+    if params.frames:
+        warn_of_clocks(recording)
     windows = WindowFitter(recording, params, camera, gyro, given.seed)
     first, last = recording.event_span()
     half, step = (round(1e6 * float(value)) for value in (params.half_window, params.step))
