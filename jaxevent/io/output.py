@@ -506,7 +506,7 @@ def _refuse_taken_path(path: Path, directory: bool) -> None:
         raise InputError(f"{path}: exists and is not what is to be written; choose another name")
 
 
-def deflate_shuffled(numbers: NDArray[np.floating]) -> bytes:
+def deflate_shuffled(numbers: NDArray) -> bytes:
     """Compress numbers as HDF5's filters "shuffle" and "gzip" do, but five times as fast.
 
     zlib spends most of its time on the bytes of mantissas, which do not get smaller. Here a sample
@@ -514,7 +514,7 @@ def deflate_shuffled(numbers: NDArray[np.floating]) -> bytes:
     searched. The result is one zlib stream (experiments/studies/compression.md compares).
 
     Args:
-        numbers: Floats of a chunk.
+        numbers: Numbers or booleans of a chunk.
 
     Returns:
         A chunk of a dataset of their type, with `compression="gzip", shuffle=True`.

@@ -122,8 +122,8 @@ def writer(out: Path) -> Writer:
     """Return the function that writes a file of some suffix.
 
     It is called as `writer(out)(video, times, out, options)`, where `times` are sorted (us). It
-    returns the end of a sentence about the file. HDF5 holds t, image and variance, exact, or t and
-    image (T, H, W, 3) in colour. Videos and PNG images are toned for the display.
+    returns the end of a sentence about the file. HDF5 holds t, image, variance and valid, exact,
+    or t and image (T, H, W, 3) in colour. Videos and PNG images are toned for the display.
 
     Raises:
         InputError: The suffix is not .h5, .hdf5, .mp4 or none.
@@ -150,7 +150,8 @@ def save_video(
         video: A reconstruction.
         times: Times of the images, integers in us or floats in s.
         path: An MP4 file, played at the rate of the times but at most at 60 images per second; a
-            folder of PNG images; or an HDF5 file of exact images and variances. It is replaced.
+            folder of PNG images; or an HDF5 file of exact images, variances and masks `valid`. It
+            is replaced.
         tone: Tone of `jaxevent.show.images.tone_map` for MP4 and PNG. None: "display"; "relative"
             or "changes" where no frames tell the brightness.
 
@@ -189,15 +190,17 @@ def write_hdf5(video: ImageSequence, times: NDArray, out: Path, options: ExportO
     units = {"image": f"{what}: 0 is the frames' black, 1 their white"}
     if colours is None:
         units["variance"] = "(ln I)^2, of ln(intensity + I0); NaN: not estimated"
+        units["valid"] = "whether the pixel rests on data"
     else:
         shape = (*shape, 3)
+    kinds = {field: "?" if field == "valid" else "<f4" for field in units}
     with complete_hdf5(out, video.estimator.name, video.params) as (file, check):
         file.attrs["recording"] = options.name
         file["t"] = times.astype("i8")
         file["t"].attrs["unit"] = CLOCK_UNIT
         fields = {
             field: file.create_dataset(
-                field, shape, "f4", chunks=(1, *shape[1:]), **_COMPRESSION_OPTIONS
+                field, shape, kinds[field], chunks=(1, *shape[1:]), **_COMPRESSION_OPTIONS
             )
             for field in units
         }
@@ -212,7 +215,7 @@ def write_hdf5(video: ImageSequence, times: NDArray, out: Path, options: ExportO
                     (
                         fields[field],
                         row + n,
-                        pool.submit(deflate_shuffled, np.asarray(image, "<f4")),
+                        pool.submit(deflate_shuffled, np.asarray(image, kinds[field])),
                     )
                     for field, images in values.items()
                     for n, image in enumerate(images)
@@ -381,7 +384,14 @@ def _batches(
         is_valid = False
         for batch, estimate in video.batches(times):
             is_valid = is_valid or bool(np.any(estimate.valid))
-            yield batch, {"image": estimate.mean, "variance": estimate.covariance}
+            yield (
+                batch,
+                {
+                    "image": estimate.mean,
+                    "variance": estimate.covariance,
+                    "valid": estimate.valid,
+                },
+            )
         if not is_valid:
             warnings.warn(
                 f"{video.recording.name}: no pixel of the images rests on data, they show what is "

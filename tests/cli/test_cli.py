@@ -511,9 +511,11 @@ def test_one_event_is_enough(tmp_path, capsys):
     assert cli.main(["reconstruct", str(path), "--method", "akf", "--out", str(out), *size]) == 0
     with h5py.File(out) as file:
         assert np.asarray(file["t"]).tolist() == [7]
-        image = np.asarray(file["image"])[0]
+        image, mask = (np.asarray(file[name])[0] for name in ("image", "valid"))
     expected = np.full((HEIGHT, WIDTH), 0.5)  # without frames the AKF begins with mid-grey
-    expected[4, 3] = 1.5 * np.exp(0.1) - 1
+    valid = np.zeros((HEIGHT, WIDTH), bool)
+    expected[4, 3], valid[4, 3] = 1.5 * np.exp(0.1) - 1, True
+    np.testing.assert_array_equal(mask, valid)
     np.testing.assert_allclose(image, expected, rtol=1e-6)
     assert "rests on data" not in capsys.readouterr().err
     argv = ["reconstruct", str(path), "--method", "events-only", *size]
@@ -536,7 +538,8 @@ def test_reconstruct_to_hdf5(folder, capsys):
         assert calibrated.startswith("not calibrated; c_off by default (not identifiable: ")
         assert written.startswith(f"{folder / name}: 6 images")
         with h5py.File(folder / name) as file:
-            contents.append({key: np.asarray(file[key]) for key in ("t", "image", "variance")})
+            fields = ("t", "image", "variance", "valid")
+            contents.append({key: np.asarray(file[key]) for key in fields})
             # An image is read by itself, and by every HDF5 library.
             image = file["image"]
             assert image.chunks == (1, HEIGHT, WIDTH) and image.compression == "gzip"
@@ -554,7 +557,9 @@ def test_reconstruct_to_hdf5(folder, capsys):
 
     params = jaxevent.akf.Params.of({"c_on": 0.2, "clock_offset": 0.0025})
     video = jaxevent.akf.estimate(small(), params)
-    image, variance, _ = video(STAMPS + 2_500)
+    image, variance, valid = video(STAMPS + 2_500)
+    assert contents[0]["valid"].dtype == bool and 0 < valid.sum()
+    np.testing.assert_array_equal(contents[0]["valid"], valid)
     assert contents[0]["t"].dtype == np.int64 and contents[0]["image"].dtype == np.float32
     np.testing.assert_array_equal(contents[0]["t"], STAMPS + 2_500)
     np.testing.assert_array_equal(contents[0]["image"], image.astype(np.float32))
