@@ -48,12 +48,12 @@ def clock_offsets(
     assert other.frames is not None
     t = other.frames.t
     step = max(float(np.median(np.diff(t))) / 2, 1.0)
-    begin, _ = recording.event_span()
-    both = [_event_signatures(recording, step), _frame_signatures(other)]
-    middle, along = (t[1:] + t[:-1]) / 2, begin + step * (np.arange(len(both[0])) + 1)
+    begin, end = recording.event_span()
+    middle, along = (t[1:] + t[:-1]) / 2, begin + step * np.arange(1, int((end - begin) / step) + 1)
     across = np.arange(middle[0], middle[-1] + 1e-3, step)
     if len(across) < 6 or len(along) < 6:
         return [0.0]
+    both = [_event_signatures(recording, step), _frame_signatures(other)]
     weights = np.append([0.5, 0.5], np.full(both[0].shape[1] - 2, 2 / (both[0].shape[1] - 2)))
     total, n = np.zeros(()), np.zeros(0)
     for weight, one, two in zip(weights, both[0].T, both[1].T, strict=True):

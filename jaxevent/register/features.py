@@ -158,7 +158,7 @@ def _pair_images(
         video = high_pass.estimate(part, high_pass.Params(alpha=alpha), progress=progress)
         images = video(t[rows], extrapolate=True).mean
         for image, row in zip(images, rows, strict=True):
-            level = np.log(np.maximum(image + 1, 1e-3))
+            level = np.log(np.clip(image + 1, 1e-3, 1e30))  # infinite where many events sum up
             yield ndimage.gaussian_filter(level, 0.7), log_image(other, int(row))[0]
     for apart in _FRAMES_APART:
         for row in rows[rows + apart < len(t)]:

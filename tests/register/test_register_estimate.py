@@ -10,6 +10,8 @@ from rigs import RIGS
 import jaxevent
 from jaxevent import cli, register
 from jaxevent.errors import InputError
+from jaxevent.recording import Events, Frames, Recording
+from jaxevent.register.clocks import clock_offsets
 
 
 @pytest.mark.slow
@@ -96,3 +98,14 @@ def test_opencv_is_named_if_it_is_missing(near, monkeypatch):
     _, _, recording, other, _, _ = near
     with pytest.raises(InputError, match=r"\[vision\]"):
         register.estimate(recording, other, offset=0.0)
+
+
+@pytest.mark.parametrize("last_us", [0, 5_000, 60_000])
+def test_events_of_few_windows_do_not_determine_the_clock(last_us):
+    rng, n = np.random.default_rng(0), 500
+    t = np.sort(rng.integers(0, last_us + 1, n))
+    events = Events(t, rng.integers(0, 64, n), rng.integers(0, 48, n), rng.random(n) < 0.5)
+    stamps = 33_333 * np.arange(12)
+    images = rng.integers(0, 256, (12, 48, 64), np.uint8)
+    other = Recording("b", 64, 48, Events.empty(), Frames(stamps, images, np.zeros(12, np.int64)))
+    assert clock_offsets(Recording("a", 64, 48, events), other) == [0.0]
