@@ -692,3 +692,11 @@ def test_frames_of_another_clock_are_not_left_out_in_silence(monkeypatch, recwar
         sequence.batch.estimate(recording, sequence.batch.Params(frames=is_used))
     told = [str(one.message) for one in recwarn if "frames last from 3600" in str(one.message)]
     assert len(told) == is_used
+
+
+def test_events_at_one_time_are_refused():
+    n = np.arange(200)
+    kept = Events(np.full(200, 7), n % 20, n // 20, n % 2 == 0)
+    camera = PinholeCamera(20.0, 20.0, 9.5, 7.0)
+    with pytest.raises(InputError, match="once: all 200 events are at one time, 7 us"):
+        sequence.batch.estimate(Recording("once", 20, 15, kept, camera=camera))
