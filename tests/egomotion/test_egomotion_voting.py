@@ -19,6 +19,7 @@ from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.filtering import smooth
 from jaxevent.egomotion.particle_filter.likelihood import is_along_edge, score_batch
+from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.errors import InputError
 from jaxevent.recording import Events
 
@@ -381,44 +382,47 @@ def relative_error(motion, truth):
     return np.linalg.norm(motion.mean[late] - truth, axis=1).mean() / np.linalg.norm(truth)
 
 
-FAST = voting.Params.of({"every": 2, "candidates": 48})
+def fast() -> Params:
+    """Parameters of few candidates, in the precision of the test."""
+    return voting.Params.of({"every": 2, "candidates": 48})
 
 
-def test_planar_motion_is_found():
+def test_planar_motion_is_found(float32):
     truth = np.array([130.0, -70.0])
     recording = moved(lambda at: truth, 0.45, 120, seed=3)
-    motion = voting.estimate(recording, FAST, seed=1, cloud=16)
+    motion = voting.estimate(recording, fast(), seed=1, cloud=16)
+    assert motion.mean.dtype == np.float32
     assert relative_error(motion, truth) < 0.03
     # The particles that are asked for are drawn by weight, and change nothing else.
     assert motion.cloud.shape == (len(motion), 16, 2)
     apart = motion.cloud.mean(1) - motion.mean
     spread = np.sqrt(np.trace(motion.covariance, axis1=1, axis2=2))
     assert (np.linalg.norm(apart, axis=1) < 1.0 * spread)[motion.valid].all()
-    again = voting.estimate(recording, FAST, seed=1)
+    again = voting.estimate(recording, fast(), seed=1)
     assert again.cloud is None
     np.testing.assert_array_equal(motion.mean, again.mean)
 
 
-def test_bursts_do_not_make_the_motion_too_fast():
+def test_bursts_do_not_make_the_motion_too_fast(float32):
     """An edge makes 16 events at a pixel, of levels that are 0.15 px apart."""
     truth = np.array([130.0, -70.0])
     e = moved(lambda at: truth, 0.25, 40, seed=8).events
     late = np.arange(16) * 0.15e6 / 148
     t = (e.t[:, None] + late).ravel()
     x, y, p = (np.repeat(column, len(late)) for column in (e.x, e.y, e.p))
-    motion = voting.estimate(recorded(t, x, y, p), FAST, seed=1)
+    motion = voting.estimate(recorded(t, x, y, p), fast(), seed=1)
     mean = motion.mean[motion.t > 150_000].mean(0)
     np.testing.assert_allclose(mean, truth, atol=3.0)
 
 
-def test_motion_is_found_where_events_were_dropped():
+def test_motion_is_found_where_events_were_dropped(float32):
     """15 of each 50 ms are missing; then nothing is told, as the camera may have stopped."""
     truth = np.array([130.0, -70.0])
     recording = moved(lambda at: truth, 0.4, 120, seed=4)
     e = recording.events
     kept = e.t % 50_000 >= 15_000
     events = Events(e.t[kept], e.x[kept], e.y[kept], e.p[kept])
-    motion = voting.estimate(dataclasses.replace(recording, events=events), FAST, seed=1)
+    motion = voting.estimate(dataclasses.replace(recording, events=events), fast(), seed=1)
     times = np.arange(200_000, 380_000, 1000)
     mean, covariance, valid = motion(times)
     silent = times % 50_000 < 15_000
@@ -428,28 +432,21 @@ def test_motion_is_found_where_events_were_dropped():
 
 
 def test_rotation_is_found():
+    """In double precision; the scenes beside it are in single precision, as users have them."""
     truth = np.array([0.5, 1.5, -1.2])
     recording = moved(turning(truth), 0.45, 150, seed=5, camera=CAMERA)
-    motion = voting.estimate(recording, FAST, model="rotation", seed=0)
+    motion = voting.estimate(recording, fast(), model="rotation", seed=0)
     assert relative_error(motion, truth) < 0.05
 
 
-def test_single_precision(float32):
-    truth = np.array([130.0, -70.0])
-    recording = moved(lambda at: truth, 0.45, 120, seed=3)
-    motion = voting.estimate(recording, voting.Params.of(FAST.values()))
-    assert motion.mean.dtype == np.float32
-    assert relative_error(motion, truth) < 0.03
-
-
-def test_motion_is_found_again_after_a_sudden_change():
+def test_motion_is_found_again_after_a_sudden_change(float32):
     before, truth = (300, 0), (60, 0)
     first = moved(lambda at: np.array(before), 0.3, 120, seed=6).events
     second = moved(lambda at: np.array(truth), 0.4, 120, seed=7).events
     parts = [np.concatenate([getattr(first, n), getattr(second, n)]) for n in "xyp"]
     recording = recorded(np.concatenate([first.t, second.t + 300_000]), *parts)
     with pytest.warns(InconsistentMotionWarning, match="does not move as one"):
-        motion = voting.estimate(recording, FAST)
+        motion = voting.estimate(recording, fast())
     assert not motion.valid[motion.t > 300_000].all()
     # Candidates of the new motion are as old as the baseline takes: 76 to 108 ms at 60 px/s.
     again = 0.3 + 0.1 + 0.7 * 6.5 / np.hypot(*truth)
@@ -485,7 +482,7 @@ RUN = eqx.filter_jit(filtering.run)
     [("planar", "soft"), ("general", "soft"), ("planar", "literal"), ("general", "literal")],
 )
 def test_odd_streams(model, likelihood):
-    params = voting.Params.of({**FAST.values(), "likelihood": likelihood})
+    params = voting.Params.of({**fast().values(), "likelihood": likelihood})
     rng = np.random.default_rng(0)
     n = 300
     x, y, p = rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n), rng.random(n) < 0.5
@@ -681,9 +678,9 @@ def test_impossible_estimates_are_refused():
     recording = recorded([0, 1], [0, 1], [0, 1], [0, 1])
     for model in ("rotation", "general"):
         with pytest.raises(InputError, match="calibration"):
-            voting.estimate(recording, FAST, model=model)
+            voting.estimate(recording, fast(), model=model)
     with pytest.raises(InputError, match="planar"):
-        voting.estimate(recording, FAST, model="planer")
+        voting.estimate(recording, fast(), model="planer")
 
 
 def test_candidates_along_an_edge_against_a_loop():

@@ -333,7 +333,7 @@ def test_numbers_of_parameters_are_found_without_compiling():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "options"), [("akf", {}), ("cf", {}), ("aks", ALL)])
+@pytest.mark.parametrize(("name", "options"), [("akf", {}), ("aks", ALL)])
 def test_derivatives_by_kernels_are_those_of_the_scan(name, options):
     """Of loss and gradient in reverse, and along a direction, of means and variances."""
     values = {**PARAMS, **options}

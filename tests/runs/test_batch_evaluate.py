@@ -311,7 +311,7 @@ def wait_for(count: int, tasks: Path, process: subprocess.Popen, what: str = "fi
     deadline = time.monotonic() + 120
     while not (tasks / "log.txt").exists() or len(log(tasks, what)) < count:
         assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.002)
+        time.sleep(0.01)
 
 
 def killed_twice(folder: Path, out: Path, *options: str) -> Path:

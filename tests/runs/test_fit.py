@@ -304,13 +304,14 @@ def test_a_run_taken_up_anywhere_ends_the_same():
     arguments = (toy, Toy(), ["a", "b"], batches, (), settings, {"c": (-1, 1, 3)})
     saved: list[jaxevent.tuning.Run] = []
     whole = optimise(*arguments, save=lambda run, _: saved.append(copy.deepcopy(run)))
-    assert {run.stage for run in saved} == {0, 1, 2, 3, 4, 5} and len(saved) > 30
-    assert any(run.iteration for run in saved) and any(run.tried for run in saved)
+    taken = saved[::3]
+    assert {run.stage for run in taken} == {0, 1, 2, 3, 4, 5} and len(taken) > 10
+    assert any(run.iteration for run in taken) and any(run.tried for run in taken)
 
     def looked(runs: list[jaxevent.tuning.Run], stage: int) -> int:
         return max([len(run.tried) for run in runs if run.stage == stage], default=0)
 
-    for run in saved:
+    for run in taken:
         later = [run]
         again = optimise(
             *arguments,
@@ -730,7 +731,7 @@ def test_a_fit_that_is_killed_ends_as_if_it_had_not_been(folder, capsys):
                     run = json.loads(file.readline())["run"]
                 if run is not None and run[:2] >= [stage, iteration]:
                     break
-            time.sleep(0.001)
+            time.sleep(0.005)
         assert process.poll() is None, "the fit ended before it was killed"
         process.kill()
         process.communicate()
