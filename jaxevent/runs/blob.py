@@ -116,7 +116,7 @@ class TrackGoal(Goal):
     start: TrackerParams
     loss: TrackLoss
     targets: Targets
-    # Loss and gradient by 2 numbers of 4,000 events in steps of 16: forwards 37 ms, in reverse 310.
+    # Kernels pass once for each number in either mode; XLA compiles the forward one sooner.
     forward = True
 
     @property
