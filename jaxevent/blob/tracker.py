@@ -58,6 +58,11 @@ class Tracker(Estimator[P]):
         kw_only=True,
     )
 
+    def names_left_open(self, explicit: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the names of parameters that a search for targets may set; see `Estimator`."""
+        stated = {*explicit, *self.Params.presets.get(explicit.get("preset") or "", {})}
+        return tuple(name for name in self.Params.settings() if name not in stated)
+
     def prepare(
         self,
         recording: Recording,

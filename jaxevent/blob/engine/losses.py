@@ -32,9 +32,11 @@ from jaxevent.codegen.derivative import (
 )
 from jaxevent.errors import InputError
 
+MIN_EVENTS_PER_THREAD = 50_000  # of a pass; with fewer a thread takes longer to begin
+
 
 class TrackedLosses(NamedTuple):
-    """Sums of a loss, and the tracks at requested moments.
+    """Sums of a loss, and the tracks at requested moments; None without moments.
 
     Attributes:
         loss: () sum of -ln p over the events that count.
@@ -77,14 +79,15 @@ class LossKernel(NamedTuple):
             check_track(self.filter, params, _variant(features, tangents), dtype)
 
     def __call__(
-        self, params: TrackerParams, features: Features, moments: Any = NO_MOMENTS
+        self, params: TrackerParams, features: Features, moments: Any = None
     ) -> TrackedLosses:
         """Run all chunks of a recording; differentiable in the parameters.
 
         Args:
             params: Parameters of the tracker.
             features: The chunks, from the recording's start.
-            moments: (moments,) numbers chunk * (steps + 1) + steps of the chunk done by then.
+            moments: (moments,) numbers chunk * (steps + 1) + steps of the chunk done by then; None:
+                no tracks are requested.
 
         Returns:
             The losses.
@@ -98,6 +101,34 @@ class LossKernel(NamedTuple):
 def _variant(features: Features, tangents: bool) -> TrackVariant:
     overrides = tuple(sorted(features.overrides))
     return TrackVariant(overrides, features.owner is not None, tangents)
+
+
+class _ByValue:
+    """Parameters that are equal to others if all their numbers are."""
+
+    def __init__(self, params: TrackerParams):
+        leaves, tree = jax.tree.flatten(params)
+        arrays = [np.asarray(leaf) for leaf in leaves]
+        self.params = jax.tree.map(jnp.asarray, params)
+        self._key = tree, tuple((a.dtype.str, a.shape, a.tobytes()) for a in arrays)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByValue) and self._key == other._key
+
+
+# Windows of a recording share parameters, one behind the other.
+@functools.lru_cache(maxsize=64)
+def _make_runner(
+    filter: Filter,
+    known: _ByValue,
+    detect: bool,
+    variant: TrackVariant,
+    along: tuple[str, int] | None,
+) -> KernelRunner:
+    return KernelRunner(filter, known.params, detect=detect, variant=variant, along=along)
 
 
 def _evaluate(
@@ -116,32 +147,30 @@ def _evaluate(
         behind the other.
     """
     params, *given = jax.tree.unflatten(tree, leaves)
-    params = jax.tree.map(jnp.asarray, params)
     outliers, features, moments = jax.tree.map(np.asarray, given)
-    runners = [
-        KernelRunner(
-            kernel.filter,
-            params,
-            detect=features.detect,
-            variant=_variant(features, bool(places)),
-            along=along,
-        )
-        for along in places or (None,)
-    ]
-    unique, rows = np.unique(moments.astype(np.int64), return_inverse=True)
+    known, variant = _ByValue(params), _variant(features, bool(places))
+    make = functools.partial(_make_runner, kernel.filter, known, features.detect, variant)
+    runners = [make(along) for along in places or (None,)]
+    unique, rows = NO_MOMENTS, slice(0)
+    if moments is not None:
+        unique, rows = np.unique(moments.astype(np.int64), return_inverse=True)
+    state = runners[0].init(features)
 
     def run(runner: KernelRunner) -> Any:
-        return runner.losses(features, float(outliers), kernel.every, unique)
+        return runner.losses(state, features, float(outliers), kernel.every, unique)
 
-    found = list(map_ahead(run, runners))
-    totals, tracks, _ = found[0]
+    most = None if features.t.size > MIN_EVENTS_PER_THREAD else 1
+    found = list(map_ahead(run, runners, most))
     real = np.dtype(jnp.result_type(float))
-    made = totals.astype(real), jax.tree.map(lambda a: a[rows], tracks)
+    tracks = tangents = None
+    if moments is not None:
+        tracks = jax.tree.map(lambda a: a[rows], found[0].tracks)
+        states = [one.tangents for one in found]
+        tangents = jax.tree.map(lambda *a: np.stack(a)[:, rows], *states)
+    made = found[0].totals.astype(real), tracks
     if not places:
         return made
-    slopes = np.array([one.totals[loop.LOSS_TANGENT] for one in found], real)
-    tangents = jax.tree.map(lambda *a: np.stack(a)[:, rows], *[one.tangents for one in found])
-    return *made, slopes, tangents
+    return *made, np.array([one.totals[loop.LOSS_TANGENT] for one in found], real), tangents
 
 
 def _call(
@@ -160,23 +189,23 @@ def _call(
         params: Parameters of the tracker.
         outliers: () their share of events that belong to no target.
         features: The chunks.
-        moments: (moments,) of the tracks.
+        moments: (moments,) of the tracks, or None.
 
     Returns:
         What `_evaluate` does.
     """
     leaves, tree = jax.tree.flatten((params, outliers, features, moments))
-    tracks = jax.eval_shape(
-        lambda p, f: init_state(kernel.filter, p, f).tracks, params, features
-    )  # (targets, ...)
-    times, real = len(moments), jnp.result_type(float)
+    real, tracks, tangents = jnp.result_type(float), None, None
 
     def extend(like: Any, *sizes: int) -> Any:
         return jax.tree.map(lambda a: jax.ShapeDtypeStruct((*sizes, *a.shape), a.dtype), like)
 
-    shapes: tuple[Any, ...] = jax.ShapeDtypeStruct((4,), real), extend(tracks, times)
+    if moments is not None:
+        begin = functools.partial(init_state, kernel.filter)
+        tracks = extend(jax.eval_shape(begin, params, features).tracks, len(moments))
+        tangents = extend(eqx.filter(tracks.state, is_real), len(places))
+    shapes: tuple[Any, ...] = jax.ShapeDtypeStruct((4,), real), tracks
     if places:
-        tangents = extend(eqx.filter(tracks.state, is_real), len(places), times)
         shapes = *shapes, jax.ShapeDtypeStruct((len(places),), real), tangents
     evaluate = functools.partial(_evaluate, kernel, places, tree)
     return jax.pure_callback(evaluate, shapes, leaves, vmap_method="sequential")
@@ -204,8 +233,12 @@ def _run(kernel: LossKernel, params: Any, outliers: Any, features: Any, moments:
     return _collect(kernel, totals, tracks, params)
 
 
-def _collect(kernel: LossKernel, totals: Any, tracks: TrackBuffer, params: Any) -> TrackedLosses:
-    measured = _measure(kernel, tracks, params, tracks.state)
+def _collect(
+    kernel: LossKernel, totals: Any, tracks: TrackBuffer | None, params: Any
+) -> TrackedLosses:
+    measured: Any = (None, None, None)
+    if tracks is not None:
+        measured = _measure(kernel, tracks, params, tracks.state)
     return TrackedLosses(totals[loop.LOSS], totals[loop.COUNT], *measured)
 
 
@@ -231,7 +264,7 @@ def _run_jvp(kernel: LossKernel, primals: Any, tangents: Any) -> Any:
         moved = jax.tree.map(lambda a: jnp.tensordot(change, a, 1), moved)
     out = _collect(kernel, totals, tracks, params)
     dots = zero_tangents(out)
-    if moved is not None:
+    if tracks is not None and moved is not None:
         real, rest = eqx.partition(tracks.state, is_real)
 
         def measure(raw: Any, real: Any) -> Any:

@@ -186,6 +186,7 @@ class KernelRunner:
 
     def losses(
         self,
+        state: TrackerState,
         features: Features,
         outliers: float,
         every: bool,
@@ -194,7 +195,8 @@ class KernelRunner:
         """Run all chunks of a recording for a loss.
 
         Args:
-            features: The chunks, from the recording's start.
+            state: State at the recording's start, of `init`.
+            features: The chunks.
             outliers: Share of events that belong to no target.
             every: Whether every event counts, not only those inside a gate.
             moments: (moments,) sorted, see `loop.Snapshots`.
@@ -203,16 +205,19 @@ class KernelRunner:
             Losses, and tracks at the moments.
         """
         sums = loop.LossSums(np.zeros(4), every, outliers)
-        state = self.init(features)
         snapshots = self._run(state, features, losses=sums, moments=moments).snapshots
         reals, integers = snapshots.reals, snapshots.integers
         tracks = self._tracks(self._compiler.track, reals, integers)
         tangents = None
         if self._variant.tangents:
-            like = eqx.filter(self._compiler.track.state, is_real)
-            columns = self._find_columns("tangent", like)
-            tangents = _read_columns(columns, like, reals, integers)
+            tangents = _read_columns(*self._tangents, reals, integers)
         return KernelLosses(sums.totals, tracks, tangents)
+
+    @functools.cached_property
+    def _tangents(self) -> tuple[list[_Column], Any]:
+        """Columns of the tangents of a state, and its shapes."""
+        like = eqx.filter(self._compiler.track.state, is_real)
+        return self._find_columns("tangent", like), like
 
     def backward_pass(
         self,
