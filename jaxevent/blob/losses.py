@@ -9,17 +9,23 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaxevent.blob.engine.losses import LossKernel
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import ChunkPacker, Features
 from jaxevent.blob.run import run
 from jaxevent.blob.track import to_seconds
 from jaxevent.blob.tracker import Tracker
+from jaxevent.codegen.module import choose_backend, make_kernel, programs_may_call
 from jaxevent.errors import InputError
 from jaxevent.recording import Recording, Times, check_recording, microseconds
 
 
 def negative_log_likelihood(
-    tracker: Tracker, params: TrackerParams, features: Features, events: str = "associated"
+    tracker: Tracker,
+    params: TrackerParams,
+    features: Features,
+    events: str = "associated",
+    compiler: str | None = None,
 ) -> Float[Array, ""]:
     """Return the mean over events of -ln p(xi), each predicted before it is used.
 
@@ -34,13 +40,52 @@ def negative_log_likelihood(
         params: Its parameters.
         features: Chunks of events, of `Tracker.prepare`.
         events: Events that count, "associated" or "all".
+        compiler: "numba" computes the loss and its derivatives by parameters by kernels, "xla" by
+            the scan of `jaxevent.blob.run`, which has all derivatives. None: numba, where it has
+            kernels.
 
     Returns:
         The loss, p in px^-2.
+
+    Raises:
+        InputError: Numba is requested and has no kernel.
     """
+    kernel = _find_kernel(tracker, params, features, events == "all", compiler)
+    if kernel is not None:
+        found = kernel(params, features)
+        return found.loss / jnp.maximum(found.count, 1)
     _, info = run(tracker.filter, params, None, features, events)
     assert info.loss is not None and info.count is not None
     return info.loss.sum() / jnp.maximum(info.count.sum(), 1)
+
+
+def _find_kernel(
+    tracker: Tracker, params: TrackerParams, features: Features, every: bool, compiler: str | None
+) -> LossKernel | None:
+    """Find the kernel of a loss.
+
+    Args:
+        tracker: The estimator.
+        params: Its parameters.
+        features: Chunks of events.
+        every: Whether every event counts, not only those inside a gate.
+        compiler: "numba" or "xla" if the user names one.
+
+    Returns:
+        The kernel, or None where XLA compiles the loss.
+
+    Raises:
+        InputError: The user names numba, and there is no kernel.
+    """
+    if choose_backend(compiler, True) == "xla" or not programs_may_call(tracker.name, compiler):
+        return None
+
+    def make() -> LossKernel:
+        kernel = LossKernel(tracker.name, tracker.filter, every)
+        kernel.check(params, features)
+        return kernel
+
+    return make_kernel(tracker.name, compiler, True, make)
 
 
 class PositionBatch(eqx.Module):
@@ -64,7 +109,11 @@ class PositionBatch(eqx.Module):
 
 
 def position_error(
-    tracker: Tracker, params: TrackerParams, batch: PositionBatch, scale: float | int = 10
+    tracker: Tracker,
+    params: TrackerParams,
+    batch: PositionBatch,
+    scale: float | int = 10,
+    compiler: str | None = None,
 ) -> Float[Array, ""]:
     """Return the mean of 2 s^2 (sqrt(1 + d^2 / s^2) - 1), d the distance of tracks from the truth.
 
@@ -76,13 +125,24 @@ def position_error(
         params: Its parameters.
         batch: A batch of `prepare_positions`.
         scale: s, px.
+        compiler: See `negative_log_likelihood`.
 
     Returns:
         The loss, px^2.
+
+    Raises:
+        InputError: Numba is requested and has no kernel.
     """
-    _, info = run(tracker.filter, params, None, batch.features, "path")
-    assert info.path is not None
-    p, v, last = (part[batch.chunk, batch.step, : batch.xi.shape[1]] for part in info.path)
+    features, targets = batch.features, batch.xi.shape[1]
+    kernel = _find_kernel(tracker, params, features, False, compiler)
+    if kernel is not None:
+        moments = batch.chunk * (features.t.shape[1] + 1) + batch.step
+        path = kernel(params, features, moments)
+        p, v, last = (part[:, :targets] for part in (path.p, path.v, path.last_update))
+    else:
+        _, info = run(tracker.filter, params, None, features, "path")
+        assert info.path is not None
+        p, v, last = (part[batch.chunk, batch.step, :targets] for part in info.path)
     dt = to_seconds(batch.time[:, None] - last, p)
     d2 = ((p + v * dt[..., None] - jnp.where(batch.known[..., None], batch.xi, p)) ** 2).sum(-1)
     error = 2 * scale**2 * (jnp.sqrt(1 + d2 / scale**2) - 1)

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from jaxevent.blob.engine.program import TrackVariant
 from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.filter import Filter
 from jaxevent.blob.lifecycle import TrackerState, shift_state
@@ -56,6 +57,11 @@ class Tracker(Estimator[P]):
         default=frozenset({"seeds", "start", "stop", "detect", "found", "smooth", "compiler"}),
         kw_only=True,
     )
+
+    def names_left_open(self, explicit: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the names of parameters that a search for targets may set; see `Estimator`."""
+        stated = {*explicit, *self.Params.presets.get(explicit.get("preset") or "", {})}
+        return tuple(name for name in self.Params.settings() if name not in stated)
 
     def prepare(
         self,
@@ -319,9 +325,7 @@ class Tracker(Estimator[P]):
     ) -> KernelRunner | XlaRunner:
         """Make the runner of segments: by numba where it has a kernel, else by XLA."""
         overrides = tuple(found.per_target_values(params)) if found else ()
-        make = functools.partial(
-            KernelRunner, self.filter, params,
-            detect=detect, overrides=overrides, has_owners=bool(found),
-        )  # fmt: skip
+        variant = TrackVariant(overrides, has_owners=bool(found))
+        make = functools.partial(KernelRunner, self.filter, params, detect=detect, variant=variant)
         kernel = make_kernel(self.name, compiler, True, make)
         return XlaRunner(self.filter, params) if kernel is None else kernel

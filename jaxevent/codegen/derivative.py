@@ -21,6 +21,7 @@ import numpy as np
 from jaxevent.codegen.functions import make_intrinsic
 from jaxevent.codegen.graph import Graph, Node, TranslationError, constant_value, find_dependencies
 from jaxevent.codegen.support import ir, types
+from jaxevent.errors import InputError
 
 
 class DerivativeDirections(NamedTuple):
@@ -63,11 +64,12 @@ class DerivativeDirections(NamedTuple):
 
     def shapes(self, tree: Any) -> Any:
         """Return the shapes of the derivatives of a tree of shapes, along all directions."""
-        real, count = eqx.filter(tree, _is_real), len(self.numbers)
+        real, count = eqx.filter(tree, is_real), len(self.numbers)
         return jax.tree.map(lambda v: jax.ShapeDtypeStruct((count, *v.shape), v.dtype), real)
 
 
-def _is_real(leaf: Any) -> bool:
+def is_real(leaf: Any) -> bool:
+    """Return whether an array, or its shape, is one of real numbers."""
     return jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
@@ -90,11 +92,11 @@ def with_derivatives(
     def both(known: Any, sensitivities: dict[str, Any], **given: Any) -> dict[str, Any]:
         params, fixed, seeds = known
         moving = {name: given[name] for name in sensitivities}
-        real, rest = eqx.partition(moving, _is_real)
+        real, rest = eqx.partition(moving, is_real)
 
         def compute(params: Any, real: Any) -> tuple[Any, Any]:
             made = function((params, fixed), **{**given, **eqx.combine(real, rest)})
-            return eqx.filter(select_outputs(made), _is_real), made
+            return eqx.filter(select_outputs(made), is_real), made
 
         def push(seeds: Any, sensitivities: Any) -> Any:
             return jax.jvp(compute, (params, real), (seeds, sensitivities), has_aux=True)[1:]
@@ -405,3 +407,34 @@ def _kind(change: Node) -> tuple[str, str]:
     if change.op not in ("number", "slot"):
         raise TranslationError(f"the derivative of {change.op!r} at a point")
     return "number" if change.op == "number" else "table", ""
+
+
+def is_zero_tangent(tangent: Any) -> bool:
+    """Return whether a tangent that a rule with `symbolic_zeros` is given is that of a constant."""
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
+
+
+def zero_tangents(tree: Any) -> Any:
+    """Return tangents of 0 for all arrays of a tree."""
+
+    def zero(leaf: Any) -> Any:
+        if is_real(leaf):
+            return jnp.zeros(leaf.shape, leaf.dtype)
+        return np.zeros(leaf.shape, jax.dtypes.float0)
+
+    return jax.tree.map(zero, tree)
+
+
+def refuse_second_derivatives(name: str, tangents: Any, remedy: str) -> None:
+    """Raise `InputError` where first derivatives would be differentiated, which no kernel carries.
+
+    Args:
+        name: Name of the method.
+        tangents: Changes of what the derivatives depend on; those of nothing are allowed.
+        remedy: What to do in place of it.
+    """
+    if not all(map(is_zero_tangent, jax.tree.leaves(tangents, is_leaf=is_zero_tangent))):
+        raise InputError(
+            f"the kernel of the method {name!r} has first derivatives only; for second ones, as of "
+            f"jax.hessian, give {remedy}"
+        )

@@ -16,13 +16,14 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent import cache
+from jaxevent import cache, threads
 from jaxevent.codegen.graph import TranslationError, find_dependencies
 from jaxevent.codegen.support import compiler_lock, numba
 from jaxevent.codegen.write import ModuleText
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 
 T = TypeVar("T")
+IS_SYNCHRONOUS = threads.use_synchronous_dispatch()  # so that programs may call kernels
 _lock = threading.RLock()  # held while what all threads use is made
 
 
@@ -129,9 +130,16 @@ class KernelCache:
         numbers = text.parameters.gather(values)
         return CompiledProgram(program, functions, numbers, text.places, values)
 
-    def _compile(self, program: Any, *layout: Any) -> tuple[ModuleText, Any]:
+    def check(self, key: Any, params: Any, translate: Callable[[], Any]) -> None:
+        """Raise `TranslationError` where there is no kernel; see `find_program`."""
+        self._check_size(self.find_program(key, params, translate)[0])
+
+    def _check_size(self, program: Any) -> None:
         if self.max_nodes is not None and count_nodes(program) > self.max_nodes:
             raise TranslationError(f"more than {self.max_nodes} operations")
+
+    def _compile(self, program: Any, *layout: Any) -> tuple[ModuleText, Any]:
+        self._check_size(program)
         text = self.write(program, *layout)
         module = compile_module(text.text)
         return text, self.functions(*(getattr(module, n) for n in self.functions._fields))
@@ -204,6 +212,26 @@ def make_kernel(
                 f"numba has no kernel for the method {name!r} ({reason}); leave out the compiler"
             ) from reason
         return None
+
+
+def programs_may_call(name: str, compiler: str | None) -> bool:
+    """Return whether JAX's programs may call kernels; an `InputWarning` says why not.
+
+    Args:
+        name: Name of the method.
+        compiler: "numba" or "xla" if the user names one.
+
+    Raises:
+        InputError: They may not, and the user names numba.
+    """
+    if IS_SYNCHRONOUS:
+        return True
+    reason = "JAX computed before jaxevent was imported; import jaxevent first"
+    if compiler == "numba":
+        raise InputError(f"no program may call the kernel of {name!r}, as {reason}")
+    slow = f"a fit of {name!r} takes several times as long without a kernel"
+    warnings.warn(f"{slow}: {reason}", InputWarning, stacklevel=4)
+    return False
 
 
 def compile_module(text: str) -> ModuleType:

@@ -13,6 +13,7 @@ n) of a table that begins at k.
 """
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -216,6 +217,9 @@ class ModuleWriter:
             The lines.
         """
         wanted = {key: node for key, node in function.results.items() if key in store}
+        # An element may have a result that is the same for all.
+        index = None if loop is None else re.compile(rf"\b{loop.index}\b")
+        per_element = {key for key in wanted if index is not None and index.search(store[key])}
         phases = TracedFunction(wanted).phases()
         last = max((phases[n] for n in wanted.values()), default=0)
         scalars = [n for n in phases if n.level < Level.ELEMENT and n.op not in ELEMENT_REDUCTIONS]
@@ -228,14 +232,14 @@ class ModuleWriter:
             reduced = [n for n in phases if n.op in ELEMENT_REDUCTIONS and phases[n] == phase + 1]
             elements = {}
             if phase == last:
-                elements = {store[key]: n for key, n in wanted.items() if n.level == Level.ELEMENT}
+                elements = {store[key]: wanted[key] for key in wanted if key in per_element}
             if reduced or elements:
                 assert loop is not None
                 call = self._loop(f"{name}_{phase}", reduced, elements, known, loop)
                 out.append(" " * indent + call)
                 known |= set(reduced)
         for key, node in wanted.items():
-            if node.level < Level.ELEMENT:
+            if key not in per_element:
                 out.append(f"{' ' * indent}{store[key].format(self.node_name(node))}")
         return out
 

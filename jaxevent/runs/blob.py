@@ -5,17 +5,22 @@ Settings of trackers in a configuration of `jaxevent.runs.fit`:
     loss = "likelihood"                 # of events, each predicted before it is used; or
                                         # "positions": distance from given ones
     events = "all"                      # or "associated"; see `losses.negative_log_likelihood`
-    seeds = [[30.0, 40.0, 8.0]]         # x, y, size in px (and s) of each target; omitted: those
-                                        # of the positions, or without any, tracks are born
+    seeds = [[30.0, 40.0, 8.0]]         # x, y, size in px (and s) of each target
     positions = "*.csv"                 # beside each recording, * being its name without suffix
+    begin = "found"                     # without seeds tracks begin at the "positions", the default
+                                        # where there are some, or else as in jaxevent track: at
+                                        # targets that are "found", with the parameters that suit
+                                        # them; or they are "born" of events that gather
 
 A method may have its own loss and events. Positions are as in `jaxevent.runs.blob_scores`.
 
 A recording is cut into windows of `window` seconds. If neither validation nor test is given, they
 are shared out: with `split` = [2, 1, 1], of every 4 windows in turn 2 are to fit, 1 to validate and
 1 to test; then `window` is by default an eighth of the recording. In every window tracking begins
-anew: with the seeds in a first one, and later where the positions are, or where tracks with the
-parameters that the fit starts from are. So windows should be longer than tracks take to settle.
+anew: with the seeds in a first one, and later where the positions are, where found targets are, or
+where tracks with the parameters that the fit starts from are. So windows should be longer than
+tracks take to settle. Parameters of found targets differ between them, but for those that are
+fitted: these have one value.
 
 Results: `nll`, the mean over events of -ln p (1/px^2, as "all"), over the windows; of tracks of the
 whole recording `rmse` and `median`, of the distances from the positions (px), and `covered`, the
@@ -24,6 +29,7 @@ share of the positions at which the track was alive.
 
 import dataclasses
 import functools
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,13 +41,16 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.blob import (
+    TargetSearchResult,
     Tracker,
     TrackerParams,
+    find,
     negative_log_likelihood,
     position_error,
     prepare_positions,
 )
 from jaxevent.blob.losses import PositionBatch
+from jaxevent.blob.owners import NO_OWNER_INDEX
 from jaxevent.blob.prepare import Features, packing_key
 from jaxevent.errors import InputError
 from jaxevent.io.output import finite, values_of
@@ -49,6 +58,7 @@ from jaxevent.parameters import Parameters, check_choice
 from jaxevent.recording import Recording
 from jaxevent.runs.blob_scores import (
     TARGET_SETTINGS,
+    TRACK_BEGINNINGS,
     KnownPositions,
     Targets,
     TrackProtocol,
@@ -106,6 +116,7 @@ class TrackWindow(NamedTuple):
     seeds: list[tuple[float, float, float, int]] | None  # x, y, size; 0: lambda0, and time (us)
     known: KnownPositions | None  # of the targets of these seeds
     split: int  # index in SPLIT_NAMES
+    found: TargetSearchResult | None = None  # in place of seeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +127,12 @@ class TrackGoal(Goal):
     start: TrackerParams
     loss: TrackLoss
     targets: Targets
-    # Loss and gradient by 2 numbers of 4,000 events in steps of 16: forwards 37 ms, in reverse 310.
+    begin: str | None = None  # "found", "born" or None: where seeds or positions are
+    fitted: tuple[str, ...] = ()  # names that are fitted or searched
+    _searches: dict[int, TargetSearchResult] = dataclasses.field(
+        default_factory=dict, compare=False, repr=False
+    )
+    # Kernels pass once for each number in either mode; XLA compiles the forward one sooner.
     forward = True
 
     @property
@@ -127,15 +143,21 @@ class TrackGoal(Goal):
     def files(self, recording: Path) -> list[Path]:
         return self.targets.files(recording)
 
+    def calibrate(self, data: FitData, params: TrackerParams, names: Sequence[str]) -> Any:
+        if not names:
+            return params
+        usual = self._usual_settings(data)
+        return params.replace(**{name: usual[name] for name in names if name in usual})
+
     def problem(self, data: FitData) -> Callable[[TrackerParams], Batches]:
         found = [part for part in self._cut_windows(data) if part.split < 2]
         if self.loss.name == "positions":
             found = [p for p in found if p.known is not None and np.isfinite(p.known.xi).any()]
+        usual = self._usual_settings(data)
 
         def make(params: TrackerParams) -> Batches:
-            return batches_by_split(
-                found, jax.device_put(self._pack(found, params, self.loss.name))
-            )
+            batches = self._pack(found, params, self.loss.name, usual)
+            return batches_by_split(found, jax.device_put(batches))
 
         return LastBatches(packing_key, make)
 
@@ -143,7 +165,7 @@ class TrackGoal(Goal):
         self, data: FitData, params: TrackerParams, progress: bool | None
     ) -> Iterator[dict[str, Any]]:
         found = self._cut_windows(data)
-        packed = self._pack(found, params, "likelihood")
+        packed = self._pack(found, params, "likelihood", self._usual_settings(data))
         for place, given, recording in data:
             errors = self.targets.errors(recording, self.tracker, params, progress)
             of_this = [
@@ -194,9 +216,37 @@ class TrackGoal(Goal):
             cuts = self._seeds(recording, known, np.array([begin for begin, _, _ in spans]))
             for (begin, end, s), seeds in zip(spans, cuts, strict=True):
                 index = recording.events.index
-                if index(begin) < index(end):
-                    found.append(_cut_window(recording, begin, end, seeds, known, s))
+                if index(begin) == index(end):
+                    continue
+                part = _cut_window(recording, begin, end, seeds, known, s)
+                if self.begin == "found":
+                    part = part._replace(found=self._find(recording).crop(begin, end))
+                if part.found is None or len(part.found):
+                    found.append(part)
         return found
+
+    def _find(self, recording: Recording) -> TargetSearchResult:
+        """Find the targets of a recording, once.
+
+        Raises:
+            InputError: There is none.
+        """
+        if id(recording) not in self._searches:
+            self._searches[id(recording)] = find(recording, progress=False)
+        found = self._searches[id(recording)]
+        if not len(found):
+            raise InputError(
+                f"{recording.name}: no target was found to fit to; give seeds, or positions, or "
+                'begin = "born" for tracks that begin wherever events gather'
+            )
+        return found
+
+    def _usual_settings(self, data: FitData) -> dict[str, Any]:
+        """Return the settings that suit the found targets of the recordings to fit."""
+        if self.begin != "found":
+            return {}
+        each = [self._find(recording).settings() for _, recording in data.sources["fit"]]
+        return {name: statistics.median_low([one[name] for one in each]) for name in each[0]}
 
     def _seeds(
         self, recording: Recording, known: KnownPositions | None, begins: NDArray
@@ -243,8 +293,25 @@ class TrackGoal(Goal):
             for begin, cut in zip(begins, cuts, strict=True)
         ]
 
-    def _pack(self, found: Sequence[TrackWindow], params: TrackerParams, loss: str) -> list[Batch]:
-        """Pack the windows into batches of one shape, so that one program serves all."""
+    def _pack(
+        self,
+        found: Sequence[TrackWindow],
+        params: TrackerParams,
+        loss: str,
+        usual: Mapping[str, Any],
+    ) -> list[Batch]:
+        """Pack the windows into batches of one shape, so that one program serves all.
+
+        Args:
+            found: The windows.
+            params: Parameters of the tracker.
+            loss: "likelihood" or "positions".
+            usual: Settings of found targets; where the parameters have them, each target has its
+                own.
+
+        Returns:
+            The batches.
+        """
         batches, used = [], [1, 1, 0, 0]
         no_times = np.empty(0, np.int64)
         for part in found:
@@ -261,8 +328,13 @@ class TrackGoal(Goal):
                 weight = batch.known.sum()
             else:
                 features, _ = self.tracker.prepare(
-                    part.recording, no_times, params, seeds=seeds, **span
-                )
+                    part.recording, no_times, params, seeds=seeds, found=part.found,
+                    detect=True if self.begin == "born" else None, **span,
+                )  # fmt: skip
+                if part.found is not None:
+                    own = part.found.per_target_values(params, usual)
+                    own = {name: own[name] for name in own if name not in self.fitted}
+                    features = dataclasses.replace(features, overrides=own)
                 batch = features
                 weight, times = features.valid.sum(), 0
             if seeds is not None and part.seeds is not None:
@@ -342,6 +414,9 @@ def _pad_batch(batch: Features | PositionBatch, f: Features, used: Sequence[int]
     }
     fields |= {name: fill(getattr(f, name), chunks) for name in ("elapsed", "stop", "cycle")}
     fields |= {name: fill(getattr(f, name), seeds) for name in ("seed_xi", "seed_size")}
+    fields["overrides"] = {name: fill(values, seeds) for name, values in f.overrides.items()}
+    if f.owner is not None:
+        fields["owner"] = fill(f.owner, chunks, steps, value=NO_OWNER_INDEX)
     features = dataclasses.replace(f, seed=fill(f.seed, seeds, value=-1), **fields)
     if isinstance(batch, Features):
         return features
@@ -364,6 +439,7 @@ class Blobs(Family):
         "loss": NAME_CHECK,
         "events": (lambda value: value in EVENT_CHOICES, '"all" or "associated"'),
         **TARGET_SETTINGS,
+        "begin": (lambda value: value in TRACK_BEGINNINGS, '"positions", "found" or "born"'),
     }
     own = ("loss", "events")
 
@@ -376,8 +452,17 @@ class Blobs(Family):
                 "the loss 'positions' needs tables of them; give their name beside the "
                 'recordings, as positions = "*.csv"'
             )
+        given = "seeds" in settings or "positions" in settings
+        begin = settings.get("begin", "positions" if given else "found")
+        if (begin == "positions") != given:
+            raise InputError(
+                "tracks begin where seeds or positions are given, or else are found or born; "
+                f"begin = {begin!r} needs {'none of them' if given else 'one of them'}"
+            )
         one = TrackLoss(method, loss, settings.get("events", "all"))
-        return TrackGoal(method, params, one, Targets.of(settings))
+        fitted = (*settings.get("fit", ()), *settings.get("search", ()))
+        begin = None if begin == "positions" else begin
+        return TrackGoal(method, params, one, Targets.of(settings), begin, fitted)
 
 
 FAMILY = Blobs()

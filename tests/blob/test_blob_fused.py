@@ -97,6 +97,47 @@ def test_kernel_equals_run(case):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_losses_and_their_slopes(case):
+    """Losses equal those of `run`; slopes along every number are those of finite differences."""
+    tracker = getattr(blob, case)
+    params = tracker.Params(**FEW, **CASES[case], max_targets=3)
+    rec, seeds = crossing(np.random.default_rng(7)), [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]
+    times = np.arange(1000, 29000, 501)
+    truth = np.full((len(times), 2, 2), 30.0)
+    batch = blob.prepare_positions(rec, params, seeds, times, truth)
+    features, _ = tracker.prepare(rec, np.empty(0), params, seeds=seeds, detect=True)
+
+    def losses(raw, compiler=None):
+        moved = params.with_raw(raw)
+        return jnp.stack(
+            [
+                *(
+                    blob.negative_log_likelihood(tracker, moved, features, events, compiler)
+                    for events in ("associated", "all")
+                ),
+                blob.position_error(tracker, moved, batch, compiler=compiler),
+            ]
+        )
+
+    stuck = params.without_gradient()
+    raw = {n: leaf for n, leaf in params.raw.items() if n not in stuck and np.isfinite(leaf)}
+    forwards = jax.jit(jax.jacfwd(losses))(raw)
+    backwards = jax.jit(jax.jacrev(losses))(raw)
+    value, h = jax.jit(losses), 1e-5
+    np.testing.assert_allclose(
+        value(raw), jax.jit(functools.partial(losses, compiler="xla"))(raw), rtol=1e-9
+    )
+    for name in raw:
+        ends = [value({**raw, name: raw[name] + step}) for step in (h, -h)]
+        slope = np.asarray(ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(forwards[name], slope, rtol=1e-5, atol=1e-7, err_msg=name)
+        np.testing.assert_allclose(backwards[name], slope, rtol=1e-5, atol=1e-7, err_msg=name)
+    with pytest.raises(InputError, match="first derivatives only"):
+        jax.hessian(lambda raw: losses(raw)[0])({"Q_v": raw["Q_v"]})
+
+
+@pytest.mark.slow
 def test_tracks_of_both_compilers():
     """Smoothed states, with pauses in which targets stand still, and whose the events are."""
     rec, seeds = crossing(np.random.default_rng(7)), [(25.0, 22.0, 4.0), (70.0, 24.0, 4.0, 0.001)]

@@ -15,7 +15,8 @@ import jaxevent
 import jaxevent.runs.fit
 from jaxevent import cli
 from jaxevent.blob import constant_velocity as tracker
-from jaxevent.blob import negative_log_likelihood, prepare_positions
+from jaxevent.blob import find, negative_log_likelihood, prepare_positions
+from jaxevent.errors import InputError
 from jaxevent.recording import Recording
 from jaxevent.runs.blob import FAMILY
 from jaxevent.runs.blob_scores import read_positions
@@ -192,8 +193,45 @@ def test_windows_are_shared_out_and_begin_where_tracks_are():
         mean = tracks(part.start).mean[0, 0]
         np.testing.assert_allclose((x, y, size), mean[[0, 1, 4]], rtol=1e-12)
         assert at == part.start
-    # Without seeds and positions tracks are born in every window.
-    assert all(part.seeds is None for part in goal()._cut_windows(FitData(sources, None, 0.05)))
+    # Tracks may be born in every window.
+    born = goal(begin="born")._cut_windows(FitData(sources, None, 0.05))
+    assert all(part.seeds is None and part.found is None for part in born)
+
+
+@pytest.mark.slow
+def test_without_seeds_targets_are_found():
+    """As in `jaxevent track`: with the parameters that suit them, but for those that are fitted."""
+    recording, path = simulated(0)
+    sources = {"fit": [("a", recording)], "validation": [], "test": []}
+    data, found = FitData(sources, (2, 1, 1), None), find(recording, progress=False)
+    mine, settings = goal(fit=["Q_v"]), found.settings()
+    given = {"Q_p": 3.0, "events_per_step": 8}
+    names = tracker.names_left_open(given)
+    params = mine.calibrate(data, tracker.Params(**given), names)
+    for name, value in {**settings, **given}.items():
+        assert float(getattr(params, name)) == pytest.approx(value, rel=1e-6), name
+    assert mine.calibrate(data, params, ()) is params
+    parts = mine._cut_windows(data)
+    packed = mine._pack(parts, params, "likelihood", mine._usual_settings(data))
+    assert len(parts) == 8 and [part.split for part in parts] == [0, 1, 0, 2, 0, 1, 0, 2]
+    for part, batch in zip(parts, packed, strict=True):
+        features = batch.features
+        at = (part.start - recording.start) * 1e-6
+        true = [np.interp(at, path[:, 0], path[:, k]) for k in (1, 2)]
+        np.testing.assert_allclose(features.seed_xi[0], true, atol=3)
+        # One value of what is fitted and of what the user gave, the target's own of the rest.
+        assert not {"Q_v", "Q_p"} & features.overrides.keys() and "P0_v" in features.overrides
+        rows = (recording.events.index(at) for at in (part.start, part.stop))
+        inside = recording.events[slice(*rows)]
+        assert 0.8 * len(inside) < float(batch.weight) < len(inside)
+    one, slope = jax.value_and_grad(lambda p: mine.loss(p, packed[0]))(params)
+    assert np.isfinite(one) and float(slope.raw["Q_v"]) != 0
+
+    with pytest.raises(InputError, match="begin = 'born' needs none of them"):
+        goal(begin="born", seeds=[[1.0, 2.0, 3.0]])
+    empty = Recording("still", 120, 90, recording.events[:0])
+    with pytest.raises(InputError, match="no target was found to fit to"):
+        mine._cut_windows(FitData({**sources, "fit": [("b", empty)]}, None, None))
 
 
 def test_sizes_that_are_not_given_can_be_fitted(folder):

@@ -5,6 +5,7 @@ the order of `REAL_NAMES` and `INTEGER_NAMES`. What differs between filters are 
 `TrackFunctions`, which `program` writes; so this module is compiled once.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,18 +28,21 @@ INTEGER_NAMES = (
 LAST_UPDATE, LAST_HIT, BIRTH, LAST_APART, ID, CONFIRMED, LIMIT, TIME, STOP, MERGING = range(10)
 DETECTED, NOW_CONFIRMED, END_REASON, DEATH, NOW_LAST_APART, TOUCHED = range(10, 16)
 
-# Rows of a step's `work`: the events', then four for each track that is alive.
+# Rows of a step's `work`: the events', then those of each track that is alive.
 X, Y, AGE, POLARITY, VALID, TRACKS = range(6)
-INSIDE, NEAR, LOG_LIKELIHOOD, WEIGHT, ROWS_PER_TRACK = range(5)
+INSIDE, NEAR, LOG_LIKELIHOOD, WEIGHT, LOG_LIKELIHOOD_TANGENT, WEIGHT_TANGENT = range(6)
+ROWS_PER_TRACK = 6
 
 GRID_TIME, NEXT_ID = 0, 1  # in `KernelState.counters`
+LOSS, COUNT, LOSS_TANGENT, LOSS_BY_OUTLIERS = range(4)  # in `LossSums.totals`
+LOG_2_PI = math.log(2 * math.pi)
 
 
 class TrackFunctions(NamedTuple):
     """Compiled functions of a filter, of one track each.
 
     Attributes:
-        init: Begin a track.
+        init: Begin a track; a size of 0 stands for the parameter `lambda0`.
         step: Predict and update the only track that is alive, with all events of a step.
         predict: Predict a track to the step's time, with its gate and likelihoods.
         weights_alone: Weigh the events of a track where no event is in two gates.
@@ -64,7 +68,6 @@ class LifecycleConfig(NamedTuple):
     """Parameters of the life cycle that are not of one track.
 
     Attributes:
-        size: Size of new tracks, px.
         births: Whether tracks begin of clutter.
         tau: Time in which the grid forgets, s.
         cell: Side of a cell of the grid, px.
@@ -72,7 +75,6 @@ class LifecycleConfig(NamedTuple):
         alone: Whether an event in one gate alone is weighted by that track alone.
     """
 
-    size: float
     births: bool
     tau: float
     cell: float
@@ -188,6 +190,37 @@ class UpdateRecord(NamedTuple):
     count: NDArray[np.int64]
 
 
+class LossSums(NamedTuple):
+    """Sums over events for `jaxevent.blob.losses`; see `track._loss`.
+
+    Attributes:
+        totals: [4] loss, number of events that count, tangent of the loss through the tracks, and
+            its derivative by `outliers`; [0] if no loss is wanted.
+        every: Whether every event counts, not only those inside a gate.
+        outliers: Share of events that belong to no target.
+    """
+
+    totals: NDArray[np.float64]
+    every: bool
+    outliers: float
+
+
+class Snapshots(NamedTuple):
+    """All tracks at requested moments.
+
+    Attributes:
+        moment: [moments] sorted numbers chunk * (steps + 1) + steps of the chunk done by then.
+        reals: [moments, targets, ...] real numbers of the tracks, output.
+        integers: [moments, targets, ...] their integers, output.
+        count: [1] number of moments that have been reached.
+    """
+
+    moment: NDArray[np.int64]
+    reals: NDArray
+    integers: NDArray[np.int64]
+    count: NDArray[np.int64]
+
+
 class Scratch(NamedTuple):
     """Scratch memory of a step."""
 
@@ -209,6 +242,8 @@ class _Context(NamedTuple):
     out: KernelOutput
     scratch: Scratch
     updates: UpdateRecord
+    losses: LossSums
+    snapshots: Snapshots
 
 
 class _NewTrack(NamedTuple):
@@ -217,7 +252,7 @@ class _NewTrack(NamedTuple):
     Attributes:
         x: Column, px.
         y: Row, px.
-        size: Size, px.
+        size: Size, px; 0: `lambda0`.
         time: Time of birth, us since the chunk's start.
         id: Serial number.
         confirmed: Whether it is confirmed at once.
@@ -232,7 +267,7 @@ class _NewTrack(NamedTuple):
 
 
 @njit_noalloc
-def run(kernel, chunks, state, out, scratch, updates):
+def run(kernel, chunks, state, out, scratch, updates, losses, snapshots):
     """Track through chunks.
 
     Args:
@@ -242,6 +277,8 @@ def run(kernel, chunks, state, out, scratch, updates):
         out: `KernelOutput`, output.
         scratch: `Scratch`.
         updates: `UpdateRecord`, output; without rows nothing is recorded.
+        losses: `LossSums`, output.
+        snapshots: `Snapshots`, output.
     """
     reals, integers = state.reals, state.integers
     pointers = (
@@ -249,8 +286,9 @@ def run(kernel, chunks, state, out, scratch, updates):
         kernel.numbers.ctypes,
     )  # fmt: skip
     context = _Context(
-        kernel.functions, pointers, kernel.config, chunks, state, out, scratch, updates
-    )
+        kernel.functions, pointers, kernel.config, chunks, state, out, scratch, updates,
+        losses, snapshots,
+    )  # fmt: skip
     for chunk in range(len(chunks.t)):
         _begin_chunk(context, chunk)
         updates.begin[chunk] = updates.count[0]
@@ -285,10 +323,9 @@ def _begin_chunk(context, chunk):
     state.counters[GRID_TIME] = max(state.counters[GRID_TIME] - elapsed, -2 * MAX_CHUNK_US)
     for k in range(len(chunks.seed)):
         if chunks.seed[k] == chunk:
-            size = chunks.seed_size[k]
-            size = size if size > 0 else state.reals.dtype.type(context.config.size)
             x, y = chunks.seed_xi[k, 0], chunks.seed_xi[k, 1]
-            _init_track(context, k, _NewTrack(x, y, size, np.int64(0), k, 1))
+            new = _NewTrack(x, y, chunks.seed_size[k], np.int64(0), k, 1)
+            _init_track(context, k, new)
 
 
 @njit_noalloc_inlined
@@ -326,10 +363,12 @@ def _run_steps(context, chunk):
     steps, size = t.shape
     owned, micro = len(chunks.owner) > 0, work.dtype.type(1e-6)
     associate, recording = len(context.out.target) > 0, len(context.updates.target) > 0
+    scoring, moment = len(context.losses.totals) > 0, chunk * (steps + 1)
     stop, faded, none = np.int64(chunks.stop[chunk]), valid[0, 0] & False, np.int64(0)
     for step in range(steps):
         if not valid[step, 0]:
             break  # the rest is padding
+        _take_snapshots(context, moment + step)
         time = np.int64(t[step, size - 1])
         for i in range(size):
             work[X, i] = xi[step, i, 0]
@@ -347,7 +386,7 @@ def _run_steps(context, chunk):
                 tracks[alive] = k
                 integers[k, TIME] = time
                 alive += 1
-        if alive == 1 and not associate:
+        if alive == 1 and not associate and not scoring:
             needs_near, k = size if size > 1 or births else 0, tracks[0]
             integers[k, TOUCHED] = 0
             functions.step(*pointers, k, TRACKS, size, needs_near)
@@ -366,10 +405,73 @@ def _run_steps(context, chunk):
                     functions.update(*pointers, k, row, size, size)
                 if some and recording:
                     _record(context.updates, reals, integers, k, step)
+        if scoring:
+            _add_losses(context, alive, size)
         if associate:
             _report_association(context, chunk, step, alive)
         if births:
             faded = _accumulate_clutter(context, t[step], stop, alive, faded)
+    _take_snapshots(context, moment + steps)
+
+
+@njit_noalloc_inlined
+def _take_snapshots(context, moment):
+    """Copy all tracks for the requested moments up to one.
+
+    Args:
+        context: `_Context`.
+        moment: Number of the moment, see `Snapshots`.
+    """
+    wanted, reals, integers = context.snapshots, context.state.reals, context.state.integers
+    while wanted.count[0] < len(wanted.moment) and wanted.moment[wanted.count[0]] <= moment:
+        row = wanted.count[0]
+        for k in range(len(reals)):
+            for field in range(reals.shape[1]):
+                wanted.reals[row, k, field] = reals[k, field]
+            for field in range(integers.shape[1]):
+                wanted.integers[row, k, field] = integers[k, field]
+        wanted.count[0] = row + 1
+
+
+@njit_noalloc_inlined
+def _add_losses(context, alive, size):
+    """Add up the negative log likelihood of a step's events, as `track._loss` does.
+
+    Args:
+        context: `_Context`.
+        alive: Number of tracks that are alive.
+        size: Number of events of the step.
+    """
+    losses, work = context.losses, context.scratch.work
+    totals, every, outliers = losses.totals, losses.every, losses.outliers
+    width, height = context.state.reals[0, FRAME], context.state.reals[0, FRAME + 1]
+    log_uniform = -np.log(np.float64(width) * np.float64(height))
+    stray = outliers if alive > 0 else 1.0
+    log_share = np.log1p(-outliers) - np.log(np.float64(max(alive, 1))) if every else 0.0
+    for i in range(size):
+        top, counted = log_uniform + LOG_2_PI if every else -np.inf, every and work[VALID, i] != 0
+        for a in range(alive):
+            row = TRACKS + ROWS_PER_TRACK * a
+            if counted if every else work[row + INSIDE, i] != 0:
+                top, counted = max(top, np.float64(work[row + LOG_LIKELIHOOD, i])), True
+        if not counted:
+            continue
+        # exp(top - ln(2 pi)) times these are the densities.
+        targets, tangent, uniform = 0.0, 0.0, 0.0
+        for a in range(alive):
+            row = TRACKS + ROWS_PER_TRACK * a
+            if every or work[row + INSIDE, i] != 0:
+                part = np.exp(np.float64(work[row + LOG_LIKELIHOOD, i]) - top + log_share)
+                targets += part
+                tangent += part * np.float64(work[row + LOG_LIKELIHOOD_TANGENT, i])
+        if every:
+            uniform = np.exp(log_uniform + LOG_2_PI - top)
+        total = targets + stray * uniform
+        totals[LOSS] -= top + np.log(total) - LOG_2_PI
+        totals[COUNT] += 1
+        totals[LOSS_TANGENT] -= tangent / total
+        if every and alive > 0:
+            totals[LOSS_BY_OUTLIERS] -= (uniform - targets / (1 - outliers)) / total
 
 
 @njit_noalloc_inlined
@@ -528,8 +630,7 @@ def _manage_tracks(context, chunk):
         if ended:
             integers[k, ID] = -1
             gate = reals[k, GATE]
-            reals[k, XI] = reals[k, XI + 1] = 0
-            reals[k, SIZE] = context.config.size
+            reals[k, XI] = reals[k, XI + 1] = reals[k, SIZE] = 0
             functions.init(*pointers, k, 0, 0, 1)
             reals[k, GATE] = gate
     if context.config.births:
@@ -570,7 +671,7 @@ def _begin_tracks(context, stop):
             return
         n = _sum_near(sums[0], row, column)
         x, y = _sum_near(sums[1], row, column) / n, _sum_near(sums[2], row, column) / n
-        new = _NewTrack(x, y, real(config.size), stop, counters[NEXT_ID], 0)
+        new = _NewTrack(x, y, real(0), stop, counters[NEXT_ID], 0)
         _init_track(context, free, new)
         counters[NEXT_ID] += 1
         for r in range(max(row - 2, 0), min(row + 3, rows)):

@@ -3,9 +3,10 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +30,7 @@ from jaxevent.blob.track import (
     track_params,
     update_track,
 )
+from jaxevent.codegen.derivative import is_real
 from jaxevent.codegen.graph import Graph, ParameterProgram, TranslationError, constant_value
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
@@ -109,6 +111,41 @@ _predict_and_gate, _update_track, _predict_measurement = (
 )
 
 
+class TrackVariant(NamedTuple):
+    """Inputs and outputs of a track's functions beside those that all have.
+
+    Attributes:
+        overrides: Names of the parameters that differ between tracks.
+        has_owners: Whether only some tracks may own an event.
+        tangents: Whether the functions have tangents along a direction in the parameters.
+    """
+
+    overrides: tuple[str, ...] = ()
+    has_owners: bool = False
+    tangents: bool = False
+
+    def known(self, params: TrackerParams, along: tuple[str, int] | None = None) -> Any:
+        """Return the first argument of the functions: parameters, and with tangents a direction.
+
+        The direction has all numbers that can move, so that one kernel serves every fit.
+
+        Args:
+            params: Parameters of the tracker.
+            along: Name of the parameter that changes, and index in it; None: none does.
+
+        Returns:
+            The parameters, or a pair of them and of the direction.
+        """
+        if not self.tangents:
+            return params
+        stuck = params.without_gradient()
+        raw = {name: np.asarray(leaf) for name, leaf in params.raw.items() if name not in stuck}
+        direction = {n: np.zeros_like(leaf) for n, leaf in raw.items() if np.isfinite(leaf).all()}
+        if along is not None and along[0] in direction:
+            direction[along[0]].reshape(-1)[along[1]] = 1
+        return params, direction
+
+
 class _TrackSteps(NamedTuple):
     """Functions of one track to be traced: of parameters and of numbers by name."""
 
@@ -116,6 +153,7 @@ class _TrackSteps(NamedTuple):
     single: bool
 
     def init(self, params: Any, track: Any, xi: Any, size: Any) -> dict[str, Any]:
+        size = jnp.where(size > 0, size, params.lambda0).astype(xi.dtype)
         state = self.filter.init(track_params(params, track.overrides), xi, size)
         gate = initial_gate(params, size).astype(xi.dtype)
         return {"track.state": state, "track.gate": gate}
@@ -166,6 +204,94 @@ class _TrackSteps(NamedTuple):
         return dataclasses.replace(events, batch=batch)
 
 
+class _TangentSteps(NamedTuple):
+    """Functions of one track with tangents: derivatives along one direction in the parameters.
+
+    `known` holds the parameters, and the direction: by name the changes of those that move.
+    `tangent` is that of the track's state, `predicted` that of the predicted one.
+    """
+
+    steps: _TrackSteps
+
+    def init(self, known: Any, track: Any, xi: Any, size: Any) -> dict[str, Any]:
+        made, tangents = _push_forward(
+            lambda params, _: self.steps.init(params, track, xi, size), known, (), ()
+        )
+        return {**made, "tangent": tangents["track.state"]}
+
+    def predict(
+        self, known: Any, track: Any, tangent: Any, limit: Any, events: Any
+    ) -> dict[str, Any]:
+        def predict(params: Any, state: Any) -> Any:
+            moved = dataclasses.replace(track, state=state)
+            return self.steps.predict(params, moved, limit, events)["prediction"]
+
+        made, tangents = _push_forward(predict, known, track.state, tangent)
+        return {
+            "prediction": made,
+            "predicted": tangents.state,
+            "log_likelihood_tangent": tangents.log_likelihood,
+        }
+
+    # A function of a module has all its inputs as arguments.
+    def update(
+        self,
+        known: Any,
+        *,
+        track: Any,
+        tangent: Any,
+        prediction: Any,
+        predicted: Any,
+        events: Any,
+        weight: Any,
+        weight_tangent: Any,
+    ) -> dict[str, Any]:
+        def update(params: Any, moving: Any) -> Any:
+            before, state, weight = moving
+            moved = dataclasses.replace(track, state=before)
+            ahead = dataclasses.replace(prediction, state=state)
+            return self.steps.update(params, moved, ahead, events, weight)["track"]
+
+        moving = track.state, prediction.state, weight
+        made, tangents = _push_forward(update, known, moving, (tangent, predicted, weight_tangent))
+        return {"track": made, "tangent": tangents.state}
+
+    def weights(
+        self, known: Any, inside: Any, log_likelihood: Any, log_likelihood_tangent: Any
+    ) -> dict[str, Any]:
+        def divide(params: Any, log_likelihood: Any) -> Any:
+            return self.steps.weights(params, inside, log_likelihood)["weight"]
+
+        made, tangent = _push_forward(divide, known, log_likelihood, log_likelihood_tangent)
+        return {"weight": made, "weight_tangent": tangent}
+
+
+def _push_forward(
+    function: Callable[[Any, Any], Any], known: Any, moving: Any, tangents: Any
+) -> tuple[Any, Any]:
+    """Compute a function, and its derivative along a direction.
+
+    Args:
+        function: A function of parameters and of a tree.
+        known: The parameters, and by name the changes of those that move.
+        moving: The tree.
+        tangents: Changes of its real numbers.
+
+    Returns:
+        The function's result, and the change of its real numbers.
+    """
+    params, direction = known
+    real, rest = eqx.partition(moving, is_real)
+
+    def compute(raw: Any, real: Any) -> tuple[Any, Any]:
+        made = function(params.with_raw(raw), eqx.combine(real, rest))
+        return eqx.filter(made, is_real), made
+
+    raw = {name: params.raw[name] for name in direction}
+    _, changes, made = jax.jvp(compute, (raw, real), (direction, tangents), has_aux=True)
+    return made, changes
+
+
 class _ReadoutSteps(NamedTuple):
     """Functions of the readout to be traced."""
 
@@ -197,46 +323,45 @@ class _Shapes(NamedTuple):
         return jax.ShapeDtypeStruct(size, self.dtype if kind is None else kind)
 
 
-def _host_program(params: TrackerParams) -> ParameterProgram:
+def _host_program(known: Any) -> ParameterProgram:
     host = ParameterProgram()
-    for leaf in jax.tree.leaves(params):
+    for leaf in jax.tree.leaves(known):
         host.add_input(np.asarray(leaf))
     return host
 
 
 def trace_track(
     filter: Filter,
-    params: TrackerParams,
-    overrides: tuple[str, ...],
-    has_owners: bool,
+    known: Any,
+    variant: TrackVariant,
     dtype: np.dtype,
 ) -> TrackProgram:
     """Trace the functions of one track.
 
     Args:
         filter: Filter of the track.
-        params: Parameters of the tracker.
-        overrides: Names of the parameters that differ between tracks.
-        has_owners: Whether only some tracks may own an event.
+        known: Parameters of the tracker, and with tangents the direction, see `TrackVariant.known`.
+        variant: Inputs and outputs of the functions.
         dtype: Type of real numbers.
 
     Raises:
         TranslationError: A function has no translation.
     """
+    params = known[0] if variant.tangents else known
     single = params.events_per_step == 1
     graph, steps, shape = Graph(), _TrackSteps(filter, single), _Shapes(dtype)
-    host = _host_program(params)
+    host = _host_program(known)
     time, flag = shape(kind=np.int32), shape(kind=bool)
 
     def make_track(params: Any, own: Any, xi: Any, size: Any, time: Any, flag: Any) -> TrackBuffer:
         state = filter.init(track_params(params, own), xi, size)
         return TrackBuffer(state, size, size, time, time, time, time, time, flag, own)
 
-    own = {name: shape() for name in overrides}
+    own = {name: shape() for name in variant.overrides}
     track = jax.eval_shape(make_track, params, own, shape(2), shape(), time, flag)
     M = 1 if single else ELEMENT_AXIS_LENGTH
     batch = jax.eval_shape(EventBatch, shape(M, 2), shape(M), shape(M))
-    owner = shape(M, 2, kind=np.int32) if has_owners else None
+    owner = shape(M, 2, kind=np.int32) if variant.has_owners else None
     events = jax.eval_shape(StepEvents, time, batch, shape(M, kind=bool), owner)
     gated = {"track": track, "limit": time, "events": events}
     at_stop = {"track": track, "stop": time}
@@ -260,12 +385,53 @@ def trace_track(
         "measurement": (steps.measurement, at_stop, True),
         "decide": (steps.decide_track, decide, True),
     }
+    columns = {"track": track, "prediction": prediction, "evidence": evidence}
+    if variant.tangents:
+        state = eqx.filter(track.state, is_real)
+        columns |= {"tangent": state, "predicted": state}
+        functions = _with_tangents(functions, _TangentSteps(steps), state)
     traced = {
-        name: translate_function(function, params, values, graph, host, single=alone)
+        name: translate_function(function, known, values, graph, host, single=alone)
         for name, (function, values, alone) in functions.items()
     }
-    layout = _make_layout({"track": track, "prediction": prediction, "evidence": evidence})
+    layout = _make_layout(columns)
     return TrackProgram(traced, host, layout, dtype, track, single, graph)
+
+
+def _with_tangents(
+    functions: dict[str, tuple[Any, dict[str, Any], bool]], steps: _TangentSteps, state: Any
+) -> dict[str, tuple[Any, dict[str, Any], bool]]:
+    """Replace functions of a track by those with tangents.
+
+    Args:
+        functions: Functions to be traced, each with its inputs and whether it is of one element.
+        steps: Those with tangents.
+        state: Shapes of the real numbers of a state.
+
+    Returns:
+        The functions; a step in one call has none.
+    """
+
+    def ignore_direction(function: Any) -> Any:
+        return lambda known, **given: function(known[0], **given)
+
+    new: dict[str, tuple[Any, dict[str, Any]]] = {
+        "init": (steps.init, {}),
+        "predict": (steps.predict, {"tangent": state}),
+        "update": (steps.update, {"tangent": state, "predicted": state}),
+        "weights": (steps.weights, {}),
+        "weights_alone": (steps.weights, {}),
+    }
+    out = {}
+    for name, (function, given, alone) in functions.items():
+        of_events = {
+            f"{key}_tangent": given[key] for key in ("weight", "log_likelihood") if key in given
+        }
+        if name in new:
+            out[name] = new[name][0], {**given, **new[name][1], **of_events}, alone
+        elif name != "step":
+            out[name] = ignore_direction(function), given, alone
+    return out
 
 
 def _make_layout(trees: Mapping[str, Any]) -> Layout:
@@ -300,25 +466,37 @@ def _event_texts(single: bool) -> tuple[dict[str, str], dict[str, str]]:
         "prediction.inside.0": f"{of_track(loop.INSIDE)} != 0",
         "prediction.near.0": f"{of_track(loop.NEAR)} != 0",
         "prediction.log_likelihood.0": of_track(loop.LOG_LIKELIHOOD),
+        "log_likelihood_tangent.0": of_track(loop.LOG_LIKELIHOOD_TANGENT),
         "weight.0": of_track(loop.WEIGHT),
+        "weight_tangent.0": of_track(loop.WEIGHT_TANGENT),
     }
     truth = " = REAL(1) if {} else REAL(0)"
     write = {
         "prediction.inside.0": of_track(loop.INSIDE) + truth,
         "prediction.near.0": of_track(loop.NEAR) + truth,
         "prediction.log_likelihood.0": of_track(loop.LOG_LIKELIHOOD) + " = {}",
+        "log_likelihood_tangent.0": of_track(loop.LOG_LIKELIHOOD_TANGENT) + " = {}",
     }
     return read, write
 
 
 def _weight_texts(row: str, i: str) -> tuple[dict[str, str], dict[str, str]]:
     """Return texts that read and write the numbers of an event for a track."""
+
+    def of_track(at: int) -> str:
+        return f"work[({row} + {at}) * size + {i}]"
+
     read = {
-        "inside.0": f"work[({row} + {loop.INSIDE}) * size + {i}] != 0",
-        "log_likelihood.0": f"work[({row} + {loop.LOG_LIKELIHOOD}) * size + {i}]",
+        "inside.0": of_track(loop.INSIDE) + " != 0",
+        "log_likelihood.0": of_track(loop.LOG_LIKELIHOOD),
+        "log_likelihood_tangent.0": of_track(loop.LOG_LIKELIHOOD_TANGENT),
         "element": "k",
     }
-    return read, {"weight.0": f"work[({row} + {loop.WEIGHT}) * size + {i}] = {{}}"}
+    write = {
+        "weight.0": of_track(loop.WEIGHT) + " = {}",
+        "weight_tangent.0": of_track(loop.WEIGHT_TANGENT) + " = {}",
+    }
+    return read, write
 
 
 def _step_lines(
@@ -449,8 +627,50 @@ def find_blocks(program: TracedProgram) -> tuple[NDArray[np.int64], NDArray[np.i
     return order, np.append(begins, 8)
 
 
+class TangentFunctions(NamedTuple):
+    """Compiled functions of `TrackFunctions` that have tangents or know none; no step in one."""
+
+    init: Any
+    predict: Any
+    weights_alone: Any
+    weights: Any
+    update: Any
+    limit: Any
+    measurement: Any
+    decide: Any
+
+
 _track_kernels = KernelCache(TrackFunctions, write_track, max_nodes=MAX_OPERATIONS)
+_tangent_kernels = KernelCache(TangentFunctions, write_track, max_nodes=2 * MAX_OPERATIONS)
 _readout_kernels = KernelCache(ReadoutFunctions, write_readout, max_nodes=MAX_OPERATIONS)
+
+
+def check_track(
+    filter: Filter, params: TrackerParams, variant: TrackVariant, dtype: np.dtype
+) -> None:
+    """Raise `TranslationError` unless the functions of a filter's track have translations.
+
+    Args:
+        filter: Filter of the track.
+        params: Parameters of the tracker.
+        variant: Inputs and outputs of the functions.
+        dtype: Type of real numbers.
+    """
+    kernels, key = _kernels_of(filter, params, variant, dtype)
+    known = variant.known(params)
+    kernels.check(key, known, lambda: trace_track(filter, known, variant, dtype))
+
+
+def _kernels_of(
+    filter: Filter, params: TrackerParams, variant: TrackVariant, dtype: np.dtype
+) -> tuple[KernelCache, Any]:
+    """Return the cache of a track's functions, and their key in it; see `check_track`."""
+    if params.association == "authors":
+        raise TranslationError('association = "authors"')
+    leaves, tree = jax.tree.flatten(params)
+    shapes = tuple(np.shape(leaf) for leaf in leaves)
+    kernels = _tangent_kernels if variant.tangents else _track_kernels
+    return kernels, (filter, tree, shapes, variant, dtype)
 
 
 class TrackCompiler:
@@ -459,9 +679,9 @@ class TrackCompiler:
     Args:
         filter: Filter of the track.
         params: Parameters of the tracker.
-        overrides: Names of the parameters that differ between tracks.
-        has_owners: Whether only some tracks may own an event.
+        variant: Inputs and outputs of the functions.
         dtype: Type of real numbers.
+        along: Name of the parameter, and index in it, along which tangents are.
 
     Raises:
         TranslationError: A function has no translation.
@@ -471,20 +691,18 @@ class TrackCompiler:
         self,
         filter: Filter,
         params: TrackerParams,
-        overrides: tuple[str, ...],
-        has_owners: bool,
+        variant: TrackVariant,
         dtype: np.dtype,
+        along: tuple[str, int] | None = None,
     ):
-        if params.association == "authors":
-            raise TranslationError('association = "authors"')
         self._filter, self._params, self._dtype = filter, params, dtype
-        leaves, tree = jax.tree.flatten(params)
-        shapes = tuple(np.shape(leaf) for leaf in leaves)
-        self._key = filter, tree, shapes, overrides, has_owners, dtype
-        compiled = _track_kernels.get(
-            self._key, params, lambda: trace_track(filter, params, overrides, has_owners, dtype)
-        )
+        kernels, self._key = _kernels_of(filter, params, variant, dtype)
+        known = variant.known(params, along)
+        compiled = kernels.get(self._key, known, lambda: trace_track(filter, known, variant, dtype))
         self.functions, self.numbers = compiled.functions, compiled.numbers
+        if variant.tangents:
+            functions = self.functions._asdict()
+            self.functions = TrackFunctions(step=functions["predict"], **functions)
         self.layout, self.track = compiled.places, compiled.program.track
 
     def readout(self) -> smoother_loop.ReadoutKernel:

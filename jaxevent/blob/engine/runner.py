@@ -1,8 +1,9 @@
 """Runner of segments by a kernel; see `jaxevent.blob.run.XlaRunner`."""
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,16 +11,27 @@ from numpy.typing import NDArray
 
 from jaxevent.blob import filter as filters
 from jaxevent.blob.engine import loop, smoother_loop
-from jaxevent.blob.engine.loop import ChunkArrays, KernelOutput, KernelState, UpdateRecord
-from jaxevent.blob.engine.program import TrackCompiler
+from jaxevent.blob.engine.loop import (
+    ChunkArrays,
+    KernelOutput,
+    KernelState,
+    Snapshots,
+    UpdateRecord,
+)
+from jaxevent.blob.engine.program import TrackCompiler, TrackVariant
 from jaxevent.blob.engine.smoother_loop import ReadoutArrays, ReadoutKernel, ReadoutScratch
 from jaxevent.blob.filter import Filter
 from jaxevent.blob.lifecycle import LifecycleLog, TrackerState, init_state
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features, Segment
 from jaxevent.blob.track import TrackBuffer
+from jaxevent.codegen.derivative import is_real
 from jaxevent.codegen.graph import evaluate_jaxpr
 from jaxevent.codegen.trace import named_leaves, number_names
+
+NO_LOSSES = loop.LossSums(np.zeros(0), False, 0.0)
+COMMON_VARIANT = TrackVariant()
+NO_MOMENTS = np.zeros(0, np.int64)
 
 
 @functools.lru_cache(maxsize=16)
@@ -39,6 +51,45 @@ def _trace_init(filter: Filter, tree: Any, kinds: tuple[jax.ShapeDtypeStruct, ..
     return closed, jax.tree.structure(shape)
 
 
+class _Column(NamedTuple):
+    """Columns of a leaf's numbers.
+
+    Attributes:
+        real: Whether they are those of real numbers rather than of integers.
+        at: Numbers of the columns.
+        shape: Shape of the leaf.
+        dtype: Its type.
+    """
+
+    real: bool
+    at: NDArray[np.int64]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class _KernelRun(NamedTuple):
+    """Result of a segment."""
+
+    state: TrackerState
+    out: KernelOutput
+    updates: UpdateRecord
+    snapshots: Snapshots
+
+
+class KernelLosses(NamedTuple):
+    """Losses of events, and tracks at requested moments, with tangents.
+
+    Attributes:
+        totals: (4,) see `loop.LossSums`.
+        tracks: (moments, targets) `TrackBuffer` of the tracks.
+        tangents: (moments, targets) tangents of the real numbers of their states; None: none.
+    """
+
+    totals: NDArray[np.float64]
+    tracks: TrackBuffer
+    tangents: Any
+
+
 class KernelRunner:
     """Runner of segments by a filter's kernel.
 
@@ -46,8 +97,8 @@ class KernelRunner:
         filter: Filter of one target.
         params: Parameters of the tracker.
         detect: Whether tracks are born of unassociated events.
-        overrides: Names of the parameters that differ between tracks.
-        has_owners: Whether only some tracks may own an event.
+        variant: Inputs and outputs of the kernel.
+        along: Name of the parameter, and index in it, along which tangents are.
 
     Raises:
         TranslationError: A function has no translation.
@@ -61,34 +112,42 @@ class KernelRunner:
         params: TrackerParams,
         *,
         detect: bool = False,
-        overrides: tuple[str, ...] = (),
-        has_owners: bool = False,
+        variant: TrackVariant = COMMON_VARIANT,
+        along: tuple[str, int] | None = None,
     ):
-        self.params, self._filter, self._detect = params, filter, detect
-        self._options = overrides, has_owners
+        self.params, self._filter = params, filter
+        self._variant = variant
+        self._options = {"detect": detect, "variant": variant, "along": along}
         self.dtype = np.dtype(jnp.result_type(float))
-        self._compiler = TrackCompiler(filter, params, overrides, has_owners, self.dtype)
+        self._compiler = TrackCompiler(filter, params, variant, self.dtype, along)
         alone = filter.association_weights is filters.association_weights
         config = loop.LifecycleConfig(
-            float(params.lambda0), detect, float(params.tau_birth), float(params.cell),
-            float(params.n_birth), alone,
-        )  # fmt: skip
+            detect, float(params.tau_birth), float(params.cell), float(params.n_birth), alone
+        )
         compiler = self._compiler
         self._kernel = loop.TrackKernel(compiler.functions, compiler.numbers, config)
-        layout = compiler.layout
-        self._columns: list[tuple[bool, NDArray[np.int64], tuple[int, ...], np.dtype]] = []
-        for name, leaf in named_leaves("track", compiler.track).items():
-            real = leaf.dtype.kind == "f"
-            places = layout.reals if real else layout.integers
-            columns = np.array([places[number] for number in number_names(name, leaf)], np.int64)
-            self._columns.append((real, columns, leaf.shape, leaf.dtype))
+        self._columns = self._find_columns("track", compiler.track)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        overrides, has_owners = self._options
-        make = functools.partial(
-            KernelRunner, detect=self._detect, overrides=overrides, has_owners=has_owners
-        )
-        return make, (self._filter, self.params)
+        return functools.partial(KernelRunner, **self._options), (self._filter, self.params)
+
+    def _find_columns(self, name: str, tree: Any) -> list[_Column]:
+        """Find the columns of the leaves of a tree.
+
+        Args:
+            name: Name of the tree.
+            tree: Shapes of one track's numbers.
+
+        Returns:
+            The columns of each leaf.
+        """
+        layout, found = self._compiler.layout, list[_Column]()
+        for leaf_name, leaf in named_leaves(name, tree).items():
+            real = leaf.dtype.kind == "f"
+            places = layout.reals if real else layout.integers
+            at = np.array([places[number] for number in number_names(leaf_name, leaf)], np.int64)
+            found.append(_Column(real, at, leaf.shape, leaf.dtype))
+        return found
 
     def init(self, features: Features) -> TrackerState:
         """Return the state without any track."""
@@ -100,7 +159,7 @@ class KernelRunner:
 
     def run(self, state: TrackerState, features: Features) -> tuple[TrackerState, LifecycleLog]:
         """Run a segment; return the state at its end, with births and deaths."""
-        state, out, _ = self._run(state, features)
+        state, out, *_ = self._run(state, features)
         return state, LifecycleLog(
             out.id_before, out.id_after, out.confirmed, out.end_reason, out.death
         )
@@ -113,7 +172,7 @@ class KernelRunner:
         chunks, steps, _ = features.t.shape
         rows = (chunks + steps) * len(state.tracks.id) + chunks * steps
         while True:
-            end, _, updates = self._run(state, features, rows)
+            end, _, updates, _ = self._run(state, features, rows)
             if updates.count[0] <= rows:
                 return end, updates
             rows = int(updates.count[0])
@@ -122,8 +181,43 @@ class KernelRunner:
         self, state: TrackerState, features: Features
     ) -> tuple[TrackerState, NDArray[np.int32], NDArray]:
         """Run a segment; return the state at its end, likeliest tracks of events, and weights."""
-        state, out, _ = self._run(state, features, associate=True)
+        state, out, *_ = self._run(state, features, associate=True)
         return state, out.target, out.weight
+
+    def losses(
+        self,
+        state: TrackerState,
+        features: Features,
+        outliers: float,
+        every: bool,
+        moments: NDArray[np.int64],
+    ) -> KernelLosses:
+        """Run all chunks of a recording for a loss.
+
+        Args:
+            state: State at the recording's start, of `init`.
+            features: The chunks.
+            outliers: Share of events that belong to no target.
+            every: Whether every event counts, not only those inside a gate.
+            moments: (moments,) sorted, see `loop.Snapshots`.
+
+        Returns:
+            Losses, and tracks at the moments.
+        """
+        sums = loop.LossSums(np.zeros(4), every, outliers)
+        snapshots = self._run(state, features, losses=sums, moments=moments).snapshots
+        reals, integers = snapshots.reals, snapshots.integers
+        tracks = self._tracks(self._compiler.track, reals, integers)
+        tangents = None
+        if self._variant.tangents:
+            tangents = _read_columns(*self._tangents, reals, integers)
+        return KernelLosses(sums.totals, tracks, tangents)
+
+    @functools.cached_property
+    def _tangents(self) -> tuple[list[_Column], Any]:
+        """Columns of the tangents of a state, and its shapes."""
+        like = eqx.filter(self._compiler.track.state, is_real)
+        return self._find_columns("tangent", like), like
 
     def backward_pass(
         self,
@@ -203,16 +297,37 @@ class KernelRunner:
         )  # fmt: skip
 
     def _run(
-        self, state: TrackerState, features: Features, rows: int = 0, associate: bool = False
-    ) -> tuple[TrackerState, KernelOutput, UpdateRecord]:
+        self,
+        state: TrackerState,
+        features: Features,
+        rows: int = 0,
+        *,
+        associate: bool = False,
+        losses: loop.LossSums = NO_LOSSES,
+        moments: NDArray[np.int64] = NO_MOMENTS,
+    ) -> _KernelRun:
+        """Run a segment.
+
+        Args:
+            state: State at the segment's start.
+            features: The segment.
+            rows: Room for records of tracks after their updates.
+            associate: Whether to report the tracks of events.
+            losses: Sums over events, output.
+            moments: (moments,) of the snapshots.
+
+        Returns:
+            The state at the segment's end, and what is reported.
+        """
         state = jax.device_get(state)
         kernel_state, chunks = self._to_kernel(state, features), _chunk_arrays(features)
         targets = len(kernel_state.integers)
         out = self._output(chunks, targets, associate)
         updates = self._record(kernel_state, len(chunks.t), rows)
         scratch = self._loop_scratch(kernel_state, chunks.t.shape[2])
-        loop.run(self._kernel, chunks, kernel_state, out, scratch, updates)
-        return self._from_kernel(state, kernel_state), out, updates
+        snapshots = self._snapshots(kernel_state, moments)
+        loop.run(self._kernel, chunks, kernel_state, out, scratch, updates, losses, snapshots)
+        return _KernelRun(self._from_kernel(state, kernel_state), out, updates, snapshots)
 
     def _output(self, chunks: ChunkArrays, targets: int, associate: bool) -> KernelOutput:
         """Allocate the report of a segment.
@@ -241,6 +356,15 @@ class KernelRunner:
             np.empty(chunks + 1, integer), np.empty(len(state.integers), integer),
             np.zeros(1, integer),
         )  # fmt: skip
+
+    def _snapshots(self, state: KernelState, moments: NDArray[np.int64]) -> Snapshots:
+        shape = len(moments), len(state.integers)
+        return Snapshots(
+            moments,
+            np.empty((*shape, state.reals.shape[1]), self.dtype),
+            np.empty((*shape, state.integers.shape[1]), np.int64),
+            np.zeros(1, np.int64),
+        )
 
     def _loop_scratch(self, state: KernelState, events: int) -> loop.Scratch:
         targets, (rows, columns) = len(state.integers), state.sums.shape[1:]
@@ -281,11 +405,26 @@ class KernelRunner:
         Returns:
             The tracks, of the rows' shape.
         """
-        leaves = []
-        for real, columns, shape, kind in self._columns:
-            part = (reals if real else integers)[..., columns].astype(kind)
-            leaves.append(part.reshape(*part.shape[:-1], *shape))
-        return jax.tree.unflatten(jax.tree.structure(like), leaves)
+        return _read_columns(self._columns, like, reals, integers)
+
+
+def _read_columns(columns: list[_Column], like: Any, reals: NDArray, integers: NDArray) -> Any:
+    """Read a tree from rows.
+
+    Args:
+        columns: Columns of the tree's leaves.
+        like: A tree of the same structure.
+        reals: (..., columns) real numbers of the rows.
+        integers: (..., columns) their integers.
+
+    Returns:
+        The tree, of the rows' shape.
+    """
+    leaves = []
+    for column in columns:
+        part = (reals if column.real else integers)[..., column.at].astype(column.dtype)
+        leaves.append(part.reshape(*part.shape[:-1], *column.shape))
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
 def _chunk_arrays(features: Features) -> ChunkArrays:

@@ -6,6 +6,7 @@ what remains, so that slow and fast targets are found in one recording.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -56,6 +57,9 @@ class TargetSearchResult:
         lamps: Number of lamps on the mains, which are left out.
         full: Whether most of the sensor has events most of the time, of whatever source, or a scene
             seems to move over it.
+        whole: Result of the whole recording, of which this is a part, and from which settings come;
+            None: this is the whole.
+        index: (targets,) index of each target in the whole.
     """
 
     paths: tuple[TargetPath, ...]
@@ -66,6 +70,8 @@ class TargetSearchResult:
     camera_moves: bool = False
     lamps: int = 0
     full: bool = False
+    whole: "TargetSearchResult | None" = None
+    index: NDArray[np.int64] | None = None
 
     own = RenamedAttribute("per_target_values")
 
@@ -130,6 +136,21 @@ class TargetSearchResult:
             out.append((float(x), float(y), float(size), at))
         return out
 
+    def crop(self, start: int, stop: int) -> "TargetSearchResult":
+        """Return the targets that are seen in a span, and their paths in it.
+
+        Args:
+            start: Begin of the span, us.
+            stop: Its end, us, which is excluded.
+
+        Returns:
+            The part; its settings and values of targets are those of the whole.
+        """
+        rows = [(start <= path.t) & (path.t < stop) for path in self.paths]
+        index = np.array([k for k, row in enumerate(rows) if row.any()], np.int64)
+        paths = tuple(self.paths[k].take(rows[k]) for k in index)
+        return dataclasses.replace(self, paths=paths, whole=self, index=index)
+
     def settings(self, accuracy: float | int | None = None) -> dict[str, Any]:
         """Return values of a tracker's parameters that suit the targets.
 
@@ -143,6 +164,8 @@ class TargetSearchResult:
             InputError: `accuracy` is not above 0 and at most 1.
         """
         check_accuracy(accuracy)
+        if self.whole is not None:
+            return self.whole.settings(accuracy)
         if not len(self):
             return {}
         sizes, _, rates, windows = self._typical_values()
@@ -163,12 +186,22 @@ class TargetSearchResult:
             "cycle": W,
         }
 
-    def per_target_values(self, params: TrackerParams) -> dict[str, NDArray]:
+    def per_target_values(
+        self, params: TrackerParams, usual: Mapping[str, Any] | None = None
+    ) -> dict[str, NDArray]:
         """Return per-target values of parameters, in unconstrained form.
 
-        Parameters that differ from `settings`, as the user changed them, are left out.
+        Args:
+            params: The parameters; those that the user changed are left out.
+            usual: Settings from which those differ; None: `settings`.
+
+        Returns:
+            (targets,) values by name.
         """
-        usual, out = self.settings(), {}
+        usual, out = self.settings() if usual is None else usual, {}
+        if self.whole is not None:
+            values = self.whole.per_target_values(params, usual)
+            return {name: value[self.index] for name, value in values.items()}
         for name, values in self._target_values().items():
             if np.isclose(float(getattr(params, name)), usual[name], rtol=1e-5):
                 stored = jnp.asarray(values, params.raw[name].dtype)

@@ -11,7 +11,6 @@ import functools
 import itertools
 import math
 import queue
-import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
@@ -23,11 +22,14 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from jaxevent import threads
 from jaxevent.codegen import run_over_rows
-from jaxevent.codegen.derivative import DerivativeDirections
-from jaxevent.codegen.module import choose_backend, make_kernel
-from jaxevent.errors import InputError, InputWarning
+from jaxevent.codegen.derivative import (
+    DerivativeDirections,
+    is_zero_tangent,
+    refuse_second_derivatives,
+    zero_tangents,
+)
+from jaxevent.codegen.module import choose_backend, make_kernel, programs_may_call
 from jaxevent.estimator import Estimate
 from jaxevent.precision import full_precision
 from jaxevent.progress import bar
@@ -70,7 +72,6 @@ from jaxevent.threads import TurnLock
 MAX_WINDOW_EVENTS = 1 << 21  # 8 bytes each, and 13 where they are read from a file
 MAX_SEGMENT_EVENTS = 1 << 22  # 8 bytes each
 MAX_SEGMENT_FRAME_PIXELS = 3_000_000  # of a segment's frames, 24 bytes each
-IS_SYNCHRONOUS = threads.use_synchronous_dispatch()  # so that programs may call kernels
 
 
 class WindowStart(NamedTuple):
@@ -657,12 +658,7 @@ def make_kernel_images(
     backend = choose_backend(compiler, serves)
     if backend == "xla" or "rho_ref" in params.followed:
         return None
-    if not IS_SYNCHRONOUS:
-        reason = "JAX computed before jaxevent was imported; import jaxevent first"
-        if compiler == "numba":
-            raise InputError(f"no program may call the kernel of {method.name!r}, as {reason}")
-        slow = f"a fit of {method.name!r} takes several times as long without a kernel"
-        warnings.warn(f"{slow}: {reason}", InputWarning, stacklevel=3)
+    if not programs_may_call(method.name, compiler):
         return None
     times = sorted_times(times)
     _, event_times = method.check_request(recording, times, params, extrapolate)
@@ -730,12 +726,12 @@ def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
         Mean, variance and valid, each (times, pixels), and their tangents.
     """
     number, rows, params = primals
-    changes = jax.tree.leaves(tangents[2], is_leaf=_is_zero)
-    moving = [k for k, change in enumerate(changes) if not _is_zero(change)]
+    changes = jax.tree.leaves(tangents[2], is_leaf=is_zero_tangent)
+    moving = [k for k, change in enumerate(changes) if not is_zero_tangent(change)]
     numbers = tuple((k, place) for k in moving for place in range(changes[k].size))
     if not numbers:
         images = _images(about, number, rows, params)
-        return images, tuple(jnp.zeros(image.shape, _tangent_dtype(image)) for image in images)
+        return images, zero_tangents(images)
     mean, variance, valid, derivatives = _with_derivatives((*about, numbers), number, rows, params)
     change = jnp.concatenate([jnp.ravel(changes[k]) for k in moving]).astype(derivatives.dtype)
     change = jnp.pad(change, (0, derivatives.shape[-1] - change.size))
@@ -765,21 +761,10 @@ def _with_derivatives_jvp(about: Any, primals: Any, tangents: Any) -> Any:
     Raises:
         InputError: A tangent is not zero.
     """
-    if not all(map(_is_zero, jax.tree.leaves(tangents, is_leaf=_is_zero))):
-        raise InputError(
-            f"the kernel of the method {about[0].method.name!r} has first derivatives only; for "
-            'second ones, as of jax.hessian, give prepare_images(..., compiler="xla")'
-        )
+    name = about[0].method.name
+    refuse_second_derivatives(name, tangents, 'prepare_images(..., compiler="xla")')
     made = _with_derivatives(about, *primals)
-    return made, tuple(jnp.zeros(one.shape, _tangent_dtype(one)) for one in made)
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
-
-
-def _tangent_dtype(image: Any) -> Any:
-    return image.dtype if jnp.issubdtype(image.dtype, jnp.inexact) else jax.dtypes.float0
+    return made, zero_tangents(made)
 
 
 _images.defjvp(_images_jvp, symbolic_zeros=True)
