@@ -590,6 +590,10 @@ def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
     """Compute the mean of a function of batches (a pytree), weighted by the batches' `weight`.
 
     In several processes the results are added in the same order as on one.
+
+    Args:
+        function: The function.
+        batches: The batches.
     """
     found = map_batches(function, batches)
     if len(batches) == 1:
@@ -681,7 +685,12 @@ class _Loop:
         replay, leader = iter(list(self.run.tried)), self.leader()
 
         def objective(name: str, value: float) -> float:
-            """The fit loss of a candidate; infinite if it is not a number."""
+            """Compute the fit loss of a candidate; infinite if it is not a number.
+
+            Args:
+                name: Name of the number.
+                value: Its value, in its unit.
+            """
             loss = next(replay, None)
             if loss is None:
                 candidate = self._with_value(leader, name, value)

@@ -123,7 +123,12 @@ class SignatureFiles:
             path.unlink(missing_ok=True)
 
     def save(self, key: Any, data: Any) -> None:
-        """Save the machine code of a key, where it can be written."""
+        """Save the machine code of a key, where it can be written.
+
+        Args:
+            key: Signature, machine and source of a function.
+            data: What numba stores of it.
+        """
         path = self._path(key)
         if path is None or cache.secret_key(self.folder) is None:
             return

@@ -36,7 +36,12 @@ def make_intrinsic(function: Callable) -> Any:
 
 @make_intrinsic
 def _as_real(context: Any, x: Any):
-    """Return the float32 with the bits of an int32."""
+    """Return the float32 with the bits of an int32.
+
+    Args:
+        context: Context of numba's types.
+        x: The int32.
+    """
 
     def make(context, builder, signature, arguments):
         return builder.bitcast(arguments[0], context.get_value_type(types.float32))
@@ -46,7 +51,12 @@ def _as_real(context: Any, x: Any):
 
 @make_intrinsic
 def _as_bits(context: Any, x: Any):
-    """Return the bits of a float32 as an int32."""
+    """Return the bits of a float32 as an int32.
+
+    Args:
+        context: Context of numba's types.
+        x: The float32.
+    """
 
     def make(context, builder, signature, arguments):
         return builder.bitcast(arguments[0], context.get_value_type(types.int32))
@@ -59,6 +69,12 @@ def _select(context: Any, truth: Any, one: Any, other: Any):
     """Select one number or another, without a branch.
 
     A wait at each costs more than both numbers.
+
+    Args:
+        context: Context of numba's types.
+        truth: Whether the first is selected.
+        one: The first number.
+        other: The second, of the same type.
     """
 
     def make(context, builder, signature, arguments):

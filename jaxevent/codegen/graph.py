@@ -559,6 +559,7 @@ class ParameterProgram:
         steps: Equations, each with its arguments and the indices of its results.
         conditions: Indices of truth values that chose a branch.
         zeros: Elements whose values must be 0, by index.
+        _known: Indices of the results of equations, by these and their arguments.
     """
 
     values: list[NDArray] = dataclasses.field(default_factory=list)

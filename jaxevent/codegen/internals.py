@@ -113,6 +113,10 @@ class SignatureCache:
 
         numba refreshes the target first, for what only compiling needs: imports that take half a
         second.
+
+        Args:
+            signature: Types of the arguments.
+            target: Context of the machine.
         """
         if not self._enabled:
             return None
@@ -121,7 +125,12 @@ class SignatureCache:
         return None if kept is None else CompileResult._rebuild(target, *kept)
 
     def save_overload(self, signature: Any, made: Any) -> None:
-        """Store the machine code of a signature, unless it holds addresses of this process."""
+        """Store the machine code of a signature, unless it holds addresses of this process.
+
+        Args:
+            signature: Types of the arguments.
+            made: numba's result of compiling it.
+        """
         if self._enabled and not made.lifted and not made.library.has_dynamic_globals:
             self._files.save(self._key(signature, made.codegen), made._reduce())
 
@@ -132,13 +141,25 @@ class SignatureCache:
 
 
 def use_signature_cache(dispatcher: Any, files: Any) -> Any:
-    """Make a dispatcher of `numba.njit` cache its signatures in files, and return it."""
+    """Make a dispatcher of `numba.njit` cache its signatures in files, and return it.
+
+    Args:
+        dispatcher: The dispatcher, which is changed.
+        files: `cache.SignatureFiles`.
+    """
     dispatcher._cache = SignatureCache(dispatcher.py_func, files)
     return dispatcher
 
 
 def cached_cfunc(function: Callable, signature: Any, options: dict[str, Any], files: Any) -> CFunc:
-    """Compile by `numba.cfunc` of a signature with these options, cached in files."""
+    """Compile a function as `numba.cfunc` does, cached in files.
+
+    Args:
+        function: The function.
+        signature: Types of its result and arguments.
+        options: Options of `numba.cfunc`.
+        files: `cache.SignatureFiles`.
+    """
     made: Any = CFunc(function, sigutils.normalize_signature(signature), {}, options)
     made._cache = SignatureCache(function, files)
     made.compile()

@@ -43,7 +43,13 @@ if hasattr(os, "register_at_fork"):
 
 
 def get_or_make(known: dict[Any, T], key: Any, make: Callable[[], T]) -> T:
-    """Return the value of a key; one thread makes it, while others wait."""
+    """Return the value of a key; one thread makes it, while others wait.
+
+    Args:
+        known: Values by key, to which a new one is added.
+        key: The key.
+        make: Makes the value.
+    """
     if key not in known:
         with _lock:
             if key not in known:
@@ -131,7 +137,13 @@ class KernelCache:
         return CompiledProgram(program, functions, numbers, text.places, values)
 
     def check(self, key: Any, params: Any, translate: Callable[[], Any]) -> None:
-        """Raise `TranslationError` where there is no kernel; see `find_program`."""
+        """Raise `TranslationError` where there is no kernel.
+
+        Args:
+            key: See `find_program`.
+            params: See `find_program`.
+            translate: See `find_program`.
+        """
         self._check_size(self.find_program(key, params, translate)[0])
 
     def _check_size(self, program: Any) -> None:

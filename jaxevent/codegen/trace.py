@@ -170,7 +170,15 @@ class JaxprTranslator:
         return [self._symbolic(eqn, values)]
 
     def split_array(self, eqn: Any, value: Value) -> list[Value]:
-        """Split an array along an axis."""
+        """Split an array along an axis.
+
+        Args:
+            eqn: The equation, with the axis and the sizes.
+            value: The array.
+
+        Returns:
+            The parts.
+        """
         sizes = eqn.params.get("sizes", [1] * len(eqn.outvars))
         parts = np.split(self.nodes(value), np.cumsum(sizes)[:-1], eqn.params["axis"])
         return [part.reshape(var.aval.shape) for part, var in zip(parts, eqn.outvars, strict=True)]
@@ -335,7 +343,18 @@ class JaxprTranslator:
         return self.reduce_axes("add", out, list(range(len(shared))))
 
     def _set(self, eqn: Any, values: list[Value]) -> NDArray:
-        """Replace single elements of an array, at known places."""
+        """Replace single elements of an array, at known places.
+
+        Args:
+            eqn: The equation.
+            values: The array, the places and the new elements.
+
+        Returns:
+            The nodes of the new array.
+
+        Raises:
+            TranslationError: The places depend on data.
+        """
         numbers, places = eqn.params["dimension_numbers"], values[1]
         if not isinstance(places, ConstantArray) or numbers.update_window_dims or places.at_point:
             raise TranslationError("elements set at places of data")
@@ -468,7 +487,15 @@ class ElementTranslator(JaxprTranslator):
         return array.squeeze(tuple(along))
 
     def _reduce_product(self, eqn: Any, values: list[Value]) -> NDArray:
-        """Translate a matrix product that sums over elements."""
+        """Translate a matrix product that sums over elements.
+
+        Args:
+            eqn: The equation.
+            values: Both matrices.
+
+        Returns:
+            The nodes of the product.
+        """
         product = self._dot(eqn, *(self.nodes(v) for v in values))
         if self.single:
             return product

@@ -312,12 +312,25 @@ def calibrated_plan(plan: Plan, data: FitData) -> Plan:
 
 
 def _format_report(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) -> str:
-    """Format results.md: the scores on images outside the fit, the numbers found, and the gain."""
+    """Format results.md: the scores on images outside the fit, the numbers found, and the gain.
+
+    Args:
+        tasks: Methods of the fit.
+        rows: Scores.
+        found: Numbers found, with their intervals.
+        gained: Gains of the methods.
+    """
     return _format_scores(tasks, rows_outside_fit(rows)) + format_findings(found, gained)
 
 
 def _read_finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
-    """Read the result of a run that had ended from its folder."""
+    """Read the result of a run that had ended from its folder.
+
+    Args:
+        rows: Its scores.
+        out: The folder.
+        plan: Its plan.
+    """
     kept = json.loads((out / "results.json").read_bytes())
     params = {
         task.label: task.method.Params.load(out / "params.toml", task.label) for task in plan.tasks
@@ -467,7 +480,12 @@ def _score(
 
 
 def _format_scores(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
-    """Format the scores of results.md: one table for the methods of each system."""
+    """Format the scores of results.md: one table for the methods of each system.
+
+    Args:
+        tasks: Methods of the fit.
+        rows: Scores.
+    """
     goals = {name: task.goal for task in tasks for name in (task.label, f"{task.label}, before")}
     kinds = dict.fromkeys(type(goal) for goal in goals.values())
     parts = []

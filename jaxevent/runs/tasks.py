@@ -36,9 +36,14 @@ EXIT_TIMEOUT_S = 5  # s that a process has to end
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Arguments of the function, a name for the progress bar, and the key of the stored result.
+    """A call of a function that is computed for a table.
 
     Tasks of equal keys are computed once. Without a key nothing is stored.
+
+    Attributes:
+        name: Name for the progress bar.
+        arguments: Arguments of the function, by name.
+        key: Key of the stored result.
     """
 
     name: str
@@ -266,7 +271,14 @@ def _log(folder: Path | None, key: str | None, what: str) -> None:
 
 
 class _Work(NamedTuple):
-    """Tasks that are computed, and how often each is tried again."""
+    """Tasks that are computed.
+
+    Attributes:
+        function: The function that they call.
+        tasks: The tasks.
+        folder: Folder of the stored results.
+        retries: Number of times that a task is tried again.
+    """
 
     function: Callable[..., Any]
     tasks: Sequence[Task]

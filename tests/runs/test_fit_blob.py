@@ -17,7 +17,7 @@ from jaxevent import cli
 from jaxevent.blob import constant_velocity as tracker
 from jaxevent.blob import find, negative_log_likelihood, prepare_positions
 from jaxevent.errors import InputError
-from jaxevent.recording import Recording
+from jaxevent.recording import Events, Recording
 from jaxevent.runs.blob import FAMILY
 from jaxevent.runs.blob_scores import read_positions
 from jaxevent.runs.family import FitData
@@ -223,13 +223,16 @@ def test_without_seeds_targets_are_found():
         assert not {"Q_v", "Q_p"} & features.overrides.keys() and "P0_v" in features.overrides
         rows = (recording.events.index(at) for at in (part.start, part.stop))
         inside = recording.events[slice(*rows)]
-        assert 0.8 * len(inside) < float(batch.weight) < len(inside)
+        assert 0.7 * len(inside) < float(batch.weight) < len(inside)
     one, slope = jax.value_and_grad(lambda p: mine.loss(p, packed[0]))(params)
     assert np.isfinite(one) and float(slope.raw["Q_v"]) != 0
 
     with pytest.raises(InputError, match="begin = 'born' needs none of them"):
         goal(begin="born", seeds=[[1.0, 2.0, 3.0]])
-    empty = Recording("still", 120, 90, recording.events[:0])
+    rng = np.random.default_rng(3)
+    x, y = rng.integers(0, 120, 3000), rng.integers(0, 90, 3000)
+    stray = Events(np.sort(rng.integers(0, 80_000, 3000)), x, y, rng.random(3000) < 0.5)
+    empty = Recording("stray", 120, 90, stray)
     with pytest.raises(InputError, match="no target was found to fit to"):
         mine._cut_windows(FitData({**sources, "fit": [("b", empty)]}, None, None))
 

@@ -221,6 +221,22 @@ class Snapshots(NamedTuple):
     count: NDArray[np.int64]
 
 
+class LoopOutput(NamedTuple):
+    """Arrays that the loop fills; those without room are not wanted.
+
+    Attributes:
+        report: Births, deaths and associations.
+        updates: Records of tracks.
+        losses: Sums over events.
+        snapshots: Tracks at requested moments.
+    """
+
+    report: KernelOutput
+    updates: UpdateRecord
+    losses: LossSums
+    snapshots: Snapshots
+
+
 class Scratch(NamedTuple):
     """Scratch memory of a step."""
 
@@ -239,8 +255,8 @@ class _Context(NamedTuple):
     config: LifecycleConfig
     chunks: ChunkArrays
     state: KernelState
-    out: KernelOutput
     scratch: Scratch
+    out: KernelOutput
     updates: UpdateRecord
     losses: LossSums
     snapshots: Snapshots
@@ -267,27 +283,24 @@ class _NewTrack(NamedTuple):
 
 
 @njit_noalloc
-def run(kernel, chunks, state, out, scratch, updates, losses, snapshots):
+def run(kernel, chunks, state, scratch, out):
     """Track through chunks.
 
     Args:
         kernel: `TrackKernel`.
         chunks: `ChunkArrays`.
         state: `KernelState` at the first chunk's start; it becomes that at the last one's end.
-        out: `KernelOutput`, output.
         scratch: `Scratch`.
-        updates: `UpdateRecord`, output; without rows nothing is recorded.
-        losses: `LossSums`, output.
-        snapshots: `Snapshots`, output.
+        out: `LoopOutput`, output.
     """
-    reals, integers = state.reals, state.integers
+    reals, integers, report, updates = state.reals, state.integers, out.report, out.updates
     pointers = (
         reals.ctypes, integers.ctypes, scratch.work.ctypes, scratch.owners.ctypes,
         kernel.numbers.ctypes,
     )  # fmt: skip
     context = _Context(
-        kernel.functions, pointers, kernel.config, chunks, state, out, scratch, updates,
-        losses, snapshots,
+        kernel.functions, pointers, kernel.config, chunks, state, scratch, report, updates,
+        out.losses, out.snapshots,
     )  # fmt: skip
     for chunk in range(len(chunks.t)):
         _begin_chunk(context, chunk)
@@ -299,9 +312,9 @@ def run(kernel, chunks, state, out, scratch, updates, losses, snapshots):
                 _record(updates, reals, integers, k, -1)
         _run_steps(context, chunk)
         for k in range(len(reals)):
-            out.id_before[chunk, k] = out.id_after[chunk, k] = integers[k, ID]
-            out.confirmed[chunk, k] = integers[k, CONFIRMED] != 0
-            out.end_reason[chunk, k] = out.death[chunk, k] = 0
+            report.id_before[chunk, k] = report.id_after[chunk, k] = integers[k, ID]
+            report.confirmed[chunk, k] = integers[k, CONFIRMED] != 0
+            report.end_reason[chunk, k] = report.death[chunk, k] = 0
         if chunks.cycle[chunk]:
             _manage_tracks(context, chunk)
     updates.begin[len(chunks.t)] = updates.count[0]

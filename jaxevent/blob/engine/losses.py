@@ -243,7 +243,19 @@ def _collect(
 
 
 def _run_jvp(kernel: LossKernel, primals: Any, tangents: Any) -> Any:
-    """Return the changes of losses: derivatives by numbers times the numbers' changes, summed."""
+    """Compute losses and their tangents: derivatives times the tangents of parameters, summed.
+
+    Args:
+        kernel: The kernel.
+        primals: Parameters, their share of outliers, features and moments.
+        tangents: Tangents of these.
+
+    Returns:
+        The losses, and their tangents.
+
+    Raises:
+        InputError: Features have tangents.
+    """
     params, outliers, features, moments = primals
     if not all(map(is_zero_tangent, jax.tree.leaves(tangents[2], is_leaf=is_zero_tangent))):
         raise InputError(

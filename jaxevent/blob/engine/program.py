@@ -1,5 +1,6 @@
 """The functions of one track, traced to expressions and written as a module for numba."""
 
+import collections
 import dataclasses
 import functools
 import itertools
@@ -627,19 +628,10 @@ def find_blocks(program: TracedProgram) -> tuple[NDArray[np.int64], NDArray[np.i
     return order, np.append(begins, 8)
 
 
-class TangentFunctions(NamedTuple):
-    """Compiled functions of `TrackFunctions` that have tangents or know none; no step in one."""
-
-    init: Any
-    predict: Any
-    weights_alone: Any
-    weights: Any
-    update: Any
-    limit: Any
-    measurement: Any
-    decide: Any
-
-
+# With tangents there is no step in one call.
+TangentFunctions = collections.namedtuple(
+    "TangentFunctions", [name for name in TrackFunctions._fields if name != "step"]
+)
 _track_kernels = KernelCache(TrackFunctions, write_track, max_nodes=MAX_OPERATIONS)
 _tangent_kernels = KernelCache(TangentFunctions, write_track, max_nodes=2 * MAX_OPERATIONS)
 _readout_kernels = KernelCache(ReadoutFunctions, write_readout, max_nodes=MAX_OPERATIONS)

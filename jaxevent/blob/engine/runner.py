@@ -326,7 +326,8 @@ class KernelRunner:
         updates = self._record(kernel_state, len(chunks.t), rows)
         scratch = self._loop_scratch(kernel_state, chunks.t.shape[2])
         snapshots = self._snapshots(kernel_state, moments)
-        loop.run(self._kernel, chunks, kernel_state, out, scratch, updates, losses, snapshots)
+        outputs = loop.LoopOutput(out, updates, losses, snapshots)
+        loop.run(self._kernel, chunks, kernel_state, scratch, outputs)
         return _KernelRun(self._from_kernel(state, kernel_state), out, updates, snapshots)
 
     def _output(self, chunks: ChunkArrays, targets: int, associate: bool) -> KernelOutput:

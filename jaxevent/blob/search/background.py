@@ -138,6 +138,7 @@ class Background:
         scene: Motion of the scene, or None; rate, calm and bright are then those of its places.
         corner: x and y (px) of the scene's place where they begin.
         level: (slices,) counts of the median cell, as a share of those in its full slices.
+        _means: (rows, columns) mean rates 1/(px s) around cells, by the reach in cells.
     """
 
     rate: NDArray[np.float64]

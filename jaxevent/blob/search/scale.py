@@ -37,10 +37,15 @@ class ScaleSelection:
 
 
 def are_evident(score: float, nats: float, background: Background) -> bool:
-    """Return whether blobs are, that gain so much per event and in a window.
+    """Return whether there are blobs that gain so much over the background.
 
     The Bayes factor of a window decides, whatever share of the events they send. The map of a
     moving scene is inexact everywhere: there they must gain per event of all.
+
+    Args:
+        score: Gain in nats per event.
+        nats: Gain in a window, nats.
+        background: The background.
     """
     if background.scene is None:
         return nats >= CONFIG.log_bayes_factor
