@@ -6,17 +6,23 @@ It runs on a simulated blob, beside the same filter as a numba loop.
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
+import jax
 import numba
 import numpy as np
 from common import least_cpu
 
-from jaxevent.blob import find, moment
+from jaxevent.blob import find, moment, negative_log_likelihood
 from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.filters.motion import gated_moments
 from jaxevent.blob.lifecycle import init_state as begin_state
 from jaxevent.blob.prepare import ChunkPacker
 from jaxevent.simulate import LinearMotion, Target, blob_scene, simulate_blobs
+
+GRADIENT = "loss and 3 gradients"
+SCANNED_GRADIENT = "loss and 3 gradients by XLA"
 
 
 @numba.njit
@@ -168,10 +174,44 @@ def tracker_bench() -> tuple[dict[str, float], dict[str, float]]:
     found = "`find` at 1280x720"
     tasks[found] = functools.partial(find, scene, progress=False)
     events[found] = len(scene.events)
+    for name, count in (("loss", 2e5), (GRADIENT, 2e5), (SCANNED_GRADIENT, 2e4)):
+        tasks[f"tracker, M = 1: {name}"], events[f"tracker, M = 1: {name}"] = fit_task(name, count)
     least = least_cpu(tasks)
     speed = {name: events[name] / 1e6 / least[name] for name in tasks}
     base = speed[loop]
     ratio = {
-        f"{name} / numba loop": v / base for name, v in speed.items() if name.startswith("tracker")
+        f"{name} / numba loop": v / base
+        for name, v in speed.items()
+        if name.startswith("tracker") and ": " not in name
     }
+    loss, kernel, scan = (
+        speed[f"tracker, M = 1: {name}"] for name in ("loss", GRADIENT, SCANNED_GRADIENT)
+    )
+    ratio["tracker, M = 1: loss and 3 gradients / loss"] = loss / kernel
+    ratio["tracker, M = 1: loss and 3 gradients by numba / by XLA"] = kernel / scan
     return speed, ratio
+
+
+def fit_task(name: str, rate: float) -> tuple[Callable[[], Any], int]:
+    """Make the loss of a tracker, or the loss with gradients by three numbers.
+
+    Args:
+        name: "loss", `GRADIENT` or `SCANNED_GRADIENT`.
+        rate: Events per second of the simulated blob.
+
+    Returns:
+        The task, compiled when it is first called, and its number of events.
+    """
+    recording, truth = blob_scene("lissajous", 0, rate=rate)
+    params, seeds = moment.Params(), [(*truth(0.0)[0, 0, :2], 20.0)]
+    features, _ = moment.prepare(recording, np.empty(0), params, seeds=seeds)
+    raw = {n: params.raw[n] for n in ("Q_p", "Q_v", "Q_lambda")}
+    compiler = "xla" if name == SCANNED_GRADIENT else "numba"
+
+    def loss(raw: Any, features: Any) -> Any:
+        moved = params.with_raw(raw)
+        return negative_log_likelihood(moment, moved, features, "all", compiler)
+
+    compute = jax.jit(loss if name == "loss" else jax.jacfwd(loss))
+    features = jax.device_put(features)
+    return lambda: jax.block_until_ready(compute(raw, features)), len(recording.events)
