@@ -459,7 +459,7 @@ def evaluate_loss(loss: Loss, params: Parameters, batch: Any) -> Array:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _values(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
+def _compute_losses(loss: Loss, params: Parameters, raw: dict[str, Array], batch: Any) -> Array:
     """Compute the loss of each start.
 
     Args:
@@ -720,7 +720,7 @@ class _Loop:
         position = self.run.position
         params = self.params.with_raw(position.searched)
         fit = self.prepare(params)[0]
-        batches = [fit[k] for k in self._drawn(len(fit))]
+        batches = [fit[k] for k in self._draw_batches(len(fit))]
         raw = {name: leaf[:1] for name, leaf in position.raw.items()}
         units = {}
         for name, leaf in raw.items():
@@ -734,7 +734,7 @@ class _Loop:
             at = moved(names, step)
             value = next(replay, None)
             if value is None:
-                function = functools.partial(_values, self.function, params, at)
+                function = functools.partial(_compute_losses, self.function, params, at)
                 value = float(_mean(function, batches)[0])
                 value = value if math.isfinite(value) else math.inf
                 self._note(value)
@@ -802,7 +802,7 @@ class _Loop:
         while True:
             i, seen = run.iteration, None
             if i % settings.every == 0 or i == settings.iterations:
-                objective = functools.partial(_values, self.function, params, position.raw)
+                objective = functools.partial(_compute_losses, self.function, params, position.raw)
                 seen = _mean(objective, watched)
                 position, going = _update_best(position, seen, i, settings.patience)
                 if i == settings.iterations or not bool(going):
@@ -811,7 +811,7 @@ class _Loop:
             objective = functools.partial(
                 loss_and_grad, self.function, self.forward, params, position.raw
             )
-            losses, slope = _mean(objective, [fit[k] for k in self._drawn(len(fit))])
+            losses, slope = _mean(objective, [fit[k] for k in self._draw_batches(len(fit))])
             fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
             position = _step(position, slope, settings.learning_rate / 2**turn * fall)
             self._record(turn, i, losses, seen)
@@ -821,7 +821,7 @@ class _Loop:
             self.save(run, False)
         run.position = dataclasses.replace(position, raw=position.best)
 
-    def _drawn(self, count: int) -> Sequence[int]:
+    def _draw_batches(self, count: int) -> Sequence[int]:
         """Return the batches of this iteration: the next ones of successive random orders."""
         size = self.settings.batch
         if size is None or size >= count:

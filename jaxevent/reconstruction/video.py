@@ -478,7 +478,7 @@ class Video(ImageSequence[P]):
         threads.check_not_forked()
         done, mine = 0, object()
         while done < len(times):
-            window, reader, trajectory = self._window_of(int(times[done]))
+            window, reader, trajectory = self._open_window_at(int(times[done]))
             stop = window.stop
             end = len(times) if stop is None else int(np.searchsorted(times, stop))
             for first in range(done, end, N_BATCH_IMAGES):
@@ -498,7 +498,7 @@ class Video(ImageSequence[P]):
         """Scale the counts of features or a read-out."""
         return part if self._factors is None else part.scale_counts(self._factors)
 
-    def _window_of(self, time: int) -> FilteredWindow:
+    def _open_window_at(self, time: int) -> FilteredWindow:
         """Return the filtered window that contains `time`; those before it are filtered first."""
         if self.estimator.needs_future and self._future is None:
             self._run_backward_pass()

@@ -304,7 +304,7 @@ def _as_list(scores: list[Scores]) -> dict[str, Any]:
     return gather(scores)
 
 
-def _means(per_frame: Mapping[str, Any]) -> dict[str, Any]:
+def _average_frames(per_frame: Mapping[str, Any]) -> dict[str, Any]:
     """Average the lists in `per_frame` over images; those of regions over pixels."""
 
     def mean(values: list[float | None], weights: list[Any] | None = None) -> float | None:
@@ -365,7 +365,7 @@ def subset(row: Mapping[str, Any], frames: ArrayLike) -> dict[str, Any]:
         return [part[i] for i in rows]
 
     per_frame = cut(row["per_frame"])
-    return {**row, **_means(per_frame), "frames": len(rows), "per_frame": per_frame}
+    return {**row, **_average_frames(per_frame), "frames": len(rows), "per_frame": per_frame}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -561,14 +561,14 @@ def score_and_sample(
     values: dict[str, Any]
     calibrated: list[str] = []
     if isinstance(method, ExternalImages):
-        estimates = _external(given, hidden, method, name or recording.name)
+        estimates = _read_external_images(given, hidden, method, name or recording.name)
         values, I0 = method.values(), 0.0
     elif isinstance(method, MethodFunction):
         estimates = _of_function(given, hidden, method)
         values, I0 = {}, 0.0
     else:
         chosen, calibrated = _calibrate(given, method, params, options.calibrate)
-        estimates = _estimates(given, hidden, method, chosen, progress)
+        estimates = _estimate_hidden_images(given, hidden, method, chosen, progress)
         values, I0 = values_of(chosen), float(chosen.I0)
     scores: list[Scores] = []
     t: list[int] = []
@@ -603,7 +603,7 @@ def score_and_sample(
     row = {
         "recording": recording.name,
         "method": method.name,
-        **_means(per_frame),
+        **_average_frames(per_frame),
         **({} if hdr is None else {"clip": list(hdr.clip)}),
         "frames": len(scores),
         **({"missing": len(hidden) - len(scores)} if external else {}),
@@ -656,7 +656,7 @@ def moving_pixels(given_recording: Recording, frame_row: int, gap_frames: int) -
 Estimates = Iterator[tuple[int, NDArray[np.floating], NDArray[np.floating]]]
 
 
-def _estimates(
+def _estimate_hidden_images(
     given: Recording,
     hidden: Frames,
     method: ImageEstimator,
@@ -684,7 +684,9 @@ def _of_function(given: Recording, hidden: Frames, method: MethodFunction) -> Es
     yield 0, found.mean, variance
 
 
-def _external(given: Recording, hidden: Frames, method: ExternalImages, name: str) -> Estimates:
+def _read_external_images(
+    given: Recording, hidden: Frames, method: ExternalImages, name: str
+) -> Estimates:
     series = method.find(name)
     times = frame_times(hidden, method)
     shape = (given.height, given.width)

@@ -20,7 +20,7 @@ import signal
 import socket
 import threading
 import traceback
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +32,9 @@ from jaxevent.progress import bar
 
 CONNECT_TIMEOUT_S = 30  # s that a scheduler has to answer
 EXIT_TIMEOUT_S = 5  # s that a process has to end
+ENDING_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -313,7 +316,8 @@ def _in_processes(work: _Work, workers: int) -> Records:
     def start() -> tuple[Any, Any]:
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, threads), daemon=True)
-        process.start()
+        with defer_signals():
+            process.start()
         theirs.close()  # else the end of the process would not end the pipe
         return ours, process
 
@@ -353,9 +357,28 @@ def _in_processes(work: _Work, workers: int) -> Records:
             process.join()
 
 
+@contextlib.contextmanager
+def defer_signals() -> Iterator[None]:
+    """Hold back the signals that end a command until the block is done.
+
+    A process that is interrupted while it is started would say so by a traceback; it inherits that
+    they are blocked.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _serve(connection: multiprocessing.connection.Connection, threads: int) -> None:
     """Run a worker process: answer tasks by (record, whether to try again)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started it ends it
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
     os.environ["NPROC"] = str(threads)  # of XLA on the CPU, when it starts
     parent = multiprocessing.parent_process()
 

@@ -2,6 +2,8 @@
 
 import json
 import logging
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,7 +15,7 @@ import pytest
 from errands import errand, log
 
 from jaxevent.errors import InputError
-from jaxevent.runs.tasks import ComputeResources, Outcome, Task, attempt, run
+from jaxevent.runs.tasks import ComputeResources, Outcome, Task, attempt, defer_signals, run
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +147,14 @@ def test_places_that_cannot_be(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"\[cluster\]"):
         ComputeResources(cluster="tcp://x:1")
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="no masks of signals here")
+def test_an_interrupt_waits_until_a_process_has_started():
+    """A child that is interrupted as it starts would print a traceback; it ignores the signal."""
+    done = []
+    with pytest.raises(KeyboardInterrupt), defer_signals():
+        os.kill(os.getpid(), signal.SIGINT)
+        text = "import os, signal; os.kill(os.getpid(), signal.SIGINT); print('goes on')"
+        done.append(subprocess.run([sys.executable, "-c", text], capture_output=True, text=True))
+    assert done[0].stdout == "goes on\n" and done[0].stderr == ""

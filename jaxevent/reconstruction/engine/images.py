@@ -128,7 +128,7 @@ class FilterVideo(ImageSequence[P]):
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         done, origin = 0, self._partitioned.origin
         while done < len(times):
-            window = self._window_of(int(times[done]))
+            window = self._open_window_at(int(times[done]))
             end = len(times)
             if window.stop is not None:
                 end = int(np.searchsorted(times, window.stop))
@@ -143,7 +143,7 @@ class FilterVideo(ImageSequence[P]):
             del images
             yield batch, made
 
-    def _window_of(self, time: int) -> BandedWindow:
+    def _open_window_at(self, time: int) -> BandedWindow:
         """Return the open window that contains a time (us), not passed over beyond it."""
         at, window = time - self._partitioned.origin, self._open
         if window is not None and window.contains(time) and self._done <= at:
@@ -264,7 +264,7 @@ class SmootherVideo(ImageSequence[P]):
             last = place == len(begins) - 1
             end = len(times) if last else int(np.searchsorted(frame, self._segments[place].end))
             batch = times[done : min(end, done + self._buffers.times)]
-            given, images = self._smoothed(place), self._buffers.take(len(batch))
+            given, images = self._enter_segment(place), self._buffers.take(len(batch))
             image_times = passes.image_times(batch - origin, begins[place])
             self._over_bands(read_images, given, self._memory, image_times, images)
             made = Estimate(images.mean, images.variance, images.valid.view(bool))
@@ -275,10 +275,10 @@ class SmootherVideo(ImageSequence[P]):
     def _over_bands(self, loop: Any, *args: Any) -> None:
         run_over_rows(loop, self._passes.layout.bands, *args)
 
-    def _smoothed(self, place: int) -> SegmentInputs:
-        """Return the inputs of a segment, which is smoothed."""
+    def _enter_segment(self, place: int) -> SegmentInputs:
+        """Filter and smooth a segment, if it is not the open one; return its inputs."""
         if not self._later:
-            self._look_ahead()
+            self._pass_over_all_segments()
         if self._open is not None and self._open[0] == place:
             return self._open[1]
         self._open = None  # so that two are never held at once
@@ -311,7 +311,7 @@ class SmootherVideo(ImageSequence[P]):
         self._over_bands(filter_frames, given, self._memory, place == 0, linked)
         return given
 
-    def _look_ahead(self) -> None:
+    def _pass_over_all_segments(self) -> None:
         """Pass over all segments once, for the messages of later frames at each."""
         states, links, last = list[NDArray](), list[NDArray](), len(self._segments) - 1
         given = None
