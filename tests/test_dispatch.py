@@ -10,15 +10,15 @@ import texture
 
 import jaxevent
 from jaxevent import threads
+from jaxevent.codegen import module
 from jaxevent.errors import InputError, InputWarning
-from jaxevent.reconstruction.engine import images
 from jaxevent.reconstruction.estimator import ScannedImages
 
 AFTER = "import jax.numpy; jax.numpy.ones(3); import jaxevent; jaxevent.akf"
 BEFORE = "import jax, jaxevent; jax.numpy.ones(3); jaxevent.akf"
 # As commands do, which count processes before they load a filter.
 LATER = "import jaxevent; import jax; jax.process_count(); jaxevent.akf"
-LOOK = "; from jaxevent.reconstruction.engine import images; print(images.IS_SYNCHRONOUS)"
+LOOK = "; from jaxevent.codegen import module; print(module.IS_SYNCHRONOUS)"
 
 
 @pytest.mark.slow
@@ -32,7 +32,7 @@ def test_programs_run_in_turn_unless_jax_computed_before(program, said):
 
 
 def test_a_fit_without_its_kernel_is_told(float32, monkeypatch):
-    monkeypatch.setattr(images, "IS_SYNCHRONOUS", False)
+    monkeypatch.setattr(module, "IS_SYNCHRONOUS", False)
     recording, akf = texture.moving(), jaxevent.akf
     with pytest.warns(InputWarning, match="'akf' takes several times as long.* import jaxevent f"):
         prepared = akf.prepare_images(recording, [0.1])

@@ -209,7 +209,7 @@ class MotionEstimator(Estimator[P]):
 
         Raises:
             InputError: The model is unknown or not supported, it needs a camera and there is none,
-                the recording lacks what the method needs, or all events are at one time.
+                or the recording lacks what the method needs.
         """
         self.check_options(model=model, camera=camera)
         if model is None:
@@ -218,8 +218,6 @@ class MotionEstimator(Estimator[P]):
         if found.needs_camera:
             camera = recording.require_camera(camera, found.title)
         self.check(recording)
-        if not self.needs_frames:
-            recording.refuse_one_time()
         return found, camera
 
     def check_against(

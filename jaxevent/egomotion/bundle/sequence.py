@@ -40,11 +40,15 @@ def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
 
     Returns:
         The motion, lost at times that no window determines.
+
+    Raises:
+        InputError: All events are at one time.
     """
     recording, camera, gyro = given.recording, given.camera, given.options.get("gyro")
     assert camera is not None
     if not len(recording.events):
         return MotionEstimate.empty(given.model)
+    recording.refuse_one_time()
     if params.frames:
         warn_of_clocks(recording)
     windows = WindowFitter(recording, params, camera, gyro, given.seed)
