@@ -143,6 +143,20 @@ MUTATIONS = (
         "tests/blob/test_blob_tracker.py -k plain_loop",
     ),
     Mutation(
+        "blob: slopes of losses forget that the weights of events move",
+        "jaxevent/blob/engine/program.py",
+        "_push_forward(divide, known, log_likelihood, log_likelihood_tangent)",
+        "_push_forward(divide, known, log_likelihood, 0 * log_likelihood_tangent)",
+        "tests/blob/test_blob_fused.py -k slopes -k moment",
+    ),
+    Mutation(
+        "dead pixels are looked for among those that fire",
+        "jaxevent/calibration/hot.py",
+        "between |= pair",
+        "between |= pair & (total > 0)",
+        "tests/test_faults.py -k dead",
+    ),
+    Mutation(
         "conjugate gradients forget the direction before",
         "jaxevent/egomotion/bundle/cg.py",
         "share = new / max(size, 1e-30)",
