@@ -486,7 +486,8 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
         elif made is None and name == "convert_element_type":
             made = np.asarray(values[0]).astype(eqn.params["new_dtype"])
     if made is None:
-        made = eqn.primitive.bind(*values, **eqn.params)
+        with jax.ensure_compile_time_eval():  # not as part of a program that is traced meanwhile
+            made = eqn.primitive.bind(*values, **eqn.params)
         many = made if eqn.primitive.multiple_results else [made]
         return [np.asarray(v) for v in many]
     return [np.asarray(made, eqn.outvars[0].aval.dtype)]
@@ -540,7 +541,8 @@ def _scan(eqn: Any, values: list[NDArray]) -> list[NDArray]:
     body = p["jaxpr"].jaxpr
     ends = zip([*eqn.invars, *eqn.outvars], [*body.invars, *body.outvars], strict=True)
     if any(whole.aval.ndim != part.aval.ndim for whole, part in ends):
-        made = eqn.primitive.bind(*values, **p)
+        with jax.ensure_compile_time_eval():
+            made = eqn.primitive.bind(*values, **p)
         return [np.asarray(v) for v in made]
     fixed = len(values) - len(eqn.outvars)
     carry = values[fixed:]

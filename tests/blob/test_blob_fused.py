@@ -108,7 +108,7 @@ def test_losses_and_their_slopes(case):
     batch = blob.prepare_positions(rec, params, seeds, times, truth)
     features, _ = tracker.prepare(rec, np.empty(0), params, seeds=seeds, detect=True)
 
-    def losses(raw, compiler=None):
+    def losses(raw, compiler="numba"):
         moved = params.with_raw(raw)
         return jnp.stack(
             [

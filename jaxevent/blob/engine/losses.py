@@ -71,13 +71,12 @@ class LossKernel(NamedTuple):
 
         Of parameters that are traced, the defaults of the same choices are checked.
         """
-        dtype = np.dtype(jnp.result_type(float))
-        # A program that is traced meanwhile would take up what constants become.
-        with jax.ensure_compile_time_eval():
-            if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
+            with jax.ensure_compile_time_eval():
                 params = type(params).of(dict(params.chosen))
-            for tangents in (False, True):
-                check_track(self.filter, params, _variant(features, tangents), dtype)
+        dtype = np.dtype(jnp.result_type(float))
+        for tangents in (False, True):
+            check_track(self.filter, params, _variant(features, tangents), dtype)
 
     def __call__(
         self, params: TrackerParams, features: Features, moments: Any = None
