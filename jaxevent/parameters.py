@@ -381,8 +381,20 @@ class Parameters(_ParameterArrays):
         Returns:
             The names, those in `calibrated_if_needed` among them.
         """
+        return cls.names_not_stated((*cls.calibrated, *cls.calibrated_if_needed), explicit)
+
+    @classmethod
+    def names_not_stated(cls, names: Iterable[str], explicit: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return those names that no value and no preset states.
+
+        Args:
+            names: The names.
+            explicit: Values by name, and perhaps "preset".
+
+        Returns:
+            The names, in their order.
+        """
         stated = {*explicit, *cls.presets.get(explicit.get("preset") or "", {})}
-        names = (*cls.calibrated, *cls.calibrated_if_needed)
         return tuple(name for name in names if name not in stated)
 
     @property

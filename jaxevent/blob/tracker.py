@@ -60,8 +60,7 @@ class Tracker(Estimator[P]):
 
     def names_left_open(self, explicit: Mapping[str, Any]) -> tuple[str, ...]:
         """Return the names of parameters that a search for targets may set; see `Estimator`."""
-        stated = {*explicit, *self.Params.presets.get(explicit.get("preset") or "", {})}
-        return tuple(name for name in self.Params.settings() if name not in stated)
+        return self.Params.names_not_stated(self.Params.settings(), explicit)
 
     def prepare(
         self,

@@ -414,6 +414,11 @@ def is_zero_tangent(tangent: Any) -> bool:
     return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
 
 
+def are_zero_tangents(tangents: Any) -> bool:
+    """Return whether all tangents of a tree are those of constants."""
+    return all(map(is_zero_tangent, jax.tree.leaves(tangents, is_leaf=is_zero_tangent)))
+
+
 def zero_tangents(tree: Any) -> Any:
     """Return tangents of 0 for all arrays of a tree."""
 
@@ -433,7 +438,7 @@ def refuse_second_derivatives(name: str, tangents: Any, remedy: str) -> None:
         tangents: Changes of what the derivatives depend on; those of nothing are allowed.
         remedy: What to do in place of it.
     """
-    if not all(map(is_zero_tangent, jax.tree.leaves(tangents, is_leaf=is_zero_tangent))):
+    if not are_zero_tangents(tangents):
         raise InputError(
             f"the kernel of the method {name!r} has first derivatives only; for second ones, as of "
             f"jax.hessian, give {remedy}"

@@ -17,7 +17,7 @@ from jax.core import Tracer
 
 from jaxevent.blob.engine import loop
 from jaxevent.blob.engine.program import TrackVariant, check_track
-from jaxevent.blob.engine.runner import NO_MOMENTS, KernelRunner
+from jaxevent.blob.engine.runner import KernelRunner
 from jaxevent.blob.filter import Filter
 from jaxevent.blob.lifecycle import init_state
 from jaxevent.blob.params import TrackerParams
@@ -25,6 +25,7 @@ from jaxevent.blob.prepare import Features
 from jaxevent.blob.track import TrackBuffer, positions
 from jaxevent.codegen import map_ahead
 from jaxevent.codegen.derivative import (
+    are_zero_tangents,
     is_real,
     is_zero_tangent,
     refuse_second_derivatives,
@@ -151,7 +152,7 @@ def _evaluate(
     known, variant = _ByValue(params), _variant(features, bool(places))
     make = functools.partial(_make_runner, kernel.filter, known, features.detect, variant)
     runners = [make(along) for along in places or (None,)]
-    unique, rows = NO_MOMENTS, slice(0)
+    unique, rows = None, slice(0)
     if moments is not None:
         unique, rows = np.unique(moments.astype(np.int64), return_inverse=True)
     state = runners[0].init(features)
@@ -257,7 +258,7 @@ def _run_jvp(kernel: LossKernel, primals: Any, tangents: Any) -> Any:
         InputError: Features have tangents.
     """
     params, outliers, features, moments = primals
-    if not all(map(is_zero_tangent, jax.tree.leaves(tangents[2], is_leaf=is_zero_tangent))):
+    if not are_zero_tangents(tangents[2]):
         raise InputError(
             f"the kernel of {kernel.name!r} has no derivatives by events and seeds; give "
             'compiler="xla"'

@@ -81,12 +81,12 @@ class KernelLosses(NamedTuple):
 
     Attributes:
         totals: (4,) see `loop.LossSums`.
-        tracks: (moments, targets) `TrackBuffer` of the tracks.
+        tracks: (moments, targets) the tracks; None without moments.
         tangents: (moments, targets) tangents of the real numbers of their states; None: none.
     """
 
     totals: NDArray[np.float64]
-    tracks: TrackBuffer
+    tracks: TrackBuffer | None
     tangents: Any
 
 
@@ -190,7 +190,7 @@ class KernelRunner:
         features: Features,
         outliers: float,
         every: bool,
-        moments: NDArray[np.int64],
+        moments: NDArray[np.int64] | None,
     ) -> KernelLosses:
         """Run all chunks of a recording for a loss.
 
@@ -199,17 +199,19 @@ class KernelRunner:
             features: The chunks.
             outliers: Share of events that belong to no target.
             every: Whether every event counts, not only those inside a gate.
-            moments: (moments,) sorted, see `loop.Snapshots`.
+            moments: (moments,) sorted, see `loop.Snapshots`; None: no tracks are wanted.
 
         Returns:
             Losses, and tracks at the moments.
         """
         sums = loop.LossSums(np.zeros(4), every, outliers)
-        snapshots = self._run(state, features, losses=sums, moments=moments).snapshots
+        at = NO_MOMENTS if moments is None else moments
+        snapshots = self._run(state, features, losses=sums, moments=at).snapshots
         reals, integers = snapshots.reals, snapshots.integers
-        tracks = self._tracks(self._compiler.track, reals, integers)
-        tangents = None
-        if self._variant.tangents:
+        tracks = tangents = None
+        if moments is not None:
+            tracks = self._tracks(self._compiler.track, reals, integers)
+        if moments is not None and self._variant.tangents:
             tangents = _read_columns(*self._tangents, reals, integers)
         return KernelLosses(sums.totals, tracks, tangents)
 
