@@ -29,7 +29,7 @@ def rows(method: Estimator) -> list[str]:
     """Return a row for each setting of a method: name, default, unit, gradient, meaning."""
     kind = method.Params
     lines = ["| parameter | default | unit | gradient | |", "|---|---|---|---|---|"]
-    fixed = {**kind.choices, **kind().without_gradient()}
+    fixed = {**kind.choices, **kind().names_without_gradient()}
     if not method.differentiable:
         fixed = kind.settings()
     for name, setting in kind.settings().items():

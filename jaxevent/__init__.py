@@ -4,8 +4,8 @@
     video = jaxevent.akf.estimate(recording, jaxevent.akf.Params(c_on=0.08))
     image, variance, valid = video(recording.frames.t)
 
-Every estimator of `METHODS` is used in this way; `help(jaxevent.akf)` tells what one is. Compiled
-programs are kept in the user's cache folder: `jaxevent.cache` says how to change that.
+Every estimator of `METHODS` is used in this way; `help(jaxevent.akf)` describes one. Compiled
+programs are kept in the user's cache folder; `jaxevent.cache` says how to change that.
 """
 
 import importlib
@@ -134,7 +134,7 @@ def _as_html(thing: Any) -> str:
     return importlib.import_module("jaxevent.show.figures").as_html(thing)
 
 
-display.as_html = _as_html  # whose module loads when something is shown
+display.as_html = _as_html  # imports the module of figures when something is first shown
 
 
 def __getattr__(name: str) -> Any:

@@ -79,6 +79,7 @@ RENAMED: dict[str, str] = {
     "jaxevent.io.whole_number": "jaxevent.io.checks.whole_number",
     "jaxevent.metrics.checked": "jaxevent.metrics.check_images",
     "jaxevent.parameters.Share": "jaxevent.parameters.UnitInterval",
+    "jaxevent.parameters.phrase": "jaxevent.parameters.describe_value_type",
     "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
     "jaxevent.reconstruction.compensated.estimator.MotionCompensated": "jaxevent.reconstruction.compensated.estimator.MotionCompensation",
     "jaxevent.reconstruction.filtering.Observer": "jaxevent.reconstruction.filtering.FrameModel",

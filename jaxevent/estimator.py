@@ -30,7 +30,7 @@ from jaxevent.arrays import shorten_value
 from jaxevent.camera import PinholeCamera
 from jaxevent.display import with_article
 from jaxevent.errors import InputError
-from jaxevent.parameters import Parameters, phrase
+from jaxevent.parameters import Parameters, describe_value_type
 from jaxevent.recording import Recording, Times, check_recording, microseconds
 
 P = TypeVar("P", bound=Parameters)
@@ -251,7 +251,7 @@ class Estimator(abc.ABC, Generic[P]):
     ) -> tuple[Any, Any]:
         """Compute what depends on the recording alone, once for all values of most parameters.
 
-        Numbers of `params` that act on data matter here; `Parameters.without_gradient` names them.
+        Numbers of `params` that act on data matter here, see `Parameters.names_without_gradient`.
 
         Args:
             recording: Events, and frames if the estimator uses them.
@@ -339,7 +339,7 @@ class Estimator(abc.ABC, Generic[P]):
                 remedy = f"Params.load({str(params)!r})"
             elif isinstance(params, dict):
                 remedy = "Params(**params)"
-            held = phrase(params)
+            held = describe_value_type(params)
             if isinstance(params, Parameters) and not params.is_gradient:
                 held = f"those of {type(params).__module__}"
             raise InputError(
@@ -472,5 +472,7 @@ def import_object(path: str, kind: type[T], what: str) -> T:
             "package that Python finds (PYTHONPATH)"
         ) from None
     if not isinstance(found, kind):
-        raise InputError(f"{path!r} is {phrase(found)}, not {with_article(kind.__name__)}")
+        raise InputError(
+            f"{path!r} is {describe_value_type(found)}, not {with_article(kind.__name__)}"
+        )
     return found

@@ -1,4 +1,4 @@
-"""Parameters of estimators: numbers in physical units that an optimiser steps without bounds."""
+"""Parameters of estimators: numbers in physical units, stored in an unconstrained form."""
 
 import difflib
 import inspect
@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from jaxevent.deprecated import renamed_names
+from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.threads import check_platform_available
@@ -25,17 +25,17 @@ Numeric = float | Array | np.ndarray | np.number  # a number, or a traced one
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
 
-MAX_VALUE = 1e15  # a value must be smaller, so that its square is in the range of float32
-MAX_SHOWN_NUMBERS = 8  # of one parameter
-CALIBRATION_TABLE = "calibration"  # name of the table that jaxevent calibrate writes
-THRESHOLDS = frozenset({"c_on", "c_off"})  # numbers of a calibration that hold for one `I0`
+MAX_VALUE = 1e15  # values are smaller in size, so that their squares are in the range of float32
+MAX_SHOWN_NUMBERS = 8  # of one parameter in a repr
+CALIBRATION_TABLE = "calibration"  # name of the table that `jaxevent calibrate` writes
+THRESHOLDS = frozenset({"c_on", "c_off"})  # calibrated numbers that hold for one `I0` only
 NO_GRADIENT_REASON = "acts when data are prepared or by comparisons, and has no gradient to follow"
 
 
 class Setting:
     """A member of a `Parameters` class: a name, a default, a unit and a meaning.
 
-    Read from the class it is this description, read from an instance its value.
+    The class attribute is this description; the attribute of an instance is the value.
     """
 
     name: str
@@ -57,15 +57,15 @@ class Setting:
 
 
 class Number(Setting):
-    """A real parameter: the instance stores `raw`, on which an optimiser may step anywhere.
+    """A real parameter, stored in an unconstrained form that an optimiser may step freely.
 
-    A default of several numbers makes an array, given as a list of as many; a default of one number
-    in a tuple allows a list of any length. With `gradient=False` the number acts when data are
-    prepared, or by comparisons: no derivative passes through it, and `optimise` takes it for
-    searches only. Values are from `least` to `most`, and below `MAX_VALUE` in size.
+    A default of several numbers makes an array, which takes lists of the same length. A default of
+    one number in a tuple takes lists of any length. `gradient=False` is for a number that acts when
+    data are prepared, or by comparisons: it has no derivative, and `optimise` can only search it.
+    Values are from `least` to `most`, and below `MAX_VALUE` in size.
     """
 
-    lower: float = -MAX_VALUE  # of the kind, where the number has no `least` of its own
+    lower: float = -MAX_VALUE  # default of `least` for this class
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class Number(Setting):
         follows = self.gradient or self.name in instance.followed
         return self.physical(raw if follows else jax.lax.stop_gradient(raw))
 
-    if TYPE_CHECKING:  # the type of an argument of a `Params`
+    if TYPE_CHECKING:  # type of the argument of a `Params` class
 
         def __set__(self, instance: Any, value: Numeric | Sequence[Numeric]) -> None: ...
 
@@ -114,7 +114,7 @@ class Number(Setting):
         return value
 
     def check(self, value: Any) -> None:
-        """Raise `InputError` for a value outside the domain, or of another shape."""
+        """Raise `InputError` for a value outside the domain, or of the wrong shape."""
         if not isinstance(self.default, tuple):
             if isinstance(value, list | tuple):
                 raise InputError(
@@ -152,7 +152,7 @@ class Number(Setting):
         return f"be from {self.least:g} to {self.most:g}"
 
     def allows(self, value: Array) -> Array:
-        """Return whether `check` would accept all of an array, which may be traced."""
+        """Return whether `check` would accept all values of an array, which may be traced."""
         inside = (value >= self.least) & (value <= self.most) & (jnp.abs(value) < MAX_VALUE)
         return inside.all()
 
@@ -163,20 +163,20 @@ class Positive(Number):
     lower = 0.0
 
     def physical(self, raw: Array) -> Array:
-        return _elementwise("exp", raw)
+        return _apply_elementwise("exp", raw)
 
     def unconstrained(self, value: Array) -> Array:
-        return _elementwise("log", value)
+        return _apply_elementwise("log", value)
 
 
 class UnitInterval(Number):
     """A number in [0, 1), stored as ln(p / (1 - p)), so that 0 is stored as -inf and stays 0."""
 
     def physical(self, raw: Array) -> Array:
-        return _elementwise("sigmoid", raw)
+        return _apply_elementwise("sigmoid", raw)
 
     def unconstrained(self, value: Array) -> Array:
-        return _elementwise("logit", value)
+        return _apply_elementwise("logit", value)
 
     def check_one(self, value: Any) -> None:
         super().check_one(value)
@@ -246,8 +246,8 @@ class Count(Setting):
 
 
 if TYPE_CHECKING:
-    # To type checkers and editors a plain class, whose arguments are keywords; those of an
-    # `eqx.Module` may be positional.
+    # Type checkers and editors see a plain class with keyword arguments: those of an `eqx.Module`
+    # may be positional.
     class _Module:
         pass
 else:
@@ -255,7 +255,7 @@ else:
 
 
 def _make_inherited_init(base: Any, owner: str) -> Any:
-    """Make an `__init__` for a class that calls that of its base.
+    """Make an `__init__` that calls the one of a base class.
 
     Args:
         base: Class whose `__init__` is called.
@@ -276,14 +276,14 @@ def _make_inherited_init(base: Any, owner: str) -> Any:
     kw_only_default=True, field_specifiers=(Number, Positive, UnitInterval, Choice, Count)
 )
 class _ParameterArrays(_Module):
-    """State of `Parameters`."""
+    """Stored fields of `Parameters`."""
 
     raw: dict[str, Array]  # numbers in unconstrained form, by name
     # choices and counts, by name
     chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
     followed: frozenset[str] = eqx.field(static=True)  # see `Parameters.with_derivatives`
-    # The homogeneous coordinate of `raw`: 1 of parameters, 0 of what is derived by them, and of
-    # differences of two. Nothing depends on it, so JAX makes it 0 in every gradient and tangent.
+    # Tells parameters, 1, from gradients and differences of parameters, 0. Nothing depends on it,
+    # so JAX makes it 0 in every gradient and tangent (a homogeneous coordinate of `raw`).
     point: Array
 
 
@@ -293,14 +293,14 @@ _FIELDS = frozenset({"raw", "chosen", "followed", "point"})
 class Parameters(_ParameterArrays):
     """Base of every estimator's `Params`: `Params(sigma_iso=0.1)`, `params.sigma_iso`.
 
-    `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A named set of
-    values is a preset: `Params(preset="paper", sigma_iso=0.1)`. Numbers may be those of Python,
-    NumPy or JAX, traced ones too. Raises `InputError` for a name that does not exist and for a
-    value outside its domain.
+    `raw` holds one differentiable leaf per number, `chosen` the choices and counts. A preset is a
+    named set of values: `Params(preset="paper", sigma_iso=0.1)`. Numbers may be Python, NumPy or
+    JAX numbers, traced or not. Raises `InputError` for a name that does not exist and for a value
+    outside its domain.
 
-    `jax.grad(loss)(params)` has this type, too. It holds derivatives by the stored numbers, of
-    positive ones by their logarithm: `gradient.raw`, which its repr shows. `gradient.per_unit(
-    params)` has those by the parameters themselves.
+    `jax.grad(loss)(params)` has this type, too. Its `raw` holds derivatives with respect to the
+    stored numbers, which are logarithms of positive parameters. `gradient.per_unit(params)` gives
+    derivatives with respect to the parameters themselves.
     """
 
     if TYPE_CHECKING:
@@ -310,19 +310,19 @@ class Parameters(_ParameterArrays):
     choices: ClassVar[Mapping[str, Choice | Count]] = {}
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of values
     calibrated: ClassVar[tuple[str, ...]] = ()  # names that calibrations of recordings determine
-    # Where frames are clipped or blurred, or events contradict them at the defaults.
+    # Names calibrated only if frames are clipped or blurred, or contradict events at the defaults.
     calibrated_if_needed: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
-        # Editors know the arguments by these annotations; to Equinox they would be fields.
+        # Annotations are for editors; Equinox would turn them into fields.
         for name, value in vars(cls).items():
             if isinstance(value, Setting):
                 cls.__annotations__.pop(name, None)
         own = vars(cls).items()
         cls.numbers = {**cls.numbers, **{k: v for k, v in own if isinstance(v, Number)}}
         cls.choices = {**cls.choices, **{k: v for k, v in own if isinstance(v, Choice | Count)}}
-        # Of its own, so that `help`, completion and `inspect` show what this class takes.
+        # Each class gets its own signature, which `help`, completion and `inspect` show.
         base: Any = next(kind for kind in cls.__mro__[1:] if "__init__" in vars(kind))
         init: Any = vars(cls).get("__init__")
         if init is None:
@@ -342,8 +342,8 @@ class Parameters(_ParameterArrays):
         cls.__doc__ = "\n".join([about, "", "Arguments:", *_describe_settings(cls)])
 
     def __init__(self, *, preset: str | None = None, **values: Any):
-        check_platform_available()  # the first arrays that JAX makes
-        # `dataclasses.replace` gives the stored fields with the values that change.
+        check_platform_available()  # JAX makes its first arrays here
+        # `dataclasses.replace` passes the stored fields together with the changed values.
         fields = {name: values.pop(name) for name in _FIELDS} if _FIELDS <= values.keys() else {}
         _refuse_unknown(values, {**self.numbers, **self.choices, "preset": None})
         if preset is not None:
@@ -360,7 +360,7 @@ class Parameters(_ParameterArrays):
             for name, number in self.numbers.items()
         }
         self.chosen = tuple(
-            (name, _check_choice(choice, values.get(name, choice.default)))
+            (name, _to_stored_setting(choice, values.get(name, choice.default)))
             for name, choice in self.choices.items()
         )
         self.followed = frozenset()
@@ -368,65 +368,65 @@ class Parameters(_ParameterArrays):
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
-        """Return all members by name."""
+        """Return all settings by name."""
         return {**cls.numbers, **cls.choices}
 
     @classmethod
     def names_left_open(cls, explicit: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the names that a calibration may set: those that no value and no preset states.
+        """Return the names that a calibration may set: those that no value and no preset sets.
 
         Args:
             explicit: Values by name, and perhaps "preset".
 
         Returns:
-            The names, those in `calibrated_if_needed` among them.
+            The names, including those in `calibrated_if_needed`.
         """
         return cls.names_not_stated((*cls.calibrated, *cls.calibrated_if_needed), explicit)
 
     @classmethod
     def names_not_stated(cls, names: Iterable[str], explicit: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return those names that no value and no preset states.
+        """Return the names among `names` that no value and no preset sets.
 
         Args:
             names: The names.
             explicit: Values by name, and perhaps "preset".
 
         Returns:
-            The names, in their order.
+            The names, in the same order.
         """
         stated = {*explicit, *cls.presets.get(explicit.get("preset") or "", {})}
         return tuple(name for name in names if name not in stated)
 
     @property
     def is_gradient(self) -> bool:
-        """True if it holds derivatives by parameters, or a step; false while JAX traces it."""
+        """True for a gradient or a difference of parameters; false while JAX traces it."""
         return isinstance(self.point, Array | np.ndarray) and not (
             isinstance(self.point, Tracer) or np.any(np.asarray(self.point))
         )
 
     def per_unit(self, params: "Parameters") -> dict[str, Array]:
-        """Convert a gradient to derivatives by the parameters themselves, in 1 / their units.
+        """Convert a gradient to derivatives with respect to the parameters, in 1 / their units.
 
             gradient = jax.grad(loss)(params)
             gradient.per_unit(params)["c_on"]  # d loss / d c_on
 
-        A gradient holds derivatives by the stored numbers, of positive ones by their logarithm. It
-        does not hold their values, which the chain rule needs.
+        A gradient holds derivatives with respect to the stored numbers, which are logarithms of
+        positive parameters. The chain rule needs the values of the parameters, too.
 
         Args:
             params: The parameters at which the gradient was taken.
 
         Returns:
-            By name, an array of the gradient's shape. 0 of a number that no derivative passes
-            through, NaN of another that is 0 and is stored as -inf, which does not move it.
+            Derivatives by name, in the gradient's shape. They are 0 for a number without gradient.
+            They are NaN for a positive parameter that is 0: it is stored as -inf, and cannot move.
 
         Raises:
-            InputError: This is no gradient, or `params` is none of parameters of the same class.
+            InputError: This is not a gradient, or `params` are not parameters of the same class.
         """
         if type(params) is not type(self) or params.is_gradient:
             raise InputError(
                 f"per_unit needs the {type(self).__qualname__} at which the gradient was taken, "
-                f"not {phrase(params)}; give gradient.per_unit(params)"
+                f"not {describe_value_type(params)}; give gradient.per_unit(params)"
             )
         if not (self.is_gradient or isinstance(self.point, Tracer)):
             raise InputError(
@@ -467,12 +467,12 @@ class Parameters(_ParameterArrays):
         return f"{type(self).__qualname__}({'; '.join(filter(None, [', '.join(changed), rest]))})"
 
     def values(self) -> dict[str, Any]:
-        """Return the physical values and the choices by name, as `Params(**values)` takes them."""
+        """Return physical values and choices by name, in the form that `Params(**values)` takes."""
         numbers = {name: np.asarray(getattr(self, name)).tolist() for name in self.numbers}
         return {**numbers, **dict(self.chosen)}
 
     def replace(self: T, **values: Any) -> T:
-        """Return a copy with some other values; raises `InputError` as the class does."""
+        """Return a copy with some values replaced; raises the same errors as the constructor."""
         _refuse_unknown(values, self.settings())
         if self.is_gradient:
             raise InputError("a gradient has no values to replace; replace those of its parameters")
@@ -483,7 +483,7 @@ class Parameters(_ParameterArrays):
         }
         chosen = dict(self.chosen)
         for name in values.keys() - raw.keys():
-            chosen[name] = _check_choice(self.choices[name], values[name])
+            chosen[name] = _to_stored_setting(self.choices[name], values[name])
         return self._with({**self.raw, **raw}, tuple(chosen.items()), self.followed)
 
     def with_raw(self: T, raw: Mapping[str, Array]) -> T:
@@ -491,9 +491,9 @@ class Parameters(_ParameterArrays):
         return self._with({**self.raw, **raw}, self.chosen, self.followed)
 
     def with_derivatives(self: T, *names: str) -> T:
-        """Return a copy with derivatives by numbers that act when data are prepared.
+        """Return a copy that has derivatives for numbers that act when data are prepared.
 
-        They hold next to the prepared value only, so they serve inspection, not descent.
+        They are valid only near the prepared value: use them for inspection, not for descent.
         """
         _refuse_unknown(dict.fromkeys(names), self.numbers)
         return self._with(self.raw, self.chosen, self.followed | set(names))
@@ -510,19 +510,21 @@ class Parameters(_ParameterArrays):
             object.__setattr__(new, name, value)
         return new
 
-    def without_gradient(self) -> dict[str, str]:
-        """Return the numbers that have no gradient, each with the reason."""
+    def names_without_gradient(self) -> dict[str, str]:
+        """Return the names of the numbers without gradient, each with the reason."""
         return {
             name: NO_GRADIENT_REASON for name, number in self.numbers.items() if not number.gradient
         }
 
+    without_gradient = RenamedAttribute("names_without_gradient")
+
     @classmethod
     def of(cls: type[T], table: Mapping[str, Any], rest: Mapping[str, Any] | None = None) -> T:
-        """Make parameters from `name = value` settings.
+        """Make parameters from a table of `name = value` settings.
 
         Args:
             table: Values by name; "preset" names a preset.
-            rest: Values of numbers that neither the table nor its preset sets.
+            rest: Values for numbers that neither the table nor its preset sets.
 
         Returns:
             The parameters.
@@ -547,14 +549,14 @@ class Parameters(_ParameterArrays):
         Args:
             path: The file.
             method: Name of the table to take from a file of several methods.
-            rest: Values of numbers that the file does not set; omitted, the defaults.
+            rest: Values for numbers that the file does not set; omitted, the defaults.
 
         Returns:
             The parameters.
 
         Raises:
-            InputError: The file cannot be read or holds another setting; the message names file and
-                key.
+            InputError: The file cannot be read or holds an invalid setting; the message names file
+                and key.
         """
         return cls.of(cls.load_table(path, method), rest)
 
@@ -563,8 +565,9 @@ class Parameters(_ParameterArrays):
         """Read `name = value` settings from a TOML file.
 
         The file holds settings, or one table of them for each of several methods, as `jaxevent fit`
-        writes. A table `[calibration]`, as `jaxevent calibrate` writes, gives the numbers that the
-        method's leaves open; its thresholds hold for its own `I0`, and are left out for another.
+        writes. A table `[calibration]`, as `jaxevent calibrate` writes, gives numbers that the
+        method's settings leave open. Its thresholds hold for its own `I0`, and are left out if the
+        settings have another one.
 
         Args:
             path: The file.
@@ -574,7 +577,7 @@ class Parameters(_ParameterArrays):
             Values by name, and perhaps "preset".
 
         Raises:
-            InputError: As `load`.
+            InputError: The file cannot be read or holds an invalid setting.
         """
         table = read_toml(path)
         try:
@@ -601,15 +604,15 @@ class Parameters(_ParameterArrays):
         """Select the values of a calibration that complete the settings of a method.
 
         Args:
-            calibration: Table `[calibration]` of a file, by `jaxevent calibrate`.
-            table: Settings of the user; they have precedence.
-            params: Parameters by `table` alone.
+            calibration: Table `[calibration]` of a file that `jaxevent calibrate` wrote.
+            table: Settings of the user, which take precedence.
+            params: Parameters made from `table` alone.
 
         Returns:
             Values of the calibration for the parameters that `table` leaves open.
 
         Raises:
-            InputError: The calibration is no table, or the method has none of its parameters.
+            InputError: The calibration is not a table, or the method has none of its parameters.
         """
         if not isinstance(calibration, dict):
             raise InputError(
@@ -638,7 +641,7 @@ class Parameters(_ParameterArrays):
         return {name: value for name, value in found.items() if name not in THRESHOLDS}
 
 
-# By NumPy, and by JAX.
+# Versions for NumPy and for JAX.
 _FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
     "exp": (np.exp, jnp.exp),
     "log": (np.log, jnp.log),
@@ -647,32 +650,32 @@ _FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
 }
 
 
-def _elementwise(name: str, values: Array) -> Array:
-    """Apply a function to each element, by NumPy where values are known.
+def _apply_elementwise(name: str, values: Array) -> Array:
+    """Apply a function of `_FUNCTIONS` to each element, with NumPy unless values are traced.
 
-    XLA would compile 60 ms for each shape.
+    XLA would compile for 60 ms for each shape.
 
     Args:
         name: Name in `_FUNCTIONS`.
         values: Array of any shape.
 
     Returns:
-        Array of that shape.
+        Array of the same shape.
     """
     known_by, traced_by = _FUNCTIONS[name]
     if isinstance(values, Tracer):
         return traced_by(values)
-    # NumPy would warn of the logarithm of 0, and of an exponential that overflows.
+    # Logarithms of 0 and overflowing exponentials are expected.
     with np.errstate(divide="ignore", over="ignore"):
         known = np.asarray(known_by(np.asarray(values)))
-    # Without the type JAX compiles a copy.
+    # Without a dtype JAX compiles a copy.
     return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))
 
 
-def _plain(value: Any) -> Any:
-    """Convert arrays of NumPy, JAX and others to numbers and lists of Python."""
+def _to_python(value: Any) -> Any:
+    """Convert arrays to Python numbers and lists; traced values stay as they are."""
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_to_python(one) for one in value]
     if isinstance(value, Tracer):
         return value
     if isinstance(value, np.ndarray | np.generic | Array):
@@ -687,14 +690,14 @@ def _to_stored(number: Number, value: Any, dtype: Any = None) -> Array:
 
     Args:
         number: The parameter.
-        value: Value in its unit.
-        dtype: Type of the stored number; None: JAX's type of floats.
+        value: Value in the parameter's unit.
+        dtype: Type of the stored number; None: JAX's default float.
 
     Returns:
         The unconstrained number.
 
     Raises:
-        InputError: The value is not possible.
+        InputError: The value is outside the parameter's domain.
     """
     dtype = jnp.result_type(float) if dtype is None else dtype
     if isinstance(value, Tracer):
@@ -707,15 +710,15 @@ def _to_stored(number: Number, value: Any, dtype: Any = None) -> Array:
     elif any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
         value = jnp.stack([jnp.asarray(one, dtype) for one in value])
     else:
-        plain = _plain(value)
+        plain = _to_python(value)
         number.check(plain)
-        # By NumPy, as JAX compiles a conversion.
+        # Converted by NumPy, as JAX would compile the conversion.
         value = np.asarray(plain, dtype)
     return number.unconstrained(jnp.asarray(value, dtype))
 
 
-def _check_choice(setting: Choice | Count, value: Any) -> Any:
-    """Return a choice or count as it is stored, checked.
+def _to_stored_setting(setting: Choice | Count, value: Any) -> Any:
+    """Check a choice or count, and convert it to the value that is stored.
 
     Args:
         setting: The parameter.
@@ -725,26 +728,26 @@ def _check_choice(setting: Choice | Count, value: Any) -> Any:
         The value.
 
     Raises:
-        InputError: The value is not possible.
+        InputError: The value is outside the parameter's domain.
     """
-    value = _plain(value)
+    value = _to_python(value)
     setting.check(value)
     return value
 
 
-def phrase(value: Any) -> str:
-    """Return a value's type in words, for messages: "a dict", "the class Params", "a gradient"."""
+def describe_value_type(value: Any) -> str:
+    """Describe a value's type for messages: "a dict", "the class Params", "a gradient"."""
     if isinstance(value, Parameters) and value.is_gradient:
         return "a gradient"
     return describe_type(value)
 
 
 def _format_leaf(value: Array | np.ndarray, number: Number) -> str:
-    """Format a number or its stored one; a traced or mapped one by type or shape.
+    """Format a physical or stored number; if traced or batched, its type or shape.
 
     Args:
         value: The value.
-        number: The parameter, whose default tells how many numbers it has.
+        number: The parameter; its default shows whether it is a list of numbers.
 
     Returns:
         The text.
@@ -756,7 +759,7 @@ def _format_leaf(value: Array | np.ndarray, number: Number) -> str:
 
 
 def _format_setting(params: Parameters, name: str) -> str:
-    """Format one value; a traced or mapped one by type and shape."""
+    """Format the value of one setting; if traced or batched, its type or shape."""
     value = getattr(params, name)
     return (
         _format_leaf(value, params.numbers[name]) if name in params.numbers else format_value(value)
@@ -764,7 +767,7 @@ def _format_setting(params: Parameters, name: str) -> str:
 
 
 def _shorten(text: str) -> str:
-    """Leave out most of a formatted list of many numbers."""
+    """Shorten the text of a list of many numbers to its first three."""
     numbers = text.split(", ")
     if len(numbers) <= MAX_SHOWN_NUMBERS:
         return text
@@ -772,7 +775,7 @@ def _shorten(text: str) -> str:
 
 
 def format_value(value: Any) -> str:
-    """Format a value for descriptions: numbers to four digits."""
+    """Format a value for descriptions; floats get four significant digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, tuple | list):
@@ -781,7 +784,7 @@ def format_value(value: Any) -> str:
 
 
 def _describe_settings(kind: type[Parameters]) -> list[str]:
-    """Return lines about every setting, for the docstring."""
+    """Return lines that describe every setting, for the docstring of a class."""
     lines = []
     for name, setting in kind.settings().items():
         unit = f" {setting.unit}" if setting.unit not in ("", "1") else ""
@@ -804,10 +807,10 @@ def _refuse_unknown(values: Mapping[str, Any], known: Mapping[str, Any]) -> None
 
 
 def check_choice(name: Any, what: str, known: Collection[str]) -> str:
-    """Check that a name is one of those known.
+    """Check that a name is one of the known names.
 
     Args:
-        name: The name, of any type as configurations hold it.
+        name: The name; configurations may give any type.
         what: Noun for it in the message.
         known: All names that exist.
 
@@ -823,7 +826,7 @@ def check_choice(name: Any, what: str, known: Collection[str]) -> str:
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:
-    """Return the end of a sentence about an unknown name: the nearest known one, or all.
+    """Return a hint for an unknown name: the closest known name, or all of them.
 
     Args:
         name: The unknown name.

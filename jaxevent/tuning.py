@@ -275,7 +275,7 @@ def begin(
     search = search or {}
     for name in [*names, *search]:
         check_choice(name, "parameter", params.raw)
-    stuck = params.without_gradient()
+    stuck = params.names_without_gradient()
     for name in names:
         if name in stuck:
             raise InputError(

@@ -37,6 +37,12 @@ def test_old_modules_lead_to_the_new_ones(old):
     assert public and all(getattr(module, name) is getattr(new, name) for name in public)
 
 
+def test_the_old_method_of_parameters_gives_what_the_new_one_does():
+    params = jaxevent.akf.Params()
+    with pytest.warns(DeprecationWarning, match="use Params.names_without_gradient"):
+        assert params.without_gradient() == params.names_without_gradient()
+
+
 def test_unknown_names_are_refused_as_ever():
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
         deprecated.renamed_names("jaxevent.blob")("nonsense")

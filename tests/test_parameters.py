@@ -63,7 +63,7 @@ def test_derivatives_stop_at_what_is_prepared():
     assert float(slope["sigma"]) == pytest.approx(2 * 0.5**2)  # by its logarithm
     assert float(slope["outliers"]) == pytest.approx(0.1 * 0.9)  # by its logit
     assert float(slope["late"]) == 0
-    assert set(params.without_gradient()) == {"late"}
+    assert set(params.names_without_gradient()) == {"late"}
     followed = params.with_derivatives("late")
     assert float(jax.grad(total)(followed).raw["late"]) == pytest.approx(3 * 0.2)
     assert float(total(followed)) == float(total(params))

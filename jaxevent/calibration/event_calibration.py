@@ -1,17 +1,17 @@
-"""Thresholds and noise of a sensor from its events alone, for methods without frames.
+"""Relative thresholds and hot pixels of a sensor from its events alone, for methods without frames.
 
 Between two times the log intensity of a pixel with U ON and D OFF events changes by
 
-    c_on U - c_off D = change + (less than a threshold).                                  (1)
+    change = c_on U - c_off D + (less than a threshold).                                  (1)
 
 Two estimates of c_on / c_off follow, which are weighted by their precision:
 
-- What rises falls again: the sum of (1) over all pixels is small. A scene that grows brighter on
-  the whole biases it, by about half of the standard deviation of (1) among pixels.
+- Intensity that rises falls again, so the sum of (1) over all pixels is small. If the whole scene
+  grows brighter, this is biased, by about half of the standard deviation of (1) among pixels.
 - Neighbours grow brighter together. The differences of U and of D between pixels a few pixels apart
-  scatter about a line of slope c_off / c_on. Both have errors: `QUANTISATION` of whole events, and
-  differences of the change, which are treated alike in ON and OFF by the geometric mean of both
-  regressions. These bound the slope (Frisch 1934).
+  scatter about a line through 0, of slope c_off / c_on. Both differences have errors: counts are
+  whole numbers (`QUANTISATION_VARIANCE`), and the changes of the two pixels differ. The geometric
+  mean of both regressions treats ON and OFF alike; the regressions bound the slope (Frisch 1934).
 """
 
 from typing import NamedTuple
@@ -25,33 +25,35 @@ from jaxevent.calibration.result import CalibrationValue, not_identifiable
 from jaxevent.events import remove_hot_pixels
 from jaxevent.recording import Recording, check_recording
 
-N_PARTS = 8
-MAX_PART_EVENTS = 2_000_000
-BLOCK_EVENTS = 1_000_000
+N_PARTS = 8  # parts of a recording whose events are counted
+MAX_PART_EVENTS = 2_000_000  # events of a part that are counted
+BLOCK_EVENTS = 1_000_000  # events that are read at once
 DISTANCES_PX = (1, 2, 4)  # between pixels that are compared
-CAUCHY_SCALE = 2.0  # thresholds, of the errors of (1)
-QUANTISATION = 1 / 3  # variance of a difference of counts, whose four ends are uniform in an event
-MIN_PART_KEPT = 0.25  # of a second moment, after the quantisation is subtracted
-COUNTS_ERROR = 0.5  # standard deviation of the image's mean change, of that of its pixels
-RATIO_SPREAD = 0.7  # standard deviation of ln(c_on / c_off) among sensors
-N_STEPS = 50  # of reweighted least squares
-MIN_EVENTS = 200  # of either polarity
-MIN_RHO = 1e-3
-MIN_ERROR = 0.03  # of ln(c_on / c_off)
+CAUCHY_SCALE = 2.0  # of the robust weights for errors of (1), in thresholds
+# Variance of a difference of two counts: its four ends are uniform within an event, 4 / 12.
+QUANTISATION_VARIANCE = 1 / 3
+MIN_MOMENT_FRACTION = 0.25  # least part of a second moment left after that is subtracted
+# Standard deviation of the image's mean change, relative to that of its pixels' changes.
+MEAN_CHANGE_RATIO = 0.5
+LOG_RATIO_SPREAD = 0.7  # standard deviation of ln(c_on / c_off) among sensors
+N_REWEIGHTINGS = 50  # steps of iteratively reweighted least squares
+MIN_EVENTS = 200  # least events of each polarity
+MIN_CORRELATION = 1e-3  # least correlation of ON with OFF differences that is used
+MIN_LOG_RATIO_ERROR = 0.03  # least standard deviation of an estimate of ln(c_on / c_off)
 
 
 class EventCalibration(NamedTuple):
-    """Numbers of a sensor that its events alone determine.
+    """Properties of a sensor that its events alone determine.
 
     Absolute contrast is not observable from events alone. So thresholds are relative: the geometric
     mean of the common ON and OFF thresholds is 1.
 
     | field | meaning |
     |---|---|
-    | thresholds | (2, height, width) ON and OFF thresholds of each pixel, relative |
-    | ratio | ratio of the ON threshold to the OFF threshold; 1 is used where it is unknown |
+    | thresholds | (2, height, width) relative ON and OFF thresholds of each pixel |
+    | ratio | ON threshold over OFF threshold; if it is unknown, `thresholds` assume 1 |
     | spread | standard deviation of the logarithm of this ratio among pixels |
-    | hot | (height, width), true for pixels that fire without cause |
+    | hot | (height, width), true for hot pixels |
     | read_out | (height, width), true within the rows and columns that the sensor reads out |
     | hot_share | share of the events that hot pixels made |
     """
@@ -67,7 +69,7 @@ class EventCalibration(NamedTuple):
 def count_parts(recording: Recording) -> NDArray[np.int32]:
     """Count the events of each pixel in parts of a recording.
 
-    Long recordings are sampled: from each part the first `MAX_PART_EVENTS` events.
+    Of long recordings only the first `MAX_PART_EVENTS` events of each part are counted.
 
     Args:
         recording: The recording, in memory or in a file.
@@ -104,7 +106,7 @@ def calibrate_events(recording: Recording) -> EventCalibration:
     root = np.sqrt(ratio.value if ratio.is_identifiable else 1.0)
     change = root * parts[:, 0] - parts[:, 1] / root
     gain = (root * parts[:, 0] + parts[:, 1] / root) / 2
-    s, spread = _estimate_deviations(change, gain, ~hot & ratio.is_identifiable)
+    s, spread = _estimate_pixel_deviations(change, gain, ~hot & ratio.is_identifiable)
     thresholds = np.stack([root * np.exp(s / 2), np.exp(-s / 2) / root]).astype(np.float32)
     return EventCalibration(thresholds, ratio, spread, hot, _find_read_region(counts), hot_share)
 
@@ -118,18 +120,17 @@ def _find_hot(parts: NDArray[np.integer]) -> tuple[NDArray[np.bool_], float]:
 def remove_many_hot_events(
     recording: Recording, calibration: EventCalibration | None = None
 ) -> Recording:
-    """Remove the events of hot pixels, where they make more than a twentieth of all events.
+    """Remove the events of hot pixels if they are more than a twentieth of all events.
 
-    Methods that read windows of so many events would find short ones otherwise, in which nothing
-    moves.
+    Otherwise hot pixels would fill the windows of methods that read a fixed number of events, and
+    these windows would become too short to show motion.
 
     Args:
         recording: The recording.
         calibration: Result of `calibrate_events` for it; None: hot pixels are found here.
 
     Returns:
-        The recording without these events; as it is where they are few, or where there are no
-        others.
+        The recording without these events; unchanged if they are few, or if there are no others.
     """
     if calibration is None:
         hot, share = _find_hot(count_parts(recording))
@@ -139,7 +140,7 @@ def remove_many_hot_events(
 
 
 def _find_read_region(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Find the region of interest: rows and columns between the first and the last with events."""
+    """Find the region that the sensor reads out: from the first to the last row and column used."""
     inside = np.ones(counts.shape, bool)
     for axis in (0, 1):
         (used,) = np.nonzero(counts.any(axis))
@@ -150,10 +151,10 @@ def _find_read_region(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     return inside
 
 
-def _differences(
+def _neighbour_differences(
     counts: NDArray[np.integer], hot: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return differences of counts between pixels `DISTANCES_PX` apart, without hot ones.
+    """Return differences of counts between pixels `DISTANCES_PX` apart that are not hot.
 
     Args:
         counts: (2, height, width) ON and OFF events.
@@ -190,20 +191,22 @@ def _estimate_ratio(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> Cali
     whole = np.log(off.sum() / on.sum())
     root, active = np.exp(whole / 2), on + off > 0
     change, gain = (root * on - off / root)[active], (root * on + off / root)[active] / 2
-    error = COUNTS_ERROR * float(change.std() / gain.mean()) + MIN_ERROR
-    estimates = [(whole, error), _compare_neighbours(counts, hot)]
+    error = MEAN_CHANGE_RATIO * float(change.std() / gain.mean()) + MIN_LOG_RATIO_ERROR
+    estimates = [(whole, error), _log_ratio_from_neighbours(counts, hot)]
     value = precision = 0.0
     for log_ratio, error in estimates:
         value += log_ratio / error**2
         precision += error**-2
     # Sensors' ratios have the mean 1.
-    precision += RATIO_SPREAD**-2
+    precision += LOG_RATIO_SPREAD**-2
     ratio, wide = np.exp([value / precision, CONFIDENCE_Z / np.sqrt(precision)]).tolist()
     return CalibrationValue(ratio, ratio / wide, ratio * wide, "1", "from events alone")
 
 
-def _compare_neighbours(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> tuple[float, float]:
-    """Estimate ln(c_on / c_off) by differences between pixels.
+def _log_ratio_from_neighbours(
+    counts: NDArray[np.integer], hot: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Estimate ln(c_on / c_off) from differences between neighbouring pixels.
 
     Args:
         counts: (2, height, width) ON and OFF events.
@@ -212,42 +215,44 @@ def _compare_neighbours(counts: NDArray[np.integer], hot: NDArray[np.bool_]) -> 
     Returns:
         The estimate and its standard deviation.
     """
-    U, D = _differences(counts, hot)
+    U, D = _neighbour_differences(counts, hot)
     root, rho = 1.0, 0.0
-    for _ in range(N_STEPS):
+    for _ in range(N_REWEIGHTINGS):
         w = 1 / (1 + (root * U - D / root) ** 2 / (2 * CAUCHY_SCALE**2))
         UU, UD, DD = (w * U * U).sum(), (w * U * D).sum(), (w * D * D).sum()
         if not UU * DD > 0:
             return 0.0, np.inf
         rho = UD / np.sqrt(UU * DD)
-        UU, DD = (max(v - QUANTISATION * w.sum(), MIN_PART_KEPT * v) for v in (UU, DD))
+        UU, DD = (
+            max(v - QUANTISATION_VARIANCE * w.sum(), MIN_MOMENT_FRACTION * v) for v in (UU, DD)
+        )
         root = (DD / UU) ** 0.25
-    rho = max(rho, MIN_RHO)
-    # The regressions of U on D and of D on U have slopes rho times smaller and larger.
-    error = -np.log(rho) / CONFIDENCE_Z + np.sqrt((1 - rho**2) / len(U)) / rho + MIN_ERROR
+    rho = max(rho, MIN_CORRELATION)
+    # The slopes of the regressions of U on D and of D on U are rho times smaller and larger.
+    error = -np.log(rho) / CONFIDENCE_Z + np.sqrt((1 - rho**2) / len(U)) / rho + MIN_LOG_RATIO_ERROR
     return 2 * float(np.log(root)), error
 
 
-def _estimate_deviations(
+def _estimate_pixel_deviations(
     change: NDArray[np.float64], gain: NDArray[np.float64], is_used: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], float]:
-    """Estimate the deviations of pixels from the common ratio by empirical Bayes.
+    """Estimate each pixel's deviation from the common ratio by empirical Bayes.
 
     A deviation s of ln(c_on / c_off) changes (1) by s (c_on U + c_off D) / 2 in every part of the
-    recording. Changes of parts that are not adjacent share no end, so that their product shows the
-    variance of s alone. What neighbours have in common belongs to the scene.
+    recording. Parts that are not adjacent have independent errors, so the mean product of their
+    changes measures the variance of s. Changes that neighbours share belong to the scene.
 
     Args:
         change: (parts, height, width) c_on U - c_off D.
         gain: (parts, height, width) (c_on U + c_off D) / 2.
-        is_used: (height, width) pixels that are not hot.
+        is_used: (height, width) whether a pixel is used.
 
     Returns:
         (height, width) deviations, and their standard deviation.
     """
     from scipy.ndimage import median_filter
 
-    change = np.where(is_used, change, 0)  # nor does a hot pixel count in its neighbours' sums
+    change = np.where(is_used, change, 0)  # a hot pixel must not count in its neighbours' medians
     own = change - median_filter(change, (1, 5, 5), mode="reflect")
     own, gain = own[:, is_used], gain[:, is_used]
     products, moments = np.zeros((2, own.shape[1]))

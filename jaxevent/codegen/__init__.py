@@ -1,4 +1,4 @@
-"""Compiled loops of the host: numba's decorators, threads over rows and items, and scratch.
+"""Numba decorators, threads over rows and items, and scratch memory for compiled loops.
 
 The other modules of the package compile functions that JAX traces (docs/codegen.md).
 """
@@ -20,17 +20,17 @@ from jaxevent.codegen import cache, support
 T = TypeVar("T")
 R = TypeVar("R")
 
-# numba makes two functions more of each. The one for those that call it by its address is left out;
-# without the one for Python a call from there would end the process.
+# numba compiles two wrappers with each function. The one for calls by address is left out. The one
+# for calls from Python stays: without it such a call would end the process.
 _COMMON_OPTIONS: dict[str, Any] = {"nogil": True}
-# Counting references to arrays is two thirds of a function that takes many of them.
+# Counting references to arrays takes two thirds of the time of a function with many of them.
 _NOALLOC_OPTIONS: dict[str, Any] = {}
 if support.HAS_INTERNALS:
     from jaxevent.codegen.internals import njit_linked
 
     _COMMON_OPTIONS |= {"no_cfunc_wrapper": True}
     _NOALLOC_OPTIONS |= {"_nrt": False}
-# Sums in any order, so that several are taken at once.
+# Sums in any order, so that they vectorise.
 _FASTMATH_OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz"},
@@ -51,9 +51,9 @@ def njit_inlined(function: Callable) -> Any:
 
 
 def njit_noalloc(function: Callable) -> Any:
-    """Compile a function that makes no arrays of its own, in less time than `njit`.
+    """Compile a function that allocates no arrays, in less time than `njit`.
 
-    A division by zero gives an infinite number or NaN, as in NumPy.
+    A division by zero gives infinity or NaN, as in NumPy.
     """
     return cache.njit_cached(
         inspect.unwrap(function), error_model="numpy", **_COMMON_OPTIONS, **_NOALLOC_OPTIONS
@@ -61,39 +61,37 @@ def njit_noalloc(function: Callable) -> Any:
 
 
 def njit_noalloc_inlined(function: Callable) -> Any:
-    """Compile a function that only `njit_noalloc` ones call; Python cannot call it."""
-    return _lean_inside(function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS)
+    """Compile a function for calls from `njit_noalloc` functions only; Python cannot call it."""
+    return _compile_inlined(function, error_model="numpy", nogil=True, **_NOALLOC_OPTIONS)
 
 
 def njit_fastmath(function: Callable) -> Any:
-    """Compile a function as `njit_noalloc` does, with sums in the fastest order."""
+    """Compile a function that allocates no arrays, with sums in the fastest order."""
     return cache.njit_cached(
         inspect.unwrap(function), **_COMMON_OPTIONS, **_NOALLOC_OPTIONS, **_FASTMATH_OPTIONS
     )
 
 
 def njit_fastmath_inlined(function: Callable) -> Any:
-    """Compile a function that only `njit_fastmath` ones call; Python cannot call it."""
-    return _lean_inside(function, nogil=True, **_NOALLOC_OPTIONS, **_FASTMATH_OPTIONS)
+    """Compile a function for calls from `njit_fastmath` functions only; Python cannot call it."""
+    return _compile_inlined(function, nogil=True, **_NOALLOC_OPTIONS, **_FASTMATH_OPTIONS)
 
 
 def _njit_without_cache(function: Callable, **options: Any) -> Any:
-    """Compile a function with `numba.njit`, without a cache.
-
-    Return it as it is where there is no numba.
-    """
+    """Compile a function with `numba.njit` and no cache; without numba, return it unchanged."""
     plain = inspect.unwrap(function)
     return support.numba.njit(**options)(plain) if support.HAS_NUMBA else plain
 
 
-def _lean_inside(function: Callable, **options: Any) -> Any:
+def _compile_inlined(function: Callable, **options: Any) -> Any:
+    """Compile a function for calls from compiled functions only, without wrappers if possible."""
     return (njit_linked if support.HAS_INTERNALS else _njit_without_cache)(function, **options)
 
 
 class ZeroedScratch:
-    """Arrays of zeros that functions fill and make 0 again: one of each shape for each thread.
+    """Arrays of zeros, one per shape and thread; who fills one must set it back to 0.
 
-    To lay out a new one takes longer than a few events of a large image.
+    Allocating a new one takes longer than processing a few events of a large image.
     """
 
     def __init__(self, dtype: Any):
@@ -115,19 +113,20 @@ N_THREADS = (
 
 
 def read_only(array: NDArray) -> NDArray:
-    """Return a view of an array that nobody may write, as JAX's arrays are.
+    """Return a read-only view of an array.
 
-    numba compiles a function once more for each kind of array.
+    JAX's arrays are read-only, and numba compiles a function again for writable ones.
     """
     view = array.view()
     view.flags.writeable = False
     return view
 
 
-def row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
-    """Return scratch (rows, ...) for kernels of `run_over_rows`: parts use that of their first row.
+def empty_row_scratch(n_rows: int, *shape: int) -> NDArray[np.float32]:
+    """Allocate uninitialised scratch (rows, ...) for kernels of `run_over_rows`.
 
-    Memory is taken by what is written alone.
+    Each part of the rows uses the scratch of its first row. Pages that are never written take no
+    memory.
     """
     return np.empty((n_rows, *shape), np.float32)
 
@@ -138,7 +137,7 @@ def _workers() -> ThreadPoolExecutor:
 
 
 class _CoreShare(threading.local):
-    """The number of cores over which kernels on a thread divide rows; None: all."""
+    """Number of cores among which a thread divides the rows of its kernels; None: all."""
 
     cores: int | None = None
 
@@ -151,9 +150,9 @@ def _limit_cores(cores: int) -> None:
 
 
 def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
-    """Run a kernel on parts of the rows, each on a thread of its own.
+    """Run a kernel on parts of the rows, each part on its own thread.
 
-    Kernels release the interpreter's lock. What they compute must not depend on the parts.
+    Kernels must release the interpreter's lock, and their results must not depend on the parts.
 
     Args:
         kernel: Function of the first row, the one after the last, and `args`.
@@ -167,34 +166,34 @@ def run_over_rows(kernel: Callable, n_rows: int, *args: Any) -> None:
     edges = [n_rows * part // parts for part in range(parts + 1)]
     try:
         jobs = [_workers().submit(kernel, *edges[k : k + 2], *args) for k in range(parts)]
-    except RuntimeError:  # the interpreter ends, and JAX waits for what it has begun
+    except RuntimeError:  # the interpreter is shutting down while JAX waits for pending work
         kernel(0, n_rows, *args)
         return
     try:
         for job in jobs:
             job.result()
     finally:
-        wait(jobs)  # interrupted, too: what they write is the caller's
+        wait(jobs)  # even if interrupted: they write to arrays of the caller
 
 
 def map_ahead(
     function: Callable[[T], R], items: Iterable[T], most: int | None = None
 ) -> Iterator[R]:
-    """Yield `function(item)` for each item, in order, while later items are made.
+    """Yield `function(item)` for each item, in order, while later items are computed.
 
-    The caller's thread makes the items. Others compute, each one item at a time, and share the
-    cores for the rows of kernels. With one core or one item the caller's thread computes, too.
+    The caller's thread iterates over the items. Worker threads compute one item each, and share
+    the cores for the rows of kernels. With one core or `most = 1` the caller's thread does both.
 
     Args:
-        function: Function of one item alone; it should release the interpreter's lock.
+        function: Function of one item; it should release the interpreter's lock.
         items: The items.
-        most: Items that are held at once; None: as many as there are cores.
+        most: Largest number of pending items; None: the number of cores.
 
     Yields:
         The results.
 
     Raises:
-        Exception: What making an item or the function raises, when its result is due.
+        Exception: Any exception of the items or the function, when that result is due.
     """
     most = N_THREADS if most is None else most
     threads = min(most, N_THREADS)
@@ -206,7 +205,7 @@ def map_ahead(
 
     def begin(item: T) -> Callable[[], R]:
         """Begin to compute an item; return a function that waits for its result."""
-        # A forked process has none of the threads, and locks of the pool may be theirs.
+        # A forked process lacks these threads, and they may hold the pool's locks.
         future = pool.submit(function, item) if os.getpid() == process else None
         return lambda: (
             function(item) if future is None or os.getpid() != process else future.result()
@@ -234,5 +233,5 @@ def map_ahead(
             pool.shutdown(cancel_futures=True)
 
 
-if hasattr(os, "register_at_fork"):  # the threads stay behind
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork
     os.register_at_fork(after_in_child=_workers.cache_clear)

@@ -1,4 +1,4 @@
-"""Motion of a live stream of events: from a camera, a socket, any iterator.
+"""Motion of a live stream of events, from a camera, a socket or any iterator.
 
     live = jaxevent.egomotion.voting.live((240, 180), model="rotation", camera=camera)
     for events in camera:  # `jaxevent.Events`, one chunk after another
@@ -6,8 +6,9 @@
         mean, covariance, valid = live(live.stop)
     live.finish()
 
-Estimates are those of `voting.estimate` with `causal=True` on all events added so far, however they
-are divided into chunks. Only the latest estimates are held, and the events that later ones need.
+Estimates are those of `voting.estimate` with `causal=True` on all events added so far, however the
+events are divided into chunks. Only the latest estimates and the events that later estimates need
+are kept.
 """
 
 import dataclasses
@@ -24,8 +25,8 @@ from jaxevent.events.live import Tail
 from jaxevent.recording import Events, Recording, Times, microseconds
 from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
-HELD_ESTIMATES = 4096  # the latest ones, which are read
-DROPPED_EVENTS = 1 << 15  # from so many on they are dropped
+MAX_HELD_ESTIMATES = 4096  # latest estimates that are kept
+MIN_DROPPED_EVENTS = 1 << 15  # number of unneeded events from which on they are dropped
 
 
 class ChunkRunner(Protocol):
@@ -43,19 +44,19 @@ class ChunkRunner(Protocol):
         ...
 
     def causal_motion(self, parts: list[Any]) -> MotionEstimate:
-        """Join chunks to an estimate."""
+        """Join the results of chunks to an estimate that uses no later events."""
         ...
 
 
 class LiveMotion:
     """The motion of all events added so far: `mean, covariance, valid = live(times)`.
 
-    One thread may add what another reads.
+    One thread may add events while another reads the motion.
 
     Args:
-        recording: A recording without events, whose events are a `Tail`.
+        recording: A recording whose events are a `Tail`, without events so far.
         model: Motion model.
-        make_runner: Function that makes the runner of the filter, once the first event is there.
+        make_runner: Function that makes the filter's runner, called after the first event.
     """
 
     def __init__(
@@ -103,13 +104,13 @@ class LiveMotion:
 
     @synchronized
     def add(self, events: Events) -> MotionEstimate:
-        """Add events that are not earlier than those before.
+        """Add events that are not earlier than those added before.
 
         Args:
             events: The events.
 
         Returns:
-            The estimates that are new.
+            The new estimates.
 
         Raises:
             InputError: The events are not valid, or the stream was finished.
@@ -121,7 +122,7 @@ class LiveMotion:
 
     @synchronized
     def finish(self) -> MotionEstimate:
-        """Estimate the motion at the last events, and return the estimates that are new."""
+        """Estimate the motion at the last events, and return the new estimates."""
         self._is_finished = True
         return self._run(until_end=True)
 
@@ -129,8 +130,8 @@ class LiveMotion:
     def __call__(self, times: Times) -> Estimate:
         """Return the motion at some times, as `MotionEstimate` does.
 
-        Later ones are predicted, for as long as candidates live (`tau_max`). After that nothing is
-        known, as in a pause of events.
+        Up to `tau_max` after the last estimate the motion is predicted. Later it is unknown, as in
+        a pause of events.
         """
         us, motion = np.atleast_1d(microseconds(times)), self._motion
         mean, covariance, valid = motion(us, extrapolate=True)
@@ -140,7 +141,7 @@ class LiveMotion:
         return Estimate(mean, covariance, valid)
 
     def _run(self, until_end: bool) -> MotionEstimate:
-        """Run the chunks that no event to come can change."""
+        """Run the chunks that later events cannot change."""
         if len(self._tail) and self._runner is None:
             self._runner = self._make_runner()
         runner, parts = self._runner, []
@@ -154,16 +155,16 @@ class LiveMotion:
         last = _take_estimates(self._motion, slice(-1, None))
         joined = _join(last, new)._with_gaps(float(runner.params.tau_max))
         new = _take_estimates(joined, slice(len(last), None))
-        self._motion = _take_estimates(_join(self._motion, new), slice(-HELD_ESTIMATES, None))
+        self._motion = _take_estimates(_join(self._motion, new), slice(-MAX_HELD_ESTIMATES, None))
         needed = self._tail.index(int(new.t[-1] - 1e6 * float(runner.params.tau_max)) - 1)
         needed = min(needed, runner.sampler.next_row)
-        if needed - self._tail.dropped > DROPPED_EVENTS:
+        if needed - self._tail.dropped > MIN_DROPPED_EVENTS:
             self._tail.drop(needed)
         return new
 
 
 def _take_estimates(motion: MotionEstimate, rows: slice) -> MotionEstimate:
-    """Return some estimates."""
+    """Return the estimates of some rows."""
     arrays = {
         f.name: v[rows]
         for f in dataclasses.fields(motion)
@@ -173,7 +174,7 @@ def _take_estimates(motion: MotionEstimate, rows: slice) -> MotionEstimate:
 
 
 def _join(one: MotionEstimate, two: MotionEstimate) -> MotionEstimate:
-    """Return the estimates of both."""
+    """Join two sequences of estimates."""
     arrays = {
         f.name: np.concatenate([getattr(one, f.name), v])
         for f in dataclasses.fields(two)

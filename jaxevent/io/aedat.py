@@ -123,7 +123,7 @@ def read_aedat2(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in the file.
@@ -432,8 +432,8 @@ def read_aedat4(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller: `stream` is the number of a stream of events, needed where
-            there are several, and `frames` that of a stream of frames.
+        options: Options of `jaxevent.io.load`: `stream` is the number of a stream of events, needed
+            where there are several, and `frames` that of a stream of frames.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in the file.
@@ -490,7 +490,7 @@ def _choose_streams(
     Args:
         path: The file.
         streams: Descriptions of the streams by number.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         Numbers of streams by kind, "events", "frame", "imus" and "triggers", and the entries of

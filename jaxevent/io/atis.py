@@ -57,7 +57,7 @@ def read_n_caltech(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events stay in the file.
@@ -95,7 +95,7 @@ def read_event_stream(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events stay in the file.

@@ -29,7 +29,7 @@ _COUNT_WORDS = {8: "eight", 9: "nine", 12: "twelve"}  # of the numbers of a came
 
 @dataclasses.dataclass(frozen=True)
 class ReadOptions:
-    """Choices of `jaxevent.io.load`, which describes each of them, for a reader.
+    """Options of `jaxevent.io.load`, as readers get them.
 
     Attributes:
         size: (width, height) in pixels; None takes the size that the file states.

@@ -264,7 +264,7 @@ def infer_format(
         n_events: Number of events in all.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         name: Name of the column of times, which may state a unit.
         stated: Unit that the file states otherwise, and the words for how.
         usual: Usual unit of the layout, see `infer_unit`.
@@ -321,7 +321,7 @@ def read_columns(
         count: Number of events.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         name: Name of the column of times, which may state a unit.
         usual: Usual unit of the layout, see `infer_unit`.
         unit: Unit of the times where the layout fixes it.

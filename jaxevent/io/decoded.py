@@ -193,7 +193,7 @@ def read_events(
         decode: The decoder; its blocks hold t (int64 us), x, y and p as `check_events` takes them.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         origin: Number of the first column and row of the sensor, 0 or 1.
 
     Returns:

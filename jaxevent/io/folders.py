@@ -193,7 +193,7 @@ def read_evimo(
 
     Args:
         path: The folder.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         meta: The dictionary of dataset_info.npz. With it there are frames of the classical camera,
             the calibration, the poses of the camera in the world and, in `extra`, the ground truth:
             `depth` (n, height, width) in m, `mask`, and their times `depth_t` and `mask_t` (n,) in
@@ -357,7 +357,7 @@ def read_evreal(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The folder.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in their files.
@@ -463,7 +463,7 @@ def read_timelens(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The folder.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in their files.

@@ -131,7 +131,7 @@ def infer_column_format(
         columns: Columns t, x, y and p, in any unit of time.
         size: (width, height) of the sensor in px.
         source: Name of the file for messages.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         name: Name of the column of times, which may state a unit.
         usual: Usual unit of the layout, see `infer_unit`.
 
@@ -365,7 +365,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in the file.
@@ -386,7 +386,7 @@ def read_by(
     Args:
         read_open: Reader of an open file, which leaves events and images in it.
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; with `options.in_memory`, its events and images are read and the file closed.
@@ -479,7 +479,7 @@ def _read_events(
         file: The open file.
         source: Name of the file for messages.
         size: (width, height) of the sensor in px.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         states_unit: Whether the file states that times are in us.
 
     Returns:

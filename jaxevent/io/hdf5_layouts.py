@@ -67,7 +67,8 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller; `stream` is "left" or "right" of a file with two cameras.
+        options: Options of `jaxevent.io.load`; `stream` is "left" or "right" of a file with two
+            cameras.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in the file.

@@ -64,7 +64,7 @@ def read_v5(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording, in memory.
@@ -200,7 +200,7 @@ def read_v73(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording, in memory.

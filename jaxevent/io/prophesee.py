@@ -71,7 +71,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording; unless `options.in_memory`, events stay in the file.

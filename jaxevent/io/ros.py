@@ -114,8 +114,8 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file or folder.
-        options: Choices of the caller: `stream` is the topic of the events, needed where there are
-            several, and `frames` that of the frames.
+        options: Options of `jaxevent.io.load`: `stream` is the topic of the events, needed where
+            there are several, and `frames` that of the frames.
 
     Returns:
         The recording; unless `options.in_memory`, events and images stay in the bag.
@@ -217,7 +217,7 @@ def _choose_frames(
         bag: The bag.
         events: Topic of the events.
         images: Topics of images by name.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
         size: (width, height) of the sensor in px; None where it is not known.
 
     Returns:

@@ -88,7 +88,7 @@ def read_npy(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording.
@@ -130,7 +130,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording.
@@ -259,7 +259,7 @@ def read_text(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording.
@@ -543,7 +543,7 @@ def read_parquet(path: Path, options: ReadOptions) -> Recording:
 
     Args:
         path: The file.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording.

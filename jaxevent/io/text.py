@@ -1,18 +1,18 @@
 """The text layout of the Event-Camera Dataset (Mueggler et al., IJRR 2017), in a folder or zip.
 
-    events.txt       t x y p                  p is 0/1 or -1/1; first lines may be: width height,
-                                              and names of the columns, in any order
+    events.txt       t x y p                  p is 0/1 or -1/1; the first lines may be "width
+                                              height" and names of the columns, in any order
     images.txt       t path                   path relative to the folder
     groundtruth.txt  t px py pz qx qy qz qw   m, unit quaternion
     imu.txt          t ax ay az gx gy gz      m/s^2, rad/s
     calib.txt        fx fy cx cy k1 k2 p1 p2 k3
 
-All t are seconds. Where those of events.txt are whole numbers only, their unit is another, which is
-inferred (`time_units`) or given, and the other files are read on the clock of the events. Only
-events.txt is required, and it may be empty where there are images. In a zip the files may lie in
-one top folder; a zip of one text alone, as rpg_e2vid reads, may name it otherwise. The exposure of
-the images is unknown: 0. Colour images become grey (ITU-R 601 luma); where all are, `extra["rgb"]`
-keeps their colours.
+All t are seconds. If those of events.txt are all whole numbers, their unit is another one, which is
+inferred (`time_units`) or given; the other files are then read on the clock of the events. Only
+events.txt is required, and it may be empty if there are images. In a zip the files may lie in one
+top folder. A zip of a single text file, as rpg_e2vid reads, may give it another name. The exposure
+of the images is unknown and set to 0. Colour images become grey (ITU-R 601 luma); if all images are
+in colour, `extra["rgb"]` keeps their colours.
 """
 
 import re
@@ -44,9 +44,9 @@ from jaxevent.time_units import unit_of_name
 
 
 def find_event_texts(names: Sequence[str]) -> list[str]:
-    """Return the texts of events among the names in a zip.
+    """Return the text files of events among the names in a zip.
 
-    They are all events.txt, or else a text of any name that is the only file, as of rpg_e2vid.
+    These are all files events.txt; without any, a single file *.txt, as rpg_e2vid writes.
     """
     found = [name for name in names if name.rpartition("/")[2] == "events.txt"]
     files = [name for name in names if not name.endswith("/") and not name.startswith("__MACOSX/")]
@@ -54,17 +54,17 @@ def find_event_texts(names: Sequence[str]) -> list[str]:
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read a folder or zip.
+    """Read a recording from a folder or zip in the layout of the Event-Camera Dataset.
 
     Args:
         path: The folder or zip.
-        options: Choices of the caller.
+        options: Options of `jaxevent.io.load`.
 
     Returns:
         The recording, in memory.
 
     Raises:
-        InputError: A file is missing or damaged, or what it holds is not valid.
+        InputError: A file is missing, damaged or invalid.
     """
     if path.is_dir():
         return _read(path, path, options)
@@ -104,7 +104,7 @@ def _read(
         )
 
     def table(name: str, layout: str, what: str) -> tuple[NDArray[np.int64], NDArray] | None:
-        """Read times in us and further columns of a file beside the events."""
+        """Read the times (us) and further columns of another file of the folder."""
         if not (root / f"{name}.txt").is_file():
             return None
         source = f"{path}: {name}.txt"
@@ -141,10 +141,10 @@ def _read_numbers(
     header: str | None = None,
     progress: bool | None = None,
 ) -> tuple[list[NDArray[np.float64]], tuple[int, int] | None, list[str]]:
-    """Read the columns of a file of numbers, finite float64, its header and the columns' names.
+    """Read the columns of a file of finite numbers, with its header and the columns' names.
 
-    Lines before the numbers that are blank, start with # or hold letters are passed over. One with
-    the names of events names the columns, which otherwise are those of the layout.
+    Leading lines that are blank, start with # or hold letters are skipped. If one of them holds the
+    names of an event's columns, it gives their order; otherwise the layout does.
     """
     names = layout.split()
     found = None
@@ -204,20 +204,21 @@ def _read_numbers(
 
 
 def _split_words(line: bytes) -> list[str]:
-    """Split a line that may be a comment into words; a unit belongs to its name: "t [s] x y p"."""
+    """Split a line or comment into words; a unit in brackets stays with its name, as in "t [s]"."""
     text = line.decode("utf-8", "replace").lstrip("#% ")
     return re.sub(r"\s+(?=[\[(])", "", text).split()
 
 
 def _are_names(words: list[str]) -> bool:
-    """Return whether a line names columns: none of its words begins as a number does."""
+    """Return whether words can be names of columns: none begins like a number."""
     return bool(words) and not any(re.match(r"[+-]?\.?\d|nan|inf", w, re.I) for w in words)
 
 
 def _read_images(
     path: Path, root: Path | zipfile.Path
 ) -> tuple[NDArray, str | None, Any, dict[str, Any]]:
-    """Read the times of the frames, as stored, the unit in their name, the frames and colours."""
+    """Read the frames' stored times, the unit that their header names, the images and extras."""
+
     if not (root / "images.txt").is_file():
         return np.empty(0), None, None, {}
     source = f"{path}: images.txt"

@@ -92,8 +92,8 @@ class Params(AugmentParams):
     def predictor(cls) -> Filter:
         return akf
 
-    def without_gradient(self) -> dict[str, str]:
-        found = super().without_gradient()
+    def names_without_gradient(self) -> dict[str, str]:
+        found = super().names_without_gradient()
         if not float(self.rho_width) > 0:
             found["rho"] = "is compared with while rho_width is 0; start with rho_width above 0"
         return found

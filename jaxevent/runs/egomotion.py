@@ -414,7 +414,7 @@ class MotionGoal(Goal):
         found = [one for one in self._cut_windows(data) if one.split < 2]
 
         def acting(params: Any) -> dict[str, float]:
-            acts = params.without_gradient() if self.method.differentiable else params.numbers
+            acts = params.names_without_gradient() if self.method.differentiable else params.numbers
             return {name: float(getattr(params, name)) for name in acts}
 
         def make(params: Any) -> Batches:

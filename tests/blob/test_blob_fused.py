@@ -120,7 +120,7 @@ def test_losses_and_their_slopes(case):
             ]
         )
 
-    stuck = params.without_gradient()
+    stuck = params.names_without_gradient()
     raw = {n: leaf for n, leaf in params.raw.items() if n not in stuck and np.isfinite(leaf)}
     forwards = jax.jit(jax.jacfwd(losses))(raw)
     backwards = jax.jit(jax.jacrev(losses))(raw)

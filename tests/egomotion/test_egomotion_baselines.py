@@ -489,7 +489,7 @@ def test_windows_across_a_stop_are_lost(active, filled):
     recording = recorded(t, x, y, x % 2 == 0, *SIZE)
     params = SMALL.replace(duration=0.0996)
     windows = maximisation.WindowSequence(recording, params)
-    assert len(windows) == 1 and tuple(windows.fills(next(iter(windows)))) == filled
+    assert len(windows) == 1 and tuple(windows.filled_parts(next(iter(windows)))) == filled
     if not filled[1]:
         with pytest.warns(LostMotionWarning):
             assert not contrast.estimate(recording, params).valid.any()

@@ -107,7 +107,7 @@ def test_a_run_is_pure():
 
     value, slope = size(params)
     assert np.isfinite(value) and np.isfinite(slope.raw["alpha"])
-    for name in params.without_gradient():
+    for name in params.names_without_gradient():
         assert slope.raw[name] == 0, name
     with pytest.raises(jaxevent.InputError, match="extrapolate=True"):
         voting.prepare(recording, np.array([2_000_000]), params, model=MODEL)

@@ -77,7 +77,7 @@ def test_motion_is_found_from_nothing(v, a):
     L = moved(v, a, s)
     pyramid = trajectories.ImagePyramid(L, np.full_like(L, 1e-3), 0.35)
     plan = trajectories.plan_stages(s, 0.5)
-    motion = trajectories.estimate_trajectories(pyramid, PathTimes.of(s), plan, COST)
+    motion = trajectories.estimate_trajectories(pyramid, PathTimes.without_common(s), plan, COST)
     assert motion.level == 1
     p = motion.at_level(0, (40, 56)).p
     inner = p[6:-6, 6:-6]
@@ -97,7 +97,7 @@ def test_motion_of_a_pattern_finer_than_coarse_pixels():
     L += np.random.default_rng(0).normal(0, 0.05, L.shape).astype(np.float32)
     pyramid = trajectories.ImagePyramid(L, np.full_like(L, 2.5e-3), 0.35)
     plan = trajectories.plan_stages(s, 0.2)
-    p = trajectories.estimate_trajectories(pyramid, PathTimes.of(s), plan, COST).p
+    p = trajectories.estimate_trajectories(pyramid, PathTimes.without_common(s), plan, COST).p
     np.testing.assert_allclose(2 * np.median(p, (0, 1))[:2], (12, 0), atol=0.3)
 
 
@@ -108,7 +108,7 @@ def test_motion_of_half_the_image_alone():
     L = np.where(np.arange(56) < 28, still, moving).astype(np.float32)
     pyramid = trajectories.ImagePyramid(L, np.full_like(L, 1e-3), 0.35)
     plan = trajectories.plan_stages(s, 0.5)
-    p = trajectories.estimate_trajectories(pyramid, PathTimes.of(s), plan, COST).p
+    p = trajectories.estimate_trajectories(pyramid, PathTimes.without_common(s), plan, COST).p
     assert np.abs(p[:, :5, :2] * 2).max() < 0.3  # of half resolution
     np.testing.assert_allclose(p[2:-2, -5:-2, 0] * 2, 3, atol=0.4)
 
@@ -171,7 +171,7 @@ def test_pixels_take_the_path_of_their_side():
     x = np.arange(56)
     still, moving = moved((0, 0), (0, 0), s), moved((6.0, -3.0), (0, 0), s)
     packed = trajectories.pack_images(np.where(x < 28, still, moving), np.full_like(still, 1e-3))
-    images = PackedImages.of(packed, PathTimes.of(s))
+    images = PackedImages.of(packed, PathTimes.without_common(s))
     # Between both motions a ramp, 12 px wide, as nodes leave it.
     part = np.clip((x - 21.5) / 12, 0, 1)[None, :, None] * np.ones((40, 1, 1))
     paths = (part * [6.0, -3, 0, 0]).astype(np.float32)
@@ -187,7 +187,7 @@ def test_pixels_take_the_path_of_their_side():
     # What moves has left the image's other half, so that some pixels see it in few instants.
     assert wrong(before) > 0.5 and wrong(chosen) < 0.25
     # Steps from paths of others leave fewer wrong ones than steps alone; sizes may be odd.
-    odd = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), PathTimes.of(s))
+    odd = PackedImages.of(np.ascontiguousarray(packed[:, :39, :55]), PathTimes.without_common(s))
     p = np.ascontiguousarray(paths[::2, ::2])
     step = trajectories.gauss_newton_step
     refined = step(odd, trajectories.borrow_paths(odd, step(odd, p, COST), COST), COST)
@@ -203,7 +203,7 @@ def test_pixels_take_the_path_of_their_side():
     rng = np.random.default_rng(4)
     noise = rng.normal(0, 0.05, still.shape).astype(np.float32)
     packed = trajectories.pack_images(noise, np.full_like(still, 0.01))
-    images = PackedImages.of(packed, PathTimes.of(s))
+    images = PackedImages.of(packed, PathTimes.without_common(s))
     rough = rng.normal(0, 1, paths.shape).astype(np.float32)
     assert (trajectories.select_paths(images, rough, COST) != own).mean() < 0.05
 
@@ -990,7 +990,7 @@ def test_equations_do_not_depend_on_the_turns_of_threads():
     L = moved((1.0, -0.5), (0.2, 0.1), s, 8, 200) + rng.normal(0, 0.02, (5, 8, 200))
     V = np.full(L.shape, 5e-4, np.float32)
     packed = trajectories.pack_images(L.astype(np.float32), V)
-    images = PackedImages.of(packed, PathTimes.of(s))
+    images = PackedImages.of(packed, PathTimes.without_common(s))
     p = np.float32([1, -0.5, 0.2, 0.1]) + rng.normal(0, 0.02, (4, 100, 4)).astype(np.float32)
     cost = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
     first = normal_equations.linearise(images, p, cost)

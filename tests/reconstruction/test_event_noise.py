@@ -113,7 +113,7 @@ def test_trajectories_are_chosen_by_region():
     still = np.repeat(scene[None, :, :WIDTH], 5, 0)
     moving = np.stack([scene[:, 10 - k : 10 - k + WIDTH] for k in (-4, -2, 0, 2, 4)])
     L = np.where(np.arange(WIDTH) < WIDTH // 2, still, moving).astype(np.float32)
-    images = PackedImages.of(pack_images(L, np.full_like(L, 1e-3)), PathTimes.of(s))
+    images = PackedImages.of(pack_images(L, np.full_like(L, 1e-3)), PathTimes.without_common(s))
     cost = CostParams(*map(np.float32, (2e-4, 10, 40, 0.04, 0.1, 0.2)))
     resting = np.zeros((HEIGHT // 2, WIDTH // 2, 4), np.float32)
     going = resting.copy()
@@ -122,7 +122,7 @@ def test_trajectories_are_chosen_by_region():
     assert (chosen[3:-3, 3 : WIDTH // 4 - 5] == 0).all()
     assert (chosen[3:-3, WIDTH // 4 + 5 : -5] == 4).all()
     noisy = (L + rng.normal(size=L.shape) * 0.02).astype(np.float32)
-    images = PackedImages.of(pack_images(noisy, np.full_like(L, 1e-3)), PathTimes.of(s))
+    images = PackedImages.of(pack_images(noisy, np.full_like(L, 1e-3)), PathTimes.without_common(s))
     chosen = choose_trajectories(images, (resting, going), cost, (1.0, 1e-6))[..., 0]
     assert (chosen[3:-3, 5:-5] == 0).all()
 

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from jaxevent.camera import UnknownResponse
 from jaxevent.methods import find
 from jaxevent.reconstruction.compensated import images, target_motion
-from jaxevent.reconstruction.compensated.images import is_equally_bright
+from jaxevent.reconstruction.compensated.images import are_equally_bright
 from jaxevent.reconstruction.compensated.robust_mean import InstantLayout
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.simulate import Sensor, simulate
@@ -105,10 +105,10 @@ def test_light_that_all_events_show_is_told_from_motion():
     texture = gaussian_filter(rng.standard_normal((192, 400)), 3, mode="wrap")
     moving = np.stack([texture[:, 7 * k : 7 * k + 256] for k in range(15)]) / texture.std()
     fading = -0.06 * np.arange(15)[:, None, None]
-    assert is_equally_bright(moving)
-    assert not is_equally_bright(moving + fading)
-    assert is_equally_bright(moving + fading / 30)
-    assert not is_equally_bright(0 * moving + fading)
+    assert are_equally_bright(moving)
+    assert not are_equally_bright(moving + fading)
+    assert are_equally_bright(moving + fading / 30)
+    assert not are_equally_bright(0 * moving + fading)
 
 
 def test_brightness_is_in_doubt_where_frames_differ_from_those_around():
@@ -159,11 +159,11 @@ def test_beyond_the_frames_brightness_is_that_of_the_nearest_along_trajectories(
     common = np.zeros((2, 2), np.float32)
     layout = InstantLayout(at - 1, at * 0 + 1, 1 - at, at, common, *np.array([1, 0, 0, 0]))
     brightness = images.BrightnessPrior(np.float32(0.02), np.float32(-b))
-    base, P = images.smooth_at_target(np.stack([frame, own]), layout, zero, paths, brightness)
+    base, P = images.smooth_part_at_target(np.stack([frame, own]), layout, zero, paths, brightness)
     np.testing.assert_allclose(base[:, :-3], frame[:, 3:] - b, rtol=1e-6)
     np.testing.assert_allclose(P, 0.02, rtol=1e-6)
     between = layout._replace(after=np.array(1))
-    base, _ = images.smooth_at_target(np.stack([frame, own]), between, zero, paths, brightness)
+    base, _ = images.smooth_part_at_target(np.stack([frame, own]), between, zero, paths, brightness)
     np.testing.assert_array_equal(base, own)
 
 
@@ -187,7 +187,7 @@ def test_images_between_frames_of_different_brightness(monkeypatch):
     low, high = (recording.frames.intensity[k].mean() for k in (BRIGHT + 1, BRIGHT))
     assert low + 0.1 * (high - low) < image.mean() < high - 0.1 * (high - low)
     monkeypatch.setattr(target_motion.FrameBrightness, "is_steady", lambda *_: True)
-    monkeypatch.setattr(target_motion, "is_equally_bright", lambda *_: True)
+    monkeypatch.setattr(target_motion, "are_equally_bright", lambda *_: True)
     unaware = mc.estimate(recording, params, progress=False)(t).mean
     assert error(image) < 0.5 * error(unaware)
 

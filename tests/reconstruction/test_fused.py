@@ -340,7 +340,7 @@ def test_derivatives_by_kernels_are_those_of_the_scan(name, options):
     recording, method = random_recording(7, 300, 5, size=(4, 3), exposure=700), METHODS[name]
     params = params_of(method, **values)
     times = np.unique(np.clip(times_of(recording), recording.start, recording.stop))
-    still = {*params.without_gradient(), "ratio_min", "ratio_max"}
+    still = {*params.names_without_gradient(), "ratio_min", "ratio_max"}
     raw = {n: leaf for n, leaf in params.raw.items() if n not in still}
     truth = np.random.default_rng(0).random((len(times), 12))
 

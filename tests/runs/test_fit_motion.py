@@ -143,7 +143,7 @@ def test_bad_settings(tmp_path, capsys):
 def test_loss_of_a_perfect_filter_is_small():
     params = voting.Params.of({**START, "particles": 100, "noise": 0.1})
     goal = FAMILY.goal(voting, params, {"truth": "*.csv"})
-    assert goal.loss == MotionLoss(True) and "tau_max" in params.without_gradient()
+    assert goal.loss == MotionLoss(True) and "tau_max" in params.names_without_gradient()
     with pytest.raises(InputError, match="true motion"):
         FAMILY.goal(voting, params, {})
 

@@ -139,7 +139,7 @@ class TrackVariant(NamedTuple):
         """
         if not self.tangents:
             return params
-        stuck = params.without_gradient()
+        stuck = params.names_without_gradient()
         raw = {name: np.asarray(leaf) for name, leaf in params.raw.items() if name not in stuck}
         direction = {n: np.zeros_like(leaf) for n, leaf in raw.items() if np.isfinite(leaf).all()}
         if along is not None and along[0] in direction:

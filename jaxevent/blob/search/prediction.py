@@ -1,4 +1,4 @@
-"""Density of a window's events, predicted from the two windows before by blobs at some scale."""
+"""Density of a window's events, predicted from blobs in the two windows before it, at a scale."""
 
 import functools
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ from jaxevent.codegen import ZeroedScratch, njit_noalloc, njit_noalloc_inlined
 
 _bins = ZeroedScratch(np.int32)
 KERNEL_RADII_PX = (3.0, 8.0, 20.0)
-KERNEL_BINS_PX = (2, 4, 8)  # of events about each kernel
-N_DENSITIES = 1 + len(KERNEL_RADII_PX)  # of ellipses and kernels
-N_EM_STEPS = 15  # expectation and maximisation, for the shares of ellipses and kernels
+KERNEL_BINS_PX = (2, 4, 8)  # side of the bins of events that each kernel is applied to
+N_DENSITIES = 1 + len(KERNEL_RADII_PX)  # one of ellipses, one of each kernel
+N_EM_STEPS = 15  # expectation-maximisation steps for the shares of these densities
 MAX_SQUARED_SIGMAS = 80.0  # squared standard deviations beyond which a Gaussian is 0
 
 
@@ -39,10 +39,10 @@ def _kernel_weights(r: float, g: int) -> NDArray[np.float64]:
         g: Side of a bin, px.
 
     Returns:
-        (g, g, bins, bins) weights of bins of g px around a pixel in row v and column u of its bin,
-        by v and u.
+        (g, g, bins, bins) weights [v, u] of the bins around a pixel that lies in row v and column u
+        of its own bin.
     """
-    reach = int(np.ceil((r + g - 1) / g - 0.5)) - 1  # of the last bin that is nearer than r
+    reach = int(np.ceil((r + g - 1) / g - 0.5)) - 1  # bins nearer than r, on either side
     apart = (np.arange(-reach, reach + 1) + 0.5) * g - np.arange(g)[:, None]
     squared = apart[:, None, :, None] ** 2 + apart[None, :, None, :] ** 2
     return 3 / (np.pi * r**2) * np.maximum(1 - squared / r**2, 0) ** 2
@@ -52,39 +52,40 @@ class ScoredEvents(NamedTuple):
     """Events of a window on which predictions are scored."""
 
     pixels: PixelCounts
-    background: NDArray[np.float64]  # (pixels,) 1/px^2, density of the background there
-    number: int  # of all events of the window
+    background: NDArray[np.float64]  # (pixels,) 1/px^2, density of background events there
+    n_window_events: int  # number of all events of the window
 
 
 class ScalePrediction(NamedTuple):
     """Density of a window's events, predicted at one scale."""
 
-    density: NDArray[np.float64]  # (pixels, 4) 1/px^2, by ellipses and by each kernel
+    density: NDArray[np.float64]  # (pixels, 4) 1/px^2, of ellipses and of each kernel
     scored: ScoredEvents
-    sums: NDArray[np.float64]  # (3,) events of the blobs, those in blobs of three and more, and
-    # those in such blobs that are in contact with another one
+    # (3,) numbers of events in blobs, in large ones (`min_blob_events`), and in large ones that
+    # touch another
+    blob_events: NDArray[np.float64]
 
 
 class PredictionScore(NamedTuple):
-    """Gain of the predictions of a scale over the background alone, in nats per event.
+    """Log-likelihood gain of the predictions of a scale over background alone.
 
     Attributes:
         raw: Gain, nats per event.
-        penalised: Gain less a share for blobs in contact.
-        ellipses: Penalised gain by ellipses alone.
-        parts: (windows,) contributions to `raw`.
-        number: Number of all events of the windows.
+        penalised: Gain less a penalty for blobs in contact, nats per event.
+        ellipses_only: Penalised gain of ellipses without kernels, nats per event.
+        by_window: (windows,) contributions to `raw`.
+        n_events: Number of all events of the windows.
     """
 
     raw: float
     penalised: float
-    ellipses: float
-    parts: NDArray[np.float64]
-    number: int
+    ellipses_only: float
+    by_window: NDArray[np.float64]
+    n_events: int
 
 
 class _PredictionScratch(NamedTuple):
-    """Scratch memory of `_add_prediction`, for windows of so many pixels."""
+    """Scratch memory of `_add_prediction`."""
 
     detection: DetectionScratch
     before: Blobs
@@ -96,7 +97,7 @@ class _PredictionScratch(NamedTuple):
 
     @classmethod
     def empty(cls, pixels: int, shape: tuple[int, int]) -> "_PredictionScratch":
-        """Allocate scratch memory for windows of so many pixels at most, of a sensor's shape."""
+        """Allocate scratch memory for windows of at most `pixels` pixels on a sensor (h, w)."""
         tables = tuple(map(_kernel_weights, KERNEL_RADII_PX, KERNEL_BINS_PX))
         bins = tuple(_bins(*(n // len(one) + one.shape[-1] for n in shape)) for one in tables)
         return cls(
@@ -108,13 +109,13 @@ class _PredictionScratch(NamedTuple):
 def sample_scored(
     stream: Stream, background: Background, t: float | int, window: float | int
 ) -> ScoredEvents:
-    """Choose events of a window, on which predictions are scored.
+    """Sample the events of a window on which predictions are scored.
 
     Args:
         stream: Events.
         background: Their background.
         t: Begin of the window, s.
-        window: Its length, s.
+        window: Length of the window, s.
 
     Returns:
         The events.
@@ -155,44 +156,44 @@ def predict(
 def score(predictions: list[ScalePrediction]) -> PredictionScore:
     """Score the predictions of one scale for several windows."""
     scored = [one.scored for one in predictions]
-    number = sum(one.number for one in scored)
+    number = sum(one.n_window_events for one in scored)
     windows = np.arange(len(scored)).repeat([len(one.pixels) for one in scored])
     b = np.concatenate([one.background for one in scored])
     ratio = np.concatenate([one.density for one in predictions]) / b[:, None]
     most = CONFIG.max_scored_events
-    weight = np.concatenate([max(1.0, one.number / most) * one.pixels.n for one in scored])
-    expected, large, split = np.array([one.sums for one in predictions]).T
+    weight = np.concatenate([max(1.0, one.n_window_events / most) * one.pixels.n for one in scored])
+    expected, large, touching = np.array([one.blob_events for one in predictions]).T
     near = ratio.any(1)  # pixels that a blob may reach
     windows, ratio, weight = windows[near], ratio[near], weight[near]
-    # The likeliest shares of the densities.
+    # Maximum-likelihood shares of the densities.
     shares = np.full(N_DENSITIES, 1 / N_DENSITIES)
     for _ in range(N_EM_STEPS):
         shares = shares * ((weight / (1 + ratio @ shares)) @ ratio) + 1e-12
         shares /= shares.sum()
     gains = weight * np.log1p(ratio @ shares)
-    parts = (np.bincount(windows, gains, len(scored)) - expected) / max(number, 1)
-    raw = float(parts.sum())
+    by_window = (np.bincount(windows, gains, len(scored)) - expected) / max(number, 1)
+    raw = float(by_window.sum())
     ellipses = float(weight @ np.log1p(ratio[:, 0]) - expected.sum()) / max(number, 1)
-    lost = CONFIG.split_loss * abs(raw) * float(split.sum()) / max(float(large.sum()), 1e-9)
-    return PredictionScore(raw, raw - lost, ellipses - lost, parts, number)
+    penalty = CONFIG.split_loss * abs(raw) * float(touching.sum()) / max(float(large.sum()), 1e-9)
+    return PredictionScore(raw, raw - penalty, ellipses - penalty, by_window, number)
 
 
 @njit_noalloc
 def _add_prediction(
     before: Any, scored: Any, rows: Any, clutter: Any, cells: Any, scratch: Any, out: Any
 ) -> None:
-    """Add the predicted densities of a window's events, and the sums of `ScalePrediction`.
+    """Add the predicted densities of a window's events, and the events of blobs.
 
     Args:
         before: `PixelCounts` of the two windows before, the earlier first.
         scored: `PixelCounts` at which the density is evaluated.
-        rows: Order of the scored pixels by their rows, and these rows, sorted.
+        rows: Indices that sort the scored pixels by row, and the sorted rows.
         clutter: `ClutterModel`.
         cells: Counts of `zeroed_cells`, zero before and after.
         scratch: `_PredictionScratch`.
-        out: Densities (pixels, 4), 1/px^2, and sums (3,), added to.
+        out: `density` (pixels, 4), 1/px^2, and `blob_events` (3,) of `ScalePrediction`, added to.
     """
-    (first, second), (density, sums) = before, out
+    (first, second), (density, blob_events) = before, out
     labels = scratch.detection.labels
     earlier = find_blobs(first.x, first.y, first.n, clutter, cells, scratch.detection)
     sum_blobs(first.x, first.y, first.n, labels, earlier, scratch.before)
@@ -203,15 +204,15 @@ def _add_prediction(
     _extrapolate(earlier, number, scratch)
     _add_ellipses(density, scored, rows, number, scratch)
     for k in range(len(KERNEL_RADII_PX)):
-        _add_kernels(density[:, k + 1], scored, second, k, scratch)
+        _fill_kernel_density(density[:, k + 1], scored, second, k, scratch)
     for k in range(number):
-        sums[0] += scratch.last.n[k]
-    sums[1], sums[2] = _count_split(number, scratch)
+        blob_events[0] += scratch.last.n[k]
+    blob_events[1], blob_events[2] = _count_events_in_contact(number, scratch)
 
 
 @njit_noalloc_inlined
 def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
-    """Predict the blobs of the next window, each from the nearest one of the window before.
+    """Predict each blob of the next window from its last position and its nearest predecessor.
 
     Args:
         earlier: Number of blobs in `scratch.before`.
@@ -240,13 +241,12 @@ def _extrapolate(earlier: int, number: int, scratch: Any) -> None:
 
 @njit_noalloc_inlined
 def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: Any) -> None:
-    """Add the densities of Gaussian blobs at pixels to the first column.
+    """Add the densities of Gaussian blobs at the scored pixels to the first column.
 
     Args:
         density: (pixels, 4), 1/px^2, added to.
         scored: `PixelCounts`.
-        rows: Order of the pixels by their rows, and these rows, sorted: a blob visits those it
-            reaches.
+        rows: Indices that sort the pixels by row, and the sorted rows.
         number: Number of blobs.
         scratch: `_PredictionScratch`.
     """
@@ -269,10 +269,10 @@ def _add_ellipses(density: Any, scored: Any, rows: Any, number: int, scratch: An
 
 
 @njit_noalloc_inlined
-def _add_kernels(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> None:
-    """Compute the density of moved events at the scored pixels by one kernel.
+def _fill_kernel_density(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> None:
+    """Compute the kernel density of the moved events at the scored pixels.
 
-    Events lie in the middles of bins.
+    Each event is put into the middle of its bin.
 
     Args:
         out: (scored pixels,) output, 1/px^2.
@@ -283,8 +283,8 @@ def _add_kernels(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> No
     """
     table, counts = scratch.tables[k], scratch.bins[k]
     g, reach = len(table), table.shape[2] // 2
-    _add_counts(counts, pixels, 1, (g, reach), scratch)
-    # numba checks signed indices at every place, which takes two fifths of the time.
+    _bin_moved_events(counts, pixels, 1, (g, reach), scratch)
+    # Unsigned: numba checks the sign of signed indices, which takes two fifths of the time.
     wide, side = np.uint64(2 * reach + 1), np.uint64(g)
     for j in range(len(out)):
         at_y, at_x, total = np.uint64(scored.y[j]), np.uint64(scored.x[j]), 0.0
@@ -294,17 +294,17 @@ def _add_kernels(out: Any, scored: Any, pixels: Any, k: int, scratch: Any) -> No
             for b in range(wide):
                 total += table[v, u, a, b] * counts[row + a, column + b]
         out[j] = total
-    _add_counts(counts, pixels, -1, (g, reach), scratch)
+    _bin_moved_events(counts, pixels, -1, (g, reach), scratch)
 
 
 @njit_noalloc_inlined
-def _add_counts(counts: Any, pixels: Any, sign: int, bins: Any, scratch: Any) -> None:
-    """Add the events of blobs' pixels, which move along with them, to bins, or take them away.
+def _bin_moved_events(counts: Any, pixels: Any, sign: int, bins: Any, scratch: Any) -> None:
+    """Add the events of blobs, moved with them to the next window, to bins, or subtract them.
 
     Args:
         counts: (rows, columns) of bins, added to.
         pixels: `PixelCounts` of the last window.
-        sign: 1: add; -1: take away.
+        sign: 1 to add, -1 to subtract.
         bins: Side of a bin, px, and number of bins beyond the sensor on either side.
         scratch: `_PredictionScratch`.
     """
@@ -320,10 +320,10 @@ def _add_counts(counts: Any, pixels: Any, sign: int, bins: Any, scratch: Any) ->
 
 
 @njit_noalloc_inlined
-def _count_split(number: int, scratch: Any) -> tuple[float, float]:
-    """Count events in large blobs, and in those in contact with another one.
+def _count_events_in_contact(number: int, scratch: Any) -> tuple[float, float]:
+    """Count the events in large blobs, and in large blobs that touch another one.
 
-    Pieces along an outline are in contact with each other, both of its sides are not.
+    Pieces of one outline touch each other; its two opposite sides do not.
 
     Args:
         number: Number of blobs in `scratch.last`.
@@ -333,7 +333,7 @@ def _count_split(number: int, scratch: Any) -> tuple[float, float]:
         Both numbers of events.
     """
     (n, p, C), touches = scratch.last, scratch.touches
-    least, large, split = CONFIG.min_blob_events, 0.0, 0.0
+    least, large, touching = CONFIG.min_blob_events, 0.0, 0.0
     for k in range(number):
         touches[k] = False
         for j in range(k):
@@ -344,5 +344,5 @@ def _count_split(number: int, scratch: Any) -> tuple[float, float]:
         if n[k] >= least:
             large += n[k]
             if touches[k]:
-                split += n[k]
-    return large, split
+                touching += n[k]
+    return large, touching

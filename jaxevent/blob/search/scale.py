@@ -94,7 +94,7 @@ def select_scale(
     i = int(np.flatnonzero(column >= column.max() - CONFIG.equal_window_loss * best).max())
     scale = dataclasses.replace(trial.scales[i][j], compact=compact)
     predictions, best = trial.predictions[i][j], float(scores[i, j])
-    number = sum(one.scored.number for one in predictions)
+    number = sum(one.scored.n_window_events for one in predictions)
     return ScaleSelection(scale, best, best * number / len(predictions))
 
 
@@ -143,9 +143,9 @@ class _ScaleTrial:
             scores = [score(one[j]) for one in self.predictions]
             best = max(scores, key=lambda one: one.raw)
             for i, one in enumerate(scores):
-                most, number = _upper_bound(one.parts), one.number / len(one.parts)
+                most, number = _upper_bound(one.by_window), one.n_events / len(one.by_window)
                 evident |= are_evident(most, most * number, self.background)
-                excess = _upper_bound(one.parts - CONFIG.dropped_score * best.parts)
+                excess = _upper_bound(one.by_window - CONFIG.dropped_score * best.by_window)
                 self.tried[i, j] = one is best or excess >= 0
         return evident
 

@@ -1,33 +1,34 @@
-"""Motion that makes the image of warped events sharpest: contrast maximisation, as a baseline.
+"""Contrast maximisation: the motion that makes the image of warped events sharpest; a baseline.
 
 After Gallego, Rebecq & Scaramuzza, "A Unifying Contrast Maximization Framework for Event Cameras"
 (CVPR 2018) and Gallego & Scaramuzza, "Accurate Angular Velocity Estimation with an Event Camera"
-(RA-L 2017). In a window of time events are moved along a constant motion to the window's middle,
+(RA-L 2017). The events of a time window are moved along a constant motion to the window's middle,
 
     planar:    x' = x - U t
     rotation:  X' = exp(Omega t) X,  x' = f (X'_x, X'_y) / X'_z,  X = (x, y, f)
 
-with t (s) from the middle, and are summed, by polarity, into an image J, bilinearly and blurred.
-The estimate maximises the mean square or the variance of J: events of one point of the scene then
-fall together. It is found from coarse to fine, with much blur at first, from the motion of the
-window before. For the first window, and when the motion was lost, all motions are searched.
-SciPy's BFGS uses one compiled gradient for all blurs.
+with t (s) from the middle, and are summed with their polarity into a blurred image J. The estimate
+maximises the mean square or the variance of J: the events of one scene point then fall together. It
+is refined from coarse to fine blur, starting from the motion of the previous window. For the first
+window, and after the motion was lost, all motions are searched. SciPy's BFGS uses one compiled
+gradient for all blurs.
 
-Along straight parallel edges J is as sharp for all motions, and chance decides which one is best.
-So each maximum is compared with motions up to 6 px away along the axis in which it is flattest, on
-the points that all of these keep in view: where edges leave the sensor, they would end. Cells of
-the image, drawn anew with replacement, have the maximum elsewhere (Efron, Ann. Stat. 1979). Its
-mean square is in the covariance, and if one in twenty draws has it at the ends, the motion is lost.
+If all edges are straight and parallel, J is equally sharp for all motions along them, and chance
+decides which one is best. So each maximum is compared with motions up to 6 px away along its
+flattest axis, on the points that all of these motions keep in view: elsewhere edges would end at
+the sensor's border. The cells of the image are resampled with replacement, and the maximum of each
+draw is found (bootstrap; Efron, Ann. Stat. 1979). Its mean square is added to the covariance. If
+more than one in twenty draws has its maximum at either end, the motion is lost.
 
-Points that enter or leave the sensor within the window pull the motion towards 0, for a slower one
-keeps their cut tracks together as well. So J only counts where a point is in view for the whole
-window. That region is computed from the motion that an ascent starts with, and then fixed; events
-count less towards the window's ends.
+Points that enter or leave the sensor within the window bias the motion towards 0, because a slower
+motion keeps their cut tracks together as well. So J only counts where a point is in view for the
+whole window. That region is computed from the initial motion of an ascent, and then fixed. Events
+are weighted less towards the window's ends.
 
-An event gives its pixel, not its position in it. If all were at the pixels' middles, an image along
-whose rows or columns objects about move would become sharper by the grid alone, and the motion
-across too large, whatever the blur and the number of events. Events that are spread over their
-pixels do not show the grid.
+An event gives its pixel, not its position within the pixel. If all events were at the pixels'
+middles, and objects moved almost along rows or columns, J would become sharper by the grid alone.
+The motion across would then be too large, whatever the blur and the number of events. Events that
+are spread randomly over their pixels do not show the grid.
 """
 
 import dataclasses
@@ -58,29 +59,29 @@ from jaxevent.parameters import Choice, Count, Parameters, Positive, UnitInterva
 from jaxevent.progress import bar
 from jaxevent.recording import Recording
 
-N_COARSE_BLURS = 8  # times [1 2 1] in a search: 2 px
-N_MIDDLE_BLURS = 2  # times, next
-FINEST_GRID_SPACING_PX = 2.0  # at the end of a short window, between motions of its grid
-GRID_RANGE_RATIO = 4.0  # between the ranges of the grids of a search
+N_COARSE_BLURS = 8  # blurs by [1 2 1] / 4 in a search: 2 px
+N_MIDDLE_BLURS = 2  # blurs after that
+FINEST_GRID_SPACING_PX = 2.0  # between motions of a search grid, at the window's end
+GRID_RANGE_RATIO = 4.0  # range of a search grid over that of the next, finer one
 N_REFINED_MOTIONS = 4  # motions of a grid that are refined
-INDEPENDENT_CELL_PX = 24  # of the parts of the image whose errors are independent
-CURVATURE_PROBE_PX = 0.5  # at the window's end, from the maximum, where the curvature is measured
-# At the window's end, along the flattest axis.
+INDEPENDENT_CELL_PX = 24  # side of the image's cells, whose errors are taken as independent
+CURVATURE_PROBE_PX = 0.5  # step of the differences that measure the curvature, at the window's end
+# Along the flattest axis, at the window's end.
 COMPARED_DISPLACEMENTS_PX = np.arange(-6.0, 7.0, 2.0)
-N_DRAWS = 200  # of the image's cells
-MAX_UNBOUNDED_FRACTION = 0.05  # of draws that have the maximum at the ends of these
+N_DRAWS = 200  # bootstrap draws of the image's cells
+MAX_UNBOUNDED_FRACTION = 0.05  # of draws with the maximum at the ends of the displacements
 MIN_RELATIVE_GRADIENT = 1e-3  # 1/px, relative to the objective, at which an ascent ends
-BEST_WINDOW_DISPLACEMENT_PX = 10.0  # of the image in a window, at best
-WINDOW_DISPLACEMENT_RANGE_PX = (5.0, 60.0)  # within which the default is kept
-WINDOW_DURATION_RANGE_S = (0.002, 2.0)
+BEST_WINDOW_DISPLACEMENT_PX = 10.0  # of the image in an adapted window
+WINDOW_DISPLACEMENT_RANGE_PX = (5.0, 60.0)  # within which the default duration is kept
+WINDOW_DURATION_RANGE_S = (0.002, 2.0)  # of an adapted window
 COVARIANCE_CALIBRATION = CovarianceCalibration(change=0.09)
 SYSTEMATIC_ERROR_PX = 0.25  # of the displacement in a window, from events at pixels' middles
-MIN_PART_RATIO = 0.35  # of the density of events in halves of a window, relative to the largest
-N_NEIGHBOURS = 3  # estimates, up to which halves of windows show how the motion changes
-N_HALVED_WINDOWS = 5  # of more, whose halves show changes that neighbours do not
-RELATIVE_NOISE = 0.5  # 1/sqrt(s), change of a motion that few windows do not show
-INITIAL_VARIANCE_PX2 = 2.0  # px^2, inverse curvature relative to the objective, at the start
-PARALLEL_EDGES = (
+MIN_DENSITY_RATIO = 0.35  # density of events in a half of a window over that in the densest half
+MAX_ALL_HALVED = 3  # number of estimates up to which every window is halved to measure changes
+N_HALVED_WINDOWS = 5  # windows halved if there are more, for changes that neighbours do not show
+RELATIVE_MOTION_NOISE = 0.5  # 1/sqrt(s), relative change of a motion, if windows are few
+INITIAL_INVERSE_CURVATURE_PX2 = 2.0  # px^2, relative to the objective, of an ascent's first step
+PARALLEL_EDGES_WARNING = (
     "the edges in view are parallel: events show the motion across them alone, and any motion "
     "along them explains the events as well; rows are empty"
 )
@@ -94,25 +95,27 @@ class Params(Parameters):
     window: Choice = Choice(
         ("duration", "events"), "windows of `duration`, or of `events` events each"
     )
-    polarity: Choice = Choice(("signed", "ignored"), "OFF counts -1, or as ON")
+    polarity: Choice = Choice(("signed", "ignored"), "OFF events count -1, or 1 like ON")
     measure: Choice = Choice(("mean square", "variance"), "of the image of warped events")
     taper: Choice = Choice((True, False), "weight events by cos(pi t / length), or all alike")
-    whole: Choice = Choice((True, False), "count points that are in view all the time only, or all")
+    whole: Choice = Choice(
+        (True, False), "count only points that are in view for the whole window, or all"
+    )
     dither: Choice = Choice(
-        (True, False), "place events anywhere in their pixels, randomly, or at middles"
+        (True, False), "place events randomly within their pixels, or at the middles"
     )
 
     events: Count = Count(
-        20000, "", "events of a window; of more within `duration`, these many evenly"
+        20000, "", "events of a window; if `duration` holds more, this many, evenly spaced"
     )
     fewest: Count = Count(300, "", "least number of events of an estimate")
-    blur: Count = Count(1, "", "times [1 2 1] / 4 over the image, at last")
+    blur: Count = Count(1, "", "final number of blurs of the image by [1 2 1] / 4")
     steps: Count = Count(20, "", "most steps of the ascent at each blur")
-    starts: Count = Count(7, "", "motions of each of the search's grids in each component")
-    margin: Count = Count(16, "px", "of the image around the sensor")
+    starts: Count = Count(7, "", "motions per component in each grid of the search")
+    margin: Count = Count(16, "px", "margin of the image around the sensor")
 
     duration: Positive = Positive(0.1, "s", "length of a window, in which the motion is constant")
-    overlap: UnitInterval = UnitInterval(0.5, "", "fraction of a window that the next one has too")
+    overlap: UnitInterval = UnitInterval(0.5, "", "fraction of a window that the next one shares")
     speed_max: Positive = Positive(
         4000.0, "px/s", "planar: largest component of motions of the search"
     )
@@ -125,12 +128,12 @@ class Params(Parameters):
 
 
 class Window(eqx.Module):
-    """The events of a window, padded to a fixed number by events without weight.
+    """The events of a window, padded to a fixed number by events of weight 0.
 
     Attributes:
         xi: Positions, px, see `pixel_coordinates`.
         t: Times from the middle of the window, s.
-        weight: Weights by polarity; 0 for padding.
+        weight: Signed weights; 0 for padding.
         shuffled: The times in random order, s.
         mask: 1 where the image counts; see `mask_visible`.
         ends: Begin and end of the window from its middle, s.
@@ -138,7 +141,7 @@ class Window(eqx.Module):
         model: Motion model.
         shape: Height and width of the image, px.
         offset: Position of its pixel [0, 0], px.
-        box: Extent of the events, x0, y0, x1, y1, px.
+        box: Extent of the sensor, x0, y0, x1, y1, px.
     """
 
     xi: Float[Numeric, "N 2"]
@@ -167,16 +170,15 @@ class Window(eqx.Module):
         return self.model.warp(xi, motion * t[:, None])
 
     @property
-    def total_weight(self) -> Float[Array, ""]:
-        """Sum of squared weights, at least 1: the number of events without a taper."""
+    def sum_squared_weights(self) -> Float[Array, ""]:
+        """Sum of squared weights, at least 1; without a taper the number of events."""
         return jnp.maximum(jnp.sum(jnp.asarray(self.weight) ** 2), 1)
 
 
 def mask_visible(window: Window, motion: Float[Numeric, " dimension"]) -> Window:
-    """Mask the points that the sensor sees from the start of the window to its end.
+    """Restrict the image to points that the sensor sees from the window's start to its end.
 
-    All points count where the visible ones are less than a quarter of the sensor. The mask is
-    constant for derivatives.
+    If these are less than a quarter of the sensor, all points count. The mask has no derivative.
 
     Args:
         window: The window.
@@ -191,7 +193,7 @@ def mask_visible(window: Window, motion: Float[Numeric, " dimension"]) -> Window
     x0, y0, x1, y1 = window.box
     xi, motion = xi.astype(window.mask.dtype), lax.stop_gradient(jnp.asarray(motion))
     inside = jnp.ones(len(xi), bool)
-    # The displacement from the middle to the time t is that from -t to the middle.
+    # A point moves from the middle to the time t as it moves from -t to the middle.
     for t in jnp.asarray(window.ends):
         at = window.warp(xi, jnp.full(len(xi), -t), motion)
         inside &= (at >= jnp.array([x0, y0])).all(1) & (at <= jnp.array([x1, y1])).all(1)
@@ -204,7 +206,7 @@ def warped_image(
     params: Params,
     window: Window,
     motion: Float[Numeric, " dimension"],
-    times: int | Int[Array, ""] | None = None,
+    n_blurs: int | Int[Array, ""] | None = None,
 ) -> Float[Array, "height width"]:
     """Make the blurred image of warped events J.
 
@@ -212,8 +214,8 @@ def warped_image(
         params: The parameters.
         window: The window.
         motion: (d,) motion.
-        times: Number of blurs; by default `params.blur`. Traced, it is at most the larger of 8 and
-            `params.blur`.
+        n_blurs: Number of blurs; by default `params.blur`. If traced, at most the larger of
+            `N_COARSE_BLURS` and `params.blur`.
 
     Returns:
         (height, width) image.
@@ -223,11 +225,11 @@ def warped_image(
         weight = jnp.abs(weight)
     at = window.warp(jnp.asarray(window.xi), jnp.asarray(window.t), jnp.asarray(motion))
     image = splat(at, weight, window.shape, window.offset)
-    if times is None or isinstance(times, int):
-        return blur(image, params.blur if times is None else times)
+    if n_blurs is None or isinstance(n_blurs, int):
+        return blur(image, params.blur if n_blurs is None else n_blurs)
 
     def blur_again(J, k):
-        return lax.cond(k < times, blur, lambda J: J, J), None
+        return lax.cond(k < n_blurs, blur, lambda J: J, J), None
 
     return lax.scan(blur_again, image, jnp.arange(max(N_COARSE_BLURS, params.blur)))[0]
 
@@ -236,50 +238,52 @@ def objective(
     params: Params,
     window: Window,
     motion: Float[Numeric, " dimension"],
-    times: int | Int[Array, ""] | None = None,
+    n_blurs: int | Int[Array, ""] | None = None,
 ) -> Float[Array, ""]:
-    """Compute sum J^2, or sum (J - mean J)^2, per event, over the window's mask.
+    """Compute the sum of J^2, or of (J - mean J)^2, over the window's mask, per event.
 
     It is differentiable in the motion and in the events' positions, times and weights. Bilinear
-    weights have no second derivative, so curvatures are differences of the gradient.
+    weights have no second derivative, so the curvature is measured by differences of the gradient.
 
     Args:
         params: The parameters.
         window: The window.
         motion: (d,) motion.
-        times: Number of blurs, see `warped_image`.
+        n_blurs: Number of blurs, see `warped_image`.
 
     Returns:
         The value.
     """
-    J, mask = warped_image(params, window, motion, times), jnp.asarray(window.mask)
+    J, mask = warped_image(params, window, motion, n_blurs), jnp.asarray(window.mask)
     if params.measure == "variance":
         J = J - jnp.sum(mask * J) / jnp.maximum(jnp.sum(mask), 1)
-    return jnp.sum(mask * J**2) / window.total_weight
+    return jnp.sum(mask * J**2) / window.sum_squared_weights
 
 
 @eqx.filter_jit
-def _value_and_grad(params: Params, window: Window, z: Array, times: Array) -> tuple[Array, Array]:
+def _value_and_grad(
+    params: Params, window: Window, z: Array, n_blurs: Array
+) -> tuple[Array, Array]:
     """Compute the objective and its gradient.
 
     Args:
         params: The parameters.
         window: The window.
         z: (d,) motion, px at the window's end.
-        times: Number of times that images are blurred.
+        n_blurs: Number of blurs.
 
     Returns:
         The objective and its gradient (d,).
     """
     scale = jnp.asarray(window.scale)
-    return jax.value_and_grad(lambda z: objective(params, window, z * scale, times))(z)
+    return jax.value_and_grad(lambda z: objective(params, window, z * scale, n_blurs))(z)
 
 
 _mask_visible = eqx.filter_jit(mask_visible)
 
 
 def _cell_parts(params: Params, window: Window, z: Array) -> Float[Array, " cells"]:
-    """Return each image cell's part of the objective, without that of the mean.
+    """Return each image cell's part of the objective, with the measure "mean square".
 
     Args:
         params: Parameters.
@@ -294,7 +298,7 @@ def _cell_parts(params: Params, window: Window, z: Array) -> Float[Array, " cell
     size = rows * INDEPENDENT_CELL_PX, columns * INDEPENDENT_CELL_PX
     J = jnp.pad(J, [(0, whole - n) for whole, n in zip(size, J.shape, strict=True)])
     cells = (J**2).reshape(rows, INDEPENDENT_CELL_PX, columns, INDEPENDENT_CELL_PX)
-    return cells.sum((1, 3)).reshape(-1) / window.total_weight
+    return cells.sum((1, 3)).reshape(-1) / window.sum_squared_weights
 
 
 @eqx.filter_jit
@@ -307,7 +311,7 @@ def _cell_gradients(params: Params, window: Window, z: Array) -> Float[Array, "c
         z: (dimension,) motion, in px of displacement at the window's end.
 
     Returns:
-        Gradients by `z`, 1/px.
+        Gradients with respect to `z`, 1/px.
     """
     return jax.jacfwd(lambda z: _cell_parts(params, window, z))(z)
 
@@ -334,7 +338,7 @@ def _cell_profile(
 
 
 def _evaluate(
-    params: Params, window: Window, z: NDArray, times: int
+    params: Params, window: Window, z: NDArray, n_blurs: int
 ) -> tuple[float, NDArray[np.float64]]:
     """Compute the objective and its gradient on the host, in double precision.
 
@@ -342,18 +346,18 @@ def _evaluate(
         params: The parameters.
         window: The window.
         z: (d,) motion, px at the window's end.
-        times: Number of times that images are blurred.
+        n_blurs: Number of blurs.
 
     Returns:
         The objective and its gradient (d,).
     """
-    real, number = jnp.result_type(float), jnp.asarray(times)
+    real, number = jnp.result_type(float), jnp.asarray(n_blurs)
     value, slope = _value_and_grad(params, window, jnp.asarray(z, real), number)
     return float(value), np.asarray(slope, np.float64)
 
 
 def ascend(
-    params: Params, window: Window, motion: NDArray[np.floating], times: int | None = None
+    params: Params, window: Window, motion: NDArray[np.floating], n_blurs: int | None = None
 ) -> tuple[NDArray[np.float64], float]:
     """Maximise the objective from a motion, by BFGS on motions in px at the window's end.
 
@@ -361,21 +365,21 @@ def ascend(
         params: The parameters; `steps` is the largest number of steps.
         window: The window.
         motion: (d,) motion at the start.
-        times: Number of blurs; by default `params.blur`.
+        n_blurs: Number of blurs; by default `params.blur`.
 
     Returns:
         The motion (d,) at the maximum, and the objective there.
     """
-    times = params.blur if times is None else times
+    n_blurs = params.blur if n_blurs is None else n_blurs
     scale = np.asarray(window.scale, np.float64)
     begin = np.asarray(motion, np.float64) / scale
-    unit = max(_evaluate(params, window, begin, times)[0], 1e-12)
+    unit = max(_evaluate(params, window, begin, n_blurs)[0], 1e-12)
 
     def loss(z: NDArray) -> tuple[float, NDArray]:
-        value, slope = _evaluate(params, window, z, times)
+        value, slope = _evaluate(params, window, z, n_blurs)
         return -value / unit, -slope / unit
 
-    initial = INITIAL_VARIANCE_PX2 * np.eye(len(begin))
+    initial = INITIAL_INVERSE_CURVATURE_PX2 * np.eye(len(begin))
     options = {"gtol": MIN_RELATIVE_GRADIENT, "maxiter": params.steps, "hess_inv0": initial}
     found = minimize(loss, begin, jac=True, method="BFGS", options=options)
     return found.x * scale, -float(found.fun) * unit
@@ -386,9 +390,9 @@ class WindowEstimate(NamedTuple):
 
     Attributes:
         motion: (d,) motion at the maximum.
-        contrast: The objective relative to that with shuffled times.
+        contrast: The objective, relative to its value with shuffled times.
         covariance: (d, d), see `covariance`.
-        is_observable: Whether the maximum is one along all axes.
+        is_observable: Whether the objective has a maximum along every axis.
     """
 
     motion: NDArray[np.float64]
@@ -398,7 +402,7 @@ class WindowEstimate(NamedTuple):
 
 
 def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> WindowEstimate:
-    """Refine a motion at two blurs, 2 and `params.blur`.
+    """Refine a motion, first with `N_MIDDLE_BLURS` and then with `params.blur` blurs.
 
     Args:
         params: The parameters.
@@ -408,10 +412,10 @@ def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> Wind
     Returns:
         The estimate.
     """
-    for times in (N_MIDDLE_BLURS, params.blur):
+    for n_blurs in (N_MIDDLE_BLURS, params.blur):
         if params.whole:
             window = _mask_visible(window, jnp.asarray(motion, window.xi.dtype))
-        motion, value = ascend(params, window, motion, times)
+        motion, value = ascend(params, window, motion, n_blurs)
     z = motion / np.asarray(window.scale, np.float64)
     shuffled = dataclasses.replace(window, t=window.shuffled)
     chance, _ = _evaluate(params, shuffled, z, params.blur)
@@ -424,9 +428,9 @@ def refine(params: Params, window: Window, motion: NDArray[np.floating]) -> Wind
 
 
 class Curvature(NamedTuple):
-    """Eigenvalues of the negative curvature of the objective of motions in px, rising."""
+    """Eigenvalues and eigenvectors of the objective's negative Hessian, motions in px."""
 
-    values: NDArray[np.float64]  # (d,)
+    values: NDArray[np.float64]  # (d,) in ascending order
     axes: NDArray[np.float64]  # (d, d) eigenvectors in columns
 
 
@@ -459,10 +463,9 @@ def covariance(
     """Return the sandwich covariance H^-1 (sum_c g_c g_c') H^-1 of a motion.
 
     H is the objective's curvature at its maximum. g_c is the gradient of the part of the objective
-    in cell c of the image (24 px). The sum of these is 0, and their scatter gives the error of the
-    maximum, if cells are independent. Changes of the motion within the window are not in it; see
-    `CovarianceCalibration`. A direction with less than 1 % of the largest curvature is assumed to
-    have that much.
+    in cell c of the image (24 px). These gradients sum to 0, and if cells are independent, their
+    scatter gives the error of the maximum. Changes of the motion within the window are not
+    included; see `CovarianceCalibration`. Curvatures are raised to at least 1 % of the largest.
 
     Args:
         params: The parameters.
@@ -486,7 +489,7 @@ def covariance(
 def maximum_spread(
     params: Params, window: Window, motion: NDArray[np.floating], curvature: Curvature
 ) -> NDArray[np.float64] | None:
-    """Return the covariance of the maximum along its flattest axis, if cells are drawn anew.
+    """Return the bootstrap covariance of the maximum along its flattest axis.
 
     Args:
         params: The parameters.
@@ -495,7 +498,7 @@ def maximum_spread(
         curvature: The curvature there.
 
     Returns:
-        (d, d) covariance, or None if the draws do not bound the maximum: along parallel edges.
+        (d, d) covariance, or None if the draws do not bound the maximum, as along parallel edges.
     """
     scale = np.asarray(window.scale, np.float64)
     axis = curvature.axes[:, 0]
@@ -523,7 +526,7 @@ class EventRange(NamedTuple):
 
 
 class WindowSequence:
-    """The windows of a recording: `for part in windows` are ranges of events.
+    """Windows of a recording; iterating over them gives each one's `EventRange`.
 
     Args:
         recording: The recording.
@@ -606,11 +609,11 @@ class WindowSequence:
         events = self.recording.events[part.begin : part.end]
         return max(np.abs(events.t - part.middle).max(initial=0) * 1e-6, 1e-6)
 
-    def fills(self, part: EventRange) -> NDArray[np.bool_]:
+    def filled_parts(self, part: EventRange) -> NDArray[np.bool_]:
         """Return whether events fill a window's first quarter, its middle, and its last quarter.
 
-        Where the camera stops or begins to move within a window, all events are of a part of it.
-        They fill the middle if they are about as dense in the first, the central and the last half.
+        If the camera starts or stops within a window, events fill only a part of it. They fill the
+        middle if they are about equally dense in the first, the central and the last half.
 
         Args:
             part: The range of events.
@@ -622,16 +625,16 @@ class WindowSequence:
         half = 1e6 * self.half_length(part)
         count = np.histogram(t, part.middle + half * np.linspace(-1, 1, 5))[0]
         halves = count[:-1] + count[1:]
-        least = MIN_PART_RATIO * halves.max()
+        least = MIN_DENSITY_RATIO * halves.max()
         return np.array([2 * count[0] >= least, halves.min() >= least, 2 * count[-1] >= least])
 
     def crop(self, part: EventRange, half: float | None = None) -> Window:
-        """Make a window.
+        """Make the window of a range of events, or of its middle part.
 
         Args:
             part: The range of events.
-            half: Half the length of the middle part to crop, s, for a search. It has space for a
-                quarter of the events. By default the whole window is made.
+            half: Half the length of the middle part, s, for a search; at most a quarter of
+                `params.events` are kept. By default the whole window is made.
 
         Returns:
             The window.
@@ -666,14 +669,14 @@ class WindowSequence:
     def measure_change(
         self, part: EventRange, motion: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Measure the change of the motion in a window, by its halves.
+        """Measure the change of the motion within a window from estimates of its two halves.
 
         Args:
             part: The range of events.
             motion: (d,) motion of the whole window.
 
         Returns:
-            (d,) change and its covariance (d, d); 0 if a half is lost.
+            (d,) change and its covariance (d, d); both 0 if the motion of a half is lost.
         """
         quarter = self.half_length(part) / 2
         middles = [part.middle + round(1e6 * side * quarter) for side in (-1, 1)]
@@ -689,20 +692,20 @@ class WindowSequence:
         noise = common.with_systematic_error(error, self.length(part) / 2, self.pixel_scale)
         return 2 * noise.mean, 4 * noise.covariance
 
-    def unseen_change(
+    def mean_square_unseen_change(
         self, parts: list[EventRange], spans: NDArray[np.floating], estimate: MotionEstimate
     ) -> NDArray[np.float64]:
-        """Return the mean square (d, d) of changes in windows that their neighbours do not show.
+        """Return the mean square (d, d) of changes within windows that neighbours do not show.
 
-        A motion that turns several times within a window has means that are alike.
+        A motion that reverses several times within a window has the same mean in all windows.
 
         Args:
             parts: Windows of the estimate.
-            spans: Their lengths, s.
+            spans: Lengths of the windows, s.
             estimate: Motions of the windows.
 
         Returns:
-            The mean square, without that of errors.
+            The mean square, less that of errors.
         """
         valid = np.flatnonzero(estimate.valid)
         t, found = estimate.t[valid], estimate.mean[valid]
@@ -717,13 +720,14 @@ class WindowSequence:
         return vectors * np.maximum(values, 0) @ vectors.T
 
     def search(self, part: EventRange) -> NDArray[np.float64]:
-        """Search all motions for that of a window.
+        """Search for the motion of a window over all motions, from wide to narrow grids.
 
-        Each grid of motions has a window so short that they differ by `FINEST_GRID_SPACING_PX`
-        at the end. The widest grid, of all motions, has the shortest window. Each further grid is
-        `GRID_RANGE_RATIO` narrower, and its window as much longer, up to the whole one. The best of
-        each grid, and of the windows before, are refined in the next window. So a motion is found
-        at any speed, and where several explain a short window a longer one separates them.
+        The window of each grid is so short that neighbouring motions differ by
+        `FINEST_GRID_SPACING_PX` at its end. The widest grid, of all motions, has the shortest
+        window. Each further grid is narrower by `GRID_RANGE_RATIO`, and its window longer by the
+        same factor, up to the whole window. The best motions so far join those of each grid, and
+        all are refined. So a motion is found at any speed; if several explain a short window, a
+        longer one separates them.
 
         Args:
             part: The range of events.
@@ -732,7 +736,7 @@ class WindowSequence:
             (d,) motion.
         """
         params, whole = self.params, self.half_length(part)
-        # Range of a grid in px, in units of the motion times s.
+        # Range of a grid in px, as a motion times s.
         reach = FINEST_GRID_SPACING_PX * (params.starts - 1) / 2 / self.pixel_scale.max()
         bounds = [self.search_bound]
         while params.starts > 1 and reach / bounds[-1] < whole:
@@ -776,7 +780,7 @@ class WindowSequence:
 def _drop_duplicates(
     refined: list[tuple[NDArray[np.float64], float]], scale: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Keep one of those motions that are near to each other, the best.
+    """Keep the best of motions that are close to each other.
 
     Args:
         refined: Motions (d,) and their objectives.
@@ -795,12 +799,12 @@ def _drop_duplicates(
 
 
 def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
-    """Estimate the motion in overlapping windows of time; estimates are at their middles.
+    """Estimate the motion at the middles of overlapping windows.
 
-    `contrast` is the objective relative to that with shuffled times. Where it is too small, events
-    are too few, or do not fill the window, the motion is lost. Then its mean is that of the window
-    before, and all motions are searched for the next window. The first and the last estimate are
-    extended to their windows' ends if events fill them.
+    `contrast` is the objective relative to its value with shuffled times. If it is too small, or
+    events are too few or do not fill the window, the motion is lost: its mean is that of the
+    previous window, and all motions are searched for the next one. The first and the last estimate
+    are extended to the ends of their windows if events reach them.
 
     Args:
         params: The parameters.
@@ -818,7 +822,7 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     unobservable = 0
     for part in bar(windows, desc="sharpen windows", unit="window", progress=inputs.progress):
         parts.append(part)
-        if part.end - part.begin < params.fewest or not windows.fills(part)[1]:
+        if part.end - part.begin < params.fewest or not windows.filled_parts(part)[1]:
             motion = None
             fits.append(None)
             contrasts.append(0.0)
@@ -843,8 +847,8 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     change = rate = None
     valid = np.flatnonzero(estimate.valid)
     if not len(valid) and unobservable:
-        return dataclasses.replace(estimate, warning=PARALLEL_EDGES)
-    if 0 < len(valid) <= N_NEIGHBOURS:
+        return dataclasses.replace(estimate, warning=PARALLEL_EDGES_WARNING)
+    if 0 < len(valid) <= MAX_ALL_HALVED:
         change = np.zeros_like(estimate.mean)
         for k in valid:
             change[k] = windows.measure_change(parts[k], estimate.mean[k])[0]
@@ -854,24 +858,24 @@ def solve(params: Params, inputs: HostInputs) -> MotionEstimate:
     calibration = COVARIANCE_CALIBRATION.with_lens(inputs.camera)
     estimate = estimate.with_calibrated_covariance(calibration, spans, change)
     if change is not None:
-        # A random walk of variance q^2 t is off its mean over a window T by q^2 T / 6, squared.
-        # Each window that is there shows as much of the changes as is expected beforehand.
-        square = RELATIVE_NOISE**2 * (estimate.mean**2).sum(1) * spans / (6 * len(valid))
+        # A random walk of variance q^2 t deviates from its mean over a window T by a mean square of
+        # q^2 T / 6. This prior counts as much as one window, so n windows divide it by n.
+        square = RELATIVE_MOTION_NOISE**2 * (estimate.mean**2).sum(1) * spans / (6 * len(valid))
         added = square[:, None, None] * np.eye(estimate.mean.shape[1])
         estimate = dataclasses.replace(estimate, covariance=estimate.covariance + added)
     elif len(valid):
-        # A change d along a window is off its mean by d / sqrt(12).
-        added = windows.unseen_change(parts, spans, estimate) / 12
+        # A linear change by d over a window deviates from its mean by d / sqrt(12), rms.
+        added = windows.mean_square_unseen_change(parts, spans, estimate) / 12
         estimate = dataclasses.replace(estimate, covariance=estimate.covariance + added)
     before, after = (
-        round(1e6 * windows.half_length(part)) if windows.fills(part)[end] else 0
+        round(1e6 * windows.half_length(part)) if windows.filled_parts(part)[end] else 0
         for part, end in ((parts[0], 0), (parts[-1], 2))
     )
     return estimate.extended_to(int(t[0]) - before, int(t[-1]) + after, rate)
 
 
-def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
-    """Return a duration in which the image moves by some pixels, if the default is far off."""
+def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
+    """Return a duration in which the image moves by 10 px, if the default is far from that."""
     displacement = speed.fast * float(params.duration)
     low, high = WINDOW_DISPLACEMENT_RANGE_PX
     if params.window != "duration" or low <= displacement <= high:
@@ -885,7 +889,7 @@ contrast = HostEstimator(
     Params,
     solve,
     linear=True,
-    lengths=lengths,
+    lengths=adapt_lengths,
     about="The motion that makes the image of warped events sharpest (Gallego et al., CVPR 2018), "
     "in overlapping windows of time, each by itself.",
 )

@@ -346,7 +346,7 @@ def _sampson_distances(
     return (two * to).sum(1) / np.maximum(size, 1e-12)
 
 
-def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
+def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """Return a span in which the image moves by `PAIR_DISPLACEMENT_PX`."""
     return {"span": float(np.clip(PAIR_DISPLACEMENT_PX / speed.median, *PAIR_SPAN_RANGE_S))}
 
@@ -374,7 +374,7 @@ frames = PointTracker(
     "frames",
     Params,
     solve,
-    lengths=lengths,
+    lengths=adapt_lengths,
     about="Motion from frames alone: points tracked by Lucas and Kanade's method determine the "
     "motion between each two frames, general motion by the five-point method. It needs OpenCV.",
 )

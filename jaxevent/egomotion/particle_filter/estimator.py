@@ -721,7 +721,7 @@ def _basis_at(model: Model, xi: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
 
 
-def lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
+def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     """Adapt the age of the oldest candidates, and the largest speed of a search.
 
     The oldest candidates are so old that the fast quarter of the image has moved by the baseline.
@@ -801,7 +801,7 @@ def candidate_range(
 voting = VotingEstimator(
     "voting",
     Params,
-    lengths=lengths,
+    lengths=adapt_lengths,
     options=COMMON_OPTIONS | {"causal", "smooth", "cloud", "compiler"},
     about="Motion by voting: a particle filter whose likelihood is the vote of the earlier "
     "neighbours of events (Egomotion thesis, chapters 5 and 6, with soft votes of all neighbours).",

@@ -136,11 +136,11 @@ class Params(Parameters):
         gradient=False,
     )
 
-    def without_gradient(self) -> dict[str, str]:
+    def names_without_gradient(self) -> dict[str, str]:
         # Parameters of the other likelihood have none either.
         literal = self.likelihood == "literal"
         others = {"sigma_x", "s0", "alpha"} if literal else {"r_t", "alpha_literal"}
         if not (literal and self.horizon == "fixed"):
             others.add("past")
         why = f"does nothing with likelihood = {self.likelihood!r}"
-        return {**super().without_gradient(), **{name: why for name in sorted(others)}}
+        return {**super().names_without_gradient(), **{name: why for name in sorted(others)}}

@@ -123,7 +123,7 @@ def _register(
     Returns:
         (2,) translation from image k to image k + 1, px at full resolution.
     """
-    times = PathTimes.of(np.array([0, 1], np.float32))
+    times = PathTimes.without_common(np.array([0, 1], np.float32))
     for level in levels:
         images = PackedImages.of(pyramid[level][k : k + 2], times)
         nodes = np.zeros((*node_shape(*pyramid.image_shape, level), 4), np.float32)

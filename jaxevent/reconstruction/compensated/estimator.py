@@ -45,7 +45,7 @@ from jaxevent.reconstruction.compensated.images import (
     BrightnessPrior,
     gaussian_blur,
     instant_smoother,
-    smooth_at_target,
+    smooth_part_at_target,
 )
 from jaxevent.reconstruction.compensated.instants import (
     merge_instant_times,
@@ -485,7 +485,7 @@ class MotionCompensation(ImageEstimator[Params]):
             reach = squared_reach(paths, layout.common)
             fused = fuse(params, *images[:2], warped, layout, reach, noise=factor)
             weight = after_weight(layout)
-            base, variance = smooth_at_target(smooth, layout, weight, paths, brightness)
+            base, variance = smooth_part_at_target(smooth, layout, weight, paths, brightness)
             base, added = (1 - steady) * base, (1 - steady) * variance
             fused = dataclasses.replace(fused, L=fused.L + base, P=fused.P + added)
             if out.samples is not None:

@@ -1,18 +1,18 @@
 """Images at single instants, and how the brightness of frames changes without events.
 
-An exposure that adapts, or flicker, changes frames where no events come. Such frames show the same
-points with other values, so they do not agree along any trajectory. They agree in what is left when
-the part that varies slowly over the image is taken away. Around frames that are not steady, images
-are compared and fused without that smooth part. The result is given the smooth part of the
-smoother's image at the target, which goes from frame to frame as a blend does. Beyond the frames it
-drifts with the events, and brightness is that of the nearest frame along trajectories. If that one
-is the exception, since the two next to it are alike, brightness becomes theirs within an interval
-of frames.
+Automatic exposure and flicker change frames without events. Such frames show the same points with
+other values, so they do not agree along any trajectory. They do agree once the part that varies
+slowly over the image is subtracted. Around frames that are not steady, images are compared and
+fused without that smooth part. The result gets the smooth part of the smoother's image at the
+target, which blends from one frame to the next. Beyond the first and the last frame that image
+drifts with the events, so brightness is that of the nearest frame along trajectories. If only that
+frame is an exception, as the two next to it are alike, brightness becomes theirs within one
+interval of frames.
 
-Frames are steady if pixels without events around them keep their values: a change there is none of
-the scene. If some frames are brighter than those before and after, an image between frames may be
-brighter, too, and nothing determines it. The variance of the brightness is then estimated by
-leaving out each of the frames around and predicting it from its neighbours.
+Frames are steady if pixels without events around them keep their values: such pixels show no change
+of the scene. If some frames are brighter than those before and after, an image between frames may
+be brighter, too, and nothing determines by how much. The variance of the brightness is then
+estimated by predicting each nearby frame from its neighbours.
 """
 
 import collections
@@ -38,14 +38,14 @@ from jaxevent.reconstruction.smoother import FrameMeasurements, Gaussian, Smooth
 from jaxevent.reconstruction.stream import count_events_per_pixel
 from jaxevent.recording import Recording
 
-N_CACHED_IMAGES = 96  # of instants, in a video
-SMOOTH_PART_SIGMA_PX = 12.0  # of the Gaussian that leaves the smooth part
-MIN_UNSTEADY_CHANGE = 0.05  # ln I, between frames that are not steady
-MEDIAN_BLOCK_PX = 16  # over which the change of pixels without events is a median
-MIN_BLOCK_PIXELS, MIN_BLOCKS = 8, 4  # without events
+N_CACHED_IMAGES = 96  # images at instants that a video keeps
+SMOOTH_PART_SIGMA_PX = 12.0  # of the Gaussian blur whose result is the smooth part
+MIN_UNSTEADY_CHANGE = 0.05  # ln I, smallest change between frames that are not steady
+MEDIAN_BLOCK_PX = 16  # side of the blocks whose median change is taken
+MIN_BLOCK_PIXELS, MIN_BLOCKS = 8, 4  # least pixels without events in a block, least such blocks
 MAX_BRIGHTNESS_FRAMES = 8  # on either side, from which the variance of brightness is estimated
-# Of independent brightnesses of variance v two differ by 2 v, squared, and one from the mean of two
-# others by 3 v / 2.
+# For independent brightnesses of variance v, the squared difference of two has the mean 2 v, and
+# that of one from the mean of two others has 3 v / 2: the ratio of the second to the first.
 MIDPOINT_VARIANCE_FACTOR = 0.75
 UNCLIPPED_GREY_RANGE = (0.02, 0.98)  # grey values of pixels that are not clipped
 
@@ -60,12 +60,12 @@ class FrameLevels(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class InstantSmoother(Smoother[Params]):
-    """Smoother whose images are the frames themselves at the middle of their exposures.
+    """Smoother whose image at the middle of an exposure is that frame itself.
 
-    It reads log intensity L, its variance V, and whether a frame shows the pixel unclipped. The
+    An image is log intensity L, its variance V, and whether a frame shows the pixel unclipped. The
     smoother weighs a frame by a noise model made for integrating events. At the middle of an
-    exposure the frame itself is more accurate: L of its pixel with the variance
-    (sigma_pixel / (I + I0))^2 + 1e-4, deblurred as far as events determine it.
+    exposure the frame itself is more accurate: it has the variance
+    (sigma_pixel / (I + I0))^2 + 1e-4, and is deblurred as far as events determine it.
     """
 
     has_unseen_errors: ClassVar[bool] = False  # the fusion has a variance of its own
@@ -77,20 +77,20 @@ class InstantSmoother(Smoother[Params]):
         if events is not None:
             blurred = jnp.log(frames.intensity + params.I0)
             change = z - blurred
-            # The correction by events is no better than a threshold and their noise: where it is
-            # not larger than that, a blurred frame is nearer to the truth.
+            # The events' correction has an error of about a threshold and their noise. Where it is
+            # smaller than this error, the blurred frame is closer to the truth.
             error = params.c_on * params.c_off * (0.25 + params.sigma_event**2 * events / 3)
             trust = change**2 / (change**2 + error)
             z, V = blurred + trust * change, V + trust * error
         return FrameLevels(z, V, measured.clear)
 
     def readout(self, params: Params, state: Gaussian, info: FrameLevels, here: Array) -> Estimate:
-        """Read images at times, of pixels that a frame shows just then from that frame.
+        """Read images at times; where a frame shows the pixel at that time, from the frame.
 
         Args:
             params: Parameters of `mc`.
-            state: (times, pixels) log intensity by the smoother.
-            info: (times, pixels) log intensity by the frame before.
+            state: (times, pixels) log intensity of the smoother.
+            info: (times, pixels) log intensity of the previous frame.
             here: (times, 1) whether the time is the middle of that frame's exposure.
 
         Returns:
@@ -106,7 +106,7 @@ instant_smoother = InstantSmoother("instant-smoother", Params, fuses=False)
 
 
 class InstantImages:
-    """The smoother's images at any instants of a recording; the latest ones are remembered.
+    """The smoother's images at any instants of a recording, with a cache of the latest ones.
 
     Args:
         recording: The recording.
@@ -139,11 +139,11 @@ class InstantImages:
         L, V, clear = (np.stack(part) for part in zip(*chosen, strict=True))
         return L, V, clear
 
-    def read_ahead(self, times: NDArray[np.int64]) -> None:
-        """Read the images at sorted times (us) that are asked for next, all in one pass."""
+    def cache_images(self, times: NDArray[np.int64]) -> None:
+        """Read images at sorted times (us) into the cache, in one pass, before they are needed."""
         self._read(times)
 
-    def logs(self, times: NDArray[np.int64]) -> NDArray[np.float32]:
+    def log_images(self, times: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return L alone (times, h, w) at sorted times (us)."""
         return np.stack([one.mean for one in self._read(times)])
 
@@ -162,14 +162,14 @@ class InstantImages:
 
 @functools.cache
 def _averages(size: int, sigma: float) -> NDArray[np.float32]:
-    """Make the matrix that blurs an axis; weights at the border are of the pixels inside.
+    """Make the matrix that blurs along an axis, normalised at the borders.
 
     Args:
         size: Length of the axis, px.
         sigma: Standard deviation of the Gaussian, px.
 
     Returns:
-        (size, size); the sum of each row is 1.
+        (size, size); each row sums to 1.
     """
     at = np.arange(size)
     weights = np.exp(-0.5 * ((at[:, None] - at) / sigma) ** 2)
@@ -191,13 +191,13 @@ def gaussian_blur(L: Any, sigma_px: float = SMOOTH_PART_SIGMA_PX) -> Any:
 
 
 class BrightnessPrior(NamedTuple):
-    """Brightness at a time beside that of the nearest frames, each ()."""
+    """Brightness at a time relative to the nearest frames, each ()."""
 
-    variance: Numeric  # (ln I)^2, of what no frame determines
-    offset: Numeric  # ln I, to be added to the nearest frame; 0 between frames
+    variance: Numeric  # (ln I)^2, of the part that no frame determines
+    offset: Numeric  # ln I, to add to the nearest frame; 0 between frames
 
 
-def smooth_at_target(
+def smooth_part_at_target(
     smooth: Numeric, layout: InstantLayout, weight: Numeric, paths: Numeric, prior: BrightnessPrior
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Return the smooth part of the target's image, ln I, and its variance.
@@ -207,8 +207,8 @@ def smooth_at_target(
     Args:
         smooth: (K, h, w) smooth parts of the images at the target's instants.
         layout: The instants.
-        weight: (), of the frame after the target in the blend of the two, 0..1.
-        paths: (h, w, 4) paths to frames that are on one side alone, px.
+        weight: (), weight of the later of the two frames around the target, 0..1.
+        paths: (h, w, 4) paths, px, used where all frames are on one side of the target.
         prior: Brightness at the target.
 
     Returns:
@@ -224,17 +224,18 @@ def smooth_at_target(
     return jnp.where(one_sided, beyond, smooth[layout.target]), variance
 
 
-def is_equally_bright(L: NDArray[np.floating]) -> bool:
-    """Return whether images show no change of the light that lights all of the scene.
+def are_equally_bright(L: NDArray[np.floating]) -> bool:
+    """Return whether images show the scene under the same light.
 
-    Motion brightens some blocks of pixels and darkens others, light changes all alike: the median
-    of the blocks' changes is above the limit, and above what their scatter explains.
+    Motion brightens some blocks of pixels and darkens others; a change of light acts on all alike.
+    Light has changed if the median of the blocks' changes exceeds the limit, and exceeds what
+    their scatter explains.
 
     Args:
         L: (n, h, w) log intensity.
 
     Returns:
-        True where they do not.
+        Whether they are equally bright.
     """
     h, w = (length // MEDIAN_BLOCK_PX for length in L.shape[1:])
     if h * w < MIN_BLOCKS:
@@ -262,7 +263,8 @@ class FrameBrightness:
     def is_steady(self, first_us: int, last_us: int) -> bool:
         """Return whether all frames between two times are equally bright.
 
-        Changes of a light that fades are small, and add up over the frames.
+        Changes of a fading light are small from frame to frame, so they are summed.
+
         Args:
             first_us: First time, us; a frame at it counts.
             last_us: Last time, us, likewise.
@@ -280,7 +282,7 @@ class FrameBrightness:
         return BrightnessPrior(np.float32(self.variance(t_us)), np.float32(self._offset(t_us)))
 
     def _offset(self, t: int) -> float:
-        """Return the brightness (ln I) to add to the nearest frame, beyond the frames; else 0."""
+        """Return the brightness (ln I) to add to the nearest frame; 0 between frames."""
         mid = self._mid
         if len(mid) < 3 or mid[0] <= t <= mid[-1]:
             return 0.0
@@ -324,13 +326,13 @@ class FrameBrightness:
         return float(variance * 4 * w * (1 - w))
 
     def _change(self, frame: int) -> float:
-        """Return the change of ln(I + I0) from a frame to the next, and remember it."""
+        """Return the change of ln(I + I0) from a frame to the next; it is cached."""
         if frame not in self._changes:
             self._changes[frame] = self._measure_change(frame)
         return self._changes[frame]
 
     def _measure_change(self, frame: int) -> float:
-        """Measure the change of ln(I + I0): the median over blocks of pixels without events."""
+        """Measure the change of ln(I + I0) to the next frame: a median of blocks without events."""
         source, size = self._recording.events, (self._recording.height, self._recording.width)
         begin, end = (source.index(int(t)) for t in self._mid[frame : frame + 2])
         grey, intensity, _, _ = self._images.read(slice(frame, frame + 2), 2)
@@ -350,15 +352,12 @@ class FrameBrightness:
 
 @njit_noalloc_inlined
 def _is_quiet(counts, y, x):
-    """Return whether a pixel and those around it have no events.
+    """Return whether a pixel and its eight neighbours have no events.
 
     Args:
         counts: (h, w) events of pixels.
         y: Row of the pixel.
-        x: Its column.
-
-    Returns:
-        Whether they have none.
+        x: Column of the pixel.
     """
     if counts[y, x] != 0:
         return False
@@ -372,14 +371,14 @@ def _is_quiet(counts, y, x):
 
 @njit_noalloc
 def _list_quiet_changes(frames, counts, I0, number, found):
-    """Write the changes of ln(I + I0) of each block's unclipped pixels without events around them.
+    """List, for each block, the changes of ln(I + I0) of its quiet and unclipped pixels.
 
     Args:
         frames: Grey values and intensities of two frames, (2, h, w) each.
         counts: (h, w) events of each pixel between them.
         I0: Offset inside the logarithm.
-        number: (rows, columns) of blocks, output: the number of such pixels.
-        found: (rows, columns, pixels) output: their changes.
+        number: (rows, columns) of blocks, output: number of changes.
+        found: (rows, columns, pixels) output: changes.
     """
     (grey, intensity), size = frames, MEDIAN_BLOCK_PX
     black, white = np.float32(UNCLIPPED_GREY_RANGE[0]), np.float32(UNCLIPPED_GREY_RANGE[1])

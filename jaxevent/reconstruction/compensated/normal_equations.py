@@ -22,7 +22,7 @@ from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import empty_row_scratch, njit_noalloc, njit_noalloc_inlined, run_over_rows
 from jaxevent.precision import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -224,7 +224,7 @@ class _SampleScratch(NamedTuple):
             width: Width of the images, px.
         """
         shapes = (instants, width), (2, width)
-        return cls(RowScratch.allocate(rows, width), *(row_scratch(rows, *s) for s in shapes))
+        return cls(RowScratch.allocate(rows, width), *(empty_row_scratch(rows, *s) for s in shapes))
 
 
 @njit_noalloc_inlined
@@ -462,7 +462,11 @@ def linearise(images: PackedImages, p: NDArray[np.float32], cost: CostParams) ->
     shape, (count, h, w, _) = p.shape[:2], images.pixels.shape
     entries, M = np.empty((*shape, 15), np.float32), np.empty((h, w), np.float32)
     samples = _SampleScratch.allocate(shape[0], count, w)
-    scratch = samples, row_scratch(shape[0], 12 + 15 + 1, w), row_scratch(shape[0], 4, 4, count, w)
+    scratch = (
+        samples,
+        empty_row_scratch(shape[0], 12 + 15 + 1, w),
+        empty_row_scratch(shape[0], 4, 4, count, w),
+    )
     run_over_rows(_linearise, shape[0], (images, p, cost), scratch, M, entries)
     blurred = np.empty((*shape, 14), np.float32)
     _smooth_nodes(entries, np.empty((shape[1], 14), np.float32), blurred)

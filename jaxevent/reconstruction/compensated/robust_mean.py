@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined, row_scratch, run_over_rows
+from jaxevent.codegen import empty_row_scratch, njit_noalloc, njit_noalloc_inlined, run_over_rows
 from jaxevent.reconstruction.compensated.instants import TargetInstants
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
@@ -316,7 +316,7 @@ def blur_image(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float3
     """
     taps = gaussian_taps(sigma_px)
     half, out = np.empty_like(image), np.empty_like(image)
-    scratch = row_scratch(len(image), image.shape[1] + len(taps))
+    scratch = empty_row_scratch(len(image), image.shape[1] + len(taps))
     run_over_rows(_blur_across, len(image), image, taps, scratch, half)
     run_over_rows(_blur_down, len(image), half, taps, out)
     return out
@@ -593,7 +593,7 @@ def robust_mean(
     numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
     numbers = [np.float32(v) for v in numbers]
     inputs = _MeanInputs(L, warped, layout, weights, taps, low, high, *numbers)
-    rows, padded = row_scratch(h, 10 + 2 * count, w), row_scratch(h, w + len(taps))
+    rows, padded = empty_row_scratch(h, 10 + 2 * count, w), empty_row_scratch(h, w + len(taps))
     images = np.empty((3, h, w), np.float32)
     scratch = _MeanScratch(np.empty((count, h, w), np.float32), *images, rows, padded)
     out = RobustMean(

@@ -29,9 +29,9 @@ from jaxevent.reconstruction.compensated.images import (
     BrightnessPrior,
     FrameBrightness,
     InstantImages,
+    are_equally_bright,
     gaussian_blur,
-    is_equally_bright,
-    smooth_at_target,
+    smooth_part_at_target,
 )
 from jaxevent.reconstruction.compensated.instants import (
     TIME_CLOCK,
@@ -118,7 +118,7 @@ def make_instant_schedule(
     lag = int(np.median(np.diff(frames)) / 4) if len(frames) > 1 else 5000
     inner = np.linspace(0, max(last - lag - first, 0), N_SPEED_PROBES + 2)[1:-1]
 
-    speed = measure_image_speed(images.logs, first + inner.astype(np.int64), max(lag, 400))
+    speed = measure_image_speed(images.log_images, first + inner.astype(np.int64), max(lag, 400))
     if not math.isfinite(speed):
         raise InputError(
             f"{recording.name}: with these parameters images at single instants are not finite; "
@@ -333,7 +333,7 @@ class TrajectoryEstimator:
         L, V, clear = self.images(instants.t)
         self.event_noise.inflate(instants.t, V)
         first, last = int(instants.t[0]), int(instants.t[-1])
-        if self.brightness.is_steady(first, last) and is_equally_bright(L):
+        if self.brightness.is_steady(first, last) and are_equally_bright(L):
             return InstantStack(L, V, clear, None)
         smooth = gaussian_blur(L)
         return InstantStack(L - smooth, V, clear, smooth)
@@ -574,7 +574,7 @@ class TrajectoryEstimator:
             )
         nearest, *others = anchors = self._anchor_times(t)
         new = [self.schedule(at).t for at in anchors if at not in self._anchors]
-        self.images.read_ahead(np.unique(np.concatenate([instants.t, *new])))
+        self.images.cache_images(np.unique(np.concatenate([instants.t, *new])))
         self._anchors = anchors
         images, noise = self._images(instants), self._noise(t)
         timed = self._prefers_time(t, anchors)
@@ -725,7 +725,7 @@ def add_smooth_part(
     assert target.smooth is not None
     layout = make_layout(target.instants, target.clear, len(target.instants))
     weight = after_weight(layout)
-    L, P = smooth_at_target(target.smooth, layout, weight, target.paths, brightness)
+    L, P = smooth_part_at_target(target.smooth, layout, weight, target.paths, brightness)
     return dataclasses.replace(fused, L=fused.L + L, P=fused.P + P)
 
 

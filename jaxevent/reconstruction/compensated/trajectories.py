@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import (
+    empty_row_scratch,
     njit_noalloc,
     njit_noalloc_inlined,
     read_only,
-    row_scratch,
     run_over_rows,
 )
 from jaxevent.reconstruction.compensated.normal_equations import (
@@ -155,7 +155,7 @@ def halve_resolution(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur images (K, h, w) and keep every second pixel: half the resolution, rounded up."""
     count, h, w = images.shape
     out = np.empty((count, (h + 1) // 2, (w + 1) // 2), np.float32)
-    run_over_rows(_halve, out.shape[1], images, row_scratch(out.shape[1], w), out)
+    run_over_rows(_halve, out.shape[1], images, empty_row_scratch(out.shape[1], w), out)
     return out
 
 
@@ -511,11 +511,11 @@ class _SearchScratch(NamedTuple):
         rows, columns = shape
         return cls(
             RowScratch.allocate(rows, columns),
-            row_scratch(rows, 3, instants, columns),
-            row_scratch(rows, 6, columns),
+            empty_row_scratch(rows, 3, instants, columns),
+            empty_row_scratch(rows, 6, columns),
             np.empty((rows, 2, columns)),
             np.empty((rows, columns), np.int32),
-            row_scratch(rows, columns + taps),
+            empty_row_scratch(rows, columns + taps),
         )
 
 

@@ -1,10 +1,9 @@
-"""Paths of pixels, and images read along them: in numba loops, and in JAX for derivatives.
+"""Images read along the paths of scene points: in numba loops, and in JAX for derivatives.
 
-A path holds the numbers (vx, vy, ax, ay) of a point that the target's image shows at the pixel x.
-At the instant s the point lies at x + v s + a s^2 + c, s in -1..1, where c is the displacement that
-all points have in common at the instant. Paths are given at nodes, one for
-every 2 x 2 pixels, and bilinear between them. Functions whose names end in `_jax` are
-differentiable.
+A path (vx, vy, ax, ay) belongs to the point that the target's image shows at the pixel x. At the
+instant s, -1..1, the point lies at x + v s + a s^2 + c. Here c is a displacement at that instant
+that all points share. Paths are given at nodes, one per 2 x 2 pixels, and interpolated bilinearly
+between them. Functions whose names end in `_jax` are differentiable.
 """
 
 from typing import Any, NamedTuple
@@ -16,10 +15,10 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from jaxevent.codegen import (
+    empty_row_scratch,
     njit_noalloc,
     njit_noalloc_inlined,
     read_only,
-    row_scratch,
     run_over_rows,
 )
 from jaxevent.reconstruction.features import Numeric
@@ -28,18 +27,18 @@ CUBIC_SLOPE = -0.75  # derivative of the cubic kernel at 1 px, as in OpenCV
 
 
 class PathTimes(NamedTuple):
-    """Instants on the clock of paths, and displacements of all points beside their paths."""
+    """Instants on the clock of paths, and the displacement that all points share at each."""
 
     s: Float[Numeric, " k"]  # relative to the target, -1..1
-    common: Float[Numeric, "k 2"]  # displacement along x and y that all points share, px
+    common: Float[Numeric, "k 2"]  # displacement along x and y, px
 
     @classmethod
-    def of(cls, s: NDArray[np.float32]) -> "PathTimes":
-        """Put instants s (K,) on the clock of paths that explain all motion."""
+    def without_common(cls, s: NDArray[np.float32]) -> "PathTimes":
+        """Make instants s (K,) at which paths alone describe the motion."""
         return cls(s, np.zeros((len(s), 2), np.float32))
 
     def at_level(self, level: int) -> "PathTimes":
-        """Convert to pixels of a level of resolution; 0 is full resolution."""
+        """Convert to pixels of a level of the image pyramid; 0 is full resolution."""
         return PathTimes(self.s, self.common * np.float32(0.5**level))
 
     def take(self, chosen: Any) -> "PathTimes":
@@ -48,7 +47,7 @@ class PathTimes(NamedTuple):
 
 
 class WarpedImages(NamedTuple):
-    """Images at K instants, read at the target's points."""
+    """Images at K instants, sampled at the target's points."""
 
     L: Float[Numeric, "k h w"]  # log intensity, bicubic
     V: Float[Numeric, "k h w"]  # its variance, (ln I)^2, bilinear
@@ -57,7 +56,7 @@ class WarpedImages(NamedTuple):
 
 
 class RowScratch(NamedTuple):
-    """Scratch memory for the points of one row, for each row that a kernel begins with."""
+    """Scratch memory for the points of one row, one set per row; see `empty_row_scratch`."""
 
     path: NDArray[np.float32]  # (rows, 4, points)
     x: NDArray[np.float32]  # (rows, points), px, at the target
@@ -68,19 +67,19 @@ class RowScratch(NamedTuple):
     @classmethod
     def allocate(cls, rows: int, points: int) -> "RowScratch":
         """Allocate scratch memory for `run_over_rows`."""
-        path, part = row_scratch(rows, 4, points), row_scratch(rows, 2, points)
-        x, inside = row_scratch(rows, points), row_scratch(rows, points)
+        path, part = empty_row_scratch(rows, 4, points), empty_row_scratch(rows, 2, points)
+        x, inside = empty_row_scratch(rows, points), empty_row_scratch(rows, points)
         return cls(path, x, np.empty((rows, 2, points), np.int32), part, inside)
 
 
 @njit_noalloc_inlined
 def gradient_at_pixel(image, y, x):
-    """Return the gradient along x and y at a pixel; five taps, exact up to degree 4.
+    """Return the gradient along x and y at a pixel: five taps, exact for quartic polynomials.
 
     Args:
         image: (h, w) float32.
         y: Row of the pixel.
-        x: Its column.
+        x: Column of the pixel.
     """
     h, w = image.shape
     up, down, up2, down2 = max(y - 1, 0), min(y + 1, h - 1), max(y - 2, 0), min(y + 2, h - 1)
@@ -120,13 +119,13 @@ def gradient_jax(images: Array) -> tuple[Array, Array]:
 
 @njit_noalloc_inlined
 def bilinear_cell(X, Y, h, w):
-    """Return the four pixels around a point, or at the border: x0, y0, x1, y1, and fx, fy in it.
+    """Return the cell of four pixels around a point: x0, y0, x1, y1, and fx, fy in 0..1.
 
     Args:
-        X: Column of the point, px.
-        Y: Its row, px.
+        X: Column of the point, px; beyond the border, the nearest point inside is taken.
+        Y: Row of the point, px, likewise.
         h: Height of the image, px.
-        w: Its width, px.
+        w: Width of the image, px.
     """
     zero = np.float32(0)
     X = min(max(X, zero), np.float32(w - 1))
@@ -145,7 +144,7 @@ def bilinear_weights(fx, fy):
         fy: Distance along y, 0..1.
 
     Returns:
-        Those of (y0, x0), (y0, x1), (y1, x0) and (y1, x1).
+        Weights of (y0, x0), (y0, x1), (y1, x0) and (y1, x1).
     """
     one = np.float32(1)
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
@@ -153,7 +152,7 @@ def bilinear_weights(fx, fy):
 
 @njit_noalloc_inlined
 def blend_nodes(p, cell, out_path):
-    """Write the four numbers of a path between the nodes of a cell.
+    """Interpolate the path at a point inside a cell of four nodes.
 
     Args:
         p: (rows, columns, 4) paths of nodes.
@@ -169,12 +168,12 @@ def blend_nodes(p, cell, out_path):
 
 @njit_noalloc_inlined
 def interpolate_path(p, node_y, node_x, out_path):
-    """Write the path at a place between nodes.
+    """Interpolate the path at a position in the grid of nodes.
 
     Args:
         p: (rows, columns, 4) paths of nodes.
-        node_y: Row of the place, in nodes.
-        node_x: Its column, in nodes.
+        node_y: Row of the position, in nodes.
+        node_x: Column of the position, in nodes.
         out_path: (4,) output.
     """
     rows, columns, _ = p.shape
@@ -187,14 +186,14 @@ def interpolate_path(p, node_y, node_x, out_path):
 
 @njit_noalloc
 def _resample(begin, end, p, scale, factor, out):
-    """Resample the paths of nodes on a grid of another spacing with the same border.
+    """Resample the paths of nodes on a grid of another spacing that covers the same area.
 
     Args:
         begin: First row of the output.
         end: Row after the last one.
         p: (rows, columns, 4) paths.
         scale: Points of the output per node, along each axis.
-        factor: Factor on the paths, for another unit.
+        factor: Factor on the paths, to convert their unit.
         out: (rows, columns, 4) output.
     """
     ratio, half = np.float32(1) / scale, np.float32(0.5)
@@ -224,12 +223,12 @@ def interpolate_paths(p: NDArray[np.float32], image_shape: tuple[int, int]) -> N
 def resize_nodes(
     p: NDArray[np.float32], shape: tuple[int, int], finer: bool
 ) -> NDArray[np.float32]:
-    """Interpolate nodes to those of images of twice (`finer`) or half the resolution.
+    """Resample the paths of nodes for images of twice (`finer`) or half the resolution.
 
     Args:
-        p: (rows, columns, 4) paths, in pixels of the present resolution.
+        p: (rows, columns, 4) paths, in pixels of the old resolution.
         shape: Rows and columns of the new nodes.
-        finer: Whether the new resolution is twice the present one, not half of it.
+        finer: Whether the new resolution is twice the old one, rather than half.
 
     Returns:
         (*shape, 4) paths, in pixels of the new resolution.
@@ -257,14 +256,14 @@ def interpolate_paths_jax(p: Array, height: int, width: int) -> Array:
 
 @njit_noalloc_inlined
 def locate_points(y, times, k, image_shape, n_points, scratch_row):
-    """Locate the first points of a row at an instant: write `pixel`, `part` and `inside`.
+    """Locate the points of a row at an instant: fill `pixel`, `part` and `inside`.
 
     Args:
         y: The row, px.
         times: `PathTimes`.
         k: Index of the instant.
         image_shape: Height and width of the image, px.
-        n_points: Number of points.
+        n_points: Number of points to locate, from the first on.
         scratch_row: The parts of a `RowScratch` for one row.
     """
     h, w = image_shape
@@ -278,7 +277,7 @@ def locate_points(y, times, k, image_shape, n_points, scratch_row):
         Y = y + (path[1, i] + path[3, i] * s) * s + common_y
         here = (X >= -half) & (X <= right + half) & (Y >= -half) & (Y <= bottom + half)
         inside[i] = one if here else zero
-        # So that what is no number becomes 0, too: it must not point outside.
+        # Written so that NaN becomes 0, too, and no index lies outside.
         X, Y = X if X > zero else zero, Y if Y > zero else zero
         X, Y = min(X, right), min(Y, bottom)
         x0, y0 = min(np.int32(X), last_x), min(np.int32(Y), last_y)
@@ -288,7 +287,7 @@ def locate_points(y, times, k, image_shape, n_points, scratch_row):
 
 @njit_noalloc_inlined
 def _cubic_weights(part, out):
-    """Write the weights of the four pixels around each point along an axis.
+    """Compute the cubic weights of the four pixels around each point along an axis.
 
     Args:
         part: (points,) distance from the second of the four, 0..1.
@@ -307,7 +306,7 @@ def _cubic_weights(part, out):
 
 @njit_noalloc_inlined
 def _read_bilinear(image, pixel, part, out):
-    """Read an image at points, bilinear.
+    """Sample an image at points by bilinear interpolation.
 
     Args:
         image: (h, w).
@@ -326,7 +325,7 @@ def _read_bilinear(image, pixel, part, out):
 
 @njit_noalloc_inlined
 def _read_bicubic(image, pixel, weights, out):
-    """Read an image at points, bicubic; the image's border goes on.
+    """Sample an image at points by bicubic interpolation, with its border replicated.
 
     Args:
         image: (h, w).
@@ -343,7 +342,7 @@ def _read_bicubic(image, pixel, weights, out):
                 part = weights[0, i] * row[x] + weights[1, i] * row[x + 1]
                 part = part + weights[2, i] * row[x + 2] + weights[3, i] * row[x + 3]
                 total += weights[4 + n, i] * part
-        else:  # the image's border goes on
+        else:  # the border is replicated
             for n in range(4):
                 row, part = image[min(max(y + n, 0), h - 1)], np.float32(0)
                 for m in range(4):
@@ -354,7 +353,7 @@ def _read_bicubic(image, pixel, weights, out):
 
 @njit_noalloc
 def _warp_rows(begin, end, inputs, scratch, cubic, out):
-    """Read images along the paths of some rows of pixels.
+    """Sample images along the paths of some rows of pixels.
 
     Args:
         begin: First row.
@@ -391,13 +390,13 @@ def _warp_rows(begin, end, inputs, scratch, cubic, out):
 def warp_images(
     L: NDArray, V: NDArray, clear: NDArray, times: PathTimes, paths: NDArray
 ) -> WarpedImages:
-    """Read images along the paths of pixels.
+    """Sample images along the paths of pixels, by a compiled loop.
 
     Args:
         L: (K, h, w) float32, log intensity.
         V: (K, h, w) float32, its variance, (ln I)^2.
         clear: (K, h, w) float32, 1 where a frame shows the pixel unclipped.
-        times: Their K times, float32.
+        times: K times of the images, float32.
         paths: (h, w, 4) float32, px.
 
     Returns:
@@ -406,7 +405,7 @@ def warp_images(
     _, h, w = L.shape
     out = WarpedImages(*(np.empty(L.shape, np.float32) for _ in range(4)))
     inputs = (read_only(L), read_only(V), clear, clear.any((1, 2)), times, paths)
-    run_over_rows(_warp_rows, h, inputs, RowScratch.allocate(h, w), row_scratch(h, 8, w), out)
+    run_over_rows(_warp_rows, h, inputs, RowScratch.allocate(h, w), empty_row_scratch(h, 8, w), out)
     return out
 
 
@@ -426,11 +425,11 @@ def path_displacements(paths: Array, times: PathTimes) -> Array:
 
 
 def squared_reach(paths: Numeric, common: Numeric) -> Numeric:
-    """Return an upper bound of the squared distance that points go.
+    """Return an upper bound of the squared displacement of points from the target's image.
 
     Args:
-        paths: (h, w, 4) their paths, px.
-        common: (K, 2) displacements that all share, px.
+        paths: (h, w, 4) paths, px.
+        common: (K, 2) displacements that all points share, px.
 
     Returns:
         (h, w), px^2.
@@ -440,7 +439,7 @@ def squared_reach(paths: Numeric, common: Numeric) -> Numeric:
 
 
 def path_positions(paths: Array, times: PathTimes) -> tuple[Array, Array]:
-    """Return the positions of the points of paths.
+    """Return the positions of scene points at the times of images.
 
     Args:
         paths: (h, w, 4) paths, px.
@@ -455,12 +454,12 @@ def path_positions(paths: Array, times: PathTimes) -> tuple[Array, Array]:
 
 
 def sample_bilinear(images: Array, Y: Array, X: Array) -> Array:
-    """Read images at points of their own, bilinear; differentiable.
+    """Sample each image at its own points by bilinear interpolation; differentiable.
 
     Args:
         images: (K, h, w).
         Y: (K, h', w') rows of the points, px.
-        X: (K, h', w') their columns, px.
+        X: (K, h', w') columns of the points, px.
 
     Returns:
         (K, h', w').
@@ -492,9 +491,10 @@ def _locate_cells(h: int, w: int, Y: Array, X: Array) -> tuple[Array, Array, Arr
 
 
 def _take(images: Array, y: Array, x: Array) -> Array:
-    """Read images at pixels that are in them.
+    """Read images at pixels that lie inside.
 
-    Checks of their range would make three of four operations, and as many in derivatives.
+    Bounds checks would be three of four operations, in derivatives, too.
+
     Args:
         images: (K, h, w).
         y: (..., K, h, w) rows.
@@ -509,13 +509,13 @@ def _take(images: Array, y: Array, x: Array) -> Array:
 
 
 def is_in_image(Y: Array, X: Array, height: int, width: int) -> Array:
-    """Return which points lie in an image.
+    """Return whether points lie in an image.
 
     Args:
         Y: Rows of the points, px.
-        X: Their columns, px.
+        X: Columns of the points, px.
         height: Height of the image, px.
-        width: Its width, px.
+        width: Width of the image, px.
     """
     return (X >= -0.5) & (X <= width - 0.5) & (Y >= -0.5) & (Y <= height - 0.5)
 
@@ -523,13 +523,13 @@ def is_in_image(Y: Array, X: Array, height: int, width: int) -> Array:
 def warp_images_jax(
     L: Array, V: Array, clear: Array, times: PathTimes, paths: Array
 ) -> WarpedImages:
-    """Read images along the paths of pixels, as `warp_images` does; differentiable.
+    """Sample images along the paths of pixels; differentiable, otherwise like `warp_images`.
 
     Args:
         L: (K, h, w) log intensity.
         V: (K, h, w) its variance, (ln I)^2.
         clear: (K, h, w) 1 where a frame shows the pixel unclipped.
-        times: Their K times.
+        times: K times of the images.
         paths: (h, w, 4), px.
 
     Returns:
@@ -551,7 +551,7 @@ def warp_images_jax(
         third = ((a + 2) * rest - (a + 3)) * rest * rest + 1
         return jnp.stack([first, second, third, 1 - first - second - third])
 
-    # Around the points: (rows, columns, k, h, w).
+    # Pixels around the points: (rows, columns, k, h, w).
     taps = _take(L, row[:, None], column)
     bicubic = (cubic(fy)[:, None] * cubic(fx) * taps).sum((0, 1))
     return WarpedImages(bicubic, V, clear, inside.astype(L.dtype))

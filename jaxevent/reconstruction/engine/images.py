@@ -406,7 +406,7 @@ class ImageKernel(abc.ABC):
         self._arguments = method, recording, times, params
         self._turns = TurnLock(f"images of {recording.name}")
         self._passes: dict[DerivativeDirections, Any] = {}
-        dead = params.without_gradient()
+        dead = params.names_without_gradient()
         numbers = [
             (leaf, k)
             for leaf, (path, value) in enumerate(jax.tree_util.tree_flatten_with_path(params)[0])
